@@ -1,0 +1,191 @@
+from __future__ import annotations
+
+import io
+import os
+import socket
+import sys
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from vlagents_ray.cli import doctor, machine
+from vlagents_ray.cli.doctor import Check
+from vlagents_ray.errors import MissingDependency
+
+GB = machine.GB
+
+
+def nvidia_smi(folder: Path, monkeypatch: pytest.MonkeyPatch, script: str) -> None:
+    tool = folder / "nvidia-smi"
+    tool.write_text(f"#!/bin/sh\n{script}\n")
+    tool.chmod(0o755)
+    monkeypatch.setenv("PATH", str(folder), prepend=os.pathsep)
+
+
+def table(monkeypatch: pytest.MonkeyPatch, *rows: Check) -> tuple[int, str]:
+    monkeypatch.setattr(doctor, "checks", lambda _: iter(rows))
+    text = io.StringIO()
+    code = doctor.run(Console(file=text, width=200))
+    return code, text.getvalue()
+
+
+@pytest.mark.slow
+def test_every_check_gives_a_row_of_its_own_and_none_breaks() -> None:
+    rows = list(doctor.checks(port=0))
+    names = [row.name for row in rows]
+    for expected in ("Python", "Ray", "HAProxy", "GPU", "Vulkan", "EGL", "video", "shared memory", "open files"):
+        assert names.count(expected) == 1
+    assert [row for row in rows if "the check itself broke" in row.detail] == []
+    assert [row for row in rows if row.status != "ok" and not row.cure] == []
+
+
+def test_the_exit_code_is_1_only_if_a_check_failed(monkeypatch: pytest.MonkeyPatch) -> None:
+    fine, slow, broken = Check("a", "ok", "x"), Check("b", "warn", "x", "y"), Check("c", "fail", "x", "y")
+    assert table(monkeypatch, fine, slow)[0] == 0
+    assert table(monkeypatch, fine, broken, slow)[0] == 1
+
+
+def test_the_table_shows_finding_and_cure_as_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, text = table(monkeypatch, Check("Ray", "fail", "not [red]here", "pip install 'vlagents-ray[serve]'"))
+    assert "not [red]here" in text
+    assert "pip install 'vlagents-ray[serve]'" in text
+
+
+def test_a_check_that_raises_becomes_a_row() -> None:
+    def breaks() -> Check:
+        raise ZeroDivisionError("driver")
+
+    row = doctor.guarded("GPU", breaks)
+    assert row.status == "warn"
+    assert "ZeroDivisionError: driver" in row.detail
+
+
+def test_a_missing_package_becomes_a_row_with_the_command_that_installs_it() -> None:
+    def lacks() -> Check:
+        raise MissingDependency("'av' is not installed; pip install 'vlagents-ray[sim]'")
+
+    assert doctor.guarded("video", lacks) == Check(
+        "video", "warn", "'av' is not installed", "pip install 'vlagents-ray[sim]'"
+    )
+
+
+def test_an_old_python_fails() -> None:
+    assert doctor.python((3, 9, 18)).status == "fail"
+    assert doctor.python((3, 10, 0)).status == "ok"
+
+
+def test_another_ray_than_the_pinned_one_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert doctor.ray().status == "ok"
+    monkeypatch.setattr("importlib.metadata.version", lambda _: "2.1.0")
+    row = doctor.ray()
+    assert row.status == "warn"
+    assert "2.1.0" in row.detail
+    assert "2.60.0" in row.detail
+
+
+def test_haproxy_really_starts() -> None:
+    assert doctor.haproxy().status == "ok"
+
+
+def test_an_haproxy_that_does_not_start_is_a_warning(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    binary = tmp_path / "haproxy"
+    binary.write_text("#!/bin/sh\necho 'no libssl' >&2; exit 127\n")
+    binary.chmod(0o755)
+    monkeypatch.setenv("RAY_SERVE_HAPROXY_BINARY_PATH", str(binary))
+    row = doctor.haproxy()
+    assert row.status == "warn"
+    assert "no libssl" in row.detail
+
+
+def test_no_nvidia_smi_is_a_warning(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert doctor.gpu().status == "warn"
+
+
+def test_a_driver_that_lost_its_gpu_is_told_in_its_own_words(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    nvidia_smi(tmp_path, monkeypatch, "echo 'Driver/library version mismatch'; exit 18")
+    row = doctor.gpu()
+    assert row.status == "warn"
+    assert "Driver/library version mismatch" in row.detail
+
+
+@pytest.mark.parametrize(
+    ("torch", "status", "said"),
+    [
+        ("2.13.0|13.0|True", "ok", "torch 2.13.0 uses it"),
+        ("2.13.0+cpu|None|False", "warn", "CPU-only"),
+        ("2.13.0|13.0|False", "warn", "cannot use it"),
+    ],
+)
+def test_a_gpu_counts_only_if_torch_can_use_it(
+    torch: str, status: str, said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    nvidia_smi(tmp_path, monkeypatch, "echo 'NVIDIA H200, 143771 MiB, 580.1'")
+    monkeypatch.setattr(doctor, "_TORCH_CUDA", f"print({torch!r})")
+    row = doctor.gpu()
+    assert row.status == status
+    assert "NVIDIA H200, 143771 MiB, 580.1" in row.detail
+    assert said in row.detail
+
+
+def test_h264_survives_encoding_and_decoding() -> None:
+    assert doctor.video().status == "ok"
+
+
+def test_shared_memory_must_hold_the_object_store_that_ray_will_make() -> None:
+    assert machine.judge_shared_memory(total=32 * GB, free=30 * GB, memory=64 * GB).status == "ok"
+    docker_default = machine.judge_shared_memory(total=0.064 * GB, free=0.064 * GB, memory=16 * GB)
+    assert docker_default.status == "warn"
+    assert "--shm-size=5g" in docker_default.cure
+
+
+def test_a_small_share_of_a_huge_memory_is_enough_as_ray_caps_its_store() -> None:
+    assert machine.judge_shared_memory(total=100 * GB, free=100 * GB, memory=1000 * GB).status == "ok"
+
+
+@pytest.mark.parametrize(
+    ("free", "status"), [(0.5 * GB, "fail"), (3 * GB, "warn"), (20 * GB, "warn"), (200 * GB, "ok")]
+)
+def test_temporary_space_is_judged_by_what_is_free(free: float, status: str) -> None:
+    assert machine.judge_temp_dir("/tmp", total=1000 * GB, free=free).status == status
+
+
+def test_a_temporary_folder_with_a_long_path_fails_as_sockets_will_not_fit() -> None:
+    row = machine.judge_temp_dir("/tmp/" + "x" * 60, total=100 * GB, free=90 * GB)
+    assert row.status == "fail"
+    assert "107" in row.detail
+
+
+def test_rays_temporary_folder_is_the_one_that_is_judged(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("RAY_TMPDIR", str(tmp_path / "missing"))
+    row = machine.temp_dir()
+    assert row.status == "fail"
+    assert "missing" in row.detail
+
+
+@pytest.mark.parametrize(
+    ("soft", "hard", "status"), [(1024, 1024, "warn"), (1024, 1_048_576, "ok"), (65536, 65536, "ok")]
+)
+def test_open_files_count_as_ray_will_raise_them(soft: int, hard: int, status: str) -> None:
+    assert machine.judge_open_files(soft, hard).status == status
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_a_taken_port_names_its_holder_and_another_port() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        row = machine.port_free(port)
+    assert row.status == "warn"
+    assert f"pid {os.getpid()}" in row.detail
+    assert f"--port {port + 1}" in row.cure
+    assert machine.port_free(port).status == "ok"
+
+
+def test_a_containers_memory_limit_is_what_counts(tmp_path: Path) -> None:
+    machines = machine.memory_bytes(tmp_path / "none")
+    limit = tmp_path / "memory.max"
+    limit.write_text("1000000\n")
+    assert machine.memory_bytes(limit) == 1_000_000
+    limit.write_text("max\n")
+    assert machine.memory_bytes(limit) == machines

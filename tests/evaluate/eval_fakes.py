@@ -1,0 +1,159 @@
+"""A tiny env and agent that workers import by name, with troubles to order."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import threading
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.envs import EvalEnv
+from vlagents_ray.errors import ConnectionLost
+from vlagents_ray.interface import Act, Agent, Obs
+
+LINE = "eval_fakes:Line"
+OTHER_LINE = "eval_fakes:OtherLine"
+
+
+class Line(EvalEnv):
+    """A point on a line is to be brought to 0 within 10 steps; from far away it cannot be.
+
+    `trouble` maps a kind to the seeds in whose fourth step it happens, once for each seed: a file in
+    `folder` remembers. Kinds: "raise", "exit", "hang" (asleep), "freeze" (asleep, holding the
+    interpreter), and "gate", which waits for the file `folder/open`.
+    """
+
+    max_steps = 10
+
+    def __init__(
+        self,
+        folder: str | None = None,
+        trouble: Mapping[str, list[int]] | None = None,
+        camera: tuple[int, int] | None = None,
+        state_dim: int = 1,
+        broken: str | None = None,
+    ) -> None:
+        if broken is not None:
+            raise RuntimeError(broken)
+        self._folder = Path(folder) if folder is not None else None
+        self._trouble = trouble or {}
+        self._camera = camera
+        self._state_dim = state_dim
+        self._seed = 0
+        self._steps = 0
+        self._position = 0.0
+
+    @property
+    def contract(self) -> Contract:
+        cameras = {"front": CameraSpec(*self._camera)} if self._camera else {}
+        state = {"position": StateSpec(self._state_dim)}
+        return Contract(cameras=cameras, state=state, action=ActionSpec(dim=1), control_hz=10.0)
+
+    @property
+    def instruction(self) -> str:
+        return f"bring {self._position:.3f} to zero"
+
+    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+        self._seed, self._steps = seed, 0
+        self._position = float(np.random.default_rng(seed).uniform(2.0, 12.0))
+        return self._look(), {}
+
+    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        self._steps += 1
+        if self._steps == 4:
+            for kind, seeds in self._trouble.items():
+                if self._seed in seeds and self._first_time(kind):
+                    self._misbehave(kind)
+        self._position += float(np.clip(act.action[0], -1.0, 1.0))
+        success = abs(self._position) < 0.5
+        return self._look(), -abs(self._position), False, self._steps == self.max_steps, {"success": success}
+
+    def describe(self) -> dict[str, Any]:
+        return {"simulator": "line", "version": 1}
+
+    def close(self) -> None:
+        self._position = 0.0
+
+    def _look(self) -> Obs:
+        cameras = {}
+        if self._camera:
+            cameras["front"] = np.full((*self._camera, 3), (20 * self._steps, 200 - 20 * self._steps, 60), np.uint8)
+        state = np.full(self._state_dim, self._position, np.float32)
+        return Obs(cameras=cameras, state={"position": state})
+
+    def _first_time(self, kind: str) -> bool:
+        if self._folder is None:
+            return True
+        mark = self._folder / f"{kind}-{self._seed}"
+        if mark.exists():
+            return False
+        part = mark.with_suffix(".part")
+        part.write_text(str(os.getpid()))
+        part.rename(mark)
+        return True
+
+    def _misbehave(self, kind: str) -> None:
+        if kind == "raise":
+            raise RuntimeError("the simulator exploded")
+        if kind == "exit":
+            os._exit(7)
+        if kind == "hang":
+            threading.Event().wait()
+        if kind == "freeze":
+            ctypes.PyDLL(None).pause()
+        if kind == "gate" and self._folder is not None:
+            wait_for((self._folder / "open").exists)
+
+
+class OtherLine(Line):
+    """The same under another name."""
+
+
+class ToZero(Agent):
+    """Steps to zero with some noise of its own; `chunk` rows at a time."""
+
+    def __init__(self, chunk: int = 1, state_dim: int | None = None, lost_on: int | None = None) -> None:
+        self._chunk = chunk
+        self._state_dim = state_dim
+        self._lost_on = lost_on  # the seed in whose first act the connection breaks, once
+        self._seed = 0
+        self._rng = np.random.default_rng(0)
+
+    @property
+    def contract(self) -> Contract | None:
+        state = {"position": StateSpec(self._state_dim)} if self._state_dim is not None else None
+        return Contract(state=state, action=ActionSpec(dim=1))
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self._seed = kwargs["seed"]
+        self._rng = np.random.default_rng(self._seed)
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        if self._seed == self._lost_on:
+            raise ConnectionLost("the server went away")
+        noise = self._rng.normal(0.0, 0.1, (self._chunk, 1))
+        return Act((-float(obs.state["position"][0]) + noise).astype(np.float32))
+
+
+class PausedAgent(ToZero):
+    """Never answers its first `act`."""
+
+    def act(self, obs: Obs) -> Act:
+        threading.Event().wait()
+        raise AssertionError
+
+
+def wait_for(true: Any, timeout_s: float = 120.0) -> None:
+    """Poll until `true()`; `TimeoutError` if it never is."""
+    deadline = time.monotonic() + timeout_s
+    while not true():
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"waited {timeout_s:g} s for {true}")
+        time.sleep(0.02)

@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+from io import StringIO
+
+import pytest
+from rich.console import Console
+
+from vlagents_ray.evaluate import Rate, progress_for
+from vlagents_ray.evaluate.episode import EpisodeResult, Status
+from vlagents_ray.evaluate.jobs import EpisodeKey, Job
+from vlagents_ray.evaluate.progress import LineProgress, LiveProgress, Progress
+from vlagents_ray.evaluate.rollout import Failure
+
+RETRY = Failure("worker", "env_failed", "the simulator exploded\nwith a long story")
+
+
+def key(i: int) -> EpisodeKey:
+    return EpisodeKey("tabletop", i, i, "0")
+
+
+def result(i: int, success: bool | None, status: Status = "done") -> EpisodeResult:
+    return EpisodeResult(key(i), status, success, success, steps=5)
+
+
+def shown(progress: Progress, out: StringIO) -> str:
+    progress.begin({"tabletop": 10}, {"tabletop": Rate(2, 4)})
+    progress.episode(result(4, True))
+    progress.retry(Job(key(5)), RETRY)
+    progress.episode(result(5, False))
+    progress.episode(result(6, None, "infra_failed"))
+    progress.end()
+    return out.getvalue()
+
+
+def test_a_terminal_gets_a_live_table_and_a_log_gets_lines() -> None:
+    assert isinstance(progress_for(Console(force_terminal=True)), LiveProgress)
+    assert isinstance(progress_for(Console(file=StringIO())), LineProgress)
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+def test_progress_tells_success_so_far_and_what_infrastructure_cost(terminal: bool) -> None:
+    out = StringIO()
+    last = shown(progress_for(Console(file=out, force_terminal=terminal, width=120)), out)
+    assert "7/10" in last
+    assert str(Rate(3, 6)) in last
+    assert "1 infrastructure retry" in last
+    assert "1 infrastructure failures" in last
+    assert "tabletop episode 5: attempt 1 failed, trying again: the simulator exploded" in last
+    assert "long story" not in last
+    assert " left" in last
+
+
+def test_lines_are_sparse(monkeypatch: pytest.MonkeyPatch) -> None:
+    out = StringIO()
+    progress = LineProgress(Console(file=out, width=120), every_s=1e9)
+    progress.begin({"tabletop": 100}, {})
+    for i in range(100):
+        progress.episode(result(i, True))
+    progress.end()
+    lines = out.getvalue().splitlines()
+    assert len(lines) == 2
+    assert "0/100" in lines[0]
+    assert "waiting for the first episode" in lines[0]
+    assert "100/100" in lines[1]

@@ -1,0 +1,136 @@
+"""Reading, running and checking the fenced blocks of a Markdown text.
+
+An HTML comment straight above a block says how it is tested. `<!-- test: serve scripted -->` runs it
+with a server of that policy in place of http://gpu-box:8000, `<!-- test -->` or no comment without
+one. Further lines of such a comment are code that is run before the block:
+
+    <!-- test: serve scripted
+    obs = Obs(gripper=1.0) -->
+
+`<!-- not run: REASON -->` says why a block is not run; its commands must at least exist, and
+`vlagents-ray`'s must know their options.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+DOCUMENTED_HOST = "gpu-box:8000"
+PYTHON, SHELL = {"python"}, {"bash", "sh", "console"}
+ENV = os.environ | {
+    "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "COLUMNS": "300",  # so that --help does not cut names off
+    "TERM": "dumb",
+}
+RUN_S = 300
+
+
+@dataclass(frozen=True)
+class Block:
+    """One fenced block. `source` has its code, and its comment's, at the lines of the README where they stand."""
+
+    language: str
+    line: int
+    source: str
+    server: str | None = None  # the policy that must be served meanwhile
+    not_run: str | None = None  # why it is not run
+
+    def __str__(self) -> str:
+        return f"line-{self.line}"
+
+
+def blocks(text: str) -> list[Block]:
+    """The Python and shell blocks of a Markdown text. Raises `ValueError` for an unknown or unfinished one."""
+    found: list[Block] = []
+    fence: re.Match[str] | None = None
+    comment: list[tuple[int, str]] | None = None
+    code: list[tuple[int, str]] = []
+    above: list[tuple[int, str]] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        if fence is not None:
+            if line.strip() == "```":
+                if fence["language"] in PYTHON | SHELL:
+                    found.append(_block(fence["language"], above, code))
+                fence, above, code = None, [], []
+            else:
+                code.append((number, line.removeprefix(fence["indent"])))
+        elif comment is not None or line.lstrip().startswith("<!--"):
+            comment = [*(comment or []), (number, line)]
+            if "-->" in line:
+                above, comment = comment, None
+        elif fence := re.match(r"(?P<indent> *)```(?P<language>\w*)", line):
+            pass
+        else:
+            above = []
+    if fence is not None or comment is not None:
+        raise ValueError("the text ends inside a block or comment")
+    return found
+
+
+def _block(language: str, above: list[tuple[int, str]], code: list[tuple[int, str]]) -> Block:
+    mark, setup = "test", []
+    if above:
+        stripped = [(number, line.replace("<!--", "").replace("-->", "")) for number, line in above]
+        mark, setup = stripped[0][1].strip(), stripped[1:]
+    kind, _, rest = mark.partition(":")
+    server, reason = None, None
+    if kind == "not run" and rest.strip():
+        reason = rest.strip()
+    elif match := re.fullmatch(r"test(?:: serve (\S+))?", mark):
+        server = match[1]
+    else:
+        raise ValueError(f"line {above[0][0]}: {mark!r}, want 'test', 'test: serve POLICY' or 'not run: REASON'")
+    if language == "console":  # what begins with a prompt was typed, the rest is output
+        code = [(number, line[2:]) for number, line in code if line.startswith("$ ")]
+    kept = dict([*setup, *code])
+    first = code[0][0] if code else above[0][0] if above else 0
+    source = "\n".join(kept.get(number, "") for number in range(1, max(kept, default=0) + 1))
+    return Block(language, first, source, server, reason)
+
+
+def run(block: Block, cwd: Path, host: str = DOCUMENTED_HOST) -> None:
+    """Run the block in `cwd`; a failure shows the README's own line numbers."""
+    source = block.source.replace(DOCUMENTED_HOST, host) + "\n"
+    script = cwd / ("README.py" if block.language in PYTHON else "README.sh")
+    script.write_text(source)
+    command = [sys.executable, str(script)] if block.language in PYTHON else ["bash", "-eu", "-o", "pipefail", script]
+    done = subprocess.run(
+        command, check=False, cwd=cwd, env=ENV, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=RUN_S
+    )
+    assert done.returncode == 0, f"README {block}: exit status {done.returncode}\n{done.stdout}\n{done.stderr}"
+
+
+def check_commands(block: Block) -> None:
+    """Every command of a shell block that is not run is there, and takes the options that are shown."""
+    parsed = subprocess.run(["bash", "-n"], input=block.source, check=False, capture_output=True, text=True)
+    assert parsed.returncode == 0, f"README {block}: {parsed.stderr}"
+    for line in block.source.replace("\\\n", " ").splitlines():
+        words = shlex.split(line, comments=True)
+        while words and re.match(r"\w+=", words[0]):
+            words.pop(0)  # FOO=bar command
+        if words:
+            check_command(words, f"README {block}: {line.strip()}")
+
+
+def check_command(words: list[str], where: str) -> None:
+    name, *arguments = words
+    if name == "make":
+        command = ["make", "-C", str(ROOT), "--dry-run", *arguments]
+    elif name == "vlagents-ray":
+        command = [name, *arguments[:1], "--help"]
+    else:
+        command = ["bash", "-c", f"type {shlex.quote(name)}"]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, env=ENV, timeout=60)
+    assert done.returncode == 0, f"{where}\n{done.stdout}{done.stderr}"
+    if name == "vlagents-ray":
+        known = set(re.findall(r"--[\w-]+", done.stdout))
+        shown = {word.partition("=")[0] for word in arguments if word.startswith("--")}
+        assert shown - known == set(), f"{where}: {sorted(shown - known)} are not among {sorted(known)}"

@@ -1,0 +1,92 @@
+"""The wheel holds the whole package, and it works with nothing but the light dependencies."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+LIGHT_DEPENDENCIES = {"numpy", "simplejpeg", "websockets"}
+
+pytestmark = pytest.mark.slow
+
+
+def pip(*arguments: str) -> str:
+    """Our own pip, also for other environments (`--python`): they need none then."""
+    command = [sys.executable, "-m", "pip", "--disable-pip-version-check", *arguments]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300)
+    if done.returncode != 0:
+        pytest.fail(f"{' '.join(command)}\n{done.stdout}\n{done.stderr}")
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Built from a copy, as building writes into the source tree."""
+    source, out = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("wheel")
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(ROOT / name, source)
+    shutil.copytree(ROOT / "vlagents_ray", source / "vlagents_ray", ignore=shutil.ignore_patterns("__pycache__"))
+    pip("wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", str(out), str(source))
+    (built,) = out.glob("vlagents_ray-*.whl")
+    return built
+
+
+@pytest.fixture(scope="module")
+def robot(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The Python of an empty environment into which only the wheel was installed."""
+    home = tmp_path_factory.mktemp("robot")
+    venv.create(home, with_pip=False, symlinks=True)
+    python = home / "bin" / "python"
+    pip("--python", str(python), "install", "--quiet", "--no-compile", "--only-binary=:all:", str(wheel))
+    return python
+
+
+def run(python: Path, code: str) -> str:
+    done = subprocess.run([python, "-I", "-c", code], check=False, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def test_the_wheel_holds_every_module_and_the_licence_and_no_tests(wheel: Path) -> None:
+    names = set(zipfile.ZipFile(wheel).namelist())
+    modules = {str(path.relative_to(ROOT)) for path in (ROOT / "vlagents_ray").rglob("*.py")}
+    assert modules - names == set()
+    assert "vlagents_ray/py.typed" in names
+    assert [name for name in names if name.endswith(".dist-info/licenses/LICENSE")]
+    assert [name for name in names if name.startswith(("tests/", "deployments/"))] == []
+
+
+def test_a_robot_installs_three_packages_and_those_have_no_dependencies_of_their_own(robot: Path) -> None:
+    installed = {package["name"] for package in json.loads(pip("--python", str(robot), "list", "--format=json"))}
+    assert installed == {"vlagents-ray"} | LIGHT_DEPENDENCIES
+
+
+def test_the_robots_side_works_with_those(robot: Path) -> None:
+    code = """
+import numpy as np
+from vlagents_ray import Act, Agent, Obs, RemoteAgent
+from vlagents_ray.images import decode, encode_jpeg
+obs = Obs(cameras={"front": np.zeros((8, 8, 3), np.uint8)}, gripper=1.0)
+print(decode(encode_jpeg(obs.cameras["front"])).shape)
+"""
+    assert run(robot, code) == "(8, 8, 3)"
+
+
+def test_what_a_robot_lacks_is_asked_for_by_the_extra_that_brings_it(robot: Path) -> None:
+    code = """
+from vlagents_ray.errors import MissingDependency
+from vlagents_ray.registry import require
+try:
+    require("ray")
+except MissingDependency as error:
+    print(error)
+"""
+    assert "pip install 'vlagents-ray[serve]'" in run(robot, code)

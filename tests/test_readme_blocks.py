@@ -1,0 +1,98 @@
+"""The mechanism behind test_readme.py, on texts of its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from readme_blocks import Block, blocks, check_commands, run
+
+
+def one(text: str) -> Block:
+    (block,) = blocks(text)
+    return block
+
+
+def shell(code: str, mark: str = "<!-- not run: an example -->") -> Block:
+    return one(f"{mark}\n```bash\n{code}\n```\n")
+
+
+def test_only_python_and_shell_blocks_are_taken() -> None:
+    text = "".join(f"```{language}\nx\n```\n" for language in ("python", "yaml", "bash", "", "console", "sh", "json"))
+    assert [block.language for block in blocks(text)] == ["python", "bash", "console", "sh"]
+
+
+def test_a_block_without_a_comment_is_run() -> None:
+    block = one("```python\nprint(1)\n```\n")
+    assert (block.server, block.not_run) == (None, None)
+
+
+def test_a_comment_names_the_policy_that_must_be_served() -> None:
+    assert one("<!-- test: serve scripted -->\n```python\n```\n").server == "scripted"
+
+
+def test_a_comment_says_why_a_block_is_not_run() -> None:
+    assert one("<!-- not run: needs a robot -->\n```python\n```\n").not_run == "needs a robot"
+
+
+def test_a_comment_counts_only_straight_above_its_block() -> None:
+    assert one("<!-- not run: needs a robot -->\nSome text.\n```python\n```\n").not_run is None
+
+
+@pytest.mark.parametrize("mark", ["not run", "not run:", "skip", "test: deploy scripted", "tset"])
+def test_an_unknown_mark_is_refused(mark: str) -> None:
+    with pytest.raises(ValueError, match="want 'test'"):
+        blocks(f"<!-- {mark} -->\n```python\n```\n")
+
+
+@pytest.mark.parametrize("text", ["```python\nprint(1)\n", "<!-- test\n"])
+def test_an_unfinished_block_is_refused(text: str) -> None:
+    with pytest.raises(ValueError, match="ends inside"):
+        blocks(text)
+
+
+def test_further_lines_of_the_comment_run_before_the_block(tmp_path: Path) -> None:
+    run(one("<!-- test\nx = 1 -->\n```python\nassert x == 1\n```\n"), tmp_path)
+
+
+def test_a_block_inside_a_list_loses_the_lists_indent(tmp_path: Path) -> None:
+    block = one("- how:\n  ```python\n  for i in range(2):\n      print(i)\n  ```\n")
+    assert block.source.splitlines()[-2:] == ["for i in range(2):", "    print(i)"]
+    run(block, tmp_path)
+
+
+def test_of_a_console_block_only_what_was_typed_is_run(tmp_path: Path) -> None:
+    run(one("```console\n$ echo hello >file\nnot a command\n```\n"), tmp_path)
+    assert (tmp_path / "file").read_text() == "hello\n"
+
+
+def test_a_failing_python_block_fails_with_the_readmes_line_number(tmp_path: Path) -> None:
+    with pytest.raises(AssertionError, match=r"README\.py\", line 4"):
+        run(one("# Title\n\n```python\nraise SystemError\n```\n"), tmp_path)
+
+
+def test_a_shell_block_fails_at_its_first_failing_command(tmp_path: Path) -> None:
+    with pytest.raises(AssertionError, match="exit status 1"):
+        run(one("```bash\nfalse\necho fine\n```\n"), tmp_path)
+
+
+def test_the_documented_server_stands_for_the_running_one(tmp_path: Path) -> None:
+    block = one('```python\nassert "http://gpu-box:8000/v1" == "http://" + "127.0.0.1:" + "4321/v1"\n```\n')
+    run(block, tmp_path, host="127.0.0.1:4321")
+
+
+@pytest.mark.parametrize("code", ["make setup", "git clone URL", "FOO=1 ls -l  # a comment", "ls \\\n  -l", "cd /"])
+def test_commands_that_exist_pass_without_being_run(code: str) -> None:
+    check_commands(shell(code))
+
+
+@pytest.mark.parametrize("code", ["make no-such-target", "no-such-command --option", "echo 'unfinished"])
+def test_commands_that_do_not_exist_fail(code: str) -> None:
+    with pytest.raises(AssertionError, match="README line-3"):
+        check_commands(shell(code))
+
+
+def test_an_option_that_the_command_lacks_fails() -> None:
+    check_commands(shell("vlagents-ray serve scripted --port 8000"))
+    with pytest.raises(AssertionError, match="--prot"):
+        check_commands(shell("vlagents-ray serve scripted --prot 8000"))

@@ -1,0 +1,45 @@
+"""vlagents_ray: Vision-Language-Action models served with Ray, for robots and for evaluation.
+
+This is the light install: it needs numpy, simplejpeg and websockets, and loads neither ray nor torch.
+"""
+
+from vlagents_ray.client import RemoteAgent
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.errors import (
+    ConfigError,
+    ConnectionLost,
+    ContractMismatch,
+    DeadlineExceeded,
+    InvalidInput,
+    InvalidObservation,
+    NotReset,
+    PolicyFailed,
+    PolicyUnavailable,
+    UnknownSession,
+    VLAgentsError,
+)
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.wire.frames import ImageCodec
+
+__all__ = [
+    "Act",
+    "ActionSpec",
+    "Agent",
+    "CameraSpec",
+    "ConfigError",
+    "ConnectionLost",
+    "Contract",
+    "ContractMismatch",
+    "DeadlineExceeded",
+    "ImageCodec",
+    "InvalidInput",
+    "InvalidObservation",
+    "NotReset",
+    "Obs",
+    "PolicyFailed",
+    "PolicyUnavailable",
+    "RemoteAgent",
+    "StateSpec",
+    "UnknownSession",
+    "VLAgentsError",
+]

@@ -1,0 +1,239 @@
+"""The commands; each is thin around a room of the package."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+
+import typer
+from pydantic import ValidationError
+from rich.console import Console
+from rich.table import Table
+
+from vlagents_ray.cli.settings import parse_settings
+from vlagents_ray.errors import ConfigError, VLAgentsError
+
+if TYPE_CHECKING:
+    from vlagents_ray.evaluate import EvalConfig
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Serve Vision-Language-Action models with Ray, and evaluate them in parallel simulation.",
+)
+out = Console()
+err = Console(stderr=True)
+
+Policy = Annotated[str, typer.Option(help="A registered name, a deployment file, or the URL of a running server.")]
+Set = Annotated[list[str], typer.Option("--set", metavar="KEY=VALUE", help="A setting of the policy, repeatable.")]
+Address = Annotated[
+    str | None, typer.Option(help="A running Ray cluster ('auto' finds it); default: one for the run, on this machine.")
+]
+
+
+@app.command()
+def serve(
+    source: Annotated[str, typer.Argument(help="A registered policy, 'module:Class', or a deployment file (.yaml).")],
+    host: Annotated[str, typer.Option(help="Where to listen; 0.0.0.0 lets other machines in.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=1, max=65535)] = 8000,
+    settings: Set = [],  # noqa: B006 - typer reads it
+    serve_set: Annotated[
+        list[str], typer.Option("--serve-set", metavar="KEY=VALUE", help="A setting of the server: batch.max_size=8.")
+    ] = [],  # noqa: B006
+    address: Address = None,
+) -> None:
+    """Serve a policy until Ctrl-C."""
+    from vlagents_ray.serve.cluster import read_deployment, running_server
+
+    with _errors():
+        config = read_deployment(source, _server_args(settings, serve_set))
+        with running_server(config, host=host, port=port, address=address, show_logs=True) as server:
+            for name, url in server.apps.items():
+                out.print(f"serving [bold]{name}[/] at {url}  (docs: {url}/docs, Ctrl-C stops)", highlight=False)
+            if host not in ("127.0.0.1", "localhost", "::1"):
+                err.print(f"[yellow]{host} lets anyone who reaches this port command the policy[/]", highlight=False)
+            with contextlib.suppress(KeyboardInterrupt):
+                threading.Event().wait()
+
+
+@app.command("eval")
+def evaluate_command(
+    envs: Annotated[list[str], typer.Argument(help="Environments: maniskill/PushCube-v1, tabletop, … (see `envs`).")],
+    policy: Policy,
+    out_dir: Annotated[Path, typer.Option("--out", help="Folder of the results.")],
+    episodes: Annotated[int, typer.Option(min=1, help="Episodes of each environment.")] = 10,
+    workers: Annotated[int, typer.Option(min=1, help="Environments rolled out in parallel.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Episode i uses seed + i.")] = 0,
+    video: Annotated[str, typer.Option(help="none, failures or all.")] = "failures",
+    resume: Annotated[bool, typer.Option(help="Go on with the results in --out.")] = False,
+    execute: Annotated[int | None, typer.Option(min=1, help="Rows executed of each chunk; default: all.")] = None,
+    retries: Annotated[int, typer.Option(min=0, help="Further attempts after an infrastructure failure.")] = 3,
+    settings: Set = [],  # noqa: B006 - typer reads it
+    env_set: Annotated[
+        list[str], typer.Option("--env-set", metavar="KEY=VALUE", help="An option of the environments: width=256.")
+    ] = [],  # noqa: B006
+    address: Address = None,
+) -> None:
+    """Evaluate a policy: episodes in parallel, success rates with confidence intervals, videos."""
+    with _errors():
+        fields: dict[str, Any] = {
+            "envs": envs, "episodes": episodes, "workers": workers, "seed": seed, "video": video, "out": out_dir,
+            "resume": resume, "execute": execute, "retries": retries,
+            "env_options": parse_settings(env_set, "--env-set"),
+        }  # fmt: skip
+        run_evaluation(policy, parse_settings(settings, "--set"), fields, address)
+
+
+def run_evaluation(policy: str, settings: dict[str, Any], fields: dict[str, Any], address: str | None = None) -> None:
+    """Serve the policy if it is not a URL, evaluate it, print the table."""
+    from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, evaluate, print_summary, progress_for
+
+    # Settings are checked before anything starts: a typing error should cost no time.
+    draft = EvalConfig(policy=policy, policy_url="serve://checked-below", policy_config=settings, **fields)
+    with _policy_server(policy, settings, address, draft) as (url, checkpoint):
+        config = draft.model_copy(update={"policy_url": url, "checkpoint": checkpoint})
+        try:
+            summary = evaluate(config, progress=progress_for(out))
+        except EvaluationInterrupted as interrupted:
+            print_summary(out, interrupted.summary)
+            raise
+    print_summary(out, summary)
+
+
+@contextlib.contextmanager
+def _policy_server(
+    policy: str, settings: dict[str, Any], address: str | None, config: EvalConfig
+) -> Iterator[tuple[str, str | None]]:
+    """The policy's URL and checkpoint, with a server around it unless one runs already."""
+    if "://" in policy:
+        if settings:
+            raise ConfigError(f"--set {sorted(settings)}: the server at {policy} has its settings already")
+        from vlagents_ray import RemoteAgent
+
+        with RemoteAgent(policy) as agent:
+            checkpoint = agent.metadata.get("checkpoint")
+        yield policy, checkpoint
+        return
+    from vlagents_ray.serve.cluster import read_deployment, running_server
+
+    deployed = read_deployment(policy, {"config": settings} if settings else None)
+    if len(deployed.applications) != 1:
+        names = [one.name for one in deployed.applications]
+        raise ConfigError(f"{policy}: holds {names}, want one application; serve it and give the URL of one of them")
+    application = deployed.applications[0]
+    # Ray's CPUs are bookkeeping here: the number of workers that the user asked for must fit.
+    cpus = max(os.cpu_count() or 1, math.ceil(config.workers * config.cpus_per_worker))
+    with running_server(deployed, address=address, num_cpus=cpus):
+        yield f"serve://{application.name}", application.args.get("config", {}).get("checkpoint")
+
+
+@app.command()
+def demo(
+    out_dir: Annotated[Path, typer.Option("--out", help="Folder of the results.")] = Path("runs/demo"),
+) -> None:
+    """The main job in a few minutes: serve the scripted policy, evaluate it in two environments, leave videos."""
+    from vlagents_ray.envs.maniskill import ManiSkill
+
+    with _errors():
+        missing = ManiSkill.missing()
+        if missing is None:
+            fields: dict[str, Any] = {
+                "envs": ["maniskill/PushCube-v1", "maniskill/PickCube-v1"], "episodes": 10, "video": "all"
+            }  # fmt: skip
+        else:
+            out.print(
+                f"ManiSkill cannot render here, so the demo uses the built-in tabletop: {missing}", style="yellow"
+            )
+            fields = {"envs": ["tabletop"], "episodes": 20, "video": "all"}
+        run_evaluation("scripted", {}, {**fields, "workers": 2, "out": _fresh(out_dir)})
+
+
+@app.command()
+def policies() -> None:
+    """List the policies that can be served by name."""
+    from vlagents_ray.registry import names
+
+    table = Table("policy", "class")
+    for name, target in sorted(names("policies").items()):
+        table.add_row(name, target)
+    out.print(table)
+
+
+@app.command()
+def envs() -> None:
+    """List the environments, their tasks, and what keeps one from running here."""
+    from vlagents_ray.registry import env_class, names
+
+    table = Table("environment", "tasks", "here")
+    for name in sorted(names("envs")):
+        try:
+            cls = env_class(name)
+            missing = cls.missing()
+            tasks = cls.tasks()
+        except VLAgentsError as error:
+            missing, tasks = str(error), []
+        table.add_row(
+            name, ", ".join(tasks) or "any", "[green]ready[/]" if missing is None else f"[yellow]{missing}[/]"
+        )
+    out.print(table)
+
+
+@app.command()
+def doctor(port: Annotated[int, typer.Option(help="The port that a server would take.")] = 8000) -> None:
+    """Check this machine: Python, Ray, GPU, rendering, shared memory, ports, video; each with the cure."""
+    from vlagents_ray.cli.doctor import run
+
+    raise typer.Exit(run(out, port))
+
+
+def _server_args(settings: list[str], serve_set: list[str]) -> dict[str, Any]:
+    args = parse_settings(serve_set, "--serve-set")
+    if "config" in args:
+        raise ConfigError("--serve-set config: the policy's own settings go into --set")
+    config = parse_settings(settings, "--set")
+    return {**args, **({"config": config} if config else {})}
+
+
+def _fresh(folder: Path) -> Path:
+    """`folder`, or the first of folder-2, folder-3, … that does not exist: a demo never mixes with an older one."""
+    candidate, number = folder, 1
+    while candidate.exists():
+        number += 1
+        candidate = folder.with_name(f"{folder.name}-{number}")
+    return candidate
+
+
+@contextlib.contextmanager
+def _errors() -> Iterator[None]:
+    """Errors of this package as one message on stderr: exit code 1, 2 for wrong settings, 130 for Ctrl-C.
+
+    SIGTERM is treated as Ctrl-C, so that what was started is taken down in order.
+    """
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    except ValidationError as error:
+        lines = [f"- {'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors()]
+        _fail("wrong settings:\n" + "\n".join(lines), 2)
+    except ConfigError as error:
+        _fail(str(error), 2)
+    except VLAgentsError as error:
+        _fail(f"{type(error).__name__}: {error}", 1)
+    except KeyboardInterrupt as error:
+        _fail(str(error) or "interrupted", 130)
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _fail(message: str, code: int) -> NoReturn:
+    sys.stdout.flush()
+    err.print(f"[bold red]error[/] {message}", highlight=False, soft_wrap=True)
+    raise typer.Exit(code)

@@ -1,0 +1,30 @@
+"""`--set key=value` on the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import yaml
+
+from vlagents_ray.errors import ConfigError
+
+
+def parse_settings(texts: Iterable[str], option: str) -> dict[str, Any]:
+    """Nested settings from `a.b=1` and the like; the value is YAML, so `[1, 2]` and `true` work."""
+    settings: dict[str, Any] = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        path = key.strip().split(".")
+        if not equals or not all(path):
+            raise ConfigError(f"{option}: got {text!r}, want KEY=VALUE, as in batch.max_size=8")
+        place = settings
+        for name in path[:-1]:
+            place = place.setdefault(name, {})
+            if not isinstance(place, dict):
+                raise ConfigError(f"{option}: {key!r} goes below {name!r}, which has a value already")
+        try:
+            place[path[-1]] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"{option}: the value of {key!r} is not YAML ({error})") from error
+    return settings

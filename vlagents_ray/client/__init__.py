@@ -1,0 +1,5 @@
+"""What runs on the robot or beside the env: a remote policy as an `Agent`."""
+
+from vlagents_ray.client.agent import RemoteAgent
+
+__all__ = ["RemoteAgent"]

@@ -1,0 +1,81 @@
+"""`serve://APP`: from inside the Ray cluster, with the observation in plasma.
+
+The Serve handle picks a replica once; from then on the session's requests go to that replica, since
+a handle may send each request to another one.
+"""
+
+from __future__ import annotations
+
+import pickle
+import uuid
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import ConfigError, ConnectionLost, DeadlineExceeded, PolicyUnavailable
+from vlagents_ray.wire.frames import RAW, decode_reply, encode_request
+from vlagents_ray.wire.messages import Reply, Request
+
+
+class HandleTransport:
+    """Raw frames as plasma objects, read in place by the replica if it is on this node."""
+
+    name = "handle"
+
+    def __init__(self, app: str) -> None:
+        self._app = app
+        self._session = uuid.uuid4().hex
+        self._replica: Any = None
+
+    def connect(self, timeout_s: float) -> dict[str, Any]:
+        """Choose a replica; returns the metadata."""
+        import ray
+        from ray import serve
+        from ray.serve.exceptions import RayServeException
+
+        if not ray.is_initialized():
+            raise ConfigError(
+                f"serve://{self._app}: this process is in no Ray cluster; call ray.init(), or use http://"
+            )
+        try:
+            handle = serve.get_app_handle(self._app)
+            metadata, self._replica = handle.attach.remote().result(timeout_s=timeout_s)
+        except ray.exceptions.RayTaskError as error:
+            raise PolicyUnavailable(f"serve://{self._app}: {error.cause}") from error
+        except (RayServeException, ray.exceptions.RayActorError) as error:
+            raise PolicyUnavailable(f"serve://{self._app}: {error}") from error
+        except TimeoutError as error:
+            raise PolicyUnavailable(f"serve://{self._app}: no replica within {timeout_s:g} s") from error
+        found: dict[str, Any] = metadata
+        return found
+
+    def call(self, request: Request, timeout_s: float) -> Reply:
+        """One actor call; the frame lies in plasma and is freed with the reply."""
+        import ray
+
+        frame = ray.put(np.frombuffer(encode_request(request, RAW), np.uint8))
+        pending = self._replica.handle_request.remote(self._header(request), self._session, frame)
+        try:
+            return decode_reply(ray.get(pending, timeout=timeout_s))
+        except ray.exceptions.GetTimeoutError as error:
+            ray.cancel(pending)
+            raise DeadlineExceeded(f"serve://{self._app}: no answer within {timeout_s:g} s") from error
+        except ray.exceptions.RayActorError as error:
+            raise ConnectionLost(
+                f"serve://{self._app}: the session's replica is gone; reset with a new agent"
+            ) from error
+
+    def close(self) -> None:
+        """End the session."""
+        if self._replica is None:
+            return
+        frame = np.frombuffer(encode_request(Request("close")), np.uint8)
+        self._replica.handle_request.remote(self._header(Request("close")), self._session, frame)
+        self._replica = None
+
+    def _header(self, request: Request) -> bytes:
+        """What Serve's own router sends ahead of a method call to the replica it chose."""
+        from ray.serve._private.common import RequestMetadata
+
+        request_id = request.request_id or uuid.uuid4().hex
+        return pickle.dumps(RequestMetadata(request_id=request_id, internal_request_id=request_id, call_method="call"))

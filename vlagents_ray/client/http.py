@@ -1,0 +1,149 @@
+"""`POST /v1/<op>` with binary frames on a kept-alive connection."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import select
+import socket
+import ssl
+import time
+import uuid
+from typing import Any
+from urllib.parse import SplitResult, urlsplit
+
+from vlagents_ray.errors import (
+    ConfigError,
+    ConnectionLost,
+    DeadlineExceeded,
+    PolicyUnavailable,
+    UnknownApp,
+    VLAgentsError,
+)
+from vlagents_ray.wire.frames import CONTENT_TYPE, ImageCodec, decode_reply, encode_request, read_error
+from vlagents_ray.wire.messages import REQUEST_ID_HEADER, SESSION_HEADER, Reply, Request
+
+_UNKNOWN_APP_S = 10.0  # a starting server knows no path until its first replica exists
+
+
+class HttpTransport:
+    """HTTP/1.1, one session id for the life of the object; survives a dropped connection."""
+
+    name = "http"
+
+    def __init__(self, url: str, codec: ImageCodec) -> None:
+        self._url = http_url(url)
+        self._codec = codec
+        self._session = uuid.uuid4().hex
+        self._connection: http.client.HTTPConnection | None = None
+
+    def connect(self, timeout_s: float) -> dict[str, Any]:
+        """The server's metadata."""
+        status, kind, body = self._exchange("GET", "/v1/metadata", None, {}, timeout_s)
+        if status != 200:
+            raise _refusal(status, kind, body)
+        metadata: dict[str, Any] = json.loads(body)
+        return metadata
+
+    def call(self, request: Request, timeout_s: float) -> Reply:
+        """One POST; a reply that is not a frame is the server's or the proxy's refusal."""
+        headers = {
+            SESSION_HEADER: self._session,
+            REQUEST_ID_HEADER: request.request_id,
+            "content-type": CONTENT_TYPE,
+            "accept": CONTENT_TYPE,
+        }
+        frame = encode_request(request, self._codec)
+        status, kind, body = self._exchange("POST", f"/v1/{request.op}", frame, headers, timeout_s)
+        if status == 200:
+            return decode_reply(body)
+        return Reply(request.request_id, error=_refusal(status, kind, body))
+
+    def close(self) -> None:
+        """Close the connection; the server forgets the session when it has idled."""
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+
+    def _exchange(
+        self, method: str, path: str, body: bytes | None, headers: dict[str, str], timeout_s: float
+    ) -> tuple[int, str, bytes]:
+        connection = self._open(timeout_s)
+        try:
+            connection.request(method, self._url.path.rstrip("/") + path, body, headers)
+            answer = connection.getresponse()
+            return answer.status, answer.headers.get("content-type", ""), answer.read()
+        except TimeoutError as error:
+            self.close()
+            raise DeadlineExceeded(f"{self._url.geturl()}: no answer within {timeout_s:g} s") from error
+        except (OSError, http.client.HTTPException) as error:
+            self.close()
+            raise ConnectionLost(f"{self._url.geturl()}: {type(error).__name__}: {error}") from error
+
+    def _open(self, timeout_s: float) -> http.client.HTTPConnection:
+        if self._connection is not None and _closed_by_peer(self._connection.sock):
+            self.close()
+        if self._connection is None:
+            secure = self._url.scheme == "https"
+            cls = http.client.HTTPSConnection if secure else http.client.HTTPConnection
+            connection = cls(self._url.hostname or "", self._url.port, timeout=timeout_s)
+            try:
+                connection.connect()
+            except ssl.SSLError as error:
+                raise PolicyUnavailable(f"{self._url.geturl()}: TLS failed ({error})") from error
+            except OSError as error:
+                raise PolicyUnavailable(f"{self._url.geturl()}: cannot connect ({error}); is it running?") from error
+            connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._connection = connection
+        self._connection.sock.settimeout(timeout_s)
+        return self._connection
+
+
+def http_url(url: str) -> SplitResult:
+    """The http(s) form of a server's URL; `ConfigError` if it is not one."""
+    parts = urlsplit(url)
+    scheme = {"http": "http", "https": "https", "ws": "http", "wss": "https"}.get(parts.scheme)
+    if scheme is None or not parts.hostname:
+        raise ConfigError(f"url: got {url!r}, want http(s)://HOST:PORT, ws(s)://HOST:PORT or serve://APP")
+    return parts._replace(scheme=scheme)
+
+
+def wait_ready(url: str, codec: ImageCodec, timeout_s: float) -> dict[str, Any]:
+    """The metadata of the server at `url`, as soon as it answers; retries while it is not ready."""
+    begun = time.monotonic()
+    pause_s = 0.05
+    while True:
+        left_s = begun + timeout_s - time.monotonic()
+        transport = HttpTransport(url, codec)
+        try:
+            return transport.connect(max(0.1, left_s))
+        except (PolicyUnavailable, DeadlineExceeded) as error:
+            if pause_s > left_s:
+                raise PolicyUnavailable(f"{url}: not ready within {timeout_s:g} s ({error})") from error
+        except UnknownApp:
+            if time.monotonic() - begun > _UNKNOWN_APP_S:
+                raise
+        finally:
+            transport.close()
+        time.sleep(pause_s)
+        pause_s = min(1.0, pause_s * 1.5)
+
+
+def _closed_by_peer(sock: socket.socket | None) -> bool:
+    """An idle connection has nothing to read, unless the server closed it."""
+    if sock is None:
+        return True
+    poller = select.poll()
+    poller.register(sock, select.POLLIN)
+    return bool(poller.poll(0))
+
+
+def _refusal(status: int, kind: str, body: bytes) -> VLAgentsError:
+    if "json" in kind:
+        return read_error(json.loads(body))
+    text = body[:200].decode(errors="replace").strip()
+    if status == 404:
+        return UnknownApp(f"no application at this path ({text}); check the URL")
+    if status == 500 or status in (502, 503, 504):  # the proxy's own: no replica is ready
+        return PolicyUnavailable(f"no replica answers (HTTP {status}: {text})")
+    return VLAgentsError(f"HTTP {status}: {text}")

@@ -1,0 +1,71 @@
+"""`WS /v1/stream`: binary frames on one connection, which is the session."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from typing import Any
+
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
+from websockets.sync.client import ClientConnection, connect
+
+from vlagents_ray.client.http import http_url, wait_ready
+from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable
+from vlagents_ray.wire.frames import ImageCodec, decode_reply, encode_request
+from vlagents_ray.wire.messages import Reply, Request
+
+
+class WebSocketTransport:
+    """A session that ends with its connection: after a break, `act` needs a new `reset`."""
+
+    name = "websocket"
+
+    def __init__(self, url: str, codec: ImageCodec) -> None:
+        base = http_url(url)
+        scheme = "wss" if base.scheme == "https" else "ws"
+        self._base = base.geturl()
+        self._url = base._replace(scheme=scheme, path=base.path.rstrip("/") + "/v1/stream").geturl()
+        self._codec = codec
+        self._open = contextlib.ExitStack()
+        self._socket: ClientConnection | None = None
+
+    def connect(self, timeout_s: float) -> dict[str, Any]:
+        """The server's metadata, once it answers and has accepted the stream."""
+        deadline = time.monotonic() + timeout_s
+        metadata = wait_ready(self._base, self._codec, timeout_s)
+        self._stream(max(1.0, deadline - time.monotonic()))
+        return metadata
+
+    def call(self, request: Request, timeout_s: float) -> Reply:
+        """One frame out, its reply back; replies to requests given up earlier are discarded."""
+        deadline = time.monotonic() + timeout_s
+        socket = self._stream(timeout_s)
+        try:
+            socket.send(encode_request(request, self._codec))
+            while True:
+                data = socket.recv(timeout=max(0.0, deadline - time.monotonic()), decode=False)
+                reply = decode_reply(data)
+                if reply.request_id == request.request_id:
+                    return reply
+        except TimeoutError as error:
+            raise DeadlineExceeded(f"{self._url}: no answer within {timeout_s:g} s") from error
+        except (ConnectionClosed, OSError) as error:
+            self.close()
+            raise ConnectionLost(f"{self._url}: {error}; reset before the next act") from error
+
+    def close(self) -> None:
+        """Close the connection, and so the session."""
+        self._socket = None
+        self._open.close()
+
+    def _stream(self, timeout_s: float) -> ClientConnection:
+        if self._socket is None:
+            try:
+                self._socket = self._open.enter_context(
+                    connect(self._url, open_timeout=timeout_s, close_timeout=1, compression=None, max_size=None)
+                )
+            except InvalidStatus as error:
+                raise PolicyUnavailable(f"{self._url}: refused with HTTP {error.response.status_code}") from error
+            except (OSError, InvalidHandshake, TimeoutError) as error:
+                raise PolicyUnavailable(f"{self._url}: cannot connect ({error}); is it running?") from error
+        return self._socket

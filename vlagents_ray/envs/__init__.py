@@ -1,0 +1,5 @@
+"""Environments to evaluate policies in, one file a simulator."""
+
+from vlagents_ray.envs.base import EvalEnv, make_env
+
+__all__ = ["EvalEnv", "make_env"]

@@ -1,0 +1,110 @@
+"""Making a ManiSkill environment in a process where nobody answers questions."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import gc
+import io
+import logging
+import os
+import re
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+from vlagents_ray.envs.maniskill.tasks import INSTRUCTIONS
+from vlagents_ray.envs.probe import vulkan_cure
+from vlagents_ray.errors import ConfigError, EnvFailed, UnknownEnv
+from vlagents_ray.registry import require
+
+DEFAULT_CONTROL_MODE = "pd_ee_delta_pose"
+
+
+def step_limit(task: str) -> int | None:
+    """The step limit that ManiSkill registers for `task`; imports ManiSkill and readies the process for it."""
+    os.environ.setdefault("LP_NUM_THREADS", "1")  # workers share the cores: one thread each in Mesa's driver
+    require("sapien")
+    require("mani_skill.envs")
+    _prepare_process()
+    registered = require("mani_skill.utils.registration").REGISTERED_ENVS
+    if task not in registered:
+        raise UnknownEnv(f"maniskill has no task {task!r}: want one of {sorted(INSTRUCTIONS)}, or another of its ids")
+    limit: int | None = registered[task].max_episode_steps
+    return limit
+
+
+def render_backend(wanted: str) -> str:
+    """`wanted`, or for "auto" the GPU if SAPIEN can render there, else the CPU."""
+    if wanted != "auto":
+        return wanted
+    try:
+        require("sapien").Device("cuda")
+    except RuntimeError:  # how SAPIEN says that there is none
+        return "cpu"
+    return "gpu"
+
+
+def make(task: str, control_mode: str | None, **options: Any) -> Any:
+    """The bare environment, without Gymnasium's wrappers; options that are None are left to ManiSkill.
+
+    `control_mode` None is the default one, or the robot's own if it lacks that. Raises `ConfigError`
+    for a control mode that the robot lacks, else `EnvFailed`.
+    """
+    given = {name: value for name, value in options.items() if value is not None}
+    gymnasium = require("gymnasium")
+    with _no_prompts(task), _named_errors(task):
+        try:
+            return gymnasium.make(task, control_mode=control_mode or DEFAULT_CONTROL_MODE, **given).unwrapped
+        except AssertionError as error:
+            if "not in supported modes" not in str(error):
+                raise
+            if control_mode is not None:
+                raise ConfigError(f"maniskill/{task}: control_mode {error}") from error
+        return gymnasium.make(task, **given).unwrapped
+
+
+@contextlib.contextmanager
+def _named_errors(task: str) -> Iterator[None]:
+    try:
+        yield
+    except ConfigError:
+        raise
+    except Exception as error:
+        about_vulkan = re.search(r"vk::|rendering device|Vulkan", str(error))
+        cure = f"; {vulkan_cure()}" if about_vulkan else ""
+        raise EnvFailed(f"maniskill/{task} could not be made: {type(error).__name__}: {error}{cure}") from error
+
+
+@contextlib.contextmanager
+def _no_prompts(task: str) -> Iterator[None]:
+    """ManiSkill asks on stdin whether to download missing assets, and exits when the answer is no."""
+    said = io.StringIO()
+    stdin, sys.stdin = sys.stdin, io.StringIO("n\n")
+    try:
+        with contextlib.redirect_stdout(said):
+            yield
+    except SystemExit as error:
+        question = " ".join(line for line in said.getvalue().splitlines() if "asset" in line.lower())
+        raise EnvFailed(
+            f"maniskill/{task}: assets are missing ({question}); download them with: "
+            f"python -m mani_skill.utils.download_asset {task}"
+        ) from error
+    finally:
+        sys.stdin = stdin
+        sys.stdout.write(said.getvalue())
+
+
+@functools.cache
+def _prepare_process() -> None:
+    """Once a process: make rebuilding a scene cheap, and keep one repeated warning out of the log."""
+    # ManiSkill collects garbage at each reconfiguration. Most of that time, 150 ms, goes into
+    # looking at the modules just imported, which are not garbage.
+    gc.collect()
+    gc.freeze()
+    logging.getLogger("mani_skill ").addFilter(_not_about_initial_poses)  # the name ends with a space
+
+
+def _not_about_initial_poses(record: logging.LogRecord) -> bool:
+    """Some tasks warn so in each reconfiguration, about their own code: nothing a user could change."""
+    return not record.getMessage().startswith("No initial pose set for ")

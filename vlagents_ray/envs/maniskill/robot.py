@@ -1,0 +1,109 @@
+"""What a ManiSkill robot feels, and what its control modes command."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.contract import ActionSpec, StateSpec
+
+# Finger travel in metres from closed (0) to open, by ManiSkill's name of the robot. In the action,
+# their controllers take the last component as -1 closed, 1 open. Other robots state no gripper.
+_FINGER_TRAVEL_M = {"panda": 0.04, "panda_wristcam": 0.04}
+
+# The part of the action that moves the arm, as written in mani_skill/agents/controllers. The
+# rotation of "pd_ee_*pose" is intrinsic XYZ Euler in the base frame; see `ManiSkill` for its sign.
+_EE_POSE = {"space": "ee_pose", "rotation": "euler_xyz", "frame": "base"}
+_EE_POSITION = {"space": "ee_position", "rotation": "none", "frame": "base"}
+_JOINT: dict[str, Any] = {"space": "joint", "rotation": "none"}
+CONTROL_MODES: dict[str, dict[str, Any]] = {
+    "pd_ee_delta_pose": {**_EE_POSE, "delta": True},
+    "pd_ee_target_delta_pose": {**_EE_POSE, "delta": True},
+    "pd_ee_pose": {**_EE_POSE, "delta": False},
+    "pd_ee_delta_pos": {**_EE_POSITION, "delta": True},
+    "pd_ee_target_delta_pos": {**_EE_POSITION, "delta": True},
+    "pd_joint_pos": {**_JOINT, "delta": False},
+    "pd_joint_delta_pos": {**_JOINT, "delta": True},
+    "pd_joint_target_delta_pos": {**_JOINT, "delta": True},
+    "pd_joint_vel": {"space": "joint_velocity", "rotation": "none"},
+}
+
+
+class Robot:
+    """Reads proprioception from ManiSkill's `agent`, which is a new object after each reconfiguration."""
+
+    def __init__(self, agent: Any) -> None:
+        names = [joint.name for joint in agent.robot.active_joints]
+        arm = getattr(agent, "arm_joint_names", names)
+        self._arm = np.array([names.index(name) for name in arm])
+        self._travel_m = _FINGER_TRAVEL_M.get(agent.uid)
+        self._fingers = np.array([names.index(name) for name in getattr(agent, "gripper_joint_names", ())], dtype=int)
+        self._has_tool = getattr(agent, "tcp", None) is not None
+
+    @property
+    def gives(self) -> dict[str, StateSpec]:
+        """The parts of the state that `read` fills."""
+        parts = {"joints": StateSpec(dim=len(self._arm), unit="rad")}
+        if self._has_tool:
+            parts["tquat"] = StateSpec(dim=7, unit="m+quat_xyzw")
+            parts["xyzrpy"] = StateSpec(dim=6, unit="m+rad")
+        return parts
+
+    @property
+    def has_gripper(self) -> bool:
+        """Whether the opening of the gripper is known."""
+        return self._travel_m is not None
+
+    def read(self, agent: Any) -> tuple[dict[str, np.ndarray], float | None]:
+        """The state, each part (D,) float32, and the gripper in [0, 1], 1 = open."""
+        qpos = agent.robot.get_qpos()[0].cpu().numpy()
+        state = {"joints": qpos[self._arm]}
+        if self._has_tool:
+            base = agent.robot.pose.raw_pose[0].cpu().numpy()
+            tool = agent.tcp.pose.raw_pose[0].cpu().numpy()
+            state["tquat"], state["xyzrpy"] = tool_in_base(base, tool)
+        if self._travel_m is None:
+            return state, None
+        opening = float(qpos[self._fingers].mean()) / self._travel_m
+        return state, min(max(opening, 0.0), 1.0)
+
+
+def action_spec(control_mode: str, space: Any, *, has_gripper: bool) -> ActionSpec:
+    """The contract of a control mode; `space` is its Gymnasium box, (D,)."""
+    normalized = bool((space.low == -1.0).all() and (space.high == 1.0).all())
+    return ActionSpec(
+        dim=int(space.shape[0]),
+        gripper_open=1.0 if has_gripper else None,
+        gripper_closed=-1.0 if has_gripper else None,
+        low=-1.0 if normalized else None,
+        high=1.0 if normalized else None,
+        **CONTROL_MODES.get(control_mode, {}),
+    )
+
+
+def tool_in_base(base: np.ndarray, tool: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Two (7,) world poses, metres and quaternion wxyz, as SAPIEN writes them, to the tool's pose in the base frame.
+
+    Returns `tquat` (7,), metres and quaternion xyzw with w >= 0, and `xyzrpy` (6,), metres and
+    radians, where R = Rz(yaw) Ry(pitch) Rx(roll); both float32.
+    """
+    bw, bx, by, bz = (float(v) for v in base[3:])
+    tw, tx, ty, tz = (float(v) for v in tool[3:])
+    # conj(base) * tool
+    w = bw * tw + bx * tx + by * ty + bz * tz
+    x = bw * tx - bx * tw - by * tz + bz * ty
+    y = bw * ty + bx * tz - by * tw - bz * tx
+    z = bw * tz - bx * ty + by * tx - bz * tw
+    if w < 0.0:
+        w, x, y, z = -w, -x, -y, -z
+    px, py, pz = (float(t - b) for t, b in zip(tool[:3], base[:3], strict=True))
+    # the offset turned by conj(base): v + 2 u x (u x v - bw v) with u the base's vector part
+    cx, cy, cz = by * pz - bz * py - bw * px, bz * px - bx * pz - bw * py, bx * py - by * px - bw * pz
+    px, py, pz = px + 2 * (by * cz - bz * cy), py + 2 * (bz * cx - bx * cz), pz + 2 * (bx * cy - by * cx)
+    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = math.asin(min(max(2 * (w * y - z * x), -1.0), 1.0))
+    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    tquat = np.array([px, py, pz, x, y, z, w], dtype=np.float32)
+    return tquat, np.array([px, py, pz, roll, pitch, yaw], dtype=np.float32)

@@ -1,0 +1,146 @@
+"""The tabletop as an environment for evaluations."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, get_args
+
+import numpy as np
+
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec, check_action
+from vlagents_ray.envs.base import EvalEnv
+from vlagents_ray.envs.tabletop.goals import Goal, Task, draw_episode, goals
+from vlagents_ray.envs.tabletop.render import ELEVATION, VIEW, Renderer
+from vlagents_ray.envs.tabletop.world import STEP_LIMIT, World
+from vlagents_ray.errors import ConfigError, InvalidAction, NotReset, UnknownEnv
+from vlagents_ray.interface import Act, Obs
+
+MIXED = "mixed"
+_TASKS: tuple[Task, ...] = get_args(Task)
+_VERSION = 1  # of the scenes and the physics: results of different versions do not compare
+_CONTROL_HZ = 10.0
+_POINTING_DOWN = (math.pi, 0.0, 0.0)  # roll, pitch, yaw of the gripper in rad, always
+
+
+class Tabletop(EvalEnv):
+    """Four pucks, three pads and one instruction about them, e.g. "put the red puck on the blue pad".
+
+    Tasks: `pick_place`, `slide` (never lift the puck), `stack`, `lift`, and `mixed`, the default,
+    which draws one of them for each episode.
+
+    Observation: camera "front" (height, width, 3); `state["xyzrpy"]` (6,), the fingertips' position
+    in m and the gripper's constant orientation in rad, in the base frame of the package's docstring;
+    `gripper` in [0, 1], 1 = open, about 0.58 around a puck.
+
+    Action (4,): `dx, dy, dz` in units of 0.03 m a step along the base frame's axes, and the gripper,
+    1 = open, -1 = closed. Components outside [-1, 1] are clipped, as a robot's controller would.
+
+    The reward is 1.0 in each step that ends in success, else 0.0. Nothing terminates an episode.
+    """
+
+    def __init__(self, task: str | None = None, *, width: int = 224, height: int = 224, max_steps: int = 80) -> None:
+        """`width` and `height` of the image in pixels, at least 32; `max_steps` until truncation."""
+        if task is not None and task not in self.tasks():
+            raise UnknownEnv(f"tabletop has no task {task!r}: want one of {self.tasks()}")
+        for name, value, least in (("width", width, 32), ("height", height, 32), ("max_steps", max_steps, 1)):
+            if value < least:
+                raise ConfigError(f"tabletop: {name} is {value}, want at least {least}")
+        self.max_steps = max_steps
+        self._task = task or MIXED
+        self._contract = Contract(
+            cameras={"front": CameraSpec(height, width)},
+            state={"xyzrpy": StateSpec(6, "m+rad")},
+            gripper=True,
+            instruction=True,
+            action=ActionSpec(
+                dim=4,
+                space="ee_position",
+                delta=True,
+                rotation="none",
+                frame="base",
+                gripper_open=1.0,
+                gripper_closed=-1.0,
+                low=-1.0,
+                high=1.0,
+            ),
+            control_hz=_CONTROL_HZ,
+        )
+        self._renderer = Renderer(width, height)
+        self._world: World | None = None
+        self._goal: Goal | None = None
+        self._steps = 0
+
+    @classmethod
+    def tasks(cls) -> list[str]:
+        return [MIXED, *_TASKS]
+
+    @property
+    def contract(self) -> Contract:
+        return self._contract
+
+    @property
+    def instruction(self) -> str:
+        if self._goal is None:
+            raise NotReset("tabletop: there is no instruction before the first reset(seed=...)")
+        return self._goal.instruction
+
+    def describe(self) -> dict[str, Any]:
+        return {
+            "version": _VERSION,
+            "task": self._task,
+            "control_mode": "ee_delta_position",
+            "metres_per_unit": STEP_LIMIT,
+            "camera": {"elevation_deg": round(math.degrees(ELEVATION), 6), "view_m": VIEW},
+            "numpy": np.__version__,
+        }
+
+    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+        """Begin the episode of `seed`. The one option, `instruction`, asks for something else in the same scene.
+
+        `info["instructions"]` lists what the episode's task could have asked for in this scene.
+        """
+        unknown = sorted(set(options or {}) - {"instruction"})
+        if unknown:
+            raise ConfigError(f"tabletop: unknown reset options {unknown}, want none or 'instruction'")
+        rng = np.random.default_rng(seed % 2**64)  # numpy takes no negative seed
+        task = _TASKS[rng.integers(len(_TASKS))] if self._task == MIXED else self._task_in_scene()
+        world, goal = draw_episode(task, rng)
+        if options:
+            goal = self._chosen(world, options["instruction"])
+        self._world, self._goal, self._steps = world, goal, 0
+        self._renderer.begin(world.pads)
+        info = {"instructions": [g.instruction for g in goals(world, goal.task)], "success": False}
+        return self._observe(world), info
+
+    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        world, goal = self._world, self._goal
+        if world is None or goal is None:
+            raise NotReset("tabletop: step before reset; call reset(seed=...) first")
+        action = check_action(act.action, self._contract)
+        if action.ndim != 1:
+            raise InvalidAction(f"action: got {action.shape}, want (4,); step through a chunk row by row")
+        dx, dy, dz, grip = np.clip(action, -1.0, 1.0).tolist()
+        world.step(dx * STEP_LIMIT, dy * STEP_LIMIT, dz * STEP_LIMIT, (grip + 1) / 2)
+        self._steps += 1
+        success = goal.reached(world)
+        return self._observe(world), float(success), False, self._steps >= self.max_steps, {"success": success}
+
+    def close(self) -> None:
+        self._world = self._goal = None
+
+    def _observe(self, world: World) -> Obs:
+        state = np.array((world.x, world.y, world.z, *_POINTING_DOWN), np.float32)
+        return Obs(
+            cameras={"front": self._renderer.draw(world)}, gripper=min(world.opening, 1.0), state={"xyzrpy": state}
+        )
+
+    def _task_in_scene(self) -> Task:
+        return next(task for task in _TASKS if task == self._task)
+
+    def _chosen(self, world: World, instruction: object) -> Goal:
+        tasks = _TASKS if self._task == MIXED else (self._task_in_scene(),)
+        possible = {goal.instruction: goal for task in tasks for goal in goals(world, task)}
+        if instruction not in possible:
+            raise ConfigError(f"tabletop: got instruction {instruction!r}, want one of this scene's: {list(possible)}")
+        return possible[str(instruction)]

@@ -1,0 +1,178 @@
+"""Draws the table as the camera "front" sees it.
+
+What rests is drawn once and kept; a step copies that picture and adds the gripper, what it holds
+and their shadows. The camera's geometry is in the package's docstring.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from vlagents_ray.envs.tabletop.sprites import Canvas, Colour, Sprite
+from vlagents_ray.envs.tabletop.world import (
+    FINGER_RADIUS,
+    PAD_HALF,
+    PUCK_HEIGHT,
+    PUCK_RADIUS,
+    REACH,
+    Pad,
+    Puck,
+    World,
+)
+
+VIEW = 0.66  # m, along the image's shorter side
+ELEVATION = math.radians(70)
+
+PALETTE: dict[str, Colour] = {
+    "red": (220, 50, 47),
+    "green": (40, 158, 66),
+    "blue": (38, 110, 220),
+    "yellow": (244, 196, 32),
+    "purple": (128, 48, 190),
+}
+# Everything that is not named in an instruction is nearly grey.
+_FLOOR, _TABLE, _TABLE_EDGE = (58, 59, 62), (227, 225, 221), (168, 165, 160)
+_FINGER, _PALM, _PALM_FRONT, _WRIST = (150, 152, 156), (86, 88, 92), (62, 63, 66), (118, 120, 124)
+_TABLE_HALF = (0.315, 0.255)  # m
+_TABLE_THICKNESS = 0.04  # m
+_FINGER_LENGTH = 0.07  # m
+_SHADOW = (0.35, -0.22)  # m of offset along x and y per m of height
+
+
+class Renderer:
+    """Images of one size; holds the picture of what rests in the current episode."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self._centre = (width / 2, height / 2)
+        self._scale = min(width, height) / VIEW  # px/m
+        self._up, self._deep = math.sin(ELEVATION), math.cos(ELEVATION)  # px/px of y and of z
+        self._background = self._draw_background(width, height)
+        self._pads = {name: self._draw_pad(colour) for name, colour in PALETTE.items()}
+        self._pucks = {name: self._draw_puck(colour) for name, colour in PALETTE.items()}
+        self._puck_shadow = self._draw_shadow(PUCK_RADIUS * 1.25, PUCK_RADIUS * 1.25, 0.42)
+        self._gripper_shadow = self._draw_shadow(0.06, 0.03, 0.3)
+        self._grippers: dict[int, Sprite] = {}  # by the gap in pixels
+        self._floor_picture = self._background
+        self._still = self._background
+        self._still_key: tuple[tuple[float, float, float], ...] = ()
+
+    def begin(self, pads: list[Pad]) -> None:
+        """Draw what stays for a whole episode."""
+        self._floor_picture = self._background.copy()
+        for pad in pads:
+            self._blend(self._floor_picture, self._pads[pad.colour], pad.x, pad.y, 0.0)
+        self._still_key = ()
+
+    def draw(self, world: World) -> np.ndarray:
+        """The image, (H, W, 3) uint8 RGB; a new array each time."""
+        resting = [p for p in world.pucks if p is not world.held]
+        key = tuple([(p.x, p.y, p.z) for p in resting])
+        if key != self._still_key:
+            self._still, self._still_key = self._draw_still(resting), key
+        image = self._still.copy()
+        self._shade(image, self._gripper_shadow, world.x, world.y, world.z + _FINGER_LENGTH)
+        if world.held is not None:
+            self._draw_puck_at(image, world.held)
+        gap = round(world.gap * self._scale)
+        if gap not in self._grippers:
+            self._grippers[gap] = self._draw_gripper(float(gap))
+        self._blend(image, self._grippers[gap], world.x, world.y, world.z)
+        return image
+
+    def _draw_still(self, pucks: list[Puck]) -> np.ndarray:
+        picture = self._floor_picture.copy()
+        for puck in sorted(pucks, key=lambda p: (p.z, -p.y)):  # near ones over far ones, upper over lower
+            self._draw_puck_at(picture, puck)
+        return picture
+
+    def _draw_puck_at(self, image: np.ndarray, puck: Puck) -> None:
+        self._shade(image, self._puck_shadow, puck.x, puck.y, puck.z + PUCK_HEIGHT / 3)
+        self._blend(image, self._pucks[puck.colour], puck.x, puck.y, puck.z)
+
+    def _blend(self, image: np.ndarray, sprite: Sprite, x: float, y: float, z: float) -> None:
+        u = self._centre[0] + self._scale * x
+        v = self._centre[1] - self._scale * (y * self._up + z * self._deep)
+        sprite.blend(image, round(u), round(v))
+
+    def _shade(self, image: np.ndarray, shadow: Sprite, x: float, y: float, height: float) -> None:
+        self._blend(image, shadow, x + _SHADOW[0] * height, y + _SHADOW[1] * height, 0.0)
+
+    def _draw_background(self, width: int, height: int) -> np.ndarray:
+        s = self._scale
+        canvas = Canvas(0, width, 0, height)
+        cu, cv = self._centre
+        canvas.paint(_FLOOR, np.ones_like(canvas.u))
+        half_u, half_v = _TABLE_HALF[0] * s, _TABLE_HALF[1] * s * self._up
+        drop = _TABLE_THICKNESS * s * self._deep
+        canvas.paint((30, 30, 32), 0.8 * canvas.glow(cu + 0.03 * s, cv + 0.05 * s, half_u * 1.3, half_v * 1.5))
+        canvas.paint(_TABLE_EDGE, canvas.box(cu, cv + drop, half_u, half_v, 0.02 * s))
+        light = 1.03 - 0.09 * np.hypot((canvas.u - cu) / half_u + 0.5, (canvas.v - cv) / half_v + 0.6) / 2
+        grain = np.random.default_rng(0).normal(0, 0.006, light.shape)
+        canvas.paint(np.asarray(_TABLE) * (light + grain)[..., None], canvas.box(cu, cv, half_u, half_v, 0.02 * s))
+        reach_u, reach_v = REACH[0][1] * s, REACH[1][1] * s * self._up
+        line = canvas.box(cu, cv, reach_u, reach_v, 0.015 * s) - canvas.box(cu, cv, reach_u - 1, reach_v - 1, 0.015 * s)
+        canvas.paint((200, 198, 194), 0.7 * line)
+        picture = np.zeros((height, width, 3), np.uint8)
+        canvas.sprite().blend(picture, 0, 0)
+        return picture
+
+    def _draw_pad(self, colour: Colour) -> Sprite:
+        half = PAD_HALF * self._scale
+        tall = half * self._up
+        canvas = Canvas(half, half, tall, tall)
+        pastel = 0.45 * np.asarray(colour) + 0.55 * 245
+        canvas.paint(pastel * 0.93, canvas.box(0, 0, half, tall, half * 0.2))
+        rim = max(half * 0.1, 1.0)
+        canvas.paint((250, 250, 250), canvas.box(0, 0, half - rim, tall - rim, half * 0.15))
+        canvas.paint(pastel, canvas.box(0, 0, half - 1.7 * rim, tall - 1.7 * rim, half * 0.12))
+        return canvas.sprite()
+
+    def _draw_puck(self, colour: Colour) -> Sprite:
+        r = PUCK_RADIUS * self._scale
+        ry, h = r * self._up, PUCK_HEIGHT * self._scale * self._deep
+        canvas = Canvas(r, r, h + ry, ry)
+        base = np.asarray(colour, np.float32)
+        side = np.maximum.reduce(
+            [canvas.ellipse(0, 0, r, ry), canvas.ellipse(0, -h, r, ry), canvas.box(0, -h / 2, r, h / 2)]
+        )
+        light = 0.72 - 0.28 * canvas.u / r  # from the left
+        canvas.paint(base * np.clip(light, 0.4, 1.0)[..., None], side)
+        canvas.paint(np.minimum(base * 1.08, 255), canvas.ellipse(0, -h, r, ry))
+        canvas.paint(base * 0.94, canvas.ellipse(0, -h, r * 0.78, ry * 0.78))
+        canvas.paint((255, 255, 255), 0.4 * canvas.glow(-0.3 * r, -h - 0.3 * ry, 0.5 * r, 0.45 * ry))
+        return canvas.sprite()
+
+    def _draw_shadow(self, half_x: float, half_y: float, darkness: float) -> Sprite:
+        u, v = half_x * self._scale, half_y * self._scale * self._up
+        canvas = Canvas(u, u, v, v)
+        canvas.paint((20, 20, 24), darkness * canvas.glow(0, 0, u, v))
+        return canvas.sprite()
+
+    def _draw_gripper(self, gap: float) -> Sprite:
+        """Two fingers `gap` pixels off the middle, the palm above them and the wrist on top."""
+        s = self._scale
+        finger, length = FINGER_RADIUS * s, _FINGER_LENGTH * s * self._deep
+        half, tall = 0.052 * s, 0.016 * s  # the palm's
+        front, above = 0.022 * s * self._deep, -length - 0.022 * s * self._deep
+        canvas = Canvas(half + finger, half + finger, length + front + 2 * tall + 0.03 * s, finger)
+        for side in (-1.0, 1.0):
+            u = side * (gap + finger)
+            canvas.paint(
+                np.asarray(_FINGER) * 0.72, canvas.box(u, -length / 2, finger, length / 2 + finger / 2, finger / 2)
+            )
+            lit = canvas.box(u - finger * 0.25, -length / 2, finger * 0.6, length / 2, finger / 2)
+            canvas.paint(_FINGER, lit)
+        canvas.paint(_PALM_FRONT, canvas.box(0, above + front / 2, half, tall * self._up + front / 2, 0.008 * s))
+        canvas.paint(_PALM, canvas.box(0, above, half, tall * self._up, 0.008 * s))
+        canvas.paint((48, 49, 51), 0.6 * canvas.glow(0, above, 0.03 * s, 0.024 * s))
+        wrist = 0.02 * s
+        rise = 0.02 * s * self._deep
+        column = np.maximum(
+            canvas.ellipse(0, above, wrist, wrist * self._up), canvas.box(0, above - rise / 2, wrist, rise / 2)
+        )
+        canvas.paint(np.asarray(_WRIST) * 0.75, column)
+        canvas.paint(_WRIST, canvas.ellipse(0, above - rise, wrist, wrist * self._up))
+        canvas.paint((176, 178, 182), canvas.ellipse(0, above - rise, wrist * 0.55, wrist * 0.55 * self._up))
+        return canvas.sprite()

@@ -1,0 +1,223 @@
+"""What moves on the table: pucks, and a gripper with two fingers that grasps and pushes them.
+
+Quasi-static: a puck goes where it is carried or pushed and otherwise rests or falls. Plain floats
+rather than arrays: for a handful of bodies that is several times faster.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+PUCK_RADIUS = 0.022  # m
+PUCK_HEIGHT = 0.03  # m
+PAD_HALF = 0.045  # m, half the side of the square
+FINGER_RADIUS = 0.007  # m
+GAP_OPEN = 0.038  # m, from the gripper's centre to the inner face of a finger; closed it is 0
+REACH = ((-0.30, 0.30), (-0.23, 0.23), (0.0, 0.18))  # m, of the fingertips
+HOME = (0.0, 0.20, 0.16)  # m, where they are when an episode begins
+STEP_LIMIT = 0.03  # m, travel of one control step along each axis
+
+_TABLE = (0.30, 0.24)  # m, half extents; a rim keeps the pucks on it
+_SUBSTEPS = 3  # so that a finger moves at most 1 cm, less than it is wide, between contact checks
+_OPENING_RATE = 0.5 / _SUBSTEPS  # of the whole opening
+_CONTACT_PASSES = 4  # enough for a puck cradled by two fingers to come to rest
+_FALL = 0.06 / _SUBSTEPS  # m
+_GRASP_DEPTH = 0.012  # m, how far off the fingers' line a puck's centre may be and still be grasped
+_LIFTED = 0.01  # m
+_EPSILON = 1e-6  # m
+
+
+@dataclass(slots=True)
+class Puck:
+    colour: str
+    x: float
+    y: float
+    z: float = 0.0  # m, of its underside
+    lifted: bool = False  # has it left the table in this episode?
+
+
+@dataclass(frozen=True, slots=True)
+class Pad:
+    colour: str
+    x: float
+    y: float
+
+
+class World:
+    """The state of one episode."""
+
+    def __init__(self, pucks: list[Puck], pads: list[Pad]) -> None:
+        self.pucks = pucks
+        self.pads = pads
+        self.x, self.y, self.z = HOME  # m, midway between the fingertips
+        self.gap = GAP_OPEN  # m
+        self.held: Puck | None = None
+
+    @property
+    def opening(self) -> float:
+        """How far the gripper is open, in [0, 1]; about 0.58 while it holds a puck."""
+        return self.gap / GAP_OPEN
+
+    def puck(self, colour: str) -> Puck:
+        return next(p for p in self.pucks if p.colour == colour)
+
+    def pad(self, colour: str) -> Pad:
+        return next(p for p in self.pads if p.colour == colour)
+
+    def step(self, dx: float, dy: float, dz: float, opening: float) -> None:
+        """Move the fingertips by (dx, dy, dz) m and the fingers towards `opening` in [0, 1]."""
+        for _ in range(_SUBSTEPS):
+            self._travel(dx / _SUBSTEPS, dy / _SUBSTEPS)
+            self._raise(dz / _SUBSTEPS)
+            self._grip(opening)
+            self._settle()
+
+    def _travel(self, dx: float, dy: float) -> None:
+        x, y = _clip(self.x + dx, REACH[0]), _clip(self.y + dy, REACH[1])
+        dx, dy = x - self.x, y - self.y
+        for puck in self._carried():
+            puck.x += dx
+            puck.y += dy
+        self.x, self.y = x, y
+        lowest = self.z if self.held is None else min(self.z, self.held.z)
+        if lowest < self._highest_top():
+            self._push()
+
+    def _push(self) -> None:
+        for puck in self.pucks:
+            if puck is self.held or puck.z + PUCK_HEIGHT <= self.z + _EPSILON:
+                continue
+            if self._between_fingers(puck):
+                slack = max(self.gap - PUCK_RADIUS, 0.0)
+                puck.x = _clip(puck.x, (self.x - slack, self.x + slack))
+                continue
+            self._push_by_fingers(puck)
+        for _ in range(len(self.pucks)):  # a pushed puck pushes the next
+            if not self._separate():
+                break
+
+    def _push_by_fingers(self, puck: Puck) -> None:
+        reach = PUCK_RADIUS + FINGER_RADIUS
+        offset = self.gap + FINGER_RADIUS
+        for _ in range(_CONTACT_PASSES):
+            # both fingers push at once: one after the other they would drive a centred puck aside
+            pushes = [_overlap(puck, self.x + side * offset, self.y, reach) for side in (-1.0, 1.0)]
+            if not any(pushes):
+                return
+            puck.x += sum(push[0] for push in pushes if push)
+            puck.y += sum(push[1] for push in pushes if push)
+
+    def _separate(self) -> bool:
+        moved = False
+        for i, a in enumerate(self.pucks):
+            for b in self.pucks[i + 1 :]:
+                if abs(a.z - b.z) >= PUCK_HEIGHT - _EPSILON:
+                    continue
+                still, loose = (b, a) if b is self.held else (a, b)
+                push = _overlap(loose, still.x, still.y, 2 * PUCK_RADIUS)
+                if push:
+                    loose.x += push[0]
+                    loose.y += push[1]
+                    moved = True
+        for puck in self.pucks:
+            if puck is not self.held:
+                puck.x = _clip(puck.x, (PUCK_RADIUS - _TABLE[0], _TABLE[0] - PUCK_RADIUS))
+                puck.y = _clip(puck.y, (PUCK_RADIUS - _TABLE[1], _TABLE[1] - PUCK_RADIUS))
+        return moved
+
+    def _raise(self, dz: float) -> None:
+        z = _clip(self.z + dz, REACH[2])
+        if self.held is not None:
+            under = self._support(self.held)
+            z = max(z, self.z + under - self.held.z)
+        elif dz < 0:
+            for puck in self.pucks:
+                top = puck.z + PUCK_HEIGHT
+                if z < top <= self.z + _EPSILON and self._finger_over(puck):
+                    z = top
+        for puck in self._carried():
+            puck.z += z - self.z
+        self.z = z
+
+    def _grip(self, opening: float) -> None:
+        change = _clip(opening - self.opening, (-_OPENING_RATE, _OPENING_RATE))
+        gap = self.gap + change * GAP_OPEN
+        if self.held is not None:
+            if gap > PUCK_RADIUS + _EPSILON:
+                self.held = None
+                self.gap = gap
+            return
+        if change < 0:
+            for puck in self.pucks:
+                if not self._between_fingers(puck):
+                    continue
+                slack = max(gap - PUCK_RADIUS, 0.0)
+                puck.x = _clip(puck.x, (self.x - slack, self.x + slack))
+                if gap <= PUCK_RADIUS:
+                    gap, self.held = PUCK_RADIUS, puck
+                    break
+        self.gap = gap
+
+    def _settle(self) -> None:
+        for puck in sorted(self.pucks, key=lambda p: p.z):
+            if puck is not self.held and puck.z > 0.0:
+                puck.z = max(puck.z - _FALL, self._support(puck))
+            puck.lifted = puck.lifted or puck.z > _LIFTED
+
+    def _support(self, puck: Puck) -> float:
+        """Height in m of what lies under `puck`: the table, or a puck under its centre of mass."""
+        height = 0.0
+        for other in self.pucks:
+            top = other.z + PUCK_HEIGHT
+            if other is not puck and top <= puck.z + _EPSILON and _distance(puck, other) < PUCK_RADIUS:
+                height = max(height, top)
+        return height
+
+    def _carried(self) -> list[Puck]:
+        """The held puck and what stands on it."""
+        if self.held is None:
+            return []
+        carried = [self.held]
+        for puck in sorted(self.pucks, key=lambda p: p.z):
+            if any(self._stands_on(puck, below) for below in carried):
+                carried.append(puck)
+        return carried
+
+    @staticmethod
+    def _stands_on(puck: Puck, below: Puck) -> bool:
+        return abs(puck.z - below.z - PUCK_HEIGHT) < _EPSILON and _distance(puck, below) < PUCK_RADIUS
+
+    def _between_fingers(self, puck: Puck) -> bool:
+        return (
+            abs(puck.y - self.y) < _GRASP_DEPTH
+            and abs(puck.x - self.x) < max(self.gap, _EPSILON)
+            and puck.z - _LIFTED < self.z < puck.z + 0.6 * PUCK_HEIGHT
+        )
+
+    def _finger_over(self, puck: Puck) -> bool:
+        reach = PUCK_RADIUS + FINGER_RADIUS - _EPSILON
+        offset = self.gap + FINGER_RADIUS
+        return any(math.hypot(self.x + s * offset - puck.x, self.y - puck.y) < reach for s in (-1.0, 1.0))
+
+    def _highest_top(self) -> float:
+        return max((p.z for p in self.pucks if p is not self.held), default=-PUCK_HEIGHT) + PUCK_HEIGHT
+
+
+def _overlap(puck: Puck, x: float, y: float, distance: float) -> tuple[float, float] | None:
+    """How far (dx, dy) `puck` must move straight away from (x, y) to be `distance` off; None if it is."""
+    dx, dy = puck.x - x, puck.y - y
+    have = math.hypot(dx, dy)
+    if have >= distance - _EPSILON:
+        return None
+    if have < _EPSILON:
+        return 0.0, -distance  # dead centre: any direction will do, as long as it is always the same
+    return dx * (distance / have - 1), dy * (distance / have - 1)
+
+
+def _distance(a: Puck, b: Puck) -> float:
+    return math.hypot(a.x - b.x, a.y - b.y)
+
+
+def _clip(value: float, bounds: tuple[float, float]) -> float:
+    return min(max(value, bounds[0]), bounds[1])

@@ -1,0 +1,227 @@
+"""Workers: Ray actors that play episodes, watched, killed and replaced. Nothing here knows results."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from time import monotonic
+from typing import Any
+
+import ray
+from ray.exceptions import RayActorError, RayError
+
+from vlagents_ray.errors import ConfigError, EnvFailed
+from vlagents_ray.evaluate.config import EvalConfig
+from vlagents_ray.evaluate.episode import Phase
+from vlagents_ray.evaluate.jobs import Job
+from vlagents_ray.evaluate.rollout import AgentFactory, Failure, Pulse, Report, Rollout
+
+log = logging.getLogger(__name__)
+
+WATCH_S = 1.0  # between two looks at a busy worker
+GRACE_S = 5.0  # a call past its deadline gets this long to fail by itself
+CLOSE_S = 10.0  # for workers to close their simulators at the end
+MOST_FAILED_STARTS = 3  # in a row
+
+# Pinned before any import in the worker: several workers share a machine.
+THREAD_VARIABLES = (
+    "OMP_NUM_THREADS",
+    "MKL_NUM_THREADS",
+    "OPENBLAS_NUM_THREADS",
+    "NUMEXPR_NUM_THREADS",
+    "OPENCV_FOR_THREADS_NUM",
+    "LP_NUM_THREADS",  # llvmpipe and lavapipe, Mesa's software renderers
+)
+
+
+@dataclass(slots=True, eq=False)
+class Worker:
+    """One worker as the driver sees it."""
+
+    actor: Any
+    starting: Any  # ref of `ready()`; None once it runs
+    since: float  # when it was started
+    job: Job | None = None
+    running: Any = None  # ref of `run(job)`
+    made: str | None = None  # the env it holds
+    looking: Any = None  # ref of `progress()`
+    looked: float = 0.0  # when it was asked
+    pulse: Pulse = field(default_factory=lambda: Pulse("idle", 0.0, 0))
+    heard: float = 0.0  # when it last answered
+
+
+class WorkerPool:
+    """Keeps up to `size` workers. Use as a context manager: leaving it kills every worker."""
+
+    def __init__(self, config: EvalConfig, agent_factory: AgentFactory, size: int) -> None:
+        self._config = config
+        self._actor_class = ray.remote(concurrency_groups={"watch": 1})(Rollout)
+        self._options = {
+            "num_cpus": config.cpus_per_worker,
+            "num_gpus": config.gpus_per_worker,
+            "max_restarts": 0,
+            "scheduling_strategy": "SPREAD",
+            "runtime_env": _runtime_env(config),
+        }
+        self._agent_factory = agent_factory
+        self._failed_starts = 0
+        self._limit_s: dict[Phase, float] = {
+            "connect": config.connect_timeout_s + config.policy_timeout_s,
+            "make": config.make_timeout_s,
+            "env reset": config.env_timeout_s,
+            "env step": config.env_timeout_s,
+            "policy reset": config.policy_timeout_s,
+            "policy act": config.policy_timeout_s,
+        }
+        self._workers: list[Worker] = []
+        for _ in range(size):
+            self._start()
+
+    def __enter__(self) -> WorkerPool:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        for worker in self._workers:
+            ray.kill(worker.actor)
+        self._workers.clear()
+
+    @property
+    def busy(self) -> bool:
+        """Is an episode being played?"""
+        return any(worker.job is not None for worker in self._workers)
+
+    def working(self) -> Counter[str]:
+        """How many workers are busy with which env."""
+        return Counter(worker.job.key.env for worker in self._workers if worker.job is not None)
+
+    def idle(self) -> list[Worker]:
+        """Workers that can take a job."""
+        return [worker for worker in self._workers if worker.starting is None and worker.job is None]
+
+    def dispatch(self, worker: Worker, job: Job) -> None:
+        """Have `worker` play `job`."""
+        phase: Phase = "env reset" if worker.made == job.key.env else "make"
+        worker.job = job
+        worker.pulse, worker.heard = Pulse(phase, 0.0, 0), monotonic()
+        worker.looked, worker.looking = monotonic(), None
+        worker.running = worker.actor.run.remote(job)
+
+    def wait(self, timeout_s: float) -> Iterator[tuple[Job, Report]]:
+        """Reports that arrive within `timeout_s`, those of workers that died or hung included.
+
+        Such a worker, and one that reports that its simulator broke, is replaced.
+        """
+        refs = {ref: worker for worker in self._workers for ref in _refs(worker)}
+        if refs:
+            done, _ = ray.wait(list(refs), num_returns=1, timeout=timeout_s)
+            for ref in done:
+                yield from self._arrived(refs[ref], ref)
+        yield from self._look()
+
+    def close(self) -> None:
+        """Let idle workers close their simulators, which some need for a clean exit."""
+        closing = {worker.actor.close.remote(): worker for worker in self.idle()}
+        if not closing:
+            return
+        done, late = ray.wait(list(closing), num_returns=len(closing), timeout=CLOSE_S)
+        for ref in done:
+            try:
+                ray.get(ref)
+            except RayError as error:
+                log.warning("a worker did not close its env: %s", error)
+        if late:
+            log.warning("%d workers did not close their envs within %g s", len(late), CLOSE_S)
+
+    def _start(self) -> None:
+        actor = self._actor_class.options(**self._options).remote(self._config, self._agent_factory)
+        self._workers.append(Worker(actor, starting=actor.ready.remote(), since=monotonic()))
+
+    def _replace(self, worker: Worker) -> None:
+        self._workers.remove(worker)
+        ray.kill(worker.actor)
+        self._start()
+
+    def _arrived(self, worker: Worker, ref: Any) -> Iterator[tuple[Job, Report]]:
+        if ref == worker.starting:
+            self._started(worker)
+        elif ref == worker.looking:
+            worker.looking = None
+            try:
+                worker.pulse, worker.heard = ray.get(ref), monotonic()
+            except RayActorError as error:  # the answer to its job says the same
+                log.debug("a worker did not answer: %s", error)
+        elif worker.job is not None:
+            job, worker.job, worker.running = worker.job, None, None
+            try:
+                report = ray.get(ref)
+            except RayError as error:
+                report = _lost(f"the worker died: {error}")
+            if report.made is not None:
+                worker.made = report.made.env
+            if report.failure is not None and report.failure.cause == "worker":
+                self._replace(worker)
+            yield job, report
+
+    def _started(self, worker: Worker) -> None:
+        try:
+            log.info("worker %s", ray.get(worker.starting))
+        except RayError as error:
+            self._failed_starts += 1
+            if self._failed_starts >= MOST_FAILED_STARTS:
+                raise EnvFailed(f"workers do not start, {self._failed_starts} in a row: {error}") from error
+            self._replace(worker)
+        else:
+            self._failed_starts = 0
+            worker.starting = None
+
+    def _look(self) -> Iterator[tuple[Job, Report]]:
+        now = monotonic()
+        for worker in list(self._workers):
+            if worker.starting is not None:
+                if now - worker.since > self._config.place_timeout_s:
+                    raise ConfigError(self._no_room())
+            elif worker.job is not None:
+                reason = self._overdue(worker, now)
+                if reason is not None:
+                    job = worker.job
+                    self._replace(worker)
+                    yield job, _lost(reason, worker.pulse.stack)
+                elif worker.looking is None and now - worker.looked > WATCH_S:
+                    worker.looked = now
+                    worker.looking = worker.actor.progress.options(concurrency_group="watch").remote()
+
+    def _overdue(self, worker: Worker, now: float) -> str | None:
+        """Why `worker` must be replaced, if it must."""
+        pulse = worker.pulse
+        limit_s = self._limit_s.get(pulse.phase, self._config.env_timeout_s)
+        if pulse.age_s > limit_s + GRACE_S:
+            return f"{pulse.phase} after {pulse.steps} steps took longer than {limit_s:g} s; the worker was killed"
+        # A simulator that hangs inside C code holds the interpreter, so that nothing answers.
+        silent_s = now - worker.heard
+        if silent_s > max(limit_s, self._config.env_timeout_s) + GRACE_S + WATCH_S:
+            return f"no sign of life for {silent_s:.0f} s, last seen in {pulse.phase}; the worker was killed"
+        return None
+
+    def _no_room(self) -> str:
+        want = {"CPU": self._config.cpus_per_worker, "GPU": self._config.gpus_per_worker}
+        return (
+            f"the cluster found no room for a worker in {self._config.place_timeout_s:g} s: each wants {want}, "
+            f"free are {ray.available_resources()} of {ray.cluster_resources()}; lower `workers` or "
+            f"`cpus_per_worker`, or raise `place_timeout_s` if the cluster is still growing"
+        )
+
+
+def _refs(worker: Worker) -> list[Any]:
+    return [ref for ref in (worker.starting, worker.running, worker.looking) if ref is not None]
+
+
+def _lost(reason: str, stack: str = "") -> Report:
+    return Report(failure=Failure("worker", EnvFailed.code, reason, stack))
+
+
+def _runtime_env(config: EvalConfig) -> dict[str, Any]:
+    given: dict[str, Any] = dict(config.runtime_env)
+    threads = dict.fromkeys(THREAD_VARIABLES, str(config.threads))
+    return given | {"env_vars": threads | given.get("env_vars", {})}

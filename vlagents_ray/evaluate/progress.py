@@ -1,0 +1,183 @@
+"""How an evaluation shows where it stands: live on a terminal, in plain lines elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from time import monotonic
+from typing import Protocol
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from vlagents_ray.evaluate.episode import EpisodeResult
+from vlagents_ray.evaluate.jobs import Job
+from vlagents_ray.evaluate.rollout import Failure
+from vlagents_ray.evaluate.statistics import Rate
+
+LINE_EVERY_S = 5.0
+
+
+class Progress(Protocol):
+    """What an evaluation tells while it runs. The calls come from one thread."""
+
+    def begin(self, planned: Mapping[str, int], recorded: Mapping[str, Rate]) -> None:
+        """Episodes planned per env, and those that earlier runs have finished."""
+
+    def episode(self, result: EpisodeResult) -> None:
+        """An episode is recorded."""
+
+    def retry(self, job: Job, failure: Failure) -> None:
+        """Infrastructure failed an attempt, and the episode will be tried again."""
+
+    def end(self) -> None:
+        """Nothing follows."""
+
+
+class SilentProgress:
+    """Shows nothing."""
+
+    def begin(self, planned: Mapping[str, int], recorded: Mapping[str, Rate]) -> None:
+        """Nothing."""
+
+    def episode(self, result: EpisodeResult) -> None:
+        """Nothing."""
+
+    def retry(self, job: Job, failure: Failure) -> None:
+        """Nothing."""
+
+    def end(self) -> None:
+        """Nothing."""
+
+
+class _Counts:
+    """What both displays keep count of."""
+
+    def __init__(self, planned: Mapping[str, int], recorded: Mapping[str, Rate]) -> None:
+        self._started = monotonic()
+        self._planned = dict(planned)
+        self._rates = {env: recorded.get(env, Rate(0, 0)) for env in planned}
+        self._infra_failed = dict.fromkeys(planned, 0)
+        self._steps = 0
+        self._played = 0  # in this run
+        self._left = sum(planned.values()) - sum(rate.episodes for rate in recorded.values())
+        self.retries = 0
+
+    def add(self, result: EpisodeResult) -> None:
+        self._played += 1
+        self._left -= 1
+        self._steps += result.steps
+        env = result.key.env
+        if result.status == "infra_failed":
+            self._infra_failed[env] += 1
+            return
+        before = self._rates[env]
+        self._rates[env] = Rate(before.successes + bool(result.success_once), before.episodes + 1)
+
+    def envs(self) -> list[tuple[str, str, str]]:
+        """(env, "done/planned", success so far)."""
+        return [
+            (env, f"{rate.episodes + self._infra_failed[env]}/{self._planned[env]}", str(rate))
+            for env, rate in self._rates.items()
+        ]
+
+    def overall(self) -> str:
+        elapsed_s = monotonic() - self._started
+        parts = ["waiting for the first episode"]
+        if self._played:
+            parts = [f"{self._steps / elapsed_s:.0f} steps/s", _left(self._left, self._played, elapsed_s)]
+        if self.retries:
+            parts.append(f"{self.retries} infrastructure {'retry' if self.retries == 1 else 'retries'}")
+        if any(self._infra_failed.values()):
+            parts.append(f"{sum(self._infra_failed.values())} infrastructure failures")
+        return " · ".join(filter(None, parts))
+
+
+class LiveProgress:
+    """A table that is drawn anew, for terminals."""
+
+    def __init__(self, console: Console) -> None:
+        self._live = Live(console=console, auto_refresh=True, refresh_per_second=4, get_renderable=self._table)
+        self._counts = _Counts({}, {})
+
+    def begin(self, planned: Mapping[str, int], recorded: Mapping[str, Rate]) -> None:
+        """Start drawing."""
+        self._counts = _Counts(planned, recorded)
+        self._live.start()
+
+    def episode(self, result: EpisodeResult) -> None:
+        """Count it."""
+        self._counts.add(result)
+
+    def retry(self, job: Job, failure: Failure) -> None:
+        """Count it, and say why above the table."""
+        self._counts.retries += 1
+        self._live.console.print(_retry_line(job, failure), markup=False, highlight=False)
+
+    def end(self) -> None:
+        """Leave the last state standing."""
+        self._live.stop()
+
+    def _table(self) -> Table:
+        table = Table(box=None, caption=self._counts.overall(), caption_justify="left")
+        for title in ("env", "episodes", "success so far"):
+            table.add_column(title)
+        for row in self._counts.envs():
+            table.add_row(*row)
+        return table
+
+
+class LineProgress:
+    """A line every few seconds, for logs."""
+
+    def __init__(self, console: Console, every_s: float = LINE_EVERY_S) -> None:
+        self._console = console
+        self._every_s = every_s
+        self._last = 0.0
+        self._counts = _Counts({}, {})
+
+    def begin(self, planned: Mapping[str, int], recorded: Mapping[str, Rate]) -> None:
+        """The first line."""
+        self._counts = _Counts(planned, recorded)
+        self._last = monotonic()
+        self._line()
+
+    def episode(self, result: EpisodeResult) -> None:
+        """A line, unless the last one is recent."""
+        self._counts.add(result)
+        if monotonic() - self._last >= self._every_s:
+            self._last = monotonic()
+            self._line()
+
+    def retry(self, job: Job, failure: Failure) -> None:
+        """A line with the reason."""
+        self._counts.retries += 1
+        self._print(_retry_line(job, failure))
+
+    def end(self) -> None:
+        """The last line."""
+        self._line()
+
+    def _line(self) -> None:
+        envs = " · ".join(f"{env} {done}, success {rate}" for env, done, rate in self._counts.envs())
+        self._print(f"{envs} · {self._counts.overall()}")
+
+    def _print(self, text: str) -> None:
+        self._console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def progress_for(console: Console) -> Progress:
+    """The display that suits `console`."""
+    return LiveProgress(console) if console.is_terminal else LineProgress(console)
+
+
+def _retry_line(job: Job, failure: Failure) -> str:
+    first_line = failure.message.strip().partition("\n")[0]
+    return f"{job.key.env} episode {job.key.episode}: attempt {job.attempt} failed, trying again: {first_line}"
+
+
+def _left(episodes: int, played: int, elapsed_s: float) -> str:
+    if episodes <= 0 or not played:
+        return ""
+    seconds = round(episodes * elapsed_s / played)
+    return f"{seconds // 3600}:{seconds // 60 % 60:02d}:{seconds % 60:02d} left"

@@ -1,0 +1,61 @@
+"""The table of results that ends an evaluation."""
+
+from __future__ import annotations
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from vlagents_ray.evaluate.summary import Group, Summary
+
+
+def results_table(summary: Summary) -> Table:
+    """Success, length and speed, a row an env and one for all."""
+    table = Table(title=f"{summary.config['policy']}: success in %, with the Wilson 95 % interval", box=SIMPLE_HEAD)
+    table.add_column("env", overflow="fold")
+    for title in ("episodes", "once", "at end", "steps", "return", "policy ms", "env ms"):
+        table.add_column(title, justify="right", no_wrap=title in ("once", "at end"))
+    for group in summary.envs:
+        table.add_row(*_cells(group))
+    if len(summary.envs) > 1:
+        table.add_section()
+        table.add_row(*_cells(summary.total))
+    return table
+
+
+def print_summary(console: Console, summary: Summary) -> None:
+    """The table, what went wrong beside the policy, and where everything is."""
+    console.print(results_table(summary))
+    total = summary.total
+    speed = summary.rollout_steps_per_second
+    lines = [f"{total.steps} steps in {summary.wall_seconds:.1f} s" + (f", {speed:.1f} a second" if speed else "")]
+    if total.policy_errors:
+        lines.append(f"{total.policy_errors} episodes ended by an error of the policy; they count as no success")
+    if total.retries:
+        lines.append(f"{total.retries} attempts lost to infrastructure and repeated")
+    if total.infra_failures:
+        lines.append(f"{total.infra_failures} episodes lost to infrastructure, in no rate; --resume tries them again")
+    if summary.state != "complete":
+        lines.append(f"{summary.state}: go on with --resume")
+    lines.append(f"results: {summary.out}")
+    if (summary.out / "videos").is_dir():
+        lines.append(f"videos: {summary.out / 'videos'}")
+    for line in lines:
+        console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def _cells(group: Group) -> list[str]:
+    return [
+        group.name,
+        f"{group.episodes}/{group.planned}",
+        str(group.success_once),
+        str(group.success_at_end),
+        _number(group.mean_steps),
+        _number(group.mean_return, 2),
+        _number(group.policy_ms, 2),
+        _number(group.env_step_ms, 2),
+    ]
+
+
+def _number(value: float | None, digits: int = 1) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"

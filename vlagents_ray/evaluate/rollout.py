@@ -1,0 +1,243 @@
+"""What runs in a worker process: one env, one agent, one episode after another.
+
+`Rollout` is plain Python; `vlagents_ray.evaluate.pool` makes a Ray actor of it. It never raises for
+what an episode may run into: it reports it, so that no exception has to survive pickling.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+import sys
+import threading
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from time import monotonic, sleep
+from typing import Any, Literal
+
+from vlagents_ray.contract import require_match
+from vlagents_ray.envs import EvalEnv, make_env
+from vlagents_ray.errors import (
+    ConfigError,
+    ContractMismatch,
+    DeadlineExceeded,
+    EnvFailed,
+    InvalidInput,
+    MalformedMessage,
+    MessageTooLarge,
+    MissingCamera,
+    MissingDependency,
+    MissingState,
+    NotReset,
+    PolicyFailed,
+    PolicyUnavailable,
+    UnknownApp,
+    UnknownSession,
+    VLAgentsError,
+)
+from vlagents_ray.evaluate.config import EvalConfig
+from vlagents_ray.evaluate.episode import EpisodeResult, Phase, env_side, policy_side, run_episode
+from vlagents_ray.evaluate.jobs import Job
+from vlagents_ray.evaluate.video import VideoRecorder
+from vlagents_ray.interface import Agent
+from vlagents_ray.registry import env_class
+
+log = logging.getLogger(__name__)
+
+AgentFactory = Callable[[], Agent]
+Cause = Literal["user", "policy", "worker"]
+
+FIRST_WAIT_S = 0.5  # before trying again to reach a policy, doubled each time
+LONGEST_WAIT_S = 10.0
+LONG_S = 1.0  # in one phase, before a look at it asks where
+
+
+@dataclass(frozen=True, slots=True)
+class Failure:
+    """Why an attempt came to nothing, and who can do something about it.
+
+    "user": a mistake in the settings, which stops the evaluation; "policy": the way to the policy;
+    "worker": the simulator or its process, which is then replaced.
+    """
+
+    cause: Cause
+    code: str  # of `vlagents_ray.errors`
+    message: str
+    traceback: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Made:
+    """What a worker found out when it made an env."""
+
+    env: str
+    described: dict[str, Any]  # `EvalEnv.describe()`
+    contract: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """A worker's answer to a job: a result or a failure."""
+
+    result: EpisodeResult | None = None
+    failure: Failure | None = None
+    videos: dict[str, bytes] = field(default_factory=dict)  # camera -> MP4
+    made: Made | None = None  # if an env was made for it
+    policy: dict[str, Any] | None = None  # metadata of the policy ({} of a local one), if newly connected
+
+
+@dataclass(frozen=True, slots=True)
+class Pulse:
+    """What a worker is doing, for how long."""
+
+    phase: Phase
+    age_s: float
+    steps: int
+    stack: str = ""  # where it is, once it has been there for long
+
+
+class Rollout:
+    """Plays jobs. Keeps one agent for all of them, and one env until a job needs another."""
+
+    def __init__(self, config: EvalConfig, agent_factory: AgentFactory) -> None:
+        self._config = config
+        self._agent_factory = agent_factory
+        self._agent: Agent | None = None
+        self._broken_agents = 0  # in a row
+        self._env: EvalEnv | None = None
+        self._env_name: str | None = None
+        self._thread = 0  # the one that plays
+        self._now: tuple[Phase, float, int] = ("idle", monotonic(), 0)
+
+    def ready(self) -> dict[str, Any]:
+        """Answered as soon as the process runs."""
+        return {"pid": os.getpid(), "host": socket.gethostname()}
+
+    def progress(self) -> Pulse:
+        """Called from another thread while `run` is under way."""
+        phase, since, steps = self._now
+        age_s = monotonic() - since
+        frame = sys._current_frames().get(self._thread) if age_s > LONG_S else None
+        return Pulse(phase, age_s, steps, "".join(traceback.format_stack(frame)) if frame else "")
+
+    def run(self, job: Job) -> Report:
+        """Play one episode."""
+        self._thread = threading.get_ident()
+        made: Made | None = None
+        policy: dict[str, Any] | None = None
+        try:
+            if self._agent is None:
+                self._agent = self._connect()
+                policy = _metadata(self._agent)
+            if self._env is None or self._env_name != job.key.env:
+                self._env = self._make_env(job.key.env)
+                made = Made(job.key.env, self._env.describe(), self._env.contract.to_json())
+            agent, env = self._agent, self._env
+            if made is not None or policy is not None:
+                require_match(agent.contract, env.contract)
+            with VideoRecorder(env.contract.control_hz) as recorder:
+                result = run_episode(
+                    env,
+                    agent,
+                    job.key,
+                    execute=self._config.execute,
+                    reset_options=self._config.reset_options,
+                    watch=self._watch,
+                    record=recorder.add if self._config.video != "none" else lambda _obs: None,
+                )
+                wanted = self._config.video == "all" or not result.success_once
+                videos = recorder.finish() if wanted else {}
+        except VLAgentsError as error:
+            failure = explain(error)
+            if failure.cause == "policy":
+                self._broken_agents += 1
+                self._drop_agent()
+            return Report(failure=failure, made=made, policy=policy)
+        finally:
+            self._watch("idle", 0)
+        self._broken_agents = 0
+        return Report(result=result, videos=videos, made=made, policy=policy)
+
+    def close(self) -> None:
+        """Free the simulator and the connection."""
+        self._drop_agent()
+        self._drop_env()
+
+    def _watch(self, phase: Phase, steps: int) -> None:
+        self._now = (phase, monotonic(), steps)
+
+    def _connect(self) -> Agent:
+        self._watch("connect", 0)
+        if self._broken_agents:  # the server may be restarting, or full
+            sleep(min(FIRST_WAIT_S * 2 ** (self._broken_agents - 1), LONGEST_WAIT_S))
+        with policy_side("start"):
+            agent = self._agent_factory()
+        try:
+            with policy_side("initialize"):
+                agent.initialize()
+                _metadata(agent)  # fetches it: is the server there, and does it know the policy?
+        except VLAgentsError:
+            agent.close()
+            raise
+        return agent
+
+    def _make_env(self, name: str) -> EvalEnv:
+        self._drop_env()  # first, so that a worker never holds two simulators
+        self._watch("make", 0)
+        try:
+            with env_side(f"{name!r}: make"):
+                env = make_env(name, **self._config.options_for(name))
+        except EnvFailed as error:
+            reason = env_class(name).missing()
+            if reason is None:
+                raise
+            raise MissingDependency(f"env {name!r} cannot run here: {reason}") from error
+        self._env_name = name
+        return env
+
+    def _drop_agent(self) -> None:
+        agent, self._agent = self._agent, None
+        if agent is not None:
+            try:
+                agent.close()
+            except VLAgentsError as error:  # the way to it is broken: nothing is left to close
+                log.warning("closing the agent: %s", error)
+
+    def _drop_env(self) -> None:
+        env, self._env, self._env_name = self._env, None, None
+        if env is not None:
+            with env_side("close"):
+                env.close()
+
+
+_USER = (
+    ConfigError,
+    ContractMismatch,
+    MalformedMessage,
+    MessageTooLarge,
+    MissingCamera,
+    MissingDependency,
+    MissingState,
+    PolicyFailed,
+    UnknownApp,
+)
+_POLICY = (PolicyUnavailable, DeadlineExceeded, UnknownSession, NotReset)
+_WORKER = (EnvFailed, InvalidInput)  # InvalidInput left here: the env gave an observation nobody can use
+
+
+def explain(error: VLAgentsError) -> Failure:
+    """Who is to blame for `error`. A `PolicyFailed` outside an episode is a policy that cannot start."""
+    cause: Cause
+    if isinstance(error, _USER):
+        cause = "user"
+    elif isinstance(error, _POLICY) or not isinstance(error, _WORKER):
+        cause = "policy"
+    else:
+        cause = "worker"
+    return Failure(cause, error.code, str(error), "".join(traceback.format_exception(error)))
+
+
+def _metadata(agent: Agent) -> dict[str, Any]:
+    return dict(getattr(agent, "metadata", {}))

@@ -1,0 +1,213 @@
+"""Runs an evaluation: dispatch, retries, recording, and a clean stop."""
+
+from __future__ import annotations
+
+import functools
+import os
+import signal
+import threading
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from math import ceil
+from types import FrameType
+from typing import Any
+
+import ray
+
+from vlagents_ray.client import RemoteAgent
+from vlagents_ray.errors import ConfigError, from_code
+from vlagents_ray.evaluate.config import EvalConfig
+from vlagents_ray.evaluate.episode import EpisodeResult
+from vlagents_ray.evaluate.jobs import Job, JobQueue, plan
+from vlagents_ray.evaluate.pool import WorkerPool
+from vlagents_ray.evaluate.progress import Progress, SilentProgress
+from vlagents_ray.evaluate.rollout import AgentFactory, Failure, Report
+from vlagents_ray.evaluate.statistics import Rate
+from vlagents_ray.evaluate.store import Store
+from vlagents_ray.evaluate.summary import State, Summary, summarize, versions, write_summary
+from vlagents_ray.evaluate.video import save_videos
+from vlagents_ray.registry import env_class
+
+POLL_S = 0.25  # how soon a signal is noticed
+
+
+class EvaluationInterrupted(KeyboardInterrupt):
+    """Ctrl-C or SIGTERM; what was finished is kept, and `resume` goes on from there."""
+
+    def __init__(self, summary: Summary) -> None:
+        done, planned = summary.total.episodes, summary.total.planned
+        super().__init__(f"interrupted after {done} of {planned} episodes; go on with --resume --out {summary.out}")
+        self.summary = summary
+
+
+def evaluate(
+    config: EvalConfig, *, agent_factory: AgentFactory | None = None, progress: Progress | None = None
+) -> Summary:
+    """Play every episode of `config` that has no result yet; the results are in `config.out`.
+
+    Episodes run in Ray actors: in the cluster that this process is connected to, or else in one
+    that `RAY_ADDRESS` names, or in a local one started for the length of the run. Each worker talks to
+    the policy at `config.policy_url`, or to an agent of its own that `agent_factory` makes there.
+
+    Raises `ConfigError` for settings that cannot be, or that contradict the results in `config.out`;
+    `ContractMismatch` if policy and env do not fit; the last infrastructure error after
+    `config.abort_after` lost episodes in a row; `EvaluationInterrupted` on Ctrl-C or SIGTERM.
+    Whatever it raises, each recorded episode is kept and summary.json written.
+    """
+    for env in config.envs:
+        env_class(env)  # an unknown name is better said before workers start
+    factory = agent_factory or _remote_agents(config)
+    with Store(config) as store:
+        finished = store.finished()
+        keys = plan(config)
+        pending = [key for key in keys if str(key) not in finished]
+        made_with = versions()
+        store.begin_run(config, made_with)
+        state: State = "stopped"
+        try:
+            run = _Run(config, store, JobQueue(pending), progress or SilentProgress())
+            complete = not pending or run.play(factory, len(pending))
+            state = "complete" if complete else "interrupted"
+        finally:
+            store.end_run(state)
+            summary = summarize(store, config, made_with, state)
+            write_summary(summary)
+    if state == "interrupted":
+        raise EvaluationInterrupted(summary)
+    return summary
+
+
+class _Run:
+    """The driver's side of one run."""
+
+    def __init__(self, config: EvalConfig, store: Store, queue: JobQueue, progress: Progress) -> None:
+        self._config = config
+        self._store = store
+        self._queue = queue
+        self._progress = progress
+        self._lost_in_a_row = 0
+
+    def play(self, factory: AgentFactory, episodes: int) -> bool:
+        """Play all that is queued; False if a signal ended it early."""
+        planned = dict.fromkeys(self._config.envs, self._config.episodes)
+        size = min(self._config.workers, episodes)
+        with ray_cluster(self._config), stop_signals() as stop:
+            self._progress.begin(planned, self._recorded())
+            try:
+                with WorkerPool(self._config, factory, size) as pool:
+                    while (len(self._queue) or pool.busy) and not stop.is_set():
+                        self._turn(pool)
+                    if not stop.is_set():
+                        pool.close()
+            finally:
+                self._progress.end()
+            return not stop.is_set()
+
+    def _turn(self, pool: WorkerPool) -> None:
+        for worker in pool.idle():
+            job = self._queue.take(worker.made, pool.working())
+            if job is None:
+                break
+            pool.dispatch(worker, job)
+        for job, report in pool.wait(POLL_S):
+            self._handle(job, report)
+
+    def _handle(self, job: Job, report: Report) -> None:
+        if report.policy is not None:
+            self._store.note_policy(report.policy)
+        if report.made is not None:
+            self._store.note_env(report.made)
+        if report.failure is not None:
+            self._failed(job, report.failure)
+        elif report.result is not None:
+            self._lost_in_a_row = 0
+            self._record(report.result, job.attempt, report.videos)
+
+    def _failed(self, job: Job, failure: Failure) -> None:
+        retried = failure.cause != "user" and job.attempt <= self._config.retries
+        self._store.record_attempt(job, failure, retried=retried)
+        if failure.cause == "user":
+            raise from_code(failure.code, failure.message)
+        if retried:
+            self._queue.put_back(job.again())
+            self._progress.retry(job, failure)
+            return
+        lost = EpisodeResult(job.key, "infra_failed", error=f"{failure.code}: {failure.message}")
+        self._record(lost, job.attempt, {})
+        self._lost_in_a_row += 1
+        if self._lost_in_a_row == self._config.abort_after:
+            raise from_code(
+                failure.code,
+                f"{self._lost_in_a_row} episodes in a row lost to infrastructure; resume when this is mended "
+                f"(--resume): {failure.message}",
+            )
+
+    def _record(self, result: EpisodeResult, attempts: int, videos: Mapping[str, bytes]) -> None:
+        # Videos first: a crash in between repeats the episode, and its videos are overwritten.
+        paths = save_videos(self._config.out, result, dict(videos))
+        self._store.record(result, attempts, paths)
+        self._progress.episode(result)
+
+    def _recorded(self) -> dict[str, Rate]:
+        rates = dict.fromkeys(self._config.envs, Rate(0, 0))
+        for row in self._store.rows("episodes"):
+            if row["env"] in rates and row["status"] != "infra_failed":
+                before = rates[row["env"]]
+                rates[row["env"]] = Rate(before.successes + row["success_once"], before.episodes + 1)
+        return rates
+
+
+@contextmanager
+def ray_cluster(config: EvalConfig) -> Iterator[None]:
+    """The cluster this process is in; or one that is left, and if local shut down, at the end."""
+    if ray.is_initialized():
+        yield
+        return
+    options: dict[str, Any] = {"log_to_driver": False, "logging_level": "WARNING"}
+    if not os.environ.get("RAY_ADDRESS"):
+        # Its CPUs are bookkeeping: the user's number of workers must fit.
+        needed = ceil(config.workers * config.cpus_per_worker)
+        options |= {"num_cpus": max(os.cpu_count() or 1, needed), "include_dashboard": False}
+    ray.init(**options)
+    try:
+        yield
+    finally:
+        ray.shutdown()
+
+
+@contextmanager
+def stop_signals() -> Iterator[threading.Event]:
+    """An event that Ctrl-C and SIGTERM set; a second one interrupts whatever is running.
+
+    A signal that only sets a flag cannot split a transaction. Outside the main thread Python delivers
+    no signals, and the event stays unset.
+    """
+    stop = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        yield stop
+        return
+
+    def on_signal(_number: int, _frame: FrameType | None) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        stop.set()
+
+    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def _remote_agents(config: EvalConfig) -> AgentFactory:
+    if config.policy_url is None:
+        raise ConfigError("policy_url: got none, want the URL of a policy's server, e.g. http://localhost:8000")
+    return functools.partial(
+        RemoteAgent,
+        config.policy_url,
+        transport=config.transport,
+        timeout_s=config.policy_timeout_s,
+        connect_timeout_s=config.connect_timeout_s,
+        codec=config.codec,
+    )

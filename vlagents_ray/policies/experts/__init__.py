@@ -1,0 +1,51 @@
+"""Scripted experts: for each simulator a small class that solves its tasks without learning.
+
+`EXPERTS` maps an env's full name, or the suite alone, to "module:Class"; the full name wins. A
+module is imported when the first of its experts is asked for.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Protocol
+
+from vlagents_ray.errors import ContractMismatch
+from vlagents_ray.interface import Act, Obs
+from vlagents_ray.registry import env_suite
+
+EXPERTS: dict[str, str] = {
+    "tabletop": "vlagents_ray.policies.experts.tabletop:TabletopExpert",
+    "maniskill/PushCube-v1": "vlagents_ray.policies.experts.maniskill:PushCube",
+    "maniskill/PickCube-v1": "vlagents_ray.policies.experts.maniskill:PickCube",
+    "metaworld": "vlagents_ray.policies.experts.metaworld:MetaWorldExpert",
+}
+
+
+class Expert(Protocol):
+    """One session's expert, made anew for every episode."""
+
+    def __init__(self, env_name: str) -> None: ...
+
+    def reset(self, obs: Obs, instruction: str) -> None:
+        """Begin an episode; raises `InvalidObservation` if the task cannot be made out."""
+        ...
+
+    def act(self, obs: Obs) -> Act:
+        """One action, (D,) float32, in the units of the env's contract."""
+        ...
+
+
+def expert_for(env_name: str) -> Expert:
+    """A fresh expert for the env `env_name`, e.g. "tabletop/slide" or "maniskill/PushCube-v1".
+
+    Raises `ContractMismatch` if there is none for it.
+    """
+    target = EXPERTS.get(env_name) or EXPERTS.get(env_suite(env_name))
+    if target is None:
+        raise ContractMismatch(
+            f"no scripted expert for env {env_name!r}: there are experts for {sorted(EXPERTS)}; "
+            f"choose one of these envs, or another policy"
+        )
+    module, _, name = target.partition(":")
+    expert: Expert = getattr(importlib.import_module(module), name)(env_name)
+    return expert

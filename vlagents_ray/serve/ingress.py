@@ -1,0 +1,256 @@
+"""The robots' door: HTTP and WebSocket on one port, as an ASGI application over an engine.
+
+    POST /v1/reset, /v1/act, /v1/close   multipart/form-data, application/json, or one binary frame
+    WS   /v1/stream                      one session a connection, binary frames
+    GET  /healthz, /v1/metadata, /docs
+
+Errors over HTTP are problem+json with a stable code; over WebSocket they are reply frames.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import re
+import time
+import uuid
+from collections.abc import Awaitable, Callable
+from typing import Any, cast
+
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.formparsers import MultiPartException
+from starlette.requests import ClientDisconnect
+from starlette.requests import Request as HttpRequest
+from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, UnknownApp, VLAgentsError
+from vlagents_ray.serve.calls import ask
+from vlagents_ray.serve.docs import docs_page
+from vlagents_ray.serve.engine import Engine
+from vlagents_ray.wire.frames import CONTENT_TYPE, decode_request, encode_reply
+from vlagents_ray.wire.messages import (
+    DEADLINE_HEADER,
+    OPS,
+    REQUEST_ID_HEADER,
+    SESSION_HEADER,
+    Limits,
+    Op,
+    Reply,
+    Request,
+)
+from vlagents_ray.wire.plain import CAMERA_PREFIX, PROBLEM_TYPE, problem, reply_to_json, request_from_parts
+
+logger = logging.getLogger(__name__)
+
+_SESSION_ID = re.compile(r"[\x21-\x7e]{1,128}")
+_INLINE_BYTES = 512 * 1024  # a larger body is decoded beside the event loop, which others wait for
+
+
+def build_ingress(engine: Engine, metadata: Callable[[], dict[str, Any]], limits: Limits) -> Starlette:
+    """The ASGI application of a replica."""
+    door = _Door(engine, metadata, limits)
+    return Starlette(
+        routes=[
+            *(Route(f"/v1/{op}", door.endpoint(op), methods=["POST"]) for op in OPS),
+            WebSocketRoute("/v1/stream", door.stream),
+            Route("/v1/metadata", door.show_metadata),
+            Route("/healthz", door.health),
+            Route("/docs", door.docs),
+        ],
+        exception_handlers={HTTPException: _http_problem},
+    )
+
+
+class _Door:
+    def __init__(self, engine: Engine, metadata: Callable[[], dict[str, Any]], limits: Limits) -> None:
+        self._engine = engine
+        self._metadata = metadata
+        self._limits = limits
+
+    async def health(self, http: HttpRequest) -> Response:
+        return self._when_ready(http, lambda: PlainTextResponse("OK\n"))
+
+    async def show_metadata(self, http: HttpRequest) -> Response:
+        return self._when_ready(http, lambda: JSONResponse(self._metadata()))
+
+    async def docs(self, http: HttpRequest) -> Response:
+        return self._when_ready(http, lambda: HTMLResponse(docs_page(self._metadata())))
+
+    def _when_ready(self, http: HttpRequest, answer: Callable[[], Response]) -> Response:
+        try:
+            self._engine.require_ready()
+        except VLAgentsError as error:
+            document = problem(error, _request_id(http)) | {"status": 503}
+            return JSONResponse(document, status_code=503, media_type=PROBLEM_TYPE)
+        return answer()
+
+    def endpoint(self, op: Op) -> Callable[[HttpRequest], Awaitable[Response]]:
+        """The handler of `POST /v1/<op>`."""
+
+        async def handle(http: HttpRequest) -> Response:
+            arrived = time.perf_counter()
+            request_id = _request_id(http)
+            try:
+                session_id = _session_id(http)
+                request = await self._read(op, http)
+                request.request_id = request.request_id or request_id
+                request_id = request.request_id
+                decoded = time.perf_counter()
+                reply = await ask(self._engine, session_id, request)
+                if reply.error is not None:
+                    raise reply.error
+            except ClientDisconnect:
+                return Response(status_code=499)
+            except VLAgentsError as error:
+                return _problem(error, request_id)
+            except Exception:
+                logger.exception("%s failed (request %s)", op, request_id)
+                return _problem(VLAgentsError("internal error; the server's log has the details"), request_id)
+            reply.timing |= {"decode_ms": (decoded - arrived) * 1e3, "total_ms": (time.perf_counter() - arrived) * 1e3}
+            if CONTENT_TYPE in http.headers.get("accept", ""):
+                return Response(encode_reply(reply), media_type=CONTENT_TYPE)
+            return JSONResponse(reply_to_json(reply))
+
+        return handle
+
+    async def _read(self, op: Op, http: HttpRequest) -> Request:
+        kind = http.headers.get("content-type", "").partition(";")[0].strip().lower()
+        declared = http.headers.get("content-length", "")
+        if declared.isdigit() and int(declared) > self._limits.body_bytes:
+            raise MessageTooLarge(f"body: declares {declared} bytes, the limit is {self._limits.body_bytes}")
+        if kind == "multipart/form-data":
+            request = await self._read_form(op, http)
+        elif op == "close" and not kind:
+            request = Request("close")
+        else:
+            body = await self._body(http)
+            if kind == CONTENT_TYPE:
+                request = await self._decode(body)
+                if request.op != op:
+                    raise MalformedMessage(f"op: the frame says {request.op!r}, the path says {op!r}")
+            elif kind == "application/json":
+                request = request_from_parts(op, body, {}, self._limits)
+            else:
+                raise MalformedMessage(
+                    f"content-type: got {kind or 'none'!r}, "
+                    f"want multipart/form-data, application/json or {CONTENT_TYPE}"
+                )
+        if deadline := http.headers.get(DEADLINE_HEADER):
+            request.deadline_ms = _positive(deadline)
+        return request
+
+    async def _read_form(self, op: Op, http: HttpRequest) -> Request:
+        limits = self._limits
+        document: str | bytes | None = None
+        files: dict[str, bytes] = {}
+        try:
+            async with http.form(
+                max_files=limits.cameras + 1, max_fields=limits.cameras + 1, max_part_size=limits.body_bytes
+            ) as form:
+                for name, part in form.multi_items():
+                    data = part if isinstance(part, str) else await part.read()
+                    if name == "obs":
+                        document = data
+                    elif name.startswith(CAMERA_PREFIX) and isinstance(data, bytes):
+                        files[name.removeprefix(CAMERA_PREFIX)] = data
+                    else:
+                        raise MalformedMessage(f"form: unknown part {name!r}, want 'obs' and files 'cameras.<name>'")
+        except (MultiPartException, HTTPException) as error:
+            text = error.message if isinstance(error, MultiPartException) else error.detail
+            raise MalformedMessage(f"form: {text}") from error
+        if document is None:
+            raise MalformedMessage("form: no part 'obs'; send a JSON document, {} at least")
+        if sum(map(len, files.values())) > _INLINE_BYTES:
+            return await asyncio.to_thread(request_from_parts, op, document, files, limits)
+        return request_from_parts(op, document, files, limits)
+
+    async def _body(self, http: HttpRequest) -> bytes:
+        chunks: list[bytes] = []
+        size = 0
+        async for chunk in http.stream():
+            size += len(chunk)
+            if size > self._limits.body_bytes:
+                raise MessageTooLarge(f"body: over {self._limits.body_bytes} bytes, the limit")
+            chunks.append(chunk)
+        return b"".join(chunks)
+
+    async def _decode(self, frame: bytes) -> Request:
+        if len(frame) > _INLINE_BYTES:
+            return await asyncio.to_thread(decode_request, frame, self._limits)
+        return decode_request(frame, self._limits)
+
+    async def stream(self, socket: WebSocket) -> None:
+        """One session; a broken request is answered and leaves the session as it was."""
+        await socket.accept()
+        session_id = f"ws-{uuid.uuid4().hex}"
+        try:
+            while True:
+                message = await socket.receive()
+                if message["type"] == "websocket.disconnect":
+                    return
+                reply = await self._answer(session_id, message.get("bytes"))
+                await socket.send_bytes(encode_reply(reply))
+        except WebSocketDisconnect:
+            return
+        finally:
+            self._engine.sessions.close(session_id)
+
+    async def _answer(self, session_id: str, frame: bytes | None) -> Reply:
+        arrived = time.perf_counter()
+        request_id = ""
+        try:
+            if frame is None:
+                raise MalformedMessage("stream: got a text message, want a binary frame")
+            request = await self._decode(frame)
+            request_id = request.request_id = request.request_id or uuid.uuid4().hex
+            decoded = time.perf_counter()
+            reply = await ask(self._engine, session_id, request)
+        except VLAgentsError as error:
+            return Reply(request_id, error=error)
+        except Exception:
+            logger.exception("stream failed (session %s, request %s)", session_id, request_id)
+            return Reply(request_id, error=VLAgentsError("internal error; the server's log has the details"))
+        reply.timing |= {"decode_ms": (decoded - arrived) * 1e3, "total_ms": (time.perf_counter() - arrived) * 1e3}
+        return reply
+
+
+def _session_id(http: HttpRequest) -> str:
+    session_id = http.headers.get(SESSION_HEADER, "")
+    if not _SESSION_ID.fullmatch(session_id):
+        raise MalformedMessage(
+            f"header {SESSION_HEADER}: got {session_id[:40]!r}, want 1 to 128 visible ASCII characters; "
+            f"choose one for each robot or env and send it with every request"
+        )
+    return session_id
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 < value < 1e9:
+        raise MalformedMessage(f"header {DEADLINE_HEADER}: got {text[:40]!r}, want a positive number of milliseconds")
+    return value
+
+
+def _request_id(http: HttpRequest) -> str:
+    """The caller's, or the one that Serve gave the request; Serve sends either back as a header."""
+    return http.headers.get(REQUEST_ID_HEADER) or uuid.uuid4().hex
+
+
+def _problem(error: VLAgentsError, request_id: str) -> Response:
+    return JSONResponse(problem(error, request_id), status_code=error.status, media_type=PROBLEM_TYPE)
+
+
+async def _http_problem(http: HttpRequest, error: Exception) -> Response:
+    """What the router refuses: an unknown path, or a method that a path does not take."""
+    refused = cast(HTTPException, error)
+    if refused.status_code == 404:
+        return _problem(UnknownApp("no such path; GET /docs lists what there is"), _request_id(http))
+    cause = MalformedMessage(f"{refused.detail}; GET /docs lists what there is")
+    document = problem(cause, _request_id(http)) | {"status": refused.status_code}
+    return JSONResponse(document, status_code=refused.status_code, media_type=PROBLEM_TYPE, headers=refused.headers)

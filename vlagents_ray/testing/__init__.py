@@ -1,0 +1,18 @@
+"""The suites that every policy and environment here passes, for your own as well.
+
+    from vlagents_ray.testing import check_agent, check_env
+
+    def test_my_env_keeps_its_contract():
+        check_env(MyEnv())
+
+    def test_my_policy_keeps_its_contract():
+        check_agent(MyPolicy())
+
+Each raises `ContractViolation` with the first thing that is wrong, and closes what it was given.
+"""
+
+from vlagents_ray.testing.agents import check_agent
+from vlagents_ray.testing.comparing import ContractViolation
+from vlagents_ray.testing.environments import check_env
+
+__all__ = ["ContractViolation", "check_agent", "check_env"]

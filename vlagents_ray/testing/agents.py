@@ -1,0 +1,191 @@
+"""What an `Agent` promises, checked on an instance."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.contract import CameraSpec, Contract, StateSpec, check_action
+from vlagents_ray.errors import InvalidAction
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.testing.comparing import ContractViolation, require_same, require_wireable
+
+_SESSIONS = 3
+_DEFAULT_SIDE = 64  # px, where the contract accepts any image
+_DEFAULT_DIM = 7  # where it accepts any state
+
+
+def check_agent(
+    agent: Agent,
+    *,
+    obs: Obs | Sequence[Obs] | None = None,
+    instructions: Sequence[str] = ("pick up the cube", "push the cube", "open the drawer"),
+    reset_kwargs: Mapping[str, Any] | None = None,
+    steps: int = 3,
+    atol: float = 1e-5,
+) -> None:
+    """Raise `ContractViolation` if `agent` breaks a promise of `Agent`; initializes and closes it.
+
+    Runs three sessions, copies of the initialized agent, with their own observation, instruction
+    and seed: each alone, then in turns, then in batches of 1, 2 and 3. None may notice the others.
+
+    Args:
+        agent: an instance, not initialized yet.
+        obs: what the sessions see, in turn; by default random values that fit the contract.
+        instructions: what they are told, in turn.
+        reset_kwargs: for each `reset`, beside `seed`.
+        steps: calls of `act` a session.
+        atol: how far actions of a batch may be off those of a lone session.
+    """
+    agent.initialize()
+    contract = agent.contract
+    if contract is not None and not isinstance(contract, Contract):
+        raise ContractViolation(f"contract: got {type(contract).__name__}, want a Contract or None")
+    views = [obs] if isinstance(obs, Obs) else list(obs or [_random_obs(contract, seed) for seed in range(_SESSIONS)])
+    suite = _Suite(agent, contract, views, instructions, dict(reset_kwargs or {}))
+
+    alone = [suite.play_alone(i, steps) for i in range(_SESSIONS)]
+    for i, again in enumerate([suite.play_alone(i, steps) for i in range(_SESSIONS)]):
+        require_same(
+            alone[i],
+            again,
+            f"act of session {i}",
+            "the same observations, instruction and seed must give the same actions",
+        )
+    sessions = [suite.begin(i) for i in range(_SESSIONS)]
+    for step in range(steps):
+        for i, session in enumerate(sessions):
+            require_same(
+                alone[i][step],
+                suite.act(i, session),
+                f"act {step} of session {i}",
+                "it depends on other sessions: keep what belongs to an episode in self, and out of `shared`",
+            )
+    for size in range(1, _SESSIONS + 1):
+        batch = [suite.begin(i) for i in range(size)]
+        for step in range(steps):
+            for i, act in enumerate(suite.act_batch(batch)):
+                require_same(
+                    alone[i][step],
+                    act,
+                    f"act {step} of session {i} in a batch of {size}",
+                    "act_batch must give each session what act gives it alone",
+                    atol,
+                )
+    for attempt in ("first", "second"):
+        try:
+            agent.close()
+        except Exception as error:
+            raise ContractViolation(
+                f"close: the {attempt} call raised {error!r}; it must be safe to call twice"
+            ) from error
+
+
+class _Suite:
+    """Begins sessions and asks them, checking what goes in and what comes out."""
+
+    def __init__(
+        self,
+        agent: Agent,
+        contract: Contract | None,
+        views: list[Obs],
+        instructions: Sequence[str],
+        reset_kwargs: dict[str, Any],
+    ) -> None:
+        self._agent = agent
+        self._contract = contract
+        self._views = views
+        self._instructions = instructions
+        self._reset_kwargs = reset_kwargs
+
+    def begin(self, i: int) -> Agent:
+        """Session `i`: a copy of the agent that shares what the class says may be shared, reset."""
+        shared = {
+            id(value): value for name in self._agent.shared if (value := getattr(self._agent, name, None)) is not None
+        }
+        try:
+            session = copy.deepcopy(self._agent, dict(shared))
+        except (TypeError, AttributeError, NotImplementedError, RuntimeError) as error:
+            raise ContractViolation(
+                f"the initialized agent cannot be copied for a session: {error}; "
+                f"name the attributes that sessions may share in `shared`"
+            ) from error
+        obs = self._view(i)
+        before = copy.deepcopy(obs)
+        info = session.reset(obs, self._instructions[i % len(self._instructions)], seed=i, **self._reset_kwargs)
+        require_same(before, obs, "the observation", "reset changed the caller's: work on a copy")
+        if not isinstance(info, dict):
+            raise ContractViolation(f"reset: got {type(info).__name__}, want a dict")
+        require_wireable(info, "reset: info")
+        return session
+
+    def play_alone(self, i: int, steps: int) -> list[Act]:
+        session = self.begin(i)
+        given = [self.act(i, session)]
+        kept = [copy.deepcopy(given[0])]
+        for _ in range(steps - 1):
+            given.append(self.act(i, session))
+            kept.append(copy.deepcopy(given[-1]))
+        require_same(kept, given, "an earlier act", "a later one changed it: give a new array each time")
+        return kept
+
+    def act(self, i: int, session: Agent) -> Act:
+        obs = self._view(i)
+        before = copy.deepcopy(obs)
+        act = session.act(obs)
+        require_same(before, obs, "the observation", "act changed the caller's: work on a copy")
+        return self._checked(act, "act")
+
+    def act_batch(self, sessions: list[Agent]) -> list[Act]:
+        views = [self._view(i) for i in range(len(sessions))]
+        before = copy.deepcopy(views)
+        acts = self._agent.act_batch(views, sessions)
+        require_same(before, views, "the observations", "act_batch changed the caller's: work on copies")
+        if not isinstance(acts, list) or len(acts) != len(sessions):
+            got = f"{len(acts)} of them" if isinstance(acts, list) else type(acts).__name__
+            raise ContractViolation(f"act_batch: got {got}, want a list of {len(sessions)} acts")
+        return [self._checked(act, "act_batch") for act in acts]
+
+    def _view(self, i: int) -> Obs:
+        return self._views[i % len(self._views)]
+
+    def _checked(self, act: object, where: str) -> Act:
+        if isinstance(act, Exception):
+            raise ContractViolation(f"{where}: failed with {act!r} for an observation that `act` takes") from act
+        if not isinstance(act, Act):
+            raise ContractViolation(f"{where}: got {type(act).__name__}, want an Act")
+        if not isinstance(act.action, np.ndarray) or act.action.dtype != np.float32:
+            got = act.action.dtype if isinstance(act.action, np.ndarray) else type(act.action).__name__
+            raise ContractViolation(f"{where}: the action is {got}, want a numpy array of float32")
+        try:
+            check_action(act.action, self._contract)
+        except InvalidAction as error:
+            raise ContractViolation(f"{where}: {error}") from error
+        chunk = self._contract.chunk if self._contract is not None else None
+        if chunk not in (None, len(act.rows())):
+            raise ContractViolation(f"{where}: the action has {len(act.rows())} rows, the contract states {chunk}")
+        if type(act.done) is not bool:
+            raise ContractViolation(f"{where}: done is {type(act.done).__name__}, want a bool")
+        require_wireable(act.info, f"{where}: info")
+        return act
+
+
+def _random_obs(contract: Contract | None, seed: int) -> Obs:
+    """Values that fit `contract`; where it states nothing, one camera and one state part."""
+    rng = np.random.default_rng(seed)
+    cameras: Mapping[str, CameraSpec] = {"front": CameraSpec()}
+    state: Mapping[str, StateSpec] = {"joints": StateSpec()}
+    if contract is not None:
+        cameras = cameras if contract.cameras is None else contract.cameras
+        state = state if contract.state is None else contract.state
+    return Obs(
+        cameras={
+            name: rng.integers(0, 256, (c.height or _DEFAULT_SIDE, c.width or _DEFAULT_SIDE, 3), dtype=np.uint8)
+            for name, c in cameras.items()
+        },
+        gripper=float(rng.uniform()),
+        state={name: rng.uniform(-1, 1, s.dim or _DEFAULT_DIM).astype(np.float32) for name, s in state.items()},
+    )

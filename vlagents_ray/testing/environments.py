@@ -1,0 +1,206 @@
+"""What an `EvalEnv` promises, checked on an instance."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.contract import Contract, check_observation
+from vlagents_ray.envs.base import EvalEnv
+from vlagents_ray.errors import InvalidAction, InvalidObservation
+from vlagents_ray.interface import Act, Obs
+from vlagents_ray.testing.comparing import ContractViolation, require_same, require_wireable
+
+
+def check_env(
+    env: EvalEnv,
+    *,
+    steps: int = 5,
+    seeds: tuple[int, int] = (0, 1),
+    options: Mapping[str, Any] | None = None,
+    same_steps: bool = True,
+    step_limit: bool = True,
+) -> None:
+    """Raise `ContractViolation` if `env` breaks a promise of `EvalEnv`; closes it.
+
+    Plays `steps` random actions in an episode of each of the two `seeds`, then the first again.
+
+    Args:
+        env: an instance, not reset yet.
+        steps: actions an episode.
+        seeds: of two episodes that differ.
+        options: for each `reset`.
+        same_steps: the same actions must lead to the same observations, not only the same seed to
+            the same start; False for a simulator that is not reproducible to the bit.
+        step_limit: play one episode to `env.max_steps`; False if that takes too long.
+    """
+    contract = _check_static(env)
+    actions = _random_actions(contract, steps)
+    first = _rollout(env, contract, seeds[0], options, actions)
+    other = _rollout(env, contract, seeds[1], options, actions)
+    again = _rollout(env, contract, seeds[0], options, actions)
+    because = "an episode must be a pure function of its seed and options, whatever was played before"
+    require_same(first.instruction, again.instruction, "instruction", because)
+    require_same(first.seen[0], again.seen[0], "the first observation", because)
+    if same_steps:
+        for i, (a, b) in enumerate(zip(first.seen, again.seen, strict=False)):
+            require_same(a, b, f"the observation after step {i}", because)
+        require_same(first.outcomes, again.outcomes, "[reward, terminated, truncated, success] of the steps", because)
+    for rollout in (first, other, again):
+        for i, (given, kept) in enumerate(zip(rollout.given, rollout.seen, strict=True)):
+            require_same(
+                kept,
+                given,
+                f"the observation after step {i}",
+                "a later step or reset changed it: give new arrays each time",
+            )
+    _check_invalid_actions(env, contract, seeds[0], options)
+    if step_limit:
+        _check_step_limit(env, contract, seeds[0], options)
+    for attempt in ("first", "second"):
+        try:
+            env.close()
+        except Exception as error:
+            raise ContractViolation(
+                f"close: the {attempt} call raised {error!r}; it must be safe to call twice"
+            ) from error
+
+
+@dataclass(slots=True)
+class _Rollout:
+    instruction: str
+    given: list[Obs]  # as the env gave them
+    seen: list[Obs]  # copies made at once
+    outcomes: list[Any]
+
+
+def _check_static(env: EvalEnv) -> Contract:
+    contract = env.contract
+    if not isinstance(contract, Contract):
+        raise ContractViolation(f"contract: got {type(contract).__name__}, want a Contract")
+    if contract.action.dim is None:
+        raise ContractViolation("contract.action.dim: got None, want the number of components of an action")
+    if type(env.max_steps) is not int or env.max_steps < 1:
+        raise ContractViolation(f"max_steps: got {env.max_steps!r}, want an int of at least 1")
+    require_wireable(env.describe(), "describe()")
+    if not all(isinstance(name, str) for name in env.tasks()):
+        raise ContractViolation(f"tasks(): got {env.tasks()!r}, want a list of names")
+    return contract
+
+
+def _random_actions(contract: Contract, count: int) -> list[np.ndarray]:
+    spec = contract.action
+    low = -1.0 if spec.low is None else spec.low
+    high = 1.0 if spec.high is None else spec.high
+    drawn = np.random.default_rng(0).uniform(low, high, (count, spec.dim or 1))
+    return list(drawn.astype(np.float32))
+
+
+def _rollout(
+    env: EvalEnv, contract: Contract, seed: int, options: Mapping[str, Any] | None, actions: list[np.ndarray]
+) -> _Rollout:
+    obs = _reset(env, contract, seed, options)
+    rollout = _Rollout(env.instruction, [obs], [copy.deepcopy(obs)], [])
+    for action in actions:
+        obs, outcome = _step(env, contract, action)
+        rollout.given.append(obs)
+        rollout.seen.append(copy.deepcopy(obs))
+        rollout.outcomes.append(outcome)
+        if outcome[1] or outcome[2]:
+            break
+    return rollout
+
+
+def _reset(env: EvalEnv, contract: Contract, seed: int, options: Mapping[str, Any] | None) -> Obs:
+    result = env.reset(seed=seed, options=options)
+    if not isinstance(result, tuple) or len(result) != 2:
+        raise ContractViolation(f"reset: got {_kind(result)}, want (Obs, info)")
+    obs, info = result
+    _check_obs(obs, contract, "reset")
+    if not isinstance(info, dict):
+        raise ContractViolation(f"reset: info is {_kind(info)}, want a dict")
+    require_wireable(info, "reset: info")
+    if not isinstance(env.instruction, str):
+        raise ContractViolation(f"instruction: got {_kind(env.instruction)}, want a str")
+    if contract.instruction and not env.instruction:
+        raise ContractViolation("instruction: is empty, but the contract says that the env gives one")
+    return obs
+
+
+def _step(env: EvalEnv, contract: Contract, action: np.ndarray) -> tuple[Obs, list[Any]]:
+    sent = action.copy()
+    result = env.step(Act(sent))
+    require_same(action, sent, "the action", "step must leave the caller's array as it is")
+    if not isinstance(result, tuple) or len(result) != 5:
+        raise ContractViolation(f"step: got {_kind(result)}, want (Obs, reward, terminated, truncated, info)")
+    obs, reward, terminated, truncated, info = result
+    _check_obs(obs, contract, "step")
+    for name, value, kind in (
+        ("reward", reward, float),
+        ("terminated", terminated, bool),
+        ("truncated", truncated, bool),
+    ):
+        if type(value) is not kind:
+            raise ContractViolation(f"step: {name} is {_kind(value)}, want a {kind.__name__}")
+    if not isinstance(info, dict):
+        raise ContractViolation(f"step: info is {_kind(info)}, want a dict")
+    if type(info.get("success")) is not bool:
+        raise ContractViolation(f"step: info['success'] is {_kind(info.get('success'))}, want a bool")
+    require_wireable(info, "step: info")
+    return obs, [reward, terminated, truncated, info["success"]]
+
+
+def _check_obs(obs: object, contract: Contract, where: str) -> None:
+    if not isinstance(obs, Obs):
+        raise ContractViolation(f"{where}: the observation is {_kind(obs)}, want an Obs")
+    try:
+        check_observation(obs, contract)
+    except InvalidObservation as error:
+        raise ContractViolation(f"{where}: {error}") from error
+    for name, part in obs.state.items():
+        if part.dtype != np.float32:
+            raise ContractViolation(f"{where}: state {name!r} is {part.dtype}, want float32")
+    for kind, have, stated in (("cameras", obs.cameras, contract.cameras), ("state", obs.state, contract.state)):
+        if stated is not None and set(have) != set(stated):
+            raise ContractViolation(f"{where}: {kind} are {sorted(have)}, the contract states {sorted(stated)}")
+    if contract.gripper is False and obs.gripper is not None:
+        raise ContractViolation(f"{where}: gripper is {obs.gripper}, the contract states that there is none")
+    require_wireable(obs.info, f"{where}: Obs.info")
+
+
+def _check_invalid_actions(env: EvalEnv, contract: Contract, seed: int, options: Mapping[str, Any] | None) -> None:
+    _reset(env, contract, seed, options)
+    dim = contract.action.dim or 1
+    good = _random_actions(contract, 1)[0]
+    for what, action in (
+        (f"of shape ({dim + 1},)", np.append(good, good[0])),
+        ("that holds NaN", np.full(dim, np.nan, np.float32)),
+    ):
+        try:
+            env.step(Act(action))
+        except InvalidAction:
+            continue
+        except Exception as error:
+            raise ContractViolation(f"step: an action {what} raised {error!r}, want InvalidAction") from error
+        raise ContractViolation(f"step: an action {what} was executed, want InvalidAction")
+    _step(env, contract, good)
+
+
+def _check_step_limit(env: EvalEnv, contract: Contract, seed: int, options: Mapping[str, Any] | None) -> None:
+    _reset(env, contract, seed, options)
+    action = _random_actions(contract, 1)[0]
+    for count in range(1, env.max_steps + 1):
+        _, (_, terminated, truncated, _) = _step(env, contract, action)
+        if terminated:
+            return
+        if truncated != (count == env.max_steps):
+            state = "is" if truncated else "is not"
+            raise ContractViolation(f"step {count} {state} truncated, but max_steps is {env.max_steps}")
+
+
+def _kind(value: object) -> str:
+    return f"a tuple of {len(value)}" if isinstance(value, tuple) else type(value).__name__

@@ -1,0 +1,57 @@
+"""What crosses the wire, whatever carries it: a `Request` to a policy and its `Reply`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+from vlagents_ray.errors import VLAgentsError
+from vlagents_ray.interface import Act, Obs
+
+PROTOCOL_VERSION = 1
+SESSION_HEADER = "x-session-id"
+REQUEST_ID_HEADER = "x-request-id"
+DEADLINE_HEADER = "x-deadline-ms"
+
+Op = Literal["reset", "act", "close"]
+OPS: tuple[Op, ...] = ("reset", "act", "close")
+
+
+@dataclass(slots=True)
+class Request:
+    """One call of `Agent.reset`, `Agent.act` or `Agent.close` on a remote policy."""
+
+    op: Op
+    obs: Obs | None = None  # None only for close
+    instruction: str | None = None  # reset only
+    kwargs: dict[str, Any] = field(default_factory=dict)  # reset only: `seed`, ...
+    contract: dict[str, Any] | None = None  # reset only: the robot's or env's side, compared by the server
+    request_id: str = ""
+    deadline_ms: float | None = None  # the answer is useless after this long, counted from its arrival
+
+
+@dataclass(slots=True)
+class Reply:
+    """The answer to the request with the same id: an action, reset's info, or an error."""
+
+    request_id: str = ""
+    act: Act | None = None
+    info: dict[str, Any] | None = None  # what `Agent.reset` returned
+    error: VLAgentsError | None = None
+    timing: dict[str, float] = field(default_factory=dict)  # ms, by stage
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """What a decoder accepts; anything over is `MessageTooLarge` before memory is taken for it."""
+
+    body_bytes: int = 64 * 2**20
+    pixels: int = 4096 * 4096  # of one image
+    cameras: int = 16
+    state_values: int = 4096  # of one part of the proprioception
+    depth: int = 8  # nesting of `info` and `kwargs`
+    items: int = 10_000  # values in `info` and `kwargs` together
+    text: int = 16_384  # characters of an instruction
+
+
+DEFAULT_LIMITS = Limits()

@@ -1,0 +1,88 @@
+"""Requests and replies for clients without our frames: JSON, with images as separate JPEG or PNG files.
+
+The JSON of a request holds `instruction`, `gripper`, `state`, `info`, and for reset `kwargs` and
+`contract`; each camera is a file of its own. Arrays in a reply become lists.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import MalformedMessage, VLAgentsError
+from vlagents_ray.wire.frames import check_request, read_obs
+from vlagents_ray.wire.messages import Limits, Op, Reply, Request
+from vlagents_ray.wire.tree import Reader
+
+PROBLEM_TYPE = "application/problem+json"
+CAMERA_PREFIX = "cameras."
+_KEYS = {"instruction", "gripper", "state", "info", "kwargs", "contract", "request_id", "deadline_ms"}
+
+
+def request_from_parts(op: Op, text: str | bytes, images: Mapping[str, bytes], limits: Limits) -> Request:
+    """A request from its JSON document and its images by camera name, each a JPEG or PNG file."""
+    try:
+        document = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise MalformedMessage(f"obs: not JSON ({error})") from error
+    if not isinstance(document, dict):
+        raise MalformedMessage(f"obs: got {type(document).__name__}, want an object")
+    unknown = document.keys() - _KEYS
+    if unknown:
+        raise MalformedMessage(f"obs: unknown keys {sorted(unknown)}, want some of {sorted(_KEYS)}")
+    names = list(images)
+    reader = Reader([images[name] for name in names], limits)
+    obs = {key: document[key] for key in ("gripper", "state", "info") if key in document}
+    obs["cameras"] = {name: {"$": ["img", index]} for index, name in enumerate(names)}
+    return check_request(
+        Request(
+            op=op,
+            obs=read_obs(obs, reader, limits),
+            instruction=document.get("instruction"),
+            kwargs=reader.value(document.get("kwargs") or {}),
+            contract=document.get("contract"),
+            request_id=document.get("request_id", ""),
+            deadline_ms=document.get("deadline_ms"),
+        ),
+        limits,
+    )
+
+
+def reply_to_json(reply: Reply) -> dict[str, Any]:
+    """A reply without an error as plain JSON values."""
+    document: dict[str, Any] = {"request_id": reply.request_id}
+    if reply.act is not None:
+        document |= {"action": reply.act.action.tolist(), "done": reply.act.done, "info": _plain(reply.act.info)}
+    else:
+        document["info"] = _plain(reply.info or {})
+    return document | {"timing": reply.timing}
+
+
+def problem(error: VLAgentsError, request_id: str = "") -> dict[str, Any]:
+    """The problem+json document (RFC 9457) of an error; `code` is the stable name to test for."""
+    return {
+        "type": "about:blank",
+        "title": type(error).__name__,
+        "status": error.status,
+        "code": error.code,
+        "detail": str(error),
+        "request_id": request_id,
+    }
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, (bytes, bytearray, memoryview)):
+        return base64.b64encode(value).decode()
+    return value

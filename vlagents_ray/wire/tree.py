@@ -1,0 +1,127 @@
+"""Nested values (None, bool, numbers, text, bytes, arrays, lists, dicts) <-> JSON plus binary blobs.
+
+What JSON cannot say becomes `{"$": [kind, blob index, ...]}`:
+`["nd", i, dtype, shape]` an array, `["img", i]` a JPEG or PNG file, `["bin", i]` bytes.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray import images
+from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
+from vlagents_ray.wire.messages import Limits
+
+Buffer = bytes | memoryview
+_DTYPE = re.compile(r"[<|][biuf][1248]")  # no objects, no structures, no text
+
+
+class Writer:
+    """Turns values into JSON, collecting the blobs they refer to."""
+
+    def __init__(self) -> None:
+        self.blobs: list[Buffer] = []
+
+    def array(self, value: np.ndarray) -> dict[str, Any]:
+        """The reference to an array, whose bytes become a blob without a copy where possible."""
+        dtype = value.dtype.newbyteorder("<").str
+        if not _DTYPE.fullmatch(dtype):
+            raise InvalidInput(f"array: got dtype {value.dtype}, want bool, integers or floats; convert it")
+        data = np.ascontiguousarray(value, dtype=dtype)
+        self.blobs.append(data.data.cast("B") if data.size else b"")
+        return {"$": ["nd", len(self.blobs) - 1, dtype, value.shape]}
+
+    def image(self, file: bytes) -> dict[str, Any]:
+        """The reference to an encoded image."""
+        self.blobs.append(file)
+        return {"$": ["img", len(self.blobs) - 1]}
+
+    def value(self, value: Any) -> Any:
+        """Any supported value; `InvalidInput` names the type of one that is not."""
+        if value is None or isinstance(value, (bool, str, int)):
+            return value
+        if isinstance(value, float):
+            return value
+        if isinstance(value, np.ndarray):
+            return self.array(value)
+        if isinstance(value, np.generic):
+            return value.item() if value.dtype.kind in "biuf" else self.array(np.asarray(value))
+        if isinstance(value, (bytes, bytearray, memoryview)):
+            self.blobs.append(bytes(value))
+            return {"$": ["bin", len(self.blobs) - 1]}
+        if isinstance(value, Mapping):
+            for key in value:
+                if not isinstance(key, str) or key == "$":
+                    raise InvalidInput(f"info: got key {key!r}, want text other than '$'")
+            return {key: self.value(item) for key, item in value.items()}
+        if isinstance(value, Sequence):
+            return [self.value(item) for item in value]
+        raise InvalidInput(
+            f"info: got {type(value).__name__}, want None, bool, int, float, str, bytes, array, list or dict"
+        )
+
+
+class Reader:
+    """Turns the JSON back into values, which view the blobs instead of copying them."""
+
+    def __init__(self, blobs: Sequence[Buffer], limits: Limits) -> None:
+        self._blobs = blobs
+        self._limits = limits
+        self._items = 0
+
+    def value(self, node: Any, depth: int = 0) -> Any:
+        """The value of a JSON node; `MalformedMessage` or `MessageTooLarge` if it is not one."""
+        self._items += 1
+        if self._items > self._limits.items:
+            raise MessageTooLarge(f"info: more than {self._limits.items} values; send arrays instead of lists")
+        if isinstance(node, dict):
+            if "$" in node:
+                return self.blob(node)
+            self._nest(depth)
+            return {key: self.value(item, depth + 1) for key, item in node.items()}
+        if isinstance(node, list):
+            self._nest(depth)
+            return [self.value(item, depth + 1) for item in node]
+        return node
+
+    def blob(self, node: Any) -> Any:
+        """The array, image or bytes that `{"$": [...]}` refers to."""
+        reference = node.get("$") if isinstance(node, dict) else None
+        if not isinstance(reference, list) or not reference or len(node) != 1:
+            raise MalformedMessage(f"reference: got {str(node)[:80]}, want {{'$': [kind, blob, ...]}}")
+        kind, *rest = reference
+        if kind == "nd" and len(rest) == 3:
+            return self._array(self._get(rest[0]), rest[1], rest[2])
+        if kind == "img" and len(rest) == 1:
+            return images.decode(self._get(rest[0]), self._limits.pixels)
+        if kind == "bin" and len(rest) == 1:
+            return bytes(self._get(rest[0]))
+        raise MalformedMessage(f"reference: got {str(reference)[:80]}, want 'nd', 'img' or 'bin'")
+
+    def _nest(self, depth: int) -> None:
+        if depth >= self._limits.depth:
+            raise MessageTooLarge(f"info: nested deeper than {self._limits.depth}; flatten it")
+
+    def _get(self, index: Any) -> Buffer:
+        if type(index) is not int or not 0 <= index < len(self._blobs):
+            raise MalformedMessage(f"reference: got blob {str(index)[:20]}, want one of {len(self._blobs)}")
+        return self._blobs[index]
+
+    @staticmethod
+    def _array(data: Buffer, dtype: Any, shape: Any) -> np.ndarray:
+        if not isinstance(dtype, str) or not _DTYPE.fullmatch(dtype):
+            raise MalformedMessage(f"array: got dtype {str(dtype)[:20]!r}, want one like '<f4' or '|u1'")
+        if not isinstance(shape, list) or len(shape) > 8 or not all(type(n) is int and n >= 0 for n in shape):
+            raise MalformedMessage(f"array: got shape {str(shape)[:80]}, want up to 8 non-negative integers")
+        try:
+            kind = np.dtype(dtype)
+        except TypeError as error:
+            raise MalformedMessage(f"array: got dtype {dtype!r}, which is none of numpy's") from error
+        if math.prod(shape) * kind.itemsize != len(data):
+            raise MalformedMessage(f"array: got {len(data)} bytes, want {shape} of {dtype}")
+        return np.frombuffer(data, kind).reshape(shape)
