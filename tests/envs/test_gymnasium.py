@@ -71,9 +71,9 @@ class Switch(Arm):
 
 @pytest.fixture(autouse=True)
 def _registered() -> Any:
-    gymnasium.register("VlaArm-v0", entry_point=lambda **kwargs: Arm(**kwargs), max_episode_steps=10)
-    gymnasium.register("VlaArmNoLimit-v0", entry_point=lambda **kwargs: Arm(**kwargs))
-    gymnasium.register("VlaSwitch-v0", entry_point=lambda **kwargs: Switch(**kwargs), max_episode_steps=10)
+    gymnasium.register("VlaArm-v0", entry_point=Arm, max_episode_steps=10)
+    gymnasium.register("VlaArmNoLimit-v0", entry_point=Arm)
+    gymnasium.register("VlaSwitch-v0", entry_point=Switch, max_episode_steps=10)
     yield
     for name in ("VlaArm-v0", "VlaArmNoLimit-v0", "VlaSwitch-v0"):
         gymnasium.registry.pop(name)

@@ -6,6 +6,7 @@ import hashlib
 import subprocess
 import sys
 import time
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from vlagents_ray import Act, Obs
 from vlagents_ray.envs import make_env
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import ConfigError, InvalidAction, NotReset, UnknownEnv
+from vlagents_ray.images import decode, encode_jpeg
 from vlagents_ray.policies.scripted import Scripted
 from vlagents_ray.testing import check_env
 
@@ -69,6 +71,23 @@ def test_the_expert_sees_at_every_image_size(width: int, height: int) -> None:
     env = Tabletop(width=width, height=height)
     assert env.reset(seed=0)[0].cameras["front"].shape == (height, width, 3)
     assert np.mean([play(env, seed) for seed in range(20)]) >= 0.95
+
+
+@pytest.mark.parametrize("subsampling", ["444", "420"])
+def test_the_expert_sees_through_jpeg(subsampling: str) -> None:
+    env = Tabletop()
+    successes = []
+    for seed in range(20):
+        obs, _ = env.reset(seed=seed)
+        agent = Scripted()
+        image = decode(encode_jpeg(obs.cameras["front"], 85, subsampling))
+        agent.reset(replace(obs, cameras={"front": image}), env.instruction, env="tabletop")
+        success = truncated = False
+        while not truncated and not success:
+            obs, _, _, truncated, info = env.step(agent.act(obs))
+            success = info["success"]
+        successes.append(success)
+    assert np.mean(successes) >= 0.95
 
 
 def test_mixed_draws_every_task() -> None:

@@ -1,21 +1,17 @@
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+import ray
+from eval_fakes import LINE
 
-HERE = Path(__file__).parent
-sys.path.append(str(HERE))  # for `eval_fakes`, which workers find by PYTHONPATH
+from vlagents_ray.evaluate import EvalConfig
 
-import ray  # noqa: E402
-from eval_fakes import LINE  # noqa: E402
-
-from vlagents_ray.evaluate import EvalConfig  # noqa: E402
-
-WORKER_PATH = {"env_vars": {"PYTHONPATH": f"{HERE}:{HERE.parent.parent}"}}
+ROOT = Path(__file__).parents[2]
+WORKER_PATH = {"env_vars": {"PYTHONPATH": f"{ROOT / 'tests' / 'support'}:{ROOT}"}}
 
 
 @pytest.fixture

@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import sqlite3
+import sys
 from collections.abc import Callable
 from contextlib import closing
+from subprocess import PIPE, Popen
 
 import pytest
 
@@ -115,7 +117,7 @@ def test_another_checkpoint_on_the_server_is_noticed(config: Config) -> None:
         store.begin_run(config(), {})
         store.note_policy({"policy": "act", "checkpoint": "a", "uptime_s": 3})
         store.note_policy({"policy": "act", "checkpoint": "a", "uptime_s": 9})
-        with pytest.raises(ConfigError, match="checkpoint 'b'.*are of 'a'"):
+        with pytest.raises(ConfigError, match=r"checkpoint 'b'.*are of 'a'"):
             store.note_policy({"policy": "act", "checkpoint": "b"})
         assert store.policy() == {"policy": "act", "checkpoint": "a", "uptime_s": 9}
 
@@ -135,3 +137,32 @@ def test_a_results_file_of_another_version_is_refused(config: Config) -> None:
         db.execute("PRAGMA user_version = 99")
     with pytest.raises(ConfigError, match="got version 99"):
         Store(config(resume=True))
+
+
+WRITER = """
+import sys
+from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.evaluate.episode import EpisodeResult
+from vlagents_ray.evaluate.jobs import plan
+from vlagents_ray.evaluate.store import Store
+
+config = EvalConfig.model_validate_json(sys.argv[1])
+with Store(config) as store:
+    store.begin_run(config, {})
+    for key in plan(config):
+        store.record(EpisodeResult(key, "done", True, True), 1)
+        print(key, flush=True)
+"""
+
+
+def test_a_killed_writer_loses_nothing_that_it_recorded(config: Config) -> None:
+    settings = config(episodes=1_000_000)
+    with Popen([sys.executable, "-c", WRITER, settings.model_dump_json()], stdout=PIPE, text=True) as writer:
+        assert writer.stdout is not None
+        told = [writer.stdout.readline().strip() for _ in range(200)]
+        writer.kill()
+        told += [line.strip() for line in writer.stdout if line.endswith("\n")]
+    with Store(config(episodes=1_000_000, resume=True)) as store:
+        finished = store.finished()
+    assert set(told) <= finished
+    assert len(finished) <= len(told) + 1

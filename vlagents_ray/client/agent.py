@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 from urllib.parse import urlsplit
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import ConfigError, PolicyFailed
+from vlagents_ray.errors import ConfigError, NotReset, PolicyFailed
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.wire.frames import JPEG, RAW, ImageCodec
 from vlagents_ray.wire.messages import Op, Reply, Request
@@ -102,6 +102,8 @@ class RemoteAgent(Agent):
         and `total_ms` on the server, `round_trip_ms` here.
         """
         begun = time.perf_counter()
+        if self._metadata is None:
+            raise NotReset("act before reset: this agent has no session; reset first")
         reply = self._call("act", obs)
         if reply.act is None:
             raise PolicyFailed("act: the server's reply holds no action")

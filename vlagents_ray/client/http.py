@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import json
 import select
@@ -23,6 +24,7 @@ from vlagents_ray.errors import (
 from vlagents_ray.wire.frames import CONTENT_TYPE, ImageCodec, decode_reply, encode_request, read_error
 from vlagents_ray.wire.messages import REQUEST_ID_HEADER, SESSION_HEADER, Reply, Request
 
+_CLOSE_S = 2.0
 _UNKNOWN_APP_S = 10.0  # a starting server knows no path until its first replica exists
 
 
@@ -36,6 +38,7 @@ class HttpTransport:
         self._codec = codec
         self._session = uuid.uuid4().hex
         self._connection: http.client.HTTPConnection | None = None
+        self._begun = False  # does the server hold a session for us?
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
         """The server's metadata."""
@@ -56,11 +59,20 @@ class HttpTransport:
         frame = encode_request(request, self._codec)
         status, kind, body = self._exchange("POST", f"/v1/{request.op}", frame, headers, timeout_s)
         if status == 200:
+            self._begun = True
             return decode_reply(body)
         return Reply(request.request_id, error=_refusal(status, kind, body))
 
     def close(self) -> None:
-        """Close the connection; the server forgets the session when it has idled."""
+        """End the session and close the connection; a server that is gone is not waited for."""
+        if self._begun:
+            self._begun = False
+            with contextlib.suppress(VLAgentsError):  # it forgets idle sessions anyway
+                self._exchange("POST", "/v1/close", b"", {SESSION_HEADER: self._session}, _CLOSE_S)
+        self._session = uuid.uuid4().hex
+        self._hang_up()
+
+    def _hang_up(self) -> None:
         if self._connection is not None:
             self._connection.close()
             self._connection = None
@@ -74,15 +86,15 @@ class HttpTransport:
             answer = connection.getresponse()
             return answer.status, answer.headers.get("content-type", ""), answer.read()
         except TimeoutError as error:
-            self.close()
+            self._hang_up()
             raise DeadlineExceeded(f"{self._url.geturl()}: no answer within {timeout_s:g} s") from error
         except (OSError, http.client.HTTPException) as error:
-            self.close()
+            self._hang_up()
             raise ConnectionLost(f"{self._url.geturl()}: {type(error).__name__}: {error}") from error
 
     def _open(self, timeout_s: float) -> http.client.HTTPConnection:
         if self._connection is not None and _closed_by_peer(self._connection.sock):
-            self.close()
+            self._hang_up()
         if self._connection is None:
             secure = self._url.scheme == "https"
             cls = http.client.HTTPSConnection if secure else http.client.HTTPConnection

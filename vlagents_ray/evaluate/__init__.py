@@ -6,7 +6,7 @@ summary = evaluate(EvalConfig(envs=["tabletop"], policy_url="http://localhost:80
 from vlagents_ray.evaluate.config import EvalConfig
 from vlagents_ray.evaluate.progress import Progress, SilentProgress, progress_for
 from vlagents_ray.evaluate.report import print_summary, results_table
-from vlagents_ray.evaluate.runner import EvaluationInterrupted, evaluate
+from vlagents_ray.evaluate.runner import EvaluationInterrupted, check, evaluate
 from vlagents_ray.evaluate.statistics import Rate, wilson
 from vlagents_ray.evaluate.summary import Group, Summary
 
@@ -18,6 +18,7 @@ __all__ = [
     "Rate",
     "SilentProgress",
     "Summary",
+    "check",
     "evaluate",
     "print_summary",
     "progress_for",

@@ -157,7 +157,7 @@ class WorkerPool:
             try:
                 report = ray.get(ref)
             except RayError as error:
-                report = _lost(f"the worker died: {error}")
+                report = _lost(f"the worker {'died' if isinstance(error, RayActorError) else 'failed'}: {error}")
             if report.made is not None:
                 worker.made = report.made.env
             if report.failure is not None and report.failure.cause == "worker":

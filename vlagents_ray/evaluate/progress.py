@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from time import monotonic
 from typing import Protocol
 
-from rich.console import Console
+from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.jobs import Job
@@ -97,8 +98,8 @@ class LiveProgress:
     """A table that is drawn anew, for terminals."""
 
     def __init__(self, console: Console) -> None:
-        self._live = Live(console=console, auto_refresh=True, refresh_per_second=4, get_renderable=self._table)
         self._counts = _Counts({}, {})
+        self._live = Live(console=console, auto_refresh=True, refresh_per_second=4, get_renderable=self._drawing)
 
     def begin(self, planned: Mapping[str, int], recorded: Mapping[str, Rate]) -> None:
         """Start drawing."""
@@ -118,13 +119,13 @@ class LiveProgress:
         """Leave the last state standing."""
         self._live.stop()
 
-    def _table(self) -> Table:
-        table = Table(box=None, caption=self._counts.overall(), caption_justify="left")
+    def _drawing(self) -> Group:
+        table = Table(box=None)
         for title in ("env", "episodes", "success so far"):
             table.add_column(title)
         for row in self._counts.envs():
             table.add_row(*row)
-        return table
+        return Group(table, Text(self._counts.overall()))
 
 
 class LineProgress:

@@ -11,10 +11,15 @@ from vlagents_ray.evaluate.summary import Group, Summary
 
 def results_table(summary: Summary) -> Table:
     """Success, length and speed, a row an env and one for all."""
-    table = Table(title=f"{summary.config['policy']}: success in %, with the Wilson 95 % interval", box=SIMPLE_HEAD)
+    table = Table(
+        title=f"{summary.config['policy']}: success in %, with the Wilson 95 % interval",
+        box=SIMPLE_HEAD,
+        padding=0,
+        pad_edge=False,
+    )
     table.add_column("env", overflow="fold")
-    for title in ("episodes", "once", "at end", "steps", "return", "policy ms", "env ms"):
-        table.add_column(title, justify="right", no_wrap=title in ("once", "at end"))
+    for title in ("episodes", "once", "at end", "steps", "policy ms", "env ms"):
+        table.add_column(title, justify="right", no_wrap=True)
     for group in summary.envs:
         table.add_row(*_cells(group))
     if len(summary.envs) > 1:
@@ -28,7 +33,9 @@ def print_summary(console: Console, summary: Summary) -> None:
     console.print(results_table(summary))
     total = summary.total
     speed = summary.rollout_steps_per_second
-    lines = [f"{total.steps} steps in {summary.wall_seconds:.1f} s" + (f", {speed:.1f} a second" if speed else "")]
+    lines = [f"{total.steps} steps in {summary.wall_seconds:.1f} s"]
+    if speed is not None:
+        lines[0] += f", {speed:.1f} a second once the workers had started"
     if total.policy_errors:
         lines.append(f"{total.policy_errors} episodes ended by an error of the policy; they count as no success")
     if total.retries:
@@ -49,9 +56,8 @@ def _cells(group: Group) -> list[str]:
         group.name,
         f"{group.episodes}/{group.planned}",
         str(group.success_once),
-        str(group.success_at_end),
+        "-" if group.success_at_end.rate is None else f"{group.success_at_end.rate:.0%}",
         _number(group.mean_steps),
-        _number(group.mean_return, 2),
         _number(group.policy_ms, 2),
         _number(group.env_step_ms, 2),
     ]

@@ -184,8 +184,8 @@ class Rollout:
         return agent
 
     def _make_env(self, name: str) -> EvalEnv:
-        self._drop_env()  # first, so that a worker never holds two simulators
         self._watch("make", 0)
+        self._drop_env()  # first, so that a worker never holds two simulators
         try:
             with env_side(f"{name!r}: make"):
                 env = make_env(name, **self._config.options_for(name))

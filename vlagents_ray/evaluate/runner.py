@@ -6,7 +6,7 @@ import functools
 import os
 import signal
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from math import ceil
 from types import FrameType
@@ -54,8 +54,7 @@ def evaluate(
     `config.abort_after` lost episodes in a row; `EvaluationInterrupted` on Ctrl-C or SIGTERM.
     Whatever it raises, each recorded episode is kept and summary.json written.
     """
-    for env in config.envs:
-        env_class(env)  # an unknown name is better said before workers start
+    _require_known(config.envs)
     factory = agent_factory or _remote_agents(config)
     with Store(config) as store:
         finished = store.finished()
@@ -75,6 +74,12 @@ def evaluate(
     if state == "interrupted":
         raise EvaluationInterrupted(summary)
     return summary
+
+
+def check(config: EvalConfig) -> None:
+    """Raise the `ConfigError` that `evaluate` would raise, before a policy is served for it."""
+    _require_known(config.envs)
+    Store(config).close()
 
 
 class _Run:
@@ -198,6 +203,11 @@ def stop_signals() -> Iterator[threading.Event]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def _require_known(envs: Iterable[str]) -> None:
+    for env in envs:
+        env_class(env)
 
 
 def _remote_agents(config: EvalConfig) -> AgentFactory:

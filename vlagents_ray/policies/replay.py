@@ -97,11 +97,15 @@ def load_actions(path: Path, key: str | None = None) -> np.ndarray:
 def _read_npy(path: Path, key: str | None) -> Any:
     if key is not None:
         raise ConfigError(f"recording {path}: key {key!r} is for .npz and .json; a .npy file holds one array")
-    return np.load(path, allow_pickle=False)
+    with path.open("rb") as file:
+        return np.lib.format.read_array(file, allow_pickle=False)
 
 
 def _read_npz(path: Path, key: str | None) -> Any:
-    with np.load(path, allow_pickle=False) as arrays:
+    with path.open("rb") as file:  # opened here: np.load leaves the file of a broken archive open
+        arrays = np.load(file, allow_pickle=False)
+        if not hasattr(arrays, "files"):
+            raise ConfigError(f"recording {path}: holds one bare array; rename it to .npy")
         return arrays[_choose(path, list(arrays.files), key)]
 
 

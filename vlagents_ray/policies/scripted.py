@@ -38,6 +38,7 @@ class Scripted(Agent):
 
         Raises `InvalidInput` if neither says which, `ContractMismatch` if there is no expert for it.
         """
+        self._expert = None  # the last episode's must not act in one that failed to begin
         env = kwargs.get("env") or self.config.task
         if not isinstance(env, str):
             raise InvalidInput(

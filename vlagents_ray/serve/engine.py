@@ -13,7 +13,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from vlagents_ray.contract import Contract, check_action, check_observation, require_match
-from vlagents_ray.errors import NotReset, PolicyFailed, PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import InvalidInput, NotReset, PolicyFailed, PolicyUnavailable, VLAgentsError
 from vlagents_ray.interface import Act, Agent
 from vlagents_ray.serve.batching import BatchQueue, Rank, Ticket
 from vlagents_ray.serve.sessions import AgentCopies, Session, SessionTable
@@ -119,7 +119,7 @@ class Engine:
         if not isinstance(info, dict):
             raise PolicyFailed(f"reset: the policy returned {type(info).__name__}, want a dict")
         reply = Reply(ticket.request.request_id, info=info, timing=_timing(ticket.arrived, begun, time.perf_counter()))
-        encode_reply(reply)  # an answer that cannot travel fails its own session, here
+        _require_sendable(reply)
         session.agent = agent
         ticket.answer(reply)
 
@@ -149,7 +149,7 @@ class Engine:
                 raise PolicyFailed(f"act: the policy returned {type(result).__name__}, want an Act")
             act = Act(check_action(result.action, self.contract), bool(result.done), result.info)
             if act.info:
-                encode_reply(Reply(act=Act(act.action, info=act.info)))  # as above: fail here, alone
+                _require_sendable(Reply(act=act))
         except Exception as error:  # noqa: BLE001 - becomes the reply
             return Reply(request_id, error=self._explain(error, ticket))
         return Reply(request_id, act=act)
@@ -170,6 +170,14 @@ class Engine:
 
 def _timing(arrived: float, begun: float, ended: float) -> dict[str, Any]:
     return {"queue_ms": (begun - arrived) * 1e3, "inference_ms": (ended - begun) * 1e3}
+
+
+def _require_sendable(reply: Reply) -> None:
+    """An answer that cannot travel fails its own session, here, and nothing later."""
+    try:
+        encode_reply(reply)
+    except InvalidInput as error:
+        raise PolicyFailed(f"the policy's answer cannot be sent: {error}") from error
 
 
 def _synchronize() -> None:

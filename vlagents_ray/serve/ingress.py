@@ -26,7 +26,7 @@ from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from vlagents_ray.errors import MalformedMessage, MessageTooLarge, UnknownApp, VLAgentsError
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable, UnknownApp, VLAgentsError
 from vlagents_ray.serve.calls import ask
 from vlagents_ray.serve.docs import docs_page
 from vlagents_ray.serve.engine import Engine
@@ -46,6 +46,7 @@ from vlagents_ray.wire.plain import CAMERA_PREFIX, PROBLEM_TYPE, problem, reply_
 logger = logging.getLogger(__name__)
 
 _SESSION_ID = re.compile(r"[\x21-\x7e]{1,128}")
+_TRY_AGAIN_LATER = 1013  # a WebSocket close code
 _INLINE_BYTES = 512 * 1024  # a larger body is decoded beside the event loop, which others wait for
 
 
@@ -186,6 +187,12 @@ class _Door:
         """One session; a broken request is answered and leaves the session as it was."""
         await socket.accept()
         session_id = f"ws-{uuid.uuid4().hex}"
+        try:
+            self._engine.sessions.open(session_id)
+        except PolicyUnavailable as error:
+            await socket.send_bytes(encode_reply(Reply(error=error)))
+            await socket.close(_TRY_AGAIN_LATER)
+            return
         try:
             while True:
                 message = await socket.receive()

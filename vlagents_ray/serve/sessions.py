@@ -32,7 +32,10 @@ logger = logging.getLogger(__name__)
 
 SHARED_ARRAY_BYTES = 64 * 2**20
 _BY_REFERENCE = (types.FunctionType, types.BuiltinFunctionType, types.ModuleType, type, logging.Logger)
-_PLAIN = (type(None), bool, int, float, complex, str, bytes, bytearray, list, tuple, dict, set, frozenset)
+_PLAIN = (
+    *(type(None), bool, int, float, complex, str, bytes, bytearray, list, tuple, dict, set, frozenset),
+    pickle.PickleBuffer,  # the inside of a numpy array
+)
 
 
 class _Snapshot(pickle.Pickler):

@@ -171,7 +171,7 @@ class ManiSkill(EvalEnv):
             env.close()
 
     def _check_usable(self) -> None:
-        if self._env.agent is None or not hasattr(self._env.single_action_space, "shape"):
+        if not hasattr(self._env.agent, "robot"):  # none at all, or several
             raise ConfigError(f"maniskill/{self._task}: want a task with exactly one robot")
         if "success" not in self._env.get_info():
             raise ConfigError(f"maniskill/{self._task} does not say what success is: there is nothing to evaluate")

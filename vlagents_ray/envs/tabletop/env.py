@@ -131,9 +131,7 @@ class Tabletop(EvalEnv):
 
     def _observe(self, world: World) -> Obs:
         state = np.array((world.x, world.y, world.z, *_POINTING_DOWN), np.float32)
-        return Obs(
-            cameras={"front": self._renderer.draw(world)}, gripper=min(world.opening, 1.0), state={"xyzrpy": state}
-        )
+        return Obs(cameras={"front": self._renderer.draw(world)}, gripper=world.opening, state={"xyzrpy": state})
 
     def _task_in_scene(self) -> Task:
         return next(task for task in _TASKS if task == self._task)

@@ -142,7 +142,7 @@ class World:
 
     def _grip(self, opening: float) -> None:
         change = _clip(opening - self.opening, (-_OPENING_RATE, _OPENING_RATE))
-        gap = self.gap + change * GAP_OPEN
+        gap = _clip(self.gap + change * GAP_OPEN, (0.0, GAP_OPEN))
         if self.held is not None:
             if gap > PUCK_RADIUS + _EPSILON:
                 self.held = None

@@ -14,11 +14,12 @@ import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs import EvalEnv
-from vlagents_ray.errors import ConnectionLost
+from vlagents_ray.errors import ConnectionLost, PolicyFailed
 from vlagents_ray.interface import Act, Agent, Obs
 
 LINE = "eval_fakes:Line"
 OTHER_LINE = "eval_fakes:OtherLine"
+EVERY = -1  # seed
 
 
 class Line(EvalEnv):
@@ -121,7 +122,7 @@ class ToZero(Agent):
     def __init__(self, chunk: int = 1, state_dim: int | None = None, lost_on: int | None = None) -> None:
         self._chunk = chunk
         self._state_dim = state_dim
-        self._lost_on = lost_on  # the seed in whose first act the connection breaks, once
+        self._lost_on = lost_on  # the seed in whose acts the connection breaks
         self._seed = 0
         self._rng = np.random.default_rng(0)
 
@@ -136,18 +137,25 @@ class ToZero(Agent):
         return {}
 
     def act(self, obs: Obs) -> Act:
-        if self._seed == self._lost_on:
+        if self._lost_on in (self._seed, EVERY):
             raise ConnectionLost("the server went away")
         noise = self._rng.normal(0.0, 0.1, (self._chunk, 1))
         return Act((-float(obs.state["position"][0]) + noise).astype(np.float32))
 
 
-class PausedAgent(ToZero):
-    """Never answers its first `act`."""
+class Silent(ToZero):
+    """Never answers an `act`."""
 
     def act(self, obs: Obs) -> Act:
         threading.Event().wait()
         raise AssertionError
+
+
+class Teller(ToZero):
+    """Fails by telling what its process was started with."""
+
+    def act(self, obs: Obs) -> Act:
+        raise PolicyFailed(str({name: os.environ.get(name) for name in ("OMP_NUM_THREADS", "LP_NUM_THREADS", "EXTRA")}))
 
 
 def wait_for(true: Any, timeout_s: float = 120.0) -> None:

@@ -1,0 +1,118 @@
+"""Evaluations in processes of their own, with a Ray of their own, stopped from outside."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import sqlite3
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import closing, suppress
+from pathlib import Path
+from subprocess import Popen
+
+import pytest
+from eval_fakes import wait_for
+
+from vlagents_ray.evaluate import EvalConfig
+
+pytestmark = pytest.mark.slow
+
+SCRIPT = """
+import sys
+from eval_fakes import ToZero
+from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, evaluate
+
+try:
+    evaluate(EvalConfig.model_validate_json(sys.argv[1]), agent_factory=ToZero)
+except EvaluationInterrupted:
+    sys.exit(130)
+"""
+
+
+@pytest.fixture
+def ray_folder() -> Iterator[Path]:
+    """Where Ray keeps its files; short, because the names of sockets are limited."""
+    folder = Path(tempfile.mkdtemp(prefix="r"))
+    yield folder
+    end(folder)
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def processes(ray_folder: Path, named: str = "") -> list[int]:
+    """The processes of the Ray whose files are in `ray_folder`, or those of them that are `named` so."""
+    found = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            command = (folder / "cmdline").read_bytes()
+            said = command + (folder / "environ").read_bytes()
+        except OSError:  # it has ended, or is not ours
+            continue
+        if str(ray_folder).encode() in said and named.encode() in command:
+            found.append(int(folder.name))
+    return found
+
+
+def end(ray_folder: Path) -> None:
+    """Kill what is left of that Ray: two agents of a killed one take a minute to notice."""
+    for pid in processes(ray_folder):
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    wait_for(lambda: not processes(ray_folder))
+
+
+def start(config: EvalConfig, ray_folder: Path) -> Popen[bytes]:
+    env_vars = config.runtime_env["env_vars"]
+    assert isinstance(env_vars, dict)
+    environment = {
+        **os.environ,
+        "PYTHONPATH": str(env_vars["PYTHONPATH"]),
+        "RAY_TMPDIR": str(ray_folder),
+        "RAY_USAGE_STATS_ENABLED": "0",
+    }
+    command = [sys.executable, "-c", SCRIPT, config.model_dump_json()]
+    return Popen(command, env=environment, start_new_session=True)
+
+
+def episodes(config: EvalConfig) -> list[tuple[int, int, int]]:
+    """(run, episode, attempts) of every recorded episode."""
+    if not (config.out / "results.db").exists():
+        return []
+    with closing(sqlite3.connect(config.out / "results.db")) as db:
+        if db.execute("PRAGMA user_version").fetchone() == (0,):
+            return []
+        return db.execute("SELECT run, episode, attempts FROM episodes ORDER BY episode").fetchall()
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGKILL, -9), (signal.SIGINT, 130)])
+def test_a_stopped_and_resumed_evaluation_has_each_episode_exactly_once(
+    config: Callable[..., EvalConfig], tmp_path: Path, ray_folder: Path, number: signal.Signals, code: int
+) -> None:
+    options = {"folder": str(tmp_path), "trouble": {"gate": [5, 6]}}
+    settings = config(episodes=9, env_options=options, env_timeout_s=100)
+
+    with start(settings, ray_folder) as evaluation:
+        wait_for(lambda: all((tmp_path / f"gate-{seed}").exists() for seed in (5, 6)))
+        wait_for(lambda: len(episodes(settings)) == 5)  # both workers are in mid-episode
+        if number == signal.SIGKILL:
+            evaluation.kill()
+        else:
+            os.killpg(evaluation.pid, number)  # as a terminal does
+        assert evaluation.wait(60) == code
+    wait_for(lambda: not processes(ray_folder, "Rollout"))
+    if number == signal.SIGKILL:
+        end(ray_folder)
+    wait_for(lambda: not processes(ray_folder))
+    assert [episode for _, episode, _ in episodes(settings)] == [0, 1, 2, 3, 4]
+    if number == signal.SIGINT:
+        assert json.loads((settings.out / "summary.json").read_text())["state"] == "interrupted"
+
+    with start(config(episodes=9, env_options=options, resume=True), ray_folder) as evaluation:
+        assert evaluation.wait(100) == 0
+    wait_for(lambda: not processes(ray_folder))
+    assert episodes(settings) == [(1, i, 1) for i in range(5)] + [(2, i, 1) for i in range(5, 9)]
+    summary = json.loads((settings.out / "summary.json").read_text())
+    assert (summary["state"], summary["total"]["episodes"], summary["total"]["retries"]) == ("complete", 9, 0)

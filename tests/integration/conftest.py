@@ -1,0 +1,36 @@
+"""Real servers on real Ray, one for each test file that needs one."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from vlagents_ray.serve.cluster import Server, deployment, running_server
+
+SUPPORT = Path(__file__).parent.parent / "support"
+
+
+@pytest.fixture(scope="session", autouse=True)
+def importable_agents() -> Iterator[None]:
+    """`served_agents` for this process and for the workers that it starts."""
+    before = os.environ.get("PYTHONPATH")
+    os.environ["PYTHONPATH"] = f"{SUPPORT}:{before}" if before else str(SUPPORT)
+    sys.path.append(str(SUPPORT))
+    yield
+    sys.path.remove(str(SUPPORT))
+    os.environ.pop("PYTHONPATH")
+    if before is not None:
+        os.environ["PYTHONPATH"] = before
+
+
+@contextmanager
+def serving(policy: str, **args: Any) -> Iterator[Server]:
+    """A server of one policy on a cluster of its own."""
+    with running_server(deployment(policy, **args), num_cpus=4) as server:
+        yield server

@@ -1,0 +1,67 @@
+"""Several replicas: a session stays on one, whichever transport carries it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from tests.integration.conftest import serving
+from tests.integration.test_sessions import obs
+from vlagents_ray import ConnectionLost, RemoteAgent
+from vlagents_ray.serve.cluster import Server
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Server]:
+    with serving("served_agents:Reacher", replicas=3) as server:
+        # Serve says RUNNING before HAProxy has seen every replica pass its health checks.
+        seen: set[int] = set()
+        deadline = time.monotonic() + 60
+        while len(seen) < 3:
+            assert time.monotonic() < deadline, f"HAProxy reaches only {seen}"
+            with RemoteAgent(server.url, transport="http") as agent:
+                seen.add(agent.reset(obs(0))["pid"])
+        yield server
+
+
+def opened(agents: list[RemoteAgent]) -> list[int]:
+    """Reset each; returns the process id of each one's replica."""
+    return [agent.reset(obs(i), f"task {i}")["pid"] for i, agent in enumerate(agents)]
+
+
+def check(agents: list[RemoteAgent], pids: list[int], steps: int) -> None:
+    for step in range(1, steps):
+        for i, agent in enumerate(agents):
+            act = agent.act(obs(0))
+            assert (act.info["pid"], act.info["instruction"], act.action[0]) == (pids[i], f"task {i}", step)
+
+
+def test_http_sessions_stay_on_their_replica(server: Server) -> None:
+    agents = [RemoteAgent(server.url, transport="http") for _ in range(12)]
+    pids = opened(agents)
+    assert len(set(pids)) > 1, "all sessions on one replica"
+    check(agents, pids, 20)
+    for agent in agents:
+        agent.close()
+
+
+def test_a_dead_replica_ends_its_own_sessions_and_no_others(server: Server) -> None:
+    agents = [RemoteAgent("serve://Reacher") for _ in range(8)]
+    pids = opened(agents)
+    assert len(set(pids)) > 1, "all sessions on one replica"
+    check(agents, pids, 5)
+    os.kill(pids[0], signal.SIGKILL)
+    for i, agent in enumerate(agents):
+        if pids[i] == pids[0]:
+            with pytest.raises(ConnectionLost):
+                agent.act(obs(0))
+        else:
+            assert agent.act(obs(0)).info["instruction"] == f"task {i}"
+    for agent in agents:
+        agent.close()
+    assert agents[0].reset(obs(0), "elsewhere")["instruction"] == "elsewhere"
+    agents[0].close()

@@ -1,0 +1,121 @@
+"""Sessions over every transport, on one replica and on several."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import random
+from collections.abc import Iterator
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+
+from tests.integration.conftest import serving
+from vlagents_ray import NotReset, Obs, PolicyUnavailable, RemoteAgent
+from vlagents_ray.client.agent import TransportName
+from vlagents_ray.serve.cluster import Server
+from vlagents_ray.wire.frames import JPEG
+
+TRANSPORTS: list[TransportName] = ["websocket", "http", "handle"]
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Server]:
+    """One replica of a policy written as in the paper."""
+    with serving("served_agents:Reacher", config={"scale": 2.0}, batch={"max_size": 8}) as server:
+        yield server
+
+
+def url(server: Server, transport: TransportName) -> str:
+    return "serve://Reacher" if transport == "handle" else server.url
+
+
+def obs(pixel: int, value: int = 0) -> Obs:
+    return Obs(
+        {"front": np.full((8, 8, 3), pixel, np.uint8)}, 0.5, {"joints": np.zeros(2, np.float32)}, {"value": value}
+    )
+
+
+@pytest.mark.parametrize("transport", TRANSPORTS)
+def test_two_sessions_interleaved_a_thousand_times_never_mix(server: Server, transport: TransportName) -> None:
+    choose = random.Random(7)
+    with (
+        RemoteAgent(url(server, transport), transport=transport) as red,
+        RemoteAgent(url(server, transport), transport=transport) as blue,
+    ):
+        agents = {"red": red, "blue": blue}
+        pixels = {"red": 10, "blue": 200}
+        for name, agent in agents.items():
+            assert agent.reset(obs(pixels[name]), f"the {name} cube", seed=1)["instruction"] == f"the {name} cube"
+            assert agent.transport == transport
+        counts, sums = dict.fromkeys(agents, 0), dict.fromkeys(agents, 0)
+        for _ in range(1000):
+            name = choose.choice(sorted(agents))
+            value = choose.randrange(100)
+            counts[name] += 1
+            sums[name] += value
+            act = agents[name].act(obs(0, value))
+            assert act.info["instruction"] == f"the {name} cube"
+            assert act.info["value"] == value
+            assert act.action.tolist() == [counts[name], 2.0 * sums[name], pixels[name]]
+
+
+@pytest.mark.parametrize("transport", TRANSPORTS)
+def test_an_episode_begins_from_scratch(server: Server, transport: TransportName) -> None:
+    with RemoteAgent(url(server, transport), transport=transport) as agent:
+        for _ in range(3):
+            agent.reset(obs(1), "again")
+            assert agent.act(obs(1, 5)).action.tolist() == [1, 10.0, 1]
+
+
+@pytest.mark.parametrize("transport", TRANSPORTS)
+def test_a_closed_session_has_to_be_reset(server: Server, transport: TransportName) -> None:
+    agent = RemoteAgent(url(server, transport), transport=transport)
+    agent.reset(obs(1), "x")
+    agent.close()
+    with pytest.raises(NotReset):
+        agent.act(obs(1))
+    agent.reset(obs(1), "y")
+    assert agent.act(obs(1)).info["instruction"] == "y"
+    agent.close()
+
+
+def test_timing_is_told_by_stage(server: Server) -> None:
+    with RemoteAgent(server.url) as agent:
+        agent.reset(obs(1), "x")
+        timing = agent.act(obs(1)).info["timing"]
+        assert timing["round_trip_ms"] > timing["total_ms"] > timing["inference_ms"] > 0
+
+
+def test_jpeg_reaches_the_policy_as_pixels(server: Server) -> None:
+    with RemoteAgent(server.url, codec=JPEG) as agent:
+        agent.reset(obs(128), "x")
+        assert abs(agent.act(obs(0)).action[2] - 128) <= 2
+
+
+def test_metadata_says_what_is_served(server: Server) -> None:
+    with RemoteAgent(server.url) as agent:
+        assert agent.metadata["policy"] == "served_agents:Reacher"
+        assert agent.metadata["config"] == {"scale": 2.0}
+        assert agent.contract is None
+
+
+def test_nobody_there_is_unavailable() -> None:
+    with pytest.raises(PolicyUnavailable, match="not ready within"):
+        RemoteAgent("http://127.0.0.1:9", connect_timeout_s=0.3).reset(obs(0))
+
+
+def test_a_robot_without_our_client_needs_only_http(server: Server) -> None:
+    host = urlsplit(server.url)
+    connection = http.client.HTTPConnection(host.hostname or "", host.port, timeout=10)
+    for op in ("reset", "act"):
+        body = json.dumps({"instruction": "push"} if op == "reset" else {"info": {"value": 4}})
+        connection.request("POST", f"/v1/{op}", body, {"x-session-id": "bare", "content-type": "application/json"})
+        answer = connection.getresponse()
+        document = json.loads(answer.read())
+        if op == "reset":  # this policy looks at a camera, which JSON alone does not bring
+            assert (answer.status, document["code"]) == (500, "policy_failed")
+        else:
+            assert (answer.status, document["code"]) == (409, "not_reset")
+    connection.close()

@@ -1,0 +1,205 @@
+"""Starting, loading, failing and stopping servers."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.integration.conftest import serving
+from vlagents_ray import ConfigError, Obs, RemoteAgent
+from vlagents_ray.envs import make_env
+from vlagents_ray.serve.cluster import deployment, free_port, read_deployment, running_server
+
+COMMAND = [str(Path(sys.executable).parent / "vlagents-ray")]
+ROOT = Path(__file__).parent.parent.parent
+
+
+def until(fact: Callable[[], bool], what: str, timeout_s: float = 60.0) -> None:
+    deadline = time.monotonic() + timeout_s
+    while not fact():
+        assert time.monotonic() < deadline, f"not in time: {what}"
+        time.sleep(0.05)
+
+
+def health(url: str) -> int | None:
+    try:
+        with urllib.request.urlopen(f"{url}/healthz", timeout=5) as answer:
+            return int(answer.status)
+    except urllib.error.HTTPError as error:
+        error.close()
+        return error.code
+    except OSError:
+        return None
+
+
+@contextmanager
+def command(*words: str) -> Iterator[subprocess.Popen[str]]:
+    """`vlagents-ray …` as a user runs it; every process it started must be gone afterwards."""
+    process = subprocess.Popen(
+        [*COMMAND, *words], stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, cwd=ROOT
+    )
+    family: set[psutil.Process] = set()
+    try:
+        yield process
+    finally:
+        if process.poll() is None:
+            family = set(psutil.Process(process.pid).children(recursive=True))
+            process.send_signal(signal.SIGTERM)
+        process.communicate(timeout=60)
+        _, alive = psutil.wait_procs(list(family), timeout=15)
+        names = [p.name() for p in alive]
+        for p in alive:
+            p.kill()
+        assert not names, f"left running: {names}"
+
+
+def test_health_is_503_while_the_policy_loads_and_clients_wait_for_it(tmp_path: Path) -> None:
+    gate, port = tmp_path / "gate", free_port()
+    url = f"http://127.0.0.1:{port}"
+    answers: list[object] = []
+
+    def robot() -> None:
+        with RemoteAgent(url) as agent:
+            answers.append(agent.reset(Obs(), "x"))
+
+    def watch() -> None:
+        until(lambda: health(url) == 503, "503 while loading")
+        answers.append(503)
+        thread.start()
+        gate.touch()
+
+    thread, watcher = threading.Thread(target=robot), threading.Thread(target=watch)
+    watcher.start()
+    with running_server(deployment("served_agents:Gated", config={"gate": str(gate)}), port=port):
+        watcher.join(60)
+        thread.join(60)
+        assert answers == [503, {}]
+        assert health(url) == 200
+
+
+def test_a_policy_that_does_not_load_says_why() -> None:
+    with pytest.raises(ConfigError, match="no checkpoint here"), serving("served_agents:Broken"):
+        pytest.fail("served a policy that did not load")
+
+
+def test_two_servers_on_one_machine_do_not_meet() -> None:
+    ports = [free_port(), free_port()]
+    with (
+        command("serve", "noop", "--port", str(ports[0]), "--set", "action_dim=3"),
+        command("serve", "noop", "--port", str(ports[1]), "--set", "action_dim=5", "--serve-set", "batch.max_size=2"),
+    ):
+        for port, dim in zip(ports, (3, 5), strict=True):
+            with RemoteAgent(f"http://127.0.0.1:{port}", connect_timeout_s=120) as agent:
+                until(lambda url=agent.url: health(url) == 200, "healthy")  # type: ignore[misc]
+                agent.reset(Obs(), "x")
+                for _ in range(20):
+                    assert agent.act(Obs()).action.shape == (dim,)
+
+
+def test_a_taken_port_is_said_at_once() -> None:
+    import socket
+
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        result = subprocess.run(
+            [*COMMAND, "serve", "noop", "--port", str(taken.getsockname()[1])],
+            capture_output=True, text=True, timeout=60, check=False,
+        )  # fmt: skip
+    assert result.returncode == 2
+    assert "choose another --port" in result.stderr
+
+
+def test_serve_deploy_takes_the_same_file(tmp_path: Path) -> None:
+    """Ray's own tools, on a cluster that Ray's own tools started."""
+    serve_port, dashboard, gcs = free_port(), free_port(), free_port()
+    text = (ROOT / "deployments" / "scripted.yaml").read_text()
+    file = tmp_path / "scripted.yaml"
+    file.write_text(text.replace("port: 8000", f"port: {serve_port}"))
+    assert str(serve_port) in file.read_text()
+    bin_dir = Path(sys.executable).parent
+    home = tempfile.mkdtemp(prefix="vr-")  # Unix sockets in it: the path must be short
+    environment = os.environ | {"RAY_AUTH_MODE": "disabled"}
+
+    def ray(*words: str) -> None:
+        subprocess.run(words, check=True, timeout=120, env=environment, capture_output=True)
+
+    before = {p.pid for p in psutil.process_iter()}
+    ray(
+        str(bin_dir / "ray"), "start", "--head", f"--port={gcs}", f"--dashboard-port={dashboard}", "--num-cpus=2",
+        f"--temp-dir={home}", "--min-worker-port=0", "--max-worker-port=0",
+    )  # fmt: skip
+    ours = [p for p in psutil.process_iter() if p.pid not in before and "ray" in " ".join(p.cmdline()).lower()]
+    try:
+        ray(str(bin_dir / "serve"), "deploy", "-a", f"http://127.0.0.1:{dashboard}", str(file))
+        url = f"http://127.0.0.1:{serve_port}"
+        until(lambda: health(url) == 200, "the deployment", 120)
+        with urllib.request.urlopen(f"{url}/v1/metadata", timeout=5) as answer:
+            assert json.load(answer)["policy"] == "scripted"
+        with RemoteAgent(url) as agent, make_env("tabletop") as env:
+            obs, _ = env.reset(seed=0)
+            agent.reset(obs, env.instruction, env="tabletop")
+            env.step(agent.act(obs))
+    finally:
+        ours += [p for p in psutil.process_iter() if home in " ".join(_cmdline(p))]
+        family = {child for p in ours if p.is_running() for child in p.children(recursive=True)} | set(ours)
+        for p in family:
+            if p.is_running():
+                p.terminate()
+        _, alive = psutil.wait_procs(list(family), timeout=20)
+        for p in alive:
+            p.kill()
+        shutil.rmtree(home, ignore_errors=True)
+
+
+def _cmdline(process: psutil.Process) -> list[str]:
+    try:
+        return process.cmdline()
+    except psutil.Error:
+        return []
+
+
+def application(args: str) -> str:
+    return f"applications: [{{name: a, import_path: vlagents_ray.serve.app:build, args: {args}}}]"
+
+
+@pytest.mark.parametrize(
+    ("text", "word"),
+    [
+        (application("{policy: noop, polic: 1}"), "polic"),
+        (application("{policy: nope}"), "nope"),
+        (application("{}"), "policy"),
+        (application("{policy: noop, config: {xy: 1}}"), "xy"),
+        (application("{policy: noop, batch: {max_size: 0}}"), "max_size"),
+        (application("{policy: noop, replicas: 1, autoscaling: {}}"), "exclude each other"),
+        ("applications: 3", "applications"),
+        ("a: [", "YAML"),
+    ],
+)
+def test_a_wrong_deployment_file_is_refused_before_anything_starts(tmp_path: Path, text: str, word: str) -> None:
+    file = tmp_path / "d.yaml"
+    file.write_text(text)
+    with pytest.raises(ConfigError, match=word):
+        read_deployment(str(file))
+
+
+def test_every_shipped_deployment_file_is_valid() -> None:
+    files = sorted((ROOT / "deployments").glob("*.yaml"))
+    assert files
+    for file in files:
+        assert read_deployment(str(file)).applications

@@ -1,0 +1,176 @@
+"""Session copies: own state, shared weights."""
+
+from __future__ import annotations
+
+import collections
+import logging
+import threading
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from vlagents_ray.errors import PolicyUnavailable, UnknownSession
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.serve import sessions
+from vlagents_ray.serve.sessions import AgentCopies, SessionTable
+
+
+class Stateful(Agent):
+    """Keeps state in every way that comes to mind."""
+
+    def initialize(self) -> None:
+        self.history: list[int] = []
+        self.queue: collections.deque[int] = collections.deque(maxlen=3)
+        self.buffer = np.zeros(4)
+        self.nested = {"a": [{"b": set()}]}
+        self.rng = np.random.default_rng(0)
+        self.tensor = torch.zeros(3)
+        self.bound = self.remember
+        self.scale = lambda x: 2 * x
+
+    def remember(self, value: int) -> None:
+        self.history.append(value)
+
+    def act(self, obs: Obs) -> Act:
+        value = int(obs.info["value"])
+        self.bound(value)
+        self.queue.append(value)
+        self.buffer[0] += value
+        self.nested["a"][0]["b"].add(value)
+        self.tensor += value
+        return Act(np.array([len(self.history), self.buffer[0], self.scale(value)]), info={"random": self.rng.random()})
+
+
+def copies(agent: Agent) -> AgentCopies:
+    agent.initialize()
+    return AgentCopies(agent)
+
+
+def test_copies_do_not_mix() -> None:
+    make = copies(Stateful())
+    a, b = make.make(), make.make()
+    for value in range(5):
+        a.act(Obs(info={"value": value}))
+    assert isinstance(a, Stateful)
+    assert isinstance(b, Stateful)
+    assert a.history == [0, 1, 2, 3, 4]
+    assert b.history == []
+    assert list(b.queue) == []
+    assert b.buffer.sum() == 0
+    assert b.tensor.sum() == 0
+    assert b.nested == {"a": [{"b": set()}]}
+
+
+def test_a_copy_starts_as_initialize_left_it_whatever_others_did() -> None:
+    make = copies(Stateful())
+    first = make.make().act(Obs(info={"value": 3}))
+    make.make().act(Obs(info={"value": 9}))
+    again = make.make().act(Obs(info={"value": 3}))
+    np.testing.assert_array_equal(first.action, again.action)
+    assert first.info == again.info
+
+
+class Heavy(Agent):
+    shared = ("table",)
+
+    def initialize(self) -> None:
+        self.model = torch.nn.Sequential(torch.nn.Linear(3, 3), torch.nn.BatchNorm1d(3))
+        self.table = {"big": np.zeros(10)}
+        self.own = {"small": np.zeros(10)}
+
+
+def test_weights_are_shared_and_module_state_is_not() -> None:
+    make = copies(Heavy())
+    a, b = make.make(), make.make()
+    assert isinstance(a, Heavy)
+    assert isinstance(b, Heavy)
+    assert a.model[0].weight is b.model[0].weight
+    assert a.model is not b.model
+    assert a.model[1].running_mean is not b.model[1].running_mean
+
+
+def test_named_attributes_are_shared() -> None:
+    make = copies(Heavy())
+    a, b = make.make(), make.make()
+    assert isinstance(a, Heavy)
+    assert isinstance(b, Heavy)
+    assert a.table is b.table
+    assert a.own is not b.own
+
+
+class Modular(Agent):
+    """State inside a torch module, as LeRobot's policies keep their action queue."""
+
+    class Net(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.layer = torch.nn.Linear(1, 1)
+            self.actions: list[float] = []
+
+    def initialize(self) -> None:
+        self.net = self.Net()
+
+
+def test_a_queue_inside_a_module_is_each_sessions_own() -> None:
+    make = copies(Modular())
+    a, b = make.make(), make.make()
+    assert isinstance(a, Modular)
+    assert isinstance(b, Modular)
+    a.net.actions.append(1.0)
+    assert b.net.actions == []
+    assert a.net.layer.weight is b.net.layer.weight
+
+
+class Locked(Agent):
+    def initialize(self) -> None:
+        self.lock = threading.Lock()
+        self.state = [0]
+
+
+def test_what_cannot_be_copied_is_shared_and_said(caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        make = copies(Locked())
+    a, b = make.make(), make.make()
+    assert isinstance(a, Locked)
+    assert isinstance(b, Locked)
+    assert a.lock is b.lock
+    assert a.state is not b.state
+    assert "lock" in caplog.text
+
+
+def test_a_huge_array_is_shared_but_cannot_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sessions, "SHARED_ARRAY_BYTES", 1000)
+
+    class Big(Agent):
+        def initialize(self) -> None:
+            self.weights = np.ones(1000)
+
+    agent: Any = copies(Big()).make()
+    with pytest.raises(ValueError, match="read-only"):
+        agent.weights[0] = 2
+
+
+def test_unknown_sessions_are_named() -> None:
+    with pytest.raises(UnknownSession, match="'nobody'"):
+        SessionTable(1, 1).get("nobody")
+
+
+def test_a_full_table_refuses_and_makes_room_for_the_idle() -> None:
+    table = SessionTable(limit=1, idle_s=60)
+    table.open("a")
+    with pytest.raises(PolicyUnavailable, match="limit"):
+        table.open("b")
+    table.open("a").used -= 61
+    table.open("b")
+    with pytest.raises(UnknownSession):
+        table.get("a")
+
+
+def test_idle_sessions_are_forgotten() -> None:
+    table = SessionTable(limit=10, idle_s=60)
+    table.open("old").used -= 61
+    table.open("new")
+    table.drop_idle()
+    assert len(table) == 1

@@ -1,0 +1,57 @@
+"""Policies that integration tests serve; Ray's workers import this module by PYTHONPATH."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import numpy as np
+
+from vlagents_ray import Act, Agent, Obs
+
+
+class Reacher(Agent):
+    """Written as in the paper, without a thought for sessions: state in attributes, some of them mutable."""
+
+    def __init__(self, scale: float = 1.0) -> None:
+        self.scale = scale
+        self.history: list[int] = []
+
+    def initialize(self) -> None:
+        self.counts = {"act": 0}
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
+        self.instruction = instruction
+        self.first = int(obs.cameras["front"][0, 0, 0])
+        return {"pid": os.getpid(), "instruction": instruction}
+
+    def act(self, obs: Obs) -> Act:
+        self.counts["act"] += 1
+        self.history.append(obs.info["value"])
+        total = sum(self.history) * self.scale
+        return Act(
+            np.array([self.counts["act"], total, self.first], np.float32),
+            info={"instruction": self.instruction, "pid": os.getpid(), "value": obs.info["value"]},
+        )
+
+
+class Gated(Agent):
+    """Loads when a file appears."""
+
+    def __init__(self, gate: str) -> None:
+        self.gate = gate
+
+    def initialize(self) -> None:
+        while not Path(self.gate).exists():
+            time.sleep(0.02)
+
+    def act(self, obs: Obs) -> Act:
+        return Act(np.zeros(1))
+
+
+class Broken(Agent):
+    """Cannot load."""
+
+    def initialize(self) -> None:
+        raise FileNotFoundError("no checkpoint here")

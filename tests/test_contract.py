@@ -1,0 +1,140 @@
+"""Contracts: every difference is named with its cure, and nothing unstated is compared."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vlagents_ray.contract import (
+    ActionSpec,
+    CameraSpec,
+    Contract,
+    StateSpec,
+    check_action,
+    check_observation,
+    differences,
+    require_match,
+)
+from vlagents_ray.errors import (
+    ContractMismatch,
+    InvalidAction,
+    InvalidObservation,
+    MalformedMessage,
+    MissingCamera,
+    MissingState,
+)
+from vlagents_ray.interface import Obs
+
+POLICY = Contract(
+    cameras={"front": CameraSpec(224, 224), "wrist": CameraSpec()},
+    state={"joints": StateSpec(7, "rad")},
+    gripper=True,
+    instruction=True,
+    action=ActionSpec(7, "ee_pose", True, "axis_angle", "base", 1.0, -1.0, -1.0, 1.0),
+    control_hz=20,
+    chunk=8,
+    history=2,
+)
+ENV = replace(POLICY, cameras={**POLICY.cameras, "extra": CameraSpec(64, 64)}, chunk=None, history=None)  # type: ignore[dict-item]
+OBS = Obs(
+    {"front": np.zeros((224, 224, 3), np.uint8), "wrist": np.zeros((32, 32, 3), np.uint8)},
+    0.5,
+    {"joints": np.zeros(7, np.float32)},
+)
+
+
+def test_a_fitting_pair_has_no_differences() -> None:
+    assert differences(POLICY, ENV) == []
+
+
+def test_what_is_not_stated_is_not_compared() -> None:
+    require_match(Contract(), ENV)
+    require_match(POLICY, Contract())
+    require_match(None, ENV)
+
+
+@pytest.mark.parametrize(
+    ("env", "word"),
+    [
+        (replace(ENV, cameras={"front": CameraSpec(224, 224)}), "wrist"),
+        (replace(ENV, cameras={"front": CameraSpec(256, 256), "wrist": CameraSpec()}), "256x256"),
+        (replace(ENV, state={}), "joints"),
+        (replace(ENV, state={"joints": StateSpec(9, "rad")}), "9"),
+        (replace(ENV, state={"joints": StateSpec(7, "deg")}), "deg"),
+        (replace(ENV, gripper=False), "gripper"),
+        (replace(ENV, instruction=False), "instruction"),
+        (replace(ENV, action=replace(ENV.action, dim=8)), "action.dim"),
+        (replace(ENV, action=replace(ENV.action, rotation="euler_xyz")), "action.rotation"),
+        (replace(ENV, action=replace(ENV.action, delta=False)), "action.delta"),
+        (replace(ENV, action=replace(ENV.action, gripper_open=0.0)), "action.gripper_open"),
+        (replace(ENV, action=replace(ENV.action, high=0.5)), "action.high"),
+        (replace(ENV, action=replace(ENV.action, low=-0.5)), "action.low"),
+        (replace(ENV, control_hz=10), "control_hz"),
+        (replace(ENV, chunk=4), "chunk"),
+    ],
+)
+def test_each_difference_is_named(env: Contract, word: str) -> None:
+    found = differences(POLICY, env)
+    assert len(found) == 1
+    assert word in found[0]
+
+
+def test_all_differences_are_told_at_once() -> None:
+    with pytest.raises(ContractMismatch) as caught:
+        require_match(POLICY, replace(ENV, gripper=False, control_hz=5, state={}))
+    assert str(caught.value).count("\n- ") == 3
+
+
+def test_a_wider_env_takes_a_narrower_policy() -> None:
+    assert differences(POLICY, replace(ENV, action=replace(ENV.action, low=-2.0, high=2.0))) == []
+
+
+def test_a_contract_survives_json() -> None:
+    assert Contract.from_json(POLICY.to_json()) == POLICY
+    assert Contract.from_json({}) == Contract()
+
+
+@pytest.mark.parametrize(
+    "data", [3, {"camera": {}}, {"cameras": []}, {"cameras": {"a": {"depth": 1}}}, {"action": {"dims": 1}}]
+)
+def test_an_unknown_key_in_a_contract_is_malformed(data: object) -> None:
+    with pytest.raises(MalformedMessage):
+        Contract.from_json(data)
+
+
+def test_a_good_observation_passes() -> None:
+    check_observation(OBS, POLICY)
+    check_observation(OBS, None)
+
+
+@pytest.mark.parametrize(
+    ("obs", "error"),
+    [
+        (replace(OBS, cameras={}), MissingCamera),
+        (replace(OBS, state={}), MissingState),
+        (replace(OBS, gripper=None), InvalidObservation),
+        (replace(OBS, gripper=1.5), InvalidObservation),
+        (replace(OBS, state={"joints": np.full(7, np.nan, np.float32)}), InvalidObservation),
+        (replace(OBS, state={"joints": np.zeros(6, np.float32)}), InvalidObservation),
+        (replace(OBS, state={"joints": np.zeros((1, 7), np.float32)}), InvalidObservation),
+        (replace(OBS, cameras={**OBS.cameras, "front": np.zeros((64, 64, 3), np.uint8)}), InvalidObservation),
+        (replace(OBS, cameras={**OBS.cameras, "front": np.zeros((224, 224, 3), np.float32)}), InvalidObservation),
+        (replace(OBS, cameras={**OBS.cameras, "front": np.zeros((3, 224, 224), np.uint8)}), InvalidObservation),
+    ],
+)
+def test_each_bad_observation_has_its_error(obs: Obs, error: type[Exception]) -> None:
+    with pytest.raises(error):
+        check_observation(obs, POLICY)
+
+
+@pytest.mark.parametrize("action", [[0.0] * 7, np.zeros((8, 7)), np.zeros(7, np.float64)])
+def test_actions_become_float32(action: object) -> None:
+    assert check_action(action, POLICY).dtype == np.float32
+
+
+@pytest.mark.parametrize("action", [None, "x", np.zeros(6), np.zeros((1, 1, 7)), np.full(7, np.inf), [], object()])
+def test_an_unusable_action_never_gets_through(action: object) -> None:
+    with pytest.raises(InvalidAction):
+        check_action(action, POLICY)

@@ -1,0 +1,221 @@
+"""Each check of `check_agent` fails for a policy that is broken in just that way."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vlagents_ray import Act, Agent, Obs
+from vlagents_ray.contract import ActionSpec, Contract, StateSpec
+from vlagents_ray.testing import ContractViolation, check_agent
+
+
+class GoodAgent(Agent):
+    """Stateful, seeded, looks at its observation and instruction: the parent of all broken ones."""
+
+    def __init__(self) -> None:
+        self.weights = np.zeros(0, np.float32)
+        self.told = ""
+        self.count = 0
+        self.rng = np.random.default_rng(0)
+
+    @property
+    def contract(self) -> Contract | None:
+        return Contract(state={"joints": StateSpec(2)}, action=ActionSpec(dim=2))
+
+    def initialize(self) -> None:
+        self.weights = np.full(2, 0.5, np.float32)
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self.told, self.count = instruction or "", 0
+        self.rng = np.random.default_rng(kwargs.get("seed", 0))
+        return {}
+
+    def act(self, obs: Obs) -> Any:
+        self.count += 1
+        noise = self.rng.normal(0, 0.1, 2)
+        action = obs.state["joints"] * self.weights + self.count + len(self.told) + noise
+        return Act(action.astype(np.float32))
+
+
+class CannotCopy(GoodAgent):
+    def initialize(self) -> None:
+        super().initialize()
+        self.lock = threading.Lock()
+
+
+class SharesItsLock(CannotCopy):
+    shared = ("lock", "weights")
+
+
+class Box:
+    count = 0
+
+
+class SharesItsCount(GoodAgent):
+    shared = ("box",)
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.box = Box()
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self.box.count = 0
+        return super().reset(obs, instruction, **kwargs)
+
+    def act(self, obs: Obs) -> Any:
+        self.box.count += 1
+        return Act(np.full(2, self.box.count, np.float32))
+
+
+class Unrepeatable(GoodAgent):
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        return super().reset(obs, instruction, seed=np.random.SeedSequence().entropy)
+
+
+class ChangesObsInAct(GoodAgent):
+    def act(self, obs: Obs) -> Any:
+        obs.state["joints"] += 1
+        return super().act(obs)
+
+
+class ChangesObsInReset(GoodAgent):
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        obs.cameras["front"] = obs.cameras["front"][:2]
+        return super().reset(obs, instruction, **kwargs)
+
+
+class ChangesObsInBatch(GoodAgent):
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        acts = super().act_batch(obs, sessions)
+        obs[0].info["seen"] = True
+        return acts
+
+
+class OneActionBuffer(GoodAgent):
+    def initialize(self) -> None:
+        super().initialize()
+        self.buffer = np.zeros(2, np.float32)
+
+    def act(self, obs: Obs) -> Any:
+        self.buffer[:] = super().act(obs).action
+        return Act(self.buffer)
+
+
+class SwapsBatch(GoodAgent):
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        return super().act_batch(obs, sessions)[::-1]
+
+
+class BatchesOfTwo(GoodAgent):
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        return super().act_batch(obs, sessions)[:2]
+
+
+class FailsInBatch(GoodAgent):
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        return [RuntimeError("out of memory") for _ in obs]
+
+
+class ActsByItself(GoodAgent):
+    """Forgets the sessions and asks the shared agent."""
+
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        return [self.act(one) for one in obs]
+
+
+class BatchTuple(GoodAgent):
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> Any:
+        return tuple(super().act_batch(obs, sessions))
+
+
+def with_act(change: Callable[[Act], object]) -> type[GoodAgent]:
+    class Changed(GoodAgent):
+        def act(self, obs: Obs) -> Any:
+            return change(super().act(obs))
+
+    return Changed
+
+
+class WrongChunk(GoodAgent):
+    @property
+    def contract(self) -> Contract | None:
+        return replace(super().contract or Contract(), chunk=4)
+
+
+class DictContract(GoodAgent):
+    @property
+    def contract(self) -> Any:
+        return {}
+
+
+class ResetsToNone(GoodAgent):
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> Any:
+        super().reset(obs, instruction, **kwargs)
+
+
+class ResetsToObject(GoodAgent):
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> Any:
+        super().reset(obs, instruction, **kwargs)
+        return {"agent": self}
+
+
+class AgentClosesOnce(GoodAgent):
+    closed = False
+
+    def close(self) -> None:
+        if self.closed:
+            raise RuntimeError("already closed")
+        self.closed = True
+
+
+BROKEN_AGENTS: list[tuple[type[GoodAgent], str]] = [
+    (CannotCopy, "cannot be copied.*`shared`"),
+    (SharesItsCount, "depends on other sessions"),
+    (Unrepeatable, "must give the same actions"),
+    (ChangesObsInAct, "act changed the caller's"),
+    (ChangesObsInReset, "reset changed the caller's"),
+    (ChangesObsInBatch, "act_batch changed the caller's"),
+    (OneActionBuffer, "an earlier act.*a later one changed it"),
+    (SwapsBatch, "session 0 in a batch of 2"),
+    (BatchesOfTwo, "got 2 of them, want a list of 3"),
+    (FailsInBatch, "out of memory"),
+    (ActsByItself, "act_batch must give each session"),
+    (BatchTuple, "got tuple"),
+    (with_act(lambda act: act.action), "act: got ndarray, want an Act"),
+    (with_act(lambda act: replace(act, action=act.action.astype(np.float64))), "float64"),
+    (with_act(lambda act: replace(act, action=act.action.tolist())), "action is list"),
+    (with_act(lambda act: replace(act, action=act.action * np.nan)), "NaN"),
+    (with_act(lambda act: replace(act, action=act.action[:1])), "want 2 numbers a row"),
+    (with_act(lambda act: replace(act, done=np.bool_(True))), "done is bool"),
+    (with_act(lambda act: replace(act, info={"t": np.float32(1)})), r"info\['t'\]"),
+    (WrongChunk, "has 1 rows, the contract states 4"),
+    (DictContract, "contract: got dict"),
+    (ResetsToNone, "reset: got NoneType"),
+    (ResetsToObject, r"info\['agent'\]"),
+    (AgentClosesOnce, "the second call raised"),
+]
+
+
+@pytest.mark.parametrize("cls", [GoodAgent, SharesItsLock])
+def test_a_good_agent_passes(cls: type[GoodAgent]) -> None:
+    check_agent(cls())
+
+
+@pytest.mark.parametrize(("cls", "message"), BROKEN_AGENTS, ids=lambda value: getattr(value, "__name__", str(value)))
+def test_a_broken_agent_is_told_what_is_wrong(cls: type[GoodAgent], message: str) -> None:
+    with pytest.raises(ContractViolation, match=f"(?s){message}"):
+        check_agent(cls())
+
+
+def test_an_agent_without_contract_is_shown_some_observation() -> None:
+    class Plain(Agent):
+        def act(self, obs: Obs) -> Act:
+            return Act(obs.state["joints"] + obs.cameras["front"].mean(dtype=np.float32))
+
+    check_agent(Plain())

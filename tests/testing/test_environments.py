@@ -1,0 +1,268 @@
+"""Each check of `check_env` fails for an environment that is broken in just that way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vlagents_ray import Act, Obs
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec, check_action
+from vlagents_ray.envs import EvalEnv
+from vlagents_ray.testing import ContractViolation, check_env
+
+
+class GoodEnv(EvalEnv):
+    """A point that moves, seen on a small image: the parent of all broken ones."""
+
+    max_steps = 6
+
+    def __init__(self) -> None:
+        self.position = np.zeros(2, np.float32)
+        self.count = 0
+
+    @property
+    def contract(self) -> Contract:
+        return Contract(
+            cameras={"front": CameraSpec(4, 4)},
+            state={"joints": StateSpec(2)},
+            gripper=False,
+            instruction=True,
+            action=ActionSpec(dim=2, low=-1.0, high=1.0),
+        )
+
+    @property
+    def instruction(self) -> str:
+        return "go right"
+
+    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> Any:
+        self.position = np.random.default_rng(seed).uniform(-1, 1, 2).astype(np.float32)
+        self.count = 0
+        return self.observe(), {}
+
+    def step(self, act: Act) -> Any:
+        action = check_action(act.action, self.contract)
+        self.position = self.position + action
+        self.count += 1
+        success = bool(self.position[0] > 1)
+        return self.observe(), float(success), False, self.count >= self.max_steps, {"success": success}
+
+    def observe(self) -> Obs:
+        shade = int(abs(float(self.position[0])) * 40) % 256
+        return Obs(cameras={"front": np.full((4, 4, 3), shade, np.uint8)}, state={"joints": self.position.copy()})
+
+    def close(self) -> None:
+        pass
+
+
+class Unseeded(GoodEnv):
+    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> Any:
+        return super().reset(seed=np.random.SeedSequence().entropy % 2**32, options=options)  # type: ignore[operator]
+
+
+class CarriesOver(GoodEnv):
+    """Its dynamics depend on how many episodes there were."""
+
+    episodes = 0
+
+    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> Any:
+        self.episodes += 1
+        return super().reset(seed=seed, options=options)
+
+    def step(self, act: Act) -> Any:
+        return super().step(replace(act, action=act.action * self.episodes))
+
+
+class ChangingInstruction(GoodEnv):
+    calls = 0
+
+    @property
+    def instruction(self) -> str:
+        self.calls += 1
+        return f"attempt {self.calls}"
+
+
+class OneBuffer(GoodEnv):
+    def __init__(self) -> None:
+        super().__init__()
+        self.image = np.zeros((4, 4, 3), np.uint8)
+
+    def observe(self) -> Obs:
+        self.image[:] = self.count
+        return replace(super().observe(), cameras={"front": self.image})
+
+
+class OneState(GoodEnv):
+    def step(self, act: Act) -> Any:
+        check_action(act.action, self.contract)
+        self.position += act.action
+        self.count += 1
+        return self.observe(), 0.0, False, self.count >= self.max_steps, {"success": False}
+
+    def observe(self) -> Obs:
+        return replace(super().observe(), state={"joints": self.position})
+
+
+def with_obs(change: Callable[[Obs], object]) -> type[GoodEnv]:
+    class Changed(GoodEnv):
+        def observe(self) -> Any:
+            return change(super().observe())
+
+    return Changed
+
+
+def with_step(change: Callable[[list[Any]], object]) -> type[GoodEnv]:
+    class Changed(GoodEnv):
+        def step(self, act: Act) -> Any:
+            result = list(super().step(act))
+            changed = change(result)
+            return tuple(result) if changed is None else changed
+
+    return Changed
+
+
+def with_contract(**fields: Any) -> type[GoodEnv]:
+    class Changed(GoodEnv):
+        @property
+        def contract(self) -> Contract:
+            return replace(super().contract, **fields)
+
+    return Changed
+
+
+class NoContract(GoodEnv):
+    @property
+    def contract(self) -> Any:
+        return {"action": 2}
+
+
+class NoLimit(GoodEnv):
+    max_steps = 0
+
+
+class NeverTruncates(GoodEnv):
+    def step(self, act: Act) -> Any:
+        obs, reward, terminated, _, info = super().step(act)
+        return obs, reward, terminated, False, info
+
+
+class TruncatesEarly(GoodEnv):
+    def step(self, act: Act) -> Any:
+        obs, reward, terminated, _, info = super().step(act)
+        return obs, reward, terminated, self.count >= 5, info
+
+
+class TakesAnything(GoodEnv):
+    def step(self, act: Act) -> Any:
+        return super().step(Act(np.nan_to_num(np.resize(act.action, 2))))
+
+
+class FailsOtherwise(GoodEnv):
+    def step(self, act: Act) -> Any:
+        if act.action.shape != (2,):
+            raise ValueError("shapes do not match")
+        return super().step(act)
+
+
+class ChangesAction(GoodEnv):
+    def step(self, act: Act) -> Any:
+        check_action(act.action, self.contract)
+        act.action *= 0.5
+        return super().step(act)
+
+
+class ClosesOnce(GoodEnv):
+    closed = False
+
+    def close(self) -> None:
+        if self.closed:
+            raise RuntimeError("already closed")
+        self.closed = True
+
+
+class InfoOfReset(GoodEnv):
+    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> Any:
+        obs, _ = super().reset(seed=seed, options=options)
+        return obs, {"scene": object()}
+
+
+class BareReset(GoodEnv):
+    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> Any:
+        return super().reset(seed=seed, options=options)[0]
+
+
+class Silent(GoodEnv):
+    @property
+    def instruction(self) -> str:
+        return ""
+
+
+class Describes(GoodEnv):
+    def describe(self) -> dict[str, Any]:
+        return {"mode": {1, 2}}
+
+
+BROKEN_ENVS: list[tuple[type[GoodEnv], str]] = [
+    (Unseeded, "first observation.*pure function"),
+    (CarriesOver, "observation after step 1.*pure function"),
+    (ChangingInstruction, "instruction is 'attempt"),
+    (OneBuffer, r"cameras.*front.*a later step or reset changed it"),
+    (OneState, r"state.*joints.*a later step or reset changed it"),
+    (NoContract, "contract: got dict"),
+    (with_contract(action=ActionSpec()), "action.dim: got None"),
+    (with_contract(cameras={"front": CameraSpec(8, 8)}), "want 8x8"),
+    (with_contract(cameras={"wrist": CameraSpec()}), "camera 'wrist' is missing"),
+    (with_contract(cameras={}), r"cameras are \['front'\]"),
+    (with_contract(state={"joints": StateSpec(3)}), r"want \(3,\)"),
+    (with_contract(gripper=True), "gripper: got none"),
+    (with_obs(lambda obs: replace(obs, gripper=0.5)), "gripper is 0.5"),
+    (with_obs(lambda obs: replace(obs, state={"joints": obs.state["joints"].astype(np.float64)})), "float64"),
+    (with_obs(lambda obs: replace(obs, state={"joints": obs.state["joints"] * np.nan})), "NaN"),
+    (with_obs(lambda obs: replace(obs, cameras={"front": obs.cameras["front"] / 255})), "float64"),
+    (with_obs(lambda obs: replace(obs, info={"sim": object()})), r"Obs.info\['sim'\]"),
+    (with_obs(lambda obs: {"front": obs.cameras["front"]}), "want an Obs"),
+    (with_step(lambda result: tuple(result[:4])), "got a tuple of 4"),
+    (with_step(lambda result: result.__setitem__(1, np.float32(0))), "reward is float32"),
+    (with_step(lambda result: result.__setitem__(2, np.bool_(False))), "terminated is bool"),
+    (with_step(lambda result: result.__setitem__(3, 0)), "truncated is int"),
+    (with_step(lambda result: result.__setitem__(4, {})), "info.'success'. is NoneType"),
+    (with_step(lambda result: result.__setitem__(4, {"success": np.bool_(False)})), "info.'success'. is bool"),
+    (with_step(lambda result: result.__setitem__(4, None)), "info is NoneType"),
+    (with_step(lambda result: result[4].update(score=np.float64(1))), r"info\['score'\]"),
+    (NoLimit, "max_steps: got 0"),
+    (NeverTruncates, "is not truncated, but max_steps is 6"),
+    (TruncatesEarly, "step 5 is truncated"),
+    (TakesAnything, r"of shape \(3,\) was executed"),
+    (FailsOtherwise, "raised ValueError.*want InvalidAction"),
+    (ChangesAction, "leave the caller's array"),
+    (ClosesOnce, "the second call raised"),
+    (InfoOfReset, r"info\['scene'\]"),
+    (BareReset, "reset: got Obs"),
+    (Silent, "instruction: is empty"),
+    (Describes, "describe"),
+]
+
+
+def test_a_good_env_passes_and_is_closed() -> None:
+    env = ClosesOnce()
+    with pytest.raises(ContractViolation, match="second"):
+        check_env(env)
+    assert env.closed
+    check_env(GoodEnv())
+
+
+@pytest.mark.parametrize(("cls", "message"), BROKEN_ENVS, ids=lambda value: getattr(value, "__name__", str(value)))
+def test_a_broken_env_is_told_what_is_wrong(cls: type[GoodEnv], message: str) -> None:
+    with pytest.raises(ContractViolation, match=f"(?s){message}"):
+        check_env(cls())
+
+
+def test_an_env_whose_steps_are_not_reproducible_passes_if_told_so() -> None:
+    check_env(CarriesOver(), same_steps=False)
+
+
+def test_the_step_limit_is_left_alone_if_told_so() -> None:
+    check_env(NeverTruncates(), step_limit=False)

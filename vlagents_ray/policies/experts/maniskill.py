@@ -1,0 +1,132 @@
+"""Experts for ManiSkill's PushCube and PickCube, from the simulator's state.
+
+They answer in the control mode `pd_ee_delta_pose`, (7,): 0.1 m a unit, no rotation, gripper 1 open,
+-1 closed. The arm moves only about a third of a commanded step, so commanding the whole distance to
+the target again in every step is a stable controller. For some poses ManiSkill's inverse kinematics
+finds no solution to a long step, and the arm stays where it is: then the steps become shorter.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vlagents_ray.errors import InvalidObservation
+from vlagents_ray.interface import Act, Obs
+
+_UNIT_M = 0.1  # commanded by an action of 1.0
+_OPEN, _CLOSED = 1.0, -1.0
+
+
+class PushCube:
+    """Goes around and behind the cube, down to the table, and pushes it along x onto the target."""
+
+    _BEHIND_M = 0.12  # of the tool behind the cube before the push
+    _OVER_M = 0.15  # height of the tool on its way there, clear of the cube
+    _LOW_M = 0.02  # height of the tool while pushing: the cube's middle
+    _PLACED_M = 0.03  # of the cube from the target's middle; success wants 0.1
+
+    def __init__(self, env_name: str) -> None:
+        self._name = env_name
+        self._phase = "over"
+        self._hand = _Hand()
+
+    def reset(self, obs: Obs, instruction: str) -> None:
+        """Begin an episode; raises `InvalidObservation` without PushCube's simulator state."""
+        _sim_state(obs, self._name, 35)
+        self._phase, self._hand = "over", _Hand()
+
+    def act(self, obs: Obs) -> Act:
+        """The next action, (7,) float32."""
+        state = _sim_state(obs, self._name, 35)  # qpos 9, qvel 9, tool pose 7, goal 3, cube pose 7
+        tool, goal, cube = state[18:21], state[25:28], state[28:31]
+        over = np.array([cube[0] - self._BEHIND_M, cube[1], self._OVER_M])
+        low = np.array([cube[0] - self._BEHIND_M, cube[1], self._LOW_M])
+        if self._phase == "over" and np.linalg.norm(tool[:2] - over[:2]) < 0.02:
+            self._phase = "down"
+        if self._phase == "down" and tool[2] < self._LOW_M + 0.015:
+            self._phase = "push"
+        if self._phase == "push" and np.linalg.norm(cube[:2] - goal[:2]) < self._PLACED_M:
+            self._phase = "hold"
+        if self._phase == "over":
+            return self._hand.move(tool, over, _CLOSED)
+        if self._phase == "down":
+            return self._hand.move(tool, low, _CLOSED)
+        if self._phase == "push":
+            return self._hand.move(tool, np.array([goal[0], goal[1], self._LOW_M]), _CLOSED, limit=0.5)
+        return self._hand.move(tool, tool, _CLOSED)
+
+
+class PickCube:
+    """Goes over the cube, down, grasps it, moves it to the goal and holds it there."""
+
+    _OVER_M = 0.08  # height of the tool over the cube before it goes down
+    _GRASP_STEPS = 3  # the fingers' way until the grasp is firm
+    _GIVE_UP_STEPS = 8  # without contact on both fingers: try again from above
+
+    def __init__(self, env_name: str) -> None:
+        self._name = env_name
+        self._phase = "over"
+        self._hand = _Hand()
+        self._closing = 0
+
+    def reset(self, obs: Obs, instruction: str) -> None:
+        """Begin an episode; raises `InvalidObservation` without PickCube's simulator state."""
+        _sim_state(obs, self._name, 42)
+        self._phase, self._closing, self._hand = "over", 0, _Hand()
+
+    def act(self, obs: Obs) -> Act:
+        """The next action, (7,) float32."""
+        # qpos 9, qvel 9, grasped 1, tool pose 7, goal 3, cube pose 7, tool to cube 3, cube to goal 3
+        state = _sim_state(obs, self._name, 42)
+        grasped, tool, goal, cube = state[18] > 0.5, state[19:22], state[26:29], state[29:32]
+        if self._phase == "over" and np.linalg.norm(tool[:2] - cube[:2]) < 0.01:
+            self._phase = "down"
+        if self._phase == "down" and np.linalg.norm(tool - cube) < 0.012:
+            self._phase, self._closing = "grasp", 0
+        if self._phase == "grasp":
+            self._closing += 1
+            if grasped and self._closing > self._GRASP_STEPS:
+                self._phase = "carry"
+            elif self._closing > self._GIVE_UP_STEPS:
+                self._phase = "over"
+        if self._phase == "over":
+            return self._hand.move(tool, cube + np.array([0.0, 0.0, self._OVER_M]), _OPEN)
+        if self._phase == "down":
+            return self._hand.move(tool, cube, _OPEN, limit=0.5)
+        if self._phase == "grasp":
+            return self._hand.move(tool, tool, _CLOSED)
+        # the cube, not the tool, has to arrive; a little softer, so that the arm comes to rest
+        return self._hand.move(tool, tool + 0.8 * (goal - cube), _CLOSED, limit=0.6)
+
+
+class _Hand:
+    """Turns distances to go into actions, with shorter steps while the arm does not follow."""
+
+    _STUCK_M = 0.001  # the arm moved less than this, though a longer step was commanded
+
+    def __init__(self) -> None:
+        self._at: np.ndarray | None = None  # (3,) m, where the last step began
+        self._commanded_m = 0.0
+        self._scale = 1.0
+
+    def move(self, tool: np.ndarray, target: np.ndarray, gripper: float, limit: float = 1.0) -> Act:
+        """An action that commands the way from `tool` to `target`, (3,) m, at most `limit` units along each axis."""
+        moved_m = np.inf if self._at is None else float(np.linalg.norm(tool - self._at))
+        stuck = moved_m < self._STUCK_M and self._commanded_m > 10 * self._STUCK_M
+        self._scale = max(self._scale / 2, 0.1) if stuck else min(self._scale * 2, 1.0)
+        action = np.zeros(7, dtype=np.float32)
+        action[:3] = np.clip((target - tool) / _UNIT_M, -limit, limit) * self._scale
+        action[6] = gripper
+        self._at, self._commanded_m = tool, _UNIT_M * float(np.linalg.norm(action[:3]))
+        return Act(action=action)
+
+
+def _sim_state(obs: Obs, env_name: str, size: int) -> np.ndarray:
+    state = obs.info.get("sim_state")
+    if not isinstance(state, np.ndarray) or state.shape != (size,):
+        got = f"shape {state.shape}" if isinstance(state, np.ndarray) else type(state).__name__
+        raise InvalidObservation(
+            f"info['sim_state']: got {got}, want ({size},) float32; this expert is for {env_name} with its "
+            f"own robot, in the control mode pd_ee_delta_pose"
+        )
+    return state.astype(np.float64)
