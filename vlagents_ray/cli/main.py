@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import os
 import signal
@@ -19,9 +20,10 @@ from rich.table import Table
 
 from vlagents_ray.cli.settings import parse_settings
 from vlagents_ray.errors import ConfigError, VLAgentsError
+from vlagents_ray.serve.cluster import read_deployment, running_server
 
 if TYPE_CHECKING:
-    from vlagents_ray.evaluate import EvalConfig
+    from ray.serve.schema import ServeDeploySchema
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -51,8 +53,6 @@ def serve(
     address: Address = None,
 ) -> None:
     """Serve a policy until Ctrl-C."""
-    from vlagents_ray.serve.cluster import read_deployment, running_server
-
     with _errors():
         config = read_deployment(source, _server_args(settings, serve_set))
         with running_server(config, host=host, port=port, address=address, show_logs=True) as server:
@@ -94,12 +94,23 @@ def evaluate_command(
 
 def run_evaluation(policy: str, settings: dict[str, Any], fields: dict[str, Any], address: str | None = None) -> None:
     """Serve the policy if it is not a URL, evaluate it, print the table."""
-    from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, evaluate, print_summary, progress_for
+    from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, check, evaluate, print_summary, progress_for
 
-    # Settings are checked before anything starts: a typing error should cost no time.
-    draft = EvalConfig(policy=policy, policy_url="serve://checked-below", policy_config=settings, **fields)
-    with _policy_server(policy, settings, address, draft) as (url, checkpoint):
-        config = draft.model_copy(update={"policy_url": url, "checkpoint": checkpoint})
+    with contextlib.ExitStack() as stack:
+        if "://" in policy:
+            if settings:
+                raise ConfigError(f"--set {sorted(settings)}: the server at {policy} has its settings already")
+            config = EvalConfig(policy_url=policy, **_served(policy), **fields)
+        else:
+            deployed, args = _single_application(policy, settings)
+            served = {"policy": args["policy"], "policy_config": args.get("config", {})}
+            checkpoint = served["policy_config"].get("checkpoint")
+            url = f"serve://{deployed.applications[0].name}"
+            config = EvalConfig(policy_url=url, checkpoint=checkpoint, **served, **fields)
+            check(config)  # what is wrong is said before anything starts
+            # Ray's CPUs are bookkeeping here: the number of workers that the user asked for must fit.
+            cpus = max(os.cpu_count() or 1, math.ceil(config.workers * config.cpus_per_worker))
+            stack.enter_context(running_server(deployed, address=address, num_cpus=cpus))
         try:
             summary = evaluate(config, progress=progress_for(out))
         except EvaluationInterrupted as interrupted:
@@ -108,31 +119,21 @@ def run_evaluation(policy: str, settings: dict[str, Any], fields: dict[str, Any]
     print_summary(out, summary)
 
 
-@contextlib.contextmanager
-def _policy_server(
-    policy: str, settings: dict[str, Any], address: str | None, config: EvalConfig
-) -> Iterator[tuple[str, str | None]]:
-    """The policy's URL and checkpoint, with a server around it unless one runs already."""
-    if "://" in policy:
-        if settings:
-            raise ConfigError(f"--set {sorted(settings)}: the server at {policy} has its settings already")
-        from vlagents_ray import RemoteAgent
+def _served(url: str) -> dict[str, Any]:
+    """What the server at `url` says that it serves: a result belongs to that, not to an address."""
+    from vlagents_ray import RemoteAgent
 
-        with RemoteAgent(policy) as agent:
-            checkpoint = agent.metadata.get("checkpoint")
-        yield policy, checkpoint
-        return
-    from vlagents_ray.serve.cluster import read_deployment, running_server
+    with RemoteAgent(url) as agent:
+        said = agent.metadata
+    return {"policy": said["policy"], "policy_config": said.get("config", {}), "checkpoint": said.get("checkpoint")}
 
+
+def _single_application(policy: str, settings: dict[str, Any]) -> tuple[ServeDeploySchema, dict[str, Any]]:
     deployed = read_deployment(policy, {"config": settings} if settings else None)
     if len(deployed.applications) != 1:
         names = [one.name for one in deployed.applications]
         raise ConfigError(f"{policy}: holds {names}, want one application; serve it and give the URL of one of them")
-    application = deployed.applications[0]
-    # Ray's CPUs are bookkeeping here: the number of workers that the user asked for must fit.
-    cpus = max(os.cpu_count() or 1, math.ceil(config.workers * config.cpus_per_worker))
-    with running_server(deployed, address=address, num_cpus=cpus):
-        yield f"serve://{application.name}", application.args.get("config", {}).get("checkpoint")
+    return deployed, deployed.applications[0].args
 
 
 @app.command()
@@ -154,6 +155,36 @@ def demo(
             )
             fields = {"envs": ["tabletop"], "episodes": 20, "video": "all"}
         run_evaluation("scripted", {}, {**fields, "workers": 2, "out": _fresh(out_dir)})
+
+
+bench = typer.Typer(no_args_is_help=True, help="Measure on this machine what the README claims.")
+app.add_typer(bench, name="bench")
+
+
+@bench.command("eval")
+def bench_eval(
+    env: Annotated[str, typer.Argument(help="The environment to step.")] = "tabletop",
+    workers: Annotated[int, typer.Option(min=1)] = 2,
+    episodes: Annotated[int, typer.Option(min=1, help="For each worker and round.")] = 8,
+    rounds: Annotated[int, typer.Option(min=1)] = 3,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
+    env_set: Annotated[list[str], typer.Option("--env-set", metavar="KEY=VALUE")] = [],  # noqa: B006
+) -> None:
+    """Steps a second of an evaluation against those of the bare environments."""
+    from vlagents_ray.bench.overhead import measure_overhead
+
+    with _errors():
+        options = parse_settings(env_set, "--env-set")
+        found = measure_overhead(
+            env, workers=workers, episodes=episodes, rounds=rounds, env_options=options, tell=out.print
+        )
+    table = Table("round", "bare steps/s", "evaluated steps/s", "ratio", title=f"{env}, {workers} workers")
+    for number, row in enumerate(zip(found.bare, found.evaluated, found.ratios, strict=True), 1):
+        table.add_row(str(number), f"{row[0]:.1f}", f"{row[1]:.1f}", f"{row[2]:.3f}")
+    out.print(table)
+    out.print(f"median ratio {found.ratio:.3f}")
+    if json_file is not None:
+        json_file.write_text(json.dumps(found.to_json(), indent=2) + "\n")
 
 
 @app.command()

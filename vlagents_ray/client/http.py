@@ -41,7 +41,25 @@ class HttpTransport:
         self._begun = False  # does the server hold a session for us?
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
-        """The server's metadata."""
+        """The server's metadata, as soon as it answers; retries while it is not ready."""
+        begun = time.monotonic()
+        pause_s = 0.05
+        while True:
+            left_s = begun + timeout_s - time.monotonic()
+            try:
+                return self._metadata(max(0.1, left_s))
+            except (PolicyUnavailable, DeadlineExceeded) as error:
+                if pause_s > left_s:
+                    raise PolicyUnavailable(
+                        f"{self._url.geturl()}: not ready within {timeout_s:g} s ({error})"
+                    ) from error
+            except UnknownApp:
+                if time.monotonic() - begun > _UNKNOWN_APP_S:
+                    raise
+            time.sleep(pause_s)
+            pause_s = min(1.0, pause_s * 1.5)
+
+    def _metadata(self, timeout_s: float) -> dict[str, Any]:
         status, kind, body = self._exchange("GET", "/v1/metadata", None, {}, timeout_s)
         if status != 200:
             raise _refusal(status, kind, body)
@@ -118,27 +136,6 @@ def http_url(url: str) -> SplitResult:
     if scheme is None or not parts.hostname:
         raise ConfigError(f"url: got {url!r}, want http(s)://HOST:PORT, ws(s)://HOST:PORT or serve://APP")
     return parts._replace(scheme=scheme)
-
-
-def wait_ready(url: str, codec: ImageCodec, timeout_s: float) -> dict[str, Any]:
-    """The metadata of the server at `url`, as soon as it answers; retries while it is not ready."""
-    begun = time.monotonic()
-    pause_s = 0.05
-    while True:
-        left_s = begun + timeout_s - time.monotonic()
-        transport = HttpTransport(url, codec)
-        try:
-            return transport.connect(max(0.1, left_s))
-        except (PolicyUnavailable, DeadlineExceeded) as error:
-            if pause_s > left_s:
-                raise PolicyUnavailable(f"{url}: not ready within {timeout_s:g} s ({error})") from error
-        except UnknownApp:
-            if time.monotonic() - begun > _UNKNOWN_APP_S:
-                raise
-        finally:
-            transport.close()
-        time.sleep(pause_s)
-        pause_s = min(1.0, pause_s * 1.5)
 
 
 def _closed_by_peer(sock: socket.socket | None) -> bool:

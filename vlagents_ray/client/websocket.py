@@ -9,7 +9,7 @@ from typing import Any
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from vlagents_ray.client.http import http_url, wait_ready
+from vlagents_ray.client.http import HttpTransport, http_url
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable
 from vlagents_ray.wire.frames import ImageCodec, decode_reply, encode_request
 from vlagents_ray.wire.messages import Reply, Request
@@ -32,7 +32,11 @@ class WebSocketTransport:
     def connect(self, timeout_s: float) -> dict[str, Any]:
         """The server's metadata, once it answers and has accepted the stream."""
         deadline = time.monotonic() + timeout_s
-        metadata = wait_ready(self._base, self._codec, timeout_s)
+        door = HttpTransport(self._base, self._codec)
+        try:
+            metadata = door.connect(timeout_s)
+        finally:
+            door.close()
         self._stream(max(1.0, deadline - time.monotonic()))
         return metadata
 

@@ -1,0 +1,143 @@
+"""What an evaluation costs over the bare environments: steps a second, in alternating rounds.
+
+A bare round steps the environments in as many processes as the evaluation has workers, with zeros
+as actions and no policy, server or Ray. An evaluated round plays the same episodes through a served
+`noop` policy. Both count from the first reset to the last step; making environments is left out.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from multiprocessing.synchronize import Barrier
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.envs import make_env
+from vlagents_ray.errors import EnvFailed
+from vlagents_ray.evaluate import EvalConfig, evaluate
+from vlagents_ray.evaluate.pool import THREAD_VARIABLES
+from vlagents_ray.interface import Act
+from vlagents_ray.serve.cluster import deployment, running_server
+
+_START_S = 600.0
+
+
+@dataclass(frozen=True, slots=True)
+class Overhead:
+    """Steps a second of each round, in the order measured; round i of both ran one after the other."""
+
+    env: str
+    workers: int
+    bare: tuple[float, ...]
+    evaluated: tuple[float, ...]
+
+    @property
+    def ratios(self) -> tuple[float, ...]:
+        """Evaluated over bare, by round."""
+        return tuple(e / b for e, b in zip(self.evaluated, self.bare, strict=True))
+
+    @property
+    def ratio(self) -> float:
+        """Their median."""
+        return statistics.median(self.ratios)
+
+    def to_json(self) -> dict[str, Any]:
+        """As plain JSON values."""
+        return {
+            "env": self.env,
+            "workers": self.workers,
+            "bare_steps_per_second": self.bare,
+            "evaluated_steps_per_second": self.evaluated,
+            "ratios": self.ratios,
+            "median_ratio": self.ratio,
+        }
+
+
+def measure_overhead(
+    env: str,
+    *,
+    workers: int = 2,
+    episodes: int = 8,
+    rounds: int = 3,
+    env_options: Mapping[str, Any] | None = None,
+    tell: Callable[[str], None] = lambda _: None,
+) -> Overhead:
+    """Alternate bare and evaluated rounds of `episodes` episodes for each worker."""
+    options = dict(env_options or {})
+    with make_env(env, **options) as one:
+        action_dim = one.contract.action.dim or 1
+    cpus = max(os.cpu_count() or 1, workers)
+    bare: list[float] = []
+    evaluated: list[float] = []
+    policy = deployment("noop", config={"action_dim": action_dim})
+    with running_server(policy, num_cpus=cpus), tempfile.TemporaryDirectory() as folder:
+        for number in range(rounds):
+            bare.append(bare_rate(env, options, action_dim, workers, episodes))
+            tell(f"round {number + 1}/{rounds}: bare {bare[-1]:.1f} steps/s")
+            config = EvalConfig(
+                envs=[env],
+                env_options=options,
+                policy="noop",
+                policy_url="serve://noop",
+                episodes=episodes * workers,
+                workers=workers,
+                video="none",
+                out=Path(folder) / str(number),
+            )
+            evaluated.append(evaluate(config).rollout_steps_per_second or 0.0)
+            tell(f"round {number + 1}/{rounds}: evaluated {evaluated[-1]:.1f} steps/s")
+    return Overhead(env, workers, tuple(bare), tuple(evaluated))
+
+
+def bare_rate(env: str, options: Mapping[str, Any], action_dim: int, workers: int, episodes: int) -> float:
+    """Steps a second of `workers` processes together, each playing `episodes` episodes of zeros."""
+    context = multiprocessing.get_context("spawn")
+    start = context.Barrier(workers)
+    results = context.Queue()
+    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))  # as the evaluation's workers have it
+    try:
+        processes = [
+            context.Process(
+                target=_play, args=(env, dict(options), action_dim, worker * episodes, episodes, start, results)
+            )
+            for worker in range(workers)
+        ]
+        for process in processes:
+            process.start()
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
+    spans = [results.get(timeout=_START_S) for _ in processes]
+    for process in processes:
+        process.join(60)
+        if process.exitcode != 0:
+            raise EnvFailed(f"{env}: a bare process ended with exit code {process.exitcode}")
+    seconds: float = max(span[2] for span in spans) - min(span[1] for span in spans)
+    return sum(int(span[0]) for span in spans) / seconds
+
+
+def _play(
+    name: str, options: dict[str, Any], action_dim: int, seed: int, episodes: int, start: Barrier, results: Any
+) -> None:
+    steps = 0
+    act = Act(np.zeros(action_dim, np.float32))
+    with make_env(name, **options) as env:
+        start.wait(_START_S)
+        begun = time.time()
+        for episode in range(episodes):
+            env.reset(seed=seed + episode)
+            done = False
+            while not done:
+                _, _, terminated, truncated, _ = env.step(act)
+                steps += 1
+                done = terminated or truncated
+        results.put((steps, begun, time.time()))
