@@ -11,7 +11,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vlagents_ray import Act, Obs
+from vlagents_ray import Act
 from vlagents_ray.envs import make_env
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import ConfigError, InvalidAction, NotReset, UnknownEnv
@@ -194,17 +194,18 @@ def test_the_image_shows_the_gripper_where_the_calibration_says() -> None:
     assert rows.min() < v < rows.max()
 
 
-def test_more_than_a_thousand_steps_a_second_with_an_image_each() -> None:
+def test_a_step_with_its_image_costs_no_more_than_one_jpeg_of_it() -> None:
+    """About 0.05 ms against 0.3 ms: several thousand steps a second on any machine of today."""
     env = Tabletop()
     obs, _ = env.reset(seed=0)
     acts = [Act(a) for a in np.random.default_rng(0).uniform(-1, 1, (80, 4)).astype(np.float32)]
-    rates = []
-    for seed in range(10):  # the best of several: other work on the machine only ever slows it down
-        env.reset(seed=seed)
+    step_s, jpeg_s = [], []
+    for act in acts:
         begin = time.perf_counter()
-        for act in acts:
-            obs, *_ = env.step(act)
-        rates.append(len(acts) / (time.perf_counter() - begin))
-    assert isinstance(obs, Obs)
+        obs, *_ = env.step(act)
+        stepped = time.perf_counter()
+        encode_jpeg(obs.cameras["front"])
+        step_s.append(stepped - begin)
+        jpeg_s.append(time.perf_counter() - stepped)
     assert obs.cameras["front"].shape == (224, 224, 3)
-    assert max(rates) > 1000
+    assert np.median(step_s) < np.median(jpeg_s)

@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import signal
 import sqlite3
 import sys
-import tempfile
 from collections.abc import Callable, Iterator
-from contextlib import closing, suppress
+from contextlib import closing
 from pathlib import Path
 from subprocess import Popen
 
 import pytest
 from eval_fakes import wait_for
+from ray_processes import end, processes, ray_folder
 
 from vlagents_ray.evaluate import EvalConfig
 
@@ -33,35 +32,10 @@ except EvaluationInterrupted:
 """
 
 
-@pytest.fixture
-def ray_folder() -> Iterator[Path]:
-    """Where Ray keeps its files; short, because the names of sockets are limited."""
-    folder = Path(tempfile.mkdtemp(prefix="r"))
-    yield folder
-    end(folder)
-    shutil.rmtree(folder, ignore_errors=True)
-
-
-def processes(ray_folder: Path, named: str = "") -> list[int]:
-    """The processes of the Ray whose files are in `ray_folder`, or those of them that are `named` so."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            command = (folder / "cmdline").read_bytes()
-            said = command + (folder / "environ").read_bytes()
-        except OSError:  # it has ended, or is not ours
-            continue
-        if str(ray_folder).encode() in said and named.encode() in command:
-            found.append(int(folder.name))
-    return found
-
-
-def end(ray_folder: Path) -> None:
-    """Kill what is left of that Ray: two agents of a killed one take a minute to notice."""
-    for pid in processes(ray_folder):
-        with suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
-    wait_for(lambda: not processes(ray_folder))
+@pytest.fixture(name="ray_folder")
+def own_ray_folder() -> Iterator[Path]:
+    with ray_folder() as folder:
+        yield folder
 
 
 def start(config: EvalConfig, ray_folder: Path) -> Popen[bytes]:

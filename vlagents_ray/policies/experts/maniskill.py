@@ -52,7 +52,7 @@ class PushCube:
         if self._phase == "down":
             return self._hand.move(tool, low, _CLOSED)
         if self._phase == "push":
-            return self._hand.move(tool, np.array([goal[0], goal[1], self._LOW_M]), _CLOSED, limit=0.5)
+            return self._hand.move(tool, np.array([goal[0], goal[1], self._LOW_M]), _CLOSED, limit=0.8)
         return self._hand.move(tool, tool, _CLOSED)
 
 

@@ -1,0 +1,47 @@
+"""The processes of one Ray, known by the folder that RAY_TMPDIR names for it."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+from eval_fakes import wait_for
+
+
+@contextmanager
+def ray_folder() -> Iterator[Path]:
+    """A folder for a Ray of one's own, which is ended with it; short, because the names of sockets are limited."""
+    folder = Path(tempfile.mkdtemp(prefix="r"))
+    try:
+        yield folder
+    finally:
+        end(folder)
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def processes(folder: Path, named: str = "") -> list[int]:
+    """The processes of the Ray whose files are in `folder`, or those of them that are `named` so."""
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            command = (process / "cmdline").read_bytes()
+            said = command + (process / "environ").read_bytes()
+        except OSError:  # it has ended, or is not ours
+            continue
+        program = command.partition(b"\0")[0]  # what follows may be what setproctitle left of the environment
+        if str(folder).encode() in said and named.encode() in program:
+            found.append(int(process.name))
+    return found
+
+
+def end(folder: Path) -> None:
+    """Kill what is left of that Ray: two agents of a killed one take a minute to notice."""
+    for pid in processes(folder):
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    wait_for(lambda: not processes(folder))
