@@ -61,7 +61,7 @@ def test_the_same_episodes_whatever_the_number_of_workers(ray_home: Path, tmp_pa
         summary = json.loads((out / "summary.json").read_text())
         assert summary["state"] == "complete"
         assert summary["total"]["success_once"]["rate"] >= 0.95
-        assert summary["transports"] == ["handle"]
+        assert summary["transports"] == ["websocket"]
     assert len(found[0]) == 24
     assert found[0] == found[1]
 

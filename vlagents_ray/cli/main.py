@@ -105,12 +105,14 @@ def run_evaluation(policy: str, settings: dict[str, Any], fields: dict[str, Any]
             deployed, args = _single_application(policy, settings)
             served = {"policy": args["policy"], "policy_config": args.get("config", {})}
             checkpoint = served["policy_config"].get("checkpoint")
-            url = f"serve://{deployed.applications[0].name}"
-            config = EvalConfig(policy_url=url, checkpoint=checkpoint, **served, **fields)
+            name = deployed.applications[0].name
+            config = EvalConfig(policy_url=f"serve://{name}", checkpoint=checkpoint, **served, **fields)
             check(config)  # what is wrong is said before anything starts
             # Ray's CPUs are bookkeeping here: the number of workers that the user asked for must fit.
             cpus = max(os.cpu_count() or 1, math.ceil(config.workers * config.cpus_per_worker))
-            stack.enter_context(running_server(deployed, address=address, num_cpus=cpus))
+            server = stack.enter_context(running_server(deployed, address=address, num_cpus=cpus))
+            if address is None:  # on one machine a WebSocket with raw pixels costs a fifth of a Serve handle
+                config = config.model_copy(update={"policy_url": server.apps[name]})
         try:
             summary = evaluate(config, progress=progress_for(out))
         except EvaluationInterrupted as interrupted:

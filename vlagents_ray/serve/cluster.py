@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import random
 import shutil
 import socket
 import tempfile
@@ -30,6 +31,8 @@ from vlagents_ray.serve.config import ServerArgs
 
 IMPORT_PATH = "vlagents_ray.serve.app:build"
 _SHUTDOWN_S = 30.0
+_PORTS = (30_000, 32_700)  # of HAProxy and the like
+_BLOCKS = (20_000, 30_000)
 _REPLICA_PORTS = 200  # a server's replicas listen on ports from a block of its own
 
 
@@ -104,11 +107,16 @@ def running_server(
 
 
 def free_port(host: str = "127.0.0.1") -> int:
-    """A TCP port that nobody listens on at this moment."""
-    with socket.socket() as probe:
-        probe.bind((host, 0))
-        port: int = probe.getsockname()[1]
-        return port
+    """A TCP port that nobody listens on at this moment.
+
+    Drawn at random below the range from which the system gives ports to whoever asks for any, so
+    that it is still free when its process has started.
+    """
+    for _ in range(100):
+        port = random.randrange(*_PORTS)
+        if _is_free(host, port):
+            return port
+    raise ConfigError(f"no free port between {_PORTS[0]} and {_PORTS[1]}")
 
 
 def haproxy_available() -> bool:
@@ -160,12 +168,8 @@ def _ray(address: str | None, host: str, port: int, num_cpus: int | None, show_l
         finally:
             ray.shutdown()
         return
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host, port))
-        except OSError as error:
-            raise ConfigError(f"cannot listen on {host}:{port} ({error}); choose another --port or --host") from error
+    if not _is_free(host, port):
+        raise ConfigError(f"cannot listen on {host}:{port}: it is taken; choose another --port or --host")
     with tempfile.TemporaryDirectory(prefix="vlagents-ray-") as folder, contextlib.ExitStack() as stack:
         environment = ingress_environment(Path(folder)) if haproxy_available() else {}
         stack.enter_context(_environment(environment))
@@ -187,16 +191,22 @@ def _environment(values: Mapping[str, str]) -> Iterator[None]:
 
 
 def _free_block(size: int) -> int:
-    """The first of `size` ports below the range that the system hands out; the probed port is free."""
-    start = 20_000 + (free_port() % 50) * size
-    for base in (20_000 + (start - 20_000 + step * size) % (50 * size) for step in range(50)):
-        with socket.socket() as probe:
-            try:
-                probe.bind(("127.0.0.1", base))
-            except OSError:
-                continue
+    """The first of `size` ports for the replicas; the first is free, and Ray steps over taken ones."""
+    for _ in range(100):
+        base = random.randrange(*_BLOCKS, size)
+        if _is_free("127.0.0.1", base):
             return base
-    raise ConfigError("no free block of ports between 20000 and 30000 for the replicas")
+    raise ConfigError(f"no free block of ports between {_BLOCKS[0]} and {_BLOCKS[1]} for the replicas")
+
+
+def _is_free(host: str, port: int) -> bool:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError:
+            return False
+        return True
 
 
 def _application(name: str, args: dict[str, Any]) -> dict[str, Any]:

@@ -23,6 +23,7 @@ class PushCube:
     _BEHIND_M = 0.12  # of the tool behind the cube before the push
     _OVER_M = 0.15  # height of the tool on its way there, clear of the cube
     _LOW_M = 0.02  # height of the tool while pushing: the cube's middle
+    _FAR_M = 0.28  # of the target from the middle of the table, along x
     _PLACED_M = 0.03  # of the cube from the target's middle; success wants 0.1
 
     def __init__(self, env_name: str) -> None:
@@ -52,7 +53,9 @@ class PushCube:
         if self._phase == "down":
             return self._hand.move(tool, low, _CLOSED)
         if self._phase == "push":
-            return self._hand.move(tool, np.array([goal[0], goal[1], self._LOW_M]), _CLOSED, limit=0.8)
+            # near the end of its reach the arm stops following: there the cube has to slide the last centimetres
+            speed = 0.8 if goal[0] > self._FAR_M else 0.5
+            return self._hand.move(tool, np.array([goal[0], goal[1], self._LOW_M]), _CLOSED, limit=speed)
         return self._hand.move(tool, tool, _CLOSED)
 
 

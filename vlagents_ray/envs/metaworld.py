@@ -1,0 +1,211 @@
+"""Meta-World: fifty table-top tasks of a Sawyer arm in MuJoCo, each with a scripted oracle.
+
+Images need OpenGL without a display: EGL, which Mesa also provides in software.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec, check_action
+from vlagents_ray.envs.base import EvalEnv
+from vlagents_ray.envs.probe import EGL_CURE, egl_probe
+from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset, UnknownEnv
+from vlagents_ray.interface import Act, Obs
+from vlagents_ray.registry import require
+
+_MAX_STEPS = 500  # the simulator refuses to go further
+_UPSIDE_DOWN = ("corner2",)  # cameras that Meta-World mounts so; the others stand upright
+
+
+class MetaWorld(EvalEnv):
+    """One environment of one Meta-World task, e.g. "reach-v3".
+
+    Observation: cameras, by default "corner2", turned upright; `state["xyz"]` (3,) m, the hand in
+    the world's frame, and `gripper`; in `info["sim_state"]`, (39,) float64, Meta-World's observation
+    with the goal in it, which its oracles need to the bit.
+
+    Action: (4,) in [-1, 1]: the hand's target moves by 0.01 m a unit, x, y, z in the world's frame;
+    the last is the gripper's effort, -1 opens, 1 closes.
+
+    The seed draws the object's and the goal's position, as Meta-World's own generator of tasks does.
+    The env goes on after success, and never reports `terminated`.
+    """
+
+    def __init__(
+        self,
+        task: str = "reach-v3",
+        *,
+        width: int = 224,
+        height: int = 224,
+        cameras: Sequence[str] = ("corner2",),
+        instruction: str | None = None,
+        max_steps: int = _MAX_STEPS,
+    ) -> None:
+        """Raises `UnknownEnv`, `ConfigError`, `MissingDependency`, or `EnvFailed` with its cure.
+
+        Args:
+            task: Meta-World's name.
+            width: of each image, pixels.
+            height: of each image, pixels.
+            cameras: by MuJoCo's names, e.g. "corner2", "gripperPOV".
+            instruction: None is the task's name in words.
+            max_steps: 500 at most.
+        """
+        if not 1 <= max_steps <= _MAX_STEPS:
+            raise ConfigError(f"metaworld: max_steps is {max_steps}, want 1 to {_MAX_STEPS}, where the simulator stops")
+        _choose_opengl()
+        self._mujoco = require("mujoco")
+        known = require("metaworld").ALL_V3_ENVIRONMENTS
+        if task not in known:
+            raise UnknownEnv(f"metaworld has no task {task!r}: want one of {sorted(known)}")
+        self.max_steps = max_steps
+        self._task = task
+        self._instruction = instruction or task.removesuffix("-v3").replace("-", " ")
+        self._steps: int | None = None
+        self._env: Any = None
+        self._renderer: Any = None
+        with self._failing("make"):
+            self._env = known[task](width=width, height=height)  # the model's frame buffer grows to this size
+            have = [self._env.model.camera(i).name for i in range(self._env.model.ncam)]
+            # what Meta-World does for its classes with an observable goal, but drawing from our seed
+            self._env._partially_observable = False
+            self._env._freeze_rand_vec = False
+            self._env._set_task_called = True
+            self._env.seeded_rand_vec = True
+        unknown = sorted(set(cameras) - set(have))
+        if unknown:
+            self.close()
+            raise ConfigError(f"metaworld/{task} has no camera {unknown}: want some of {sorted(have)}")
+        self._contract = Contract(
+            cameras={name: CameraSpec(height, width) for name in cameras},
+            state={"xyz": StateSpec(3, "m")},
+            gripper=True,
+            instruction=True,
+            action=ActionSpec(
+                dim=4,
+                space="ee_position",
+                delta=True,
+                rotation="none",
+                frame="world",
+                gripper_open=-1.0,
+                gripper_closed=1.0,
+                low=-1.0,
+                high=1.0,
+            ),
+            control_hz=1.0 / self._env.dt,
+        )
+        try:
+            with self._failing("make its renderer"):
+                self._renderer = self._mujoco.Renderer(self._env.model, height, width)
+        except EnvFailed:
+            self.close()
+            raise
+
+    @property
+    def contract(self) -> Contract:
+        return self._contract
+
+    @property
+    def instruction(self) -> str:
+        return self._instruction
+
+    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+        """Begin the episode of `seed`, taken modulo 2^32; there are no options."""
+        if options:
+            raise ConfigError(f"metaworld: unknown reset options {sorted(options)}, want none")
+        env = self._alive()
+        with self._failing("reset"):
+            env.seed(seed % 2**32)
+            raw, _ = env.reset()
+            self._steps = 0
+            return self._observe(raw), {"success": False}
+
+    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        env = self._alive()
+        if self._steps is None:
+            raise NotReset(f"metaworld/{self._task}: step before reset; call reset(seed=...) first")
+        action = check_action(act.action, self._contract)
+        if action.ndim != 1:
+            raise InvalidAction(f"action: got {action.shape}, want (4,); step through a chunk row by row")
+        with self._failing("step"):
+            raw, reward, _, _, info = env.step(np.clip(action, -1.0, 1.0))
+            self._steps += 1
+            success = bool(info["success"])
+            return self._observe(raw), float(reward), False, self._steps >= self.max_steps, {"success": success}
+
+    @classmethod
+    def tasks(cls) -> list[str]:
+        if importlib.util.find_spec("metaworld") is None:
+            return []
+        _choose_opengl()
+        return sorted(require("metaworld").ALL_V3_ENVIRONMENTS)
+
+    @classmethod
+    def missing(cls) -> str | None:
+        """The first call in a process renders one frame in a child."""
+        for module in ("metaworld", "mujoco"):
+            if importlib.util.find_spec(module) is None:
+                return f"{module} is not installed; pip install 'vlagents-ray[metaworld]'"
+        probe = egl_probe()
+        return None if probe.ok else f"Meta-World cannot render without a display ({probe.error}); {probe.cure}"
+
+    def describe(self) -> dict[str, Any]:
+        return {
+            "simulator": "metaworld",
+            "task": self._task,
+            "metaworld": version("metaworld"),
+            "mujoco": version("mujoco"),
+            "control_mode": "ee_delta_position",
+            "metres_per_unit": float(self._alive().action_scale),
+            "render_backend": os.environ.get("MUJOCO_GL", "glfw"),
+        }
+
+    def close(self) -> None:
+        renderer, self._renderer = self._renderer, None
+        env, self._env, self._steps = self._env, None, None
+        if renderer is not None:
+            renderer.close()
+        if env is not None:
+            env.close()
+
+    def _observe(self, raw: np.ndarray) -> Obs:
+        return Obs(
+            cameras={name: self._render(name) for name in self._contract.cameras or ()},
+            gripper=float(raw[3]),  # the fingers' distance over 0.1 m, clipped to [0, 1] by Meta-World
+            state={"xyz": raw[:3].astype(np.float32)},
+            info={"sim_state": raw},
+        )
+
+    def _render(self, camera: str) -> np.ndarray:
+        self._renderer.update_scene(self._env.data, camera=camera)
+        image: np.ndarray = self._renderer.render()
+        return np.ascontiguousarray(image[::-1, ::-1]) if camera in _UPSIDE_DOWN else image
+
+    def _alive(self) -> Any:
+        if self._env is None:
+            raise EnvFailed(f"metaworld/{self._task} is closed; make a new one")
+        return self._env
+
+    @contextlib.contextmanager
+    def _failing(self, doing: str) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:
+            about_egl = any(word in str(error) for word in ("EGL", "OpenGL", "GLContext", "mjr_makeContext"))
+            cure = f"; {EGL_CURE}" if about_egl else ""
+            raise EnvFailed(f"metaworld/{self._task} failed to {doing}: {error!r}{cure}") from error
+
+
+def _choose_opengl() -> None:
+    """EGL unless the user chose or there is a display; MuJoCo reads it when it is imported."""
+    if not os.environ.get("MUJOCO_GL") and not os.environ.get("DISPLAY"):
+        os.environ["MUJOCO_GL"] = "egl"
+    os.environ.setdefault("LP_NUM_THREADS", "1")  # workers share the cores: one thread each in Mesa's driver

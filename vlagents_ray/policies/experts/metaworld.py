@@ -1,0 +1,44 @@
+"""Meta-World's own scripted oracles, one for each of its tasks."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import ContractMismatch, InvalidObservation
+from vlagents_ray.interface import Act, Obs
+from vlagents_ray.registry import env_task, require
+
+_SIZE = 39  # hand 3, gripper 1, objects 14, the same of the step before, goal 3
+
+
+class MetaWorldExpert:
+    """Hands the simulator's observation, in `info["sim_state"]`, to the task's oracle."""
+
+    def __init__(self, env_name: str) -> None:
+        oracles: dict[str, Any] = require("metaworld.policies").ENV_POLICY_MAP
+        task = env_task(env_name) or "reach-v3"
+        if task not in oracles:
+            raise ContractMismatch(f"Meta-World has no oracle for {env_name!r}: want one of {sorted(oracles)}")
+        self._name = env_name
+        self._oracle = oracles[task]()
+
+    def reset(self, obs: Obs, instruction: str) -> None:
+        """Begin an episode; raises `InvalidObservation` without the simulator's observation."""
+        self._sim_state(obs)
+
+    def act(self, obs: Obs) -> Act:
+        """The next action, (4,) float32 in [-1, 1]."""
+        action = np.asarray(self._oracle.get_action(self._sim_state(obs)), dtype=np.float32)
+        return Act(action=np.clip(action, -1.0, 1.0))
+
+    def _sim_state(self, obs: Obs) -> np.ndarray:
+        state = obs.info.get("sim_state")
+        if not isinstance(state, np.ndarray) or state.shape != (_SIZE,):
+            got = f"shape {state.shape}" if isinstance(state, np.ndarray) else type(state).__name__
+            raise InvalidObservation(
+                f"info['sim_state']: got {got}, want ({_SIZE},), as the env {self._name} gives it; "
+                f"an oracle cannot act on images"
+            )
+        return state
