@@ -14,6 +14,7 @@ import pytest
 from tests.integration.conftest import serving
 from vlagents_ray import NotReset, Obs, PolicyUnavailable, RemoteAgent
 from vlagents_ray.client.agent import TransportName
+from vlagents_ray.errors import MessageTooLarge
 from vlagents_ray.serve.cluster import Server
 from vlagents_ray.wire.frames import JPEG
 
@@ -92,6 +93,14 @@ def test_jpeg_reaches_the_policy_as_pixels(server: Server) -> None:
     with RemoteAgent(server.url, codec=JPEG) as agent:
         agent.reset(obs(128), "x")
         assert abs(agent.act(obs(0)).action[2] - 128) <= 2
+
+
+def test_a_message_over_the_websockets_limit_says_what_to_do(server: Server) -> None:
+    huge = Obs({"front": np.zeros((2500, 2500, 3), np.uint8)}, info={"value": 0})
+    with RemoteAgent(server.url, codec="raw") as agent, pytest.raises(MessageTooLarge, match="JPEG"):
+        agent.reset(huge)
+    with RemoteAgent(server.url, codec="raw", transport="http") as agent:
+        agent.reset(huge)
 
 
 def test_metadata_says_what_is_served(server: Server) -> None:

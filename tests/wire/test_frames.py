@@ -181,6 +181,12 @@ def test_each_fault_has_its_error(header: dict, blobs: tuple[bytes, ...], error:
         decode_request(_frame(header, *blobs))
 
 
+@pytest.mark.parametrize("act", [3, {}, {"action": {"$": ["nd", 0, "<f4", [1]]}}, {"action": 1, "done": 1, "info": {}}])
+def test_a_broken_reply_is_malformed(act: object) -> None:
+    with pytest.raises(MalformedMessage):
+        decode_reply(_frame({"act": act}, b"1234"))
+
+
 def test_pixels_are_limited_before_memory_is_taken() -> None:
     jpeg = bytearray(encode_request(Request("act", Obs({"a": np.zeros((8, 8, 3), np.uint8)})), JPEG))
     at = jpeg.index(b"\xff\xc0")  # start of frame: length, precision, height, width

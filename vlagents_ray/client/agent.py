@@ -12,7 +12,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, NotReset, PolicyFailed
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.wire.frames import JPEG, RAW, ImageCodec
-from vlagents_ray.wire.messages import Op, Reply, Request
+from vlagents_ray.wire.messages import PROTOCOL_VERSION, Op, Reply, Request
 
 if TYPE_CHECKING:
     from vlagents_ray.client.transport import Transport
@@ -73,6 +73,12 @@ class RemoteAgent(Agent):
         if self._metadata is not None:
             return
         metadata = self._transport.connect(self._connect_timeout_s)
+        if metadata.get("protocol") != PROTOCOL_VERSION:
+            self._transport.close()
+            raise ConfigError(
+                f"{self.url}: speaks protocol {metadata.get('protocol')}, this client {PROTOCOL_VERSION}; "
+                f"upgrade the older of the two"
+            )
         contract = metadata.get("contract")
         self._contract = None if contract is None else Contract.from_json(contract)
         self._metadata = metadata

@@ -63,7 +63,9 @@ class HttpTransport:
         status, kind, body = self._exchange("GET", "/v1/metadata", None, {}, timeout_s)
         if status != 200:
             raise _refusal(status, kind, body)
-        metadata: dict[str, Any] = json.loads(body)
+        metadata = _json(body)
+        if not isinstance(metadata, dict) or "protocol" not in metadata:
+            raise ConfigError(f"{self._url.geturl()}: answers, but is no vlagents_ray server ({body[:80]!r})")
         return metadata
 
     def call(self, request: Request, timeout_s: float) -> Reply:
@@ -148,11 +150,18 @@ def _closed_by_peer(sock: socket.socket | None) -> bool:
 
 
 def _refusal(status: int, kind: str, body: bytes) -> VLAgentsError:
-    if "json" in kind:
-        return read_error(json.loads(body))
+    if "json" in kind and isinstance(document := _json(body), dict):
+        return read_error(document)
     text = body[:200].decode(errors="replace").strip()
     if status == 404:
         return UnknownApp(f"no application at this path ({text}); check the URL")
     if status == 500 or status in (502, 503, 504):  # the proxy's own: no replica is ready
         return PolicyUnavailable(f"no replica answers (HTTP {status}: {text})")
     return VLAgentsError(f"HTTP {status}: {text}")
+
+
+def _json(body: bytes) -> Any:
+    try:
+        return json.loads(body)
+    except ValueError:
+        return None

@@ -10,9 +10,9 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidSta
 from websockets.sync.client import ClientConnection, connect
 
 from vlagents_ray.client.http import HttpTransport, http_url
-from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable
+from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, MessageTooLarge, PolicyUnavailable
 from vlagents_ray.wire.frames import ImageCodec, decode_reply, encode_request
-from vlagents_ray.wire.messages import Reply, Request
+from vlagents_ray.wire.messages import STREAM_BYTES, Reply, Request
 
 
 class WebSocketTransport:
@@ -43,9 +43,15 @@ class WebSocketTransport:
     def call(self, request: Request, timeout_s: float) -> Reply:
         """One frame out, its reply back; replies to requests given up earlier are discarded."""
         deadline = time.monotonic() + timeout_s
+        frame = encode_request(request, self._codec)
+        if len(frame) > STREAM_BYTES:  # the server would only hang up
+            raise MessageTooLarge(
+                f"{self._url}: got {len(frame)} bytes, the limit of a WebSocket message is {STREAM_BYTES}; "
+                f"send JPEG, or use transport='http'"
+            )
         socket = self._stream(timeout_s)
         try:
-            socket.send(encode_request(request, self._codec))
+            socket.send(frame)
             while True:
                 data = socket.recv(timeout=max(0.0, deadline - time.monotonic()), decode=False)
                 reply = decode_reply(data)

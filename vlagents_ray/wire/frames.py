@@ -144,7 +144,10 @@ def decode_reply(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> Reply:
     if (error := header.get("error")) is not None:
         reply.error = read_error(error)
     elif (act := header.get("act")) is not None:
-        reply.act = Act(reader.blob(act["action"]), bool(act["done"]), reader.value(act["info"]))
+        try:
+            reply.act = Act(reader.blob(act["action"]), bool(act["done"]), reader.value(act["info"]))
+        except (KeyError, TypeError) as error:
+            raise MalformedMessage(f"reply: got {str(act)[:80]}, want action, done and info") from error
     else:
         reply.info = reader.value(header.get("info") or {})
     return reply

@@ -12,6 +12,7 @@ PROTOCOL_VERSION = 1
 SESSION_HEADER = "x-session-id"
 REQUEST_ID_HEADER = "x-request-id"
 DEADLINE_HEADER = "x-deadline-ms"
+STREAM_BYTES = 16 * 2**20  # of one WebSocket message: what uvicorn takes, and Serve does not let us change
 
 Op = Literal["reset", "act", "close"]
 OPS: tuple[Op, ...] = ("reset", "act", "close")
