@@ -2,6 +2,27 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
+import pytest
 from fail_on_skip import pytest_make_collect_report, pytest_runtest_makereport
 
 __all__ = ["pytest_make_collect_report", "pytest_runtest_makereport"]
+
+# No test talks to the world; set before anything that reads them is imported.
+os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+os.environ.setdefault("HF_HUB_OFFLINE", "1")
+os.environ.setdefault("WANDB_MODE", "offline")
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Skip what this machine cannot run; the Vulkan device is looked for when the first test wants it."""
+    if item.get_closest_marker("gpu") and not any(Path("/dev").glob("nvidia[0-9]*")):
+        pytest.skip("no NVIDIA GPU")
+    if item.get_closest_marker("vulkan"):
+        from vlagents_ray.envs.maniskill import ManiSkill
+
+        missing = ManiSkill.missing()
+        if missing:
+            pytest.skip(missing)

@@ -61,7 +61,7 @@ def test_the_same_episodes_whatever_the_number_of_workers(ray_home: Path, tmp_pa
         summary = json.loads((out / "summary.json").read_text())
         assert summary["state"] == "complete"
         assert summary["total"]["success_once"]["rate"] >= 0.95
-        assert summary["transports"] == ["websocket"]
+        assert summary["transports"] == ["shm"]
     assert len(found[0]) == 24
     assert found[0] == found[1]
 
@@ -118,7 +118,7 @@ def test_a_running_server_is_evaluated_by_its_url(ray_home: Path, tmp_path: Path
         assert done.returncode == 0, done.stderr
     summary = json.loads((tmp_path / "o" / "summary.json").read_text())
     assert summary["config"]["policy"] == "scripted"
-    assert summary["transports"] == ["websocket"]
+    assert summary["transports"] == ["shm"]
     assert len(list((tmp_path / "o" / "videos").rglob("*.mp4"))) == 6
 
 

@@ -18,7 +18,7 @@ from vlagents_ray.errors import MessageTooLarge
 from vlagents_ray.serve.cluster import Server
 from vlagents_ray.wire.frames import JPEG
 
-TRANSPORTS: list[TransportName] = ["websocket", "http", "handle"]
+TRANSPORTS: list[TransportName] = ["shm", "websocket", "http", "handle"]
 
 
 @pytest.fixture(scope="module")
@@ -82,25 +82,36 @@ def test_a_closed_session_has_to_be_reset(server: Server, transport: TransportNa
     agent.close()
 
 
-def test_timing_is_told_by_stage(server: Server) -> None:
-    with RemoteAgent(server.url) as agent:
+@pytest.mark.parametrize("transport", ["shm", "websocket", "http"])
+def test_timing_is_told_by_stage(server: Server, transport: TransportName) -> None:
+    with RemoteAgent(server.url, transport=transport) as agent:
         agent.reset(obs(1), "x")
         timing = agent.act(obs(1)).info["timing"]
         assert timing["round_trip_ms"] > timing["total_ms"] > timing["inference_ms"] > 0
 
 
 def test_jpeg_reaches_the_policy_as_pixels(server: Server) -> None:
-    with RemoteAgent(server.url, codec=JPEG) as agent:
+    with RemoteAgent(server.url, codec=JPEG, transport="websocket") as agent:
         agent.reset(obs(128), "x")
         assert abs(agent.act(obs(0)).action[2] - 128) <= 2
 
 
 def test_a_message_over_the_websockets_limit_says_what_to_do(server: Server) -> None:
     huge = Obs({"front": np.zeros((2500, 2500, 3), np.uint8)}, info={"value": 0})
-    with RemoteAgent(server.url, codec="raw") as agent, pytest.raises(MessageTooLarge, match="JPEG"):
+    with (
+        RemoteAgent(server.url, codec="raw", transport="websocket") as agent,
+        pytest.raises(MessageTooLarge, match="JPEG"),
+    ):
         agent.reset(huge)
     with RemoteAgent(server.url, codec="raw", transport="http") as agent:
         agent.reset(huge)
+
+
+def test_shared_memory_is_chosen_on_one_machine(server: Server) -> None:
+    with RemoteAgent(server.url) as agent:
+        assert agent.transport == "auto"
+        agent.reset(obs(1), "x")
+        assert agent.transport == "shm"
 
 
 def test_metadata_says_what_is_served(server: Server) -> None:

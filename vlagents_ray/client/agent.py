@@ -5,7 +5,7 @@ from __future__ import annotations
 import ipaddress
 import time
 import uuid
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 from urllib.parse import urlsplit
 
 from vlagents_ray.contract import Contract
@@ -17,14 +17,15 @@ from vlagents_ray.wire.messages import PROTOCOL_VERSION, Op, Reply, Request
 if TYPE_CHECKING:
     from vlagents_ray.client.transport import Transport
 
-TransportName = Literal["auto", "http", "websocket", "handle"]
+TransportName = Literal["auto", "shm", "websocket", "http", "handle"]
 
 
 class RemoteAgent(Agent):
     """A policy on a server, as an `Agent`; one object is one session.
 
     `url` is `http(s)://HOST:PORT[/APP]`, `ws(s)://…` or, inside a Ray cluster, `serve://APP`.
-    `transport` "auto" takes the fastest that the URL allows; `agent.transport` says which.
+    `transport` "auto" takes the fastest that there is: shared memory to a server of the same user on
+    this machine, else a WebSocket; `agent.transport` says which, once connected.
     `codec` "auto" sends raw pixels to this machine and JPEG to others; "raw", "jpeg" or an
     `ImageCodec` with quality and subsampling force one.
 
@@ -51,7 +52,7 @@ class RemoteAgent(Agent):
 
     @property
     def transport(self) -> str:
-        """What carries the requests: "websocket", "http" or "handle"."""
+        """What carries the requests: "shm", "websocket", "http" or "handle"; "auto" until connected."""
         return self._transport.name
 
     @property
@@ -131,8 +132,8 @@ class RemoteAgent(Agent):
 
 def _choose(url: str, transport: str, codec: ImageCodec | str) -> Transport:
     scheme = urlsplit(url).scheme
-    if transport not in ("auto", "http", "websocket", "handle"):
-        raise ConfigError(f"transport: got {transport!r}, want 'auto', 'http', 'websocket' or 'handle'")
+    if transport not in get_args(TransportName):
+        raise ConfigError(f"transport: got {transport!r}, want one of {list(get_args(TransportName))}")
     if transport != "auto" and (scheme == "serve") != (transport == "handle"):
         raise ConfigError(f"transport {transport!r} does not reach {url!r}; 'handle' and serve://APP go together")
     if scheme == "serve":
@@ -144,9 +145,13 @@ def _choose(url: str, transport: str, codec: ImageCodec | str) -> Transport:
         from vlagents_ray.client.http import HttpTransport
 
         return HttpTransport(url, chosen)
-    from vlagents_ray.client.websocket import WebSocketTransport
+    if transport == "websocket":
+        from vlagents_ray.client.websocket import WebSocketTransport
 
-    return WebSocketTransport(url, chosen)
+        return WebSocketTransport(url, chosen)
+    from vlagents_ray.client.auto import AutoTransport
+
+    return AutoTransport(url, chosen, only_shm=transport == "shm")
 
 
 def _codec(url: str, codec: ImageCodec | str) -> ImageCodec:

@@ -15,7 +15,10 @@ class Transport(Protocol):
     time. An error that the server answered is in `Reply.error`.
     """
 
-    name: str
+    @property
+    def name(self) -> str:
+        """What users call it: "shm", "websocket", "http", "handle"."""
+        ...
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
         """Reach the server, once; returns its metadata."""

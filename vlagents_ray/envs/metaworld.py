@@ -77,6 +77,7 @@ class MetaWorld(EvalEnv):
             have = [self._env.model.camera(i).name for i in range(self._env.model.ncam)]
             # what Meta-World does for its classes with an observable goal, but drawing from our seed
             self._env._partially_observable = False
+            del self._env.sawyer_observation_space  # cached, and clips the goal away
             self._env._freeze_rand_vec = False
             self._env._set_task_called = True
             self._env.seeded_rand_vec = True

@@ -8,18 +8,30 @@ inference.
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import os
+import selectors
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import Protocol
 
 from vlagents_ray.errors import DeadlineExceeded, PolicyFailed, PolicyUnavailable
 from vlagents_ray.wire.messages import Reply, Request
 
 logger = logging.getLogger(__name__)
+
+
+class HasFileno(Protocol):
+    """A socket, a pipe: whatever a selector can wait for."""
+
+    def fileno(self) -> int:
+        """Its descriptor."""
+        ...
 
 
 class Rank(IntEnum):
@@ -62,6 +74,9 @@ class BatchQueue:
     `prepare` runs first on that thread: what must live where inference runs (a CUDA context, a
     renderer) is made there. `run` must `answer` every ticket. `idle` is called when nothing
     came for `idle_s`.
+
+    The thread waits on file descriptors, so that a local client's socket can be one of them
+    (`watch`): its request then reaches the policy without a change of threads.
     """
 
     def __init__(
@@ -79,8 +94,14 @@ class BatchQueue:
         self._idle_s = idle_s
         self._max = max_batch_size
         self._waiting: dict[Rank, deque[Ticket]] = {rank: deque() for rank in Rank}
-        self._condition = threading.Condition()
+        self._lock = threading.Lock()
         self._closed = False
+        self._asleep = False
+        self._selector = selectors.DefaultSelector()
+        self._wake_read, self._wake_write = os.pipe()
+        os.set_blocking(self._wake_read, False)
+        os.set_blocking(self._wake_write, False)
+        self._selector.register(self._wake_read, selectors.EVENT_READ)
         self._prepared = threading.Event()
         self._failure: BaseException | None = None
         self._thread = threading.Thread(target=self._loop, name="policy", daemon=True)
@@ -94,11 +115,19 @@ class BatchQueue:
 
     def put(self, ticket: Ticket) -> None:
         """Queue a request. Raises `PolicyUnavailable` after `close`."""
-        with self._condition:
+        with self._lock:
             if self._closed:
                 raise PolicyUnavailable("the replica is stopping; connect again")
             self._waiting[ticket.rank].append(ticket)
-            self._condition.notify()
+            self._wake()
+
+    def watch(self, file: HasFileno, ready: Callable[[], None]) -> None:
+        """Call `ready` on the queue's thread whenever `file` can be read; before `start`, or on that thread."""
+        self._selector.register(file, selectors.EVENT_READ, ready)
+
+    def unwatch(self, file: HasFileno) -> None:
+        """The end of `watch`, on the queue's thread."""
+        self._selector.unregister(file)
 
     def depth(self) -> int:
         """Requests that wait for the next batch."""
@@ -110,17 +139,25 @@ class BatchQueue:
 
     def close(self, timeout_s: float | None = None) -> None:
         """Answer what waits with `PolicyUnavailable`, end the thread after the batch under way."""
-        with self._condition:
-            self._closed = True
-            self._condition.notify()
+        with self._lock:
+            again, self._closed = self._closed, True
+            self._wake()
+        if self._thread.ident is None and not again:
+            self._release()
         if self._thread.ident is not None and self._thread is not threading.current_thread():
             self._thread.join(timeout_s)
+
+    def _wake(self) -> None:
+        if self._asleep:
+            self._asleep = False
+            os.write(self._wake_write, b"x")
 
     def _loop(self) -> None:
         try:
             self._prepare()
         except BaseException as error:  # noqa: BLE001 - raised again by start(), on the caller's thread
             self._failure = error
+            self._release()
             return
         finally:
             self._prepared.set()
@@ -135,13 +172,19 @@ class BatchQueue:
                 for ticket in batch:
                     failed = PolicyFailed(f"the policy raised {type(error).__name__}")
                     ticket.answer(Reply(ticket.request.request_id, error=failed))
+        self._release()
+
+    def _release(self) -> None:
+        self._selector.close()
+        os.close(self._wake_read)
+        os.close(self._wake_write)
 
     def _take(self) -> list[Ticket] | None:
         """The next batch; [] if nothing came for a while, None when the queue is closed."""
+        if not self._listen():
+            return []
         batch: list[Ticket] | None
-        with self._condition:
-            if not self._closed and not self.depth():
-                self._condition.wait(self._idle_s)
+        with self._lock:
             if self._closed:
                 left = [ticket for waiting in self._waiting.values() for ticket in waiting]
                 for waiting in self._waiting.values():
@@ -158,6 +201,29 @@ class BatchQueue:
             late = DeadlineExceeded(f"no action within {ticket.request.deadline_ms:g} ms: dropped before inference")
             ticket.answer(Reply(ticket.request.request_id, error=late))
         return batch
+
+    def _listen(self) -> bool:
+        """Until something waits, or the queue is closed; also hear all watched files that are ready now."""
+        while True:
+            with self._lock:
+                here = self._closed or self.depth() > 0
+                self._asleep = not here
+            events = self._selector.select(0 if here else self._idle_s)
+            self._asleep = False
+            for key, _ in events:
+                if key.data is None:
+                    with contextlib.suppress(BlockingIOError):
+                        os.read(self._wake_read, 4096)
+                    continue
+                try:
+                    key.data()
+                except Exception:
+                    logger.exception("a local client's door failed")
+                    self._selector.unregister(key.fileobj)
+            if here or self.depth() > 0 or self._closed:
+                return True
+            if not events:
+                return False
 
     def _collect(self) -> tuple[list[Ticket], list[Ticket]]:
         now = time.perf_counter()

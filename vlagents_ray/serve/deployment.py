@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import importlib.metadata
 import logging
+import os
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,7 @@ from vlagents_ray.serve.calls import ask
 from vlagents_ray.serve.config import ServerArgs
 from vlagents_ray.serve.engine import Engine
 from vlagents_ray.serve.ingress import build_ingress
+from vlagents_ray.serve.local import LocalDoor
 from vlagents_ray.wire.frames import decode_request, encode_reply
 from vlagents_ray.wire.messages import PROTOCOL_VERSION, Reply
 
@@ -42,6 +45,9 @@ class PolicyReplica:
             session_limit=self._args.sessions.limit,
             session_idle_s=self._args.sessions.idle_s,
         )
+        self._local = LocalDoor(self._engine, self._limits) if hasattr(os, "memfd_create") else None
+        if self._local is not None:
+            self._local.open()
         self._loading = asyncio.ensure_future(asyncio.to_thread(self._engine.start))
         if await asyncio.to_thread(_others_run):
             await self._loading
@@ -61,6 +67,7 @@ class PolicyReplica:
             "contract": None if contract is None else contract.to_json(),
             "protocol": PROTOCOL_VERSION,
             "version": importlib.metadata.version("vlagents-ray"),
+            "local": None if self._local is None else asdict(self._local.address),
         }
 
     async def attach(self) -> tuple[dict[str, Any], Any]:
@@ -91,6 +98,8 @@ class PolicyReplica:
     async def __del__(self) -> None:
         if hasattr(self, "_engine"):
             await asyncio.to_thread(self._engine.close)
+            if self._local is not None:
+                self._local.close()
 
 
 def _others_run() -> bool:

@@ -57,6 +57,11 @@ JPEG = ImageCodec("jpeg")
 
 def encode_request(request: Request, codec: ImageCodec = RAW) -> bytes:
     """A request as one frame. `request.obs` is left as it is."""
+    return b"".join(request_parts(request, codec))
+
+
+def request_parts(request: Request, codec: ImageCodec = RAW) -> list[Buffer]:
+    """The pieces of a request's frame, in order; raw images and arrays are views, not copies."""
     writer = Writer()
     header: dict[str, Any] = {"op": request.op}
     if request.obs is not None:
@@ -71,7 +76,7 @@ def encode_request(request: Request, codec: ImageCodec = RAW) -> bytes:
         header["request_id"] = request.request_id
     if request.deadline_ms is not None:
         header["deadline_ms"] = request.deadline_ms
-    return _join(header, writer.blobs)
+    return _parts(header, writer.blobs)
 
 
 def decode_request(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> Request:
@@ -133,7 +138,7 @@ def encode_reply(reply: Reply) -> bytes:
         header["info"] = writer.value(reply.info)
     if reply.timing:
         header["timing"] = reply.timing
-    return _join(header, writer.blobs)
+    return b"".join(_parts(header, writer.blobs))
 
 
 def decode_reply(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> Reply:
@@ -230,7 +235,7 @@ def _is_number(value: object) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def _join(header: dict[str, Any], blobs: list[Buffer]) -> bytes:
+def _parts(header: dict[str, Any], blobs: list[Buffer]) -> list[Buffer]:
     header["blobs"] = [len(blob) for blob in blobs]
     head = json.dumps(header, separators=(",", ":")).encode()
     parts: list[Buffer] = [_PREFIX.pack(b"VLA", PROTOCOL_VERSION, len(head)), head]
@@ -239,7 +244,7 @@ def _join(header: dict[str, Any], blobs: list[Buffer]) -> bytes:
         gap = -at % _ALIGN
         parts += (b"\0" * gap, blob)
         at += gap + len(blob)
-    return b"".join(parts)
+    return parts
 
 
 def _split(data: Buffer, limits: Limits) -> tuple[dict[str, Any], list[Buffer]]:

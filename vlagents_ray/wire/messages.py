@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from pathlib import Path
+from typing import Any, ClassVar, Literal
 
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.interface import Act, Obs
@@ -56,3 +58,25 @@ class Limits:
 
 
 DEFAULT_LIMITS = Limits()
+
+
+@dataclass(frozen=True, slots=True)
+class LocalAddress:
+    """Where processes on the server's own machine find it: `local` in the metadata."""
+
+    socket: str  # name of a Unix socket in the abstract namespace, which no file system keeps
+    boot_id: str  # of the machine, as Linux drew it when it started
+
+    # A request's frame lies in a memory file of the client's, handed over with the message that first
+    # names it; a reply's frame follows its header, or lies in a memory file that comes with it.
+    REQUEST: ClassVar[struct.Struct] = struct.Struct("<IxxxxQ")  # number of the memory file, bytes of the frame
+    REPLY: ClassVar[struct.Struct] = struct.Struct("<II")  # number of the memory file that is free again, flags
+    IN_FILE: ClassVar[int] = 1  # flag: the frame of the reply lies in the memory file that comes with it
+
+
+def boot_id() -> str:
+    """What tells this machine from others until it is restarted; empty where there is no Linux."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        return ""

@@ -1,0 +1,283 @@
+"""ManiSkill as it really runs: every test here renders."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vlagents_ray.contract import CameraSpec, check_observation
+from vlagents_ray.envs import make_env
+from vlagents_ray.envs.maniskill import ManiSkill
+from vlagents_ray.envs.maniskill.tasks import INSTRUCTIONS, instruction_for
+from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset, UnknownEnv
+from vlagents_ray.interface import Act, Obs
+from vlagents_ray.testing import check_env
+
+pytestmark = pytest.mark.vulkan
+
+STEP_LIMITS = {
+    "PushT-v1": 100,
+    "PegInsertionSide-v1": 100,
+    "PullCubeTool-v1": 100,
+    "RollBall-v1": 80,
+    "PlugCharger-v1": 200,
+}
+TWO_CAMERAS = ("PegInsertionSide-v1", "PlugCharger-v1", "StackCube-v1")
+OPEN, CLOSED = 1.0, -1.0
+
+
+def command(**parts: float) -> Act:
+    """An action of `pd_ee_delta_pose`: zeros but for the named parts."""
+    names = ("x", "y", "z", "roll", "pitch", "yaw", "gripper")
+    return Act(np.array([parts.get(name, 0.0) for name in names], dtype=np.float32))
+
+
+def play(env: ManiSkill, seed: int, actions: list[np.ndarray]) -> list[Obs]:
+    """The first observation of the episode and those after the actions."""
+    seen = [env.reset(seed=seed)[0]]
+    seen += [env.step(Act(action))[0] for action in actions]
+    return seen
+
+
+def assert_same(some: list[Obs], others: list[Obs]) -> None:
+    for i, (a, b) in enumerate(zip(some, others, strict=True)):
+        for name, image in a.cameras.items():
+            np.testing.assert_array_equal(image, b.cameras[name], f"camera {name}, step {i}")
+        np.testing.assert_array_equal(a.info["sim_state"], b.info["sim_state"], f"step {i}")
+
+
+@pytest.fixture(scope="module")
+def push() -> Iterator[ManiSkill]:
+    with ManiSkill("PushCube-v1", width=64, height=48) as env:
+        yield env
+
+
+@pytest.mark.parametrize("task", ManiSkill.tasks())
+def test_each_task_gives_what_its_contract_states(task: str) -> None:
+    env = make_env(f"maniskill/{task}", width=40, height=32)
+    with env:
+        contract = env.contract
+        obs, _ = env.reset(seed=3)
+        check_observation(obs, contract)
+        assert (
+            set(obs.cameras)
+            == set(contract.cameras or {})
+            == {"base_camera"} | ({"hand_camera"} if task in TWO_CAMERAS else set())
+        )
+        assert env.max_steps == STEP_LIMITS.get(task, 50)
+        assert env.instruction == INSTRUCTIONS[task]
+        assert contract.control_hz == 20.0
+        assert contract.action.space == "ee_pose"
+        has_gripper = task != "PushT-v1"  # its robot holds a stick
+        assert contract.gripper is has_gripper
+        assert contract.action.dim == (7 if has_gripper else 6)
+        action = np.full(contract.action.dim or 0, 0.1, dtype=np.float32)
+        for _ in range(3):
+            obs, reward, terminated, truncated, info = env.step(Act(action))
+            check_observation(obs, contract)
+            assert set(obs.state) == set(contract.state or {}) == {"joints", "tquat", "xyzrpy"}
+            assert all(part.dtype == np.float32 for part in obs.state.values())
+            assert (obs.gripper is not None) is has_gripper
+            assert np.isfinite(obs.info["sim_state"]).all()
+            assert np.isfinite(reward)
+            assert (terminated, truncated) == (False, False)
+            assert type(info["success"]) is bool
+
+
+def test_it_keeps_the_promises_of_an_env() -> None:
+    check_env(ManiSkill("PickCube-v1", width=32, height=32, max_steps=6), steps=4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["PegInsertionSide-v1", "PlugCharger-v1"])
+def test_an_episode_does_not_depend_on_what_was_played_before(task: str) -> None:
+    """PegInsertionSide draws its geometry anew; PlugCharger's contacts survive a reset without reconfiguration."""
+    rng = np.random.default_rng(0)
+    actions = [rng.uniform(-1, 1, 7).astype(np.float32) for _ in range(12)]
+    with ManiSkill(task, width=16, height=16, cameras=["base_camera"]) as env:
+        fresh = play(env, 3, actions)
+        play(env, 1, actions[::-1])
+        assert_same(play(env, 3, actions), fresh)
+    with ManiSkill(task, width=16, height=16, cameras=["base_camera"]) as another:
+        play(another, 2, actions[:5])
+        assert_same(play(another, 3, actions), fresh)
+
+
+def test_seeds_give_different_episodes(push: ManiSkill) -> None:
+    states = [push.reset(seed=seed)[0].info["sim_state"] for seed in (0, 1, 2**32 + 1)]
+    assert not np.array_equal(states[0], states[1])
+    np.testing.assert_array_equal(states[1], states[2])  # modulo 2^32
+
+
+def test_images_have_the_size_asked_for_and_stand_upright() -> None:
+    """The camera looks back at the robot: what is nearer to it, at larger x, is lower; larger y is further right."""
+    with ManiSkill("PushCube-v1", width=160, height=120) as env:
+        assert env.contract.cameras == {"base_camera": CameraSpec(height=120, width=160)}
+        columns = []
+        for seed in range(4):
+            obs, _ = env.reset(seed=seed)
+            image = obs.cameras["base_camera"]
+            assert image.shape == (120, 160, 3)
+            assert image.dtype == np.uint8
+            assert image.flags.c_contiguous
+            red, green, blue = image.astype(int).transpose(2, 0, 1)
+            cube = np.argwhere((blue > 60) & (blue > 2 * red) & (blue > 2 * green))
+            target = np.argwhere((red > 60) & (red > 2 * green) & (red > 2 * blue))
+            assert len(cube) > 10
+            assert len(target) > 10
+            assert target[:, 0].mean() > cube[:, 0].mean()
+            columns.append((obs.info["sim_state"][29], cube[:, 1].mean()))  # the cube's y in m, its column
+        columns.sort()
+        assert [column for _, column in columns] == sorted(column for _, column in columns)
+
+
+def test_the_gripper_opens_at_one_and_closes_at_minus_one(push: ManiSkill) -> None:
+    push.reset(seed=0)
+    for _ in range(10):
+        obs, *_ = push.step(command(gripper=CLOSED))
+    assert obs.gripper == pytest.approx(0.0, abs=0.02)
+    for _ in range(10):
+        obs, *_ = push.step(command(gripper=OPEN))
+    assert obs.gripper == pytest.approx(1.0, abs=0.02)
+
+
+def test_translations_are_along_the_bases_axes(push: ManiSkill) -> None:
+    for i, name in enumerate("xyz"):
+        start = push.reset(seed=0)[0].state["tquat"]
+        for _ in range(4):
+            obs, *_ = push.step(command(**{name: 0.5}))
+        moved = obs.state["tquat"][:3] - start[:3]
+        assert moved[i] > 0.03
+        assert np.abs(np.delete(moved, i)).max() < 0.01
+
+
+def test_a_positive_rotation_turns_the_tool_negatively(push: ManiSkill) -> None:
+    """ManiSkill scales rotations by their lower bound, -0.1 rad; `ManiSkill`'s docstring says so."""
+    start = push.reset(seed=0)[0].state["xyzrpy"]
+    for _ in range(5):
+        obs, *_ = push.step(command(yaw=1.0))
+    turned = (obs.state["xyzrpy"][5] - start[5] + np.pi) % (2 * np.pi) - np.pi
+    assert -0.3 < turned < -0.1
+
+
+def test_the_pose_is_in_the_robots_base_frame(push: ManiSkill) -> None:
+    obs, _ = push.reset(seed=0)
+    in_world = obs.info["sim_state"][18:21]  # the base stands at x = -0.615 m
+    np.testing.assert_allclose(obs.state["tquat"][:3], in_world + np.array([0.615, 0.0, 0.0]), atol=1e-5)
+    np.testing.assert_allclose(obs.state["joints"], obs.info["sim_state"][:7], atol=1e-6)
+
+
+def test_only_the_cameras_asked_for_are_given_and_rendered() -> None:
+    with ManiSkill("StackCube-v1", width=32, height=32, cameras=["hand_camera"]) as env:
+        assert set(env.reset(seed=0)[0].cameras) == {"hand_camera"}
+        assert set(env.step(command())[0].cameras) == {"hand_camera"}
+        assert set(env._env.scene.sensors) == {"hand_camera"}
+
+
+def test_a_read_only_action_is_executed_and_left_alone(push: ManiSkill) -> None:
+    push.reset(seed=0)
+    action = np.full(7, 0.5, dtype=np.float32)
+    action.flags.writeable = False
+    push.step(Act(action))
+    assert (action == 0.5).all()
+
+
+@pytest.mark.parametrize("action", [np.zeros(6), np.zeros((2, 7)), np.full(7, np.nan)])
+def test_an_unusable_action_is_refused(push: ManiSkill, action: np.ndarray) -> None:
+    push.reset(seed=0)
+    with pytest.raises(InvalidAction):
+        push.step(Act(action.astype(np.float32)))
+
+
+def test_a_description_names_versions_and_backends(push: ManiSkill) -> None:
+    facts = push.describe()
+    assert facts["mani_skill"] == "3.0.1"
+    assert facts["sapien"] == "3.0.3"
+    assert facts["control_mode"] == "pd_ee_delta_pose"
+    assert facts["sim_backend"] == "physx_cpu"
+    assert facts["render_backend"] in ("sapien_cpu", "sapien_cuda")
+    assert facts["render_device"]
+    assert facts["shaders"] == {"base_camera": "minimal"}
+    assert facts["reconfigure"] is True
+
+
+def test_other_control_modes_state_themselves() -> None:
+    with ManiSkill("PushCube-v1", width=16, height=16, control_mode="pd_joint_delta_pos") as env:
+        action = env.contract.action
+        assert (action.dim, action.space, action.delta, action.rotation) == (8, "joint", True, "none")
+        assert env.describe()["control_mode"] == "pd_joint_delta_pos"
+
+
+def test_a_robot_without_the_default_control_mode_uses_its_own() -> None:
+    with ManiSkill("PickCubeSO100-v1", width=16, height=16) as env:
+        assert env.contract.action.space == "joint"
+        env.reset(seed=0)
+        obs, *_ = env.step(Act(np.zeros(env.contract.action.dim or 0, dtype=np.float32)))
+        check_observation(obs, env.contract)
+
+
+def test_what_is_unknown_is_named_with_what_there_is() -> None:
+    with pytest.raises(UnknownEnv, match=r"PushCub-v1.*PushCube-v1"):
+        ManiSkill("PushCub-v1")
+    with pytest.raises(ConfigError, match=r"no_such_mode.*pd_ee_delta_pose"):
+        ManiSkill("PushCube-v1", control_mode="no_such_mode")
+    with pytest.raises(ConfigError, match=r"no camera \['wrist'\].*base_camera"):
+        ManiSkill("PushCube-v1", cameras=["wrist"])
+
+
+def test_a_task_that_cannot_be_evaluated_is_refused() -> None:
+    with pytest.raises(ConfigError, match="does not say what success is"):
+        ManiSkill("Empty-v1", width=16, height=16)
+    with pytest.raises(ConfigError, match="exactly one robot"):
+        ManiSkill("TwoRobotPickCube-v1", width=16, height=16)
+
+
+def test_missing_assets_fail_with_the_command_that_gets_them(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    class Keyboard:
+        def readline(self) -> str:
+            pytest.fail("waited for an answer on stdin")
+
+    from mani_skill.utils.assets import DATA_SOURCES
+
+    monkeypatch.setattr(DATA_SOURCES["ycb"], "output_dir", tmp_path)
+    keyboard = Keyboard()
+    monkeypatch.setattr("sys.stdin", keyboard)
+    with pytest.raises(EnvFailed, match=r"ycb.*python -m mani_skill.utils.download_asset PickSingleYCB-v1"):
+        ManiSkill("PickSingleYCB-v1", width=16, height=16)
+    import sys
+
+    assert sys.stdin is keyboard
+
+
+def test_a_simulator_error_is_an_infrastructure_failure(push: ManiSkill, monkeypatch: pytest.MonkeyPatch) -> None:
+    push.reset(seed=0)
+
+    def broken(action: object) -> None:
+        raise RuntimeError("the physics exploded")
+
+    monkeypatch.setattr(push._env, "step", broken)
+    with pytest.raises(EnvFailed, match=r"PushCube-v1 failed in step: RuntimeError: the physics exploded"):
+        push.step(command())
+
+
+def test_a_closed_env_says_so() -> None:
+    env = ManiSkill("PushCube-v1", width=16, height=16)
+    with pytest.raises(NotReset, match="reset"):
+        env.step(command())
+    env.close()
+    env.close()
+    with pytest.raises(EnvFailed, match="closed"):
+        env.reset(seed=0)
+
+
+@pytest.mark.parametrize(
+    ("task", "words"),
+    [("PickSingleYCB-v1", "pick single ycb"), ("OpenCabinetDrawer-v1", "open cabinet drawer")],
+)
+def test_a_task_without_an_instruction_is_named_in_words(task: str, words: str) -> None:
+    assert instruction_for(task) == words

@@ -1,0 +1,75 @@
+"""The rendering probe: what it finds, and what it says when there is nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from vlagents_ray.envs import probe
+from vlagents_ray.envs.maniskill import ManiSkill
+
+
+@pytest.fixture(autouse=True)
+def _fresh_answers() -> Iterator[None]:
+    probe.render_probe.cache_clear()
+    yield
+    probe.render_probe.cache_clear()
+
+
+@pytest.mark.vulkan
+def test_a_frame_is_rendered_and_the_device_named() -> None:
+    found = probe.render_probe()
+    assert found.ok, found.error
+    assert found.device
+    assert found.cure is None
+    assert 0.0 < found.seconds < probe.TIMEOUT_S
+
+
+def test_mujoco_renders_through_egl() -> None:
+    pytest.importorskip("mujoco")
+    found = probe.egl_probe()
+    assert found.ok, found.error
+    assert found.device
+
+
+def test_without_a_vulkan_driver_the_cure_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("sapien")
+    monkeypatch.setenv("VK_ICD_FILENAMES", "/nonexistent.json")
+    monkeypatch.setenv("VK_DRIVER_FILES", "/nonexistent.json")
+    found = probe.render_probe()
+    assert not found.ok
+    assert found.error
+    assert found.cure == probe.vulkan_cure()
+    missing = ManiSkill.missing()
+    assert missing is not None
+    assert found.cure in missing
+
+
+def test_a_driver_that_hangs_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("sapien")
+    found = probe.render_probe(timeout_s=0.01)
+    assert not found.ok
+    assert found.error == "no frame within 0.01 s"
+
+
+def test_the_frame_is_rendered_once_a_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    pytest.importorskip("sapien")
+    first = probe.render_probe(timeout_s=0.01)
+
+    def run(*_: object, **__: object) -> None:
+        pytest.fail("a second child")
+
+    monkeypatch.setattr(probe.subprocess, "run", run)
+    assert probe.render_probe(timeout_s=0.01) is first
+
+
+def test_without_sapien_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(probe.importlib.util, "find_spec", lambda _: None)
+    assert probe.render_probe().cure == "pip install 'vlagents-ray[maniskill]'"
+    assert "vlagents-ray[maniskill]" in (ManiSkill.missing() or "")
+
+
+def test_a_machine_with_an_nvidia_driver_gets_its_own_cure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(probe.shutil, "which", lambda _: "/usr/bin/nvidia-smi")
+    assert probe.vulkan_cure() == probe.VULKAN_CURE_NVIDIA

@@ -1,0 +1,285 @@
+"""Shared memory between a policy and processes on its machine, over an engine without Ray."""
+
+from __future__ import annotations
+
+import fcntl
+import gc
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vlagents_ray.client.shm import ShmTransport, reaches
+from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.serve.engine import Engine
+from vlagents_ray.serve.local import LocalDoor, peer_uid
+from vlagents_ray.wire.frames import encode_request
+from vlagents_ray.wire.messages import Limits, LocalAddress, Request
+
+LIMITS = Limits(body_bytes=4 * 2**20)
+
+
+class Keeper(Agent):
+    """Keeps what it saw, as a policy with history does."""
+
+    gate: threading.Event | None = None
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self.instruction, self.seen = instruction, []
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        if obs.info.get("wait") and Keeper.gate is not None:
+            Keeper.gate.wait(10)
+        self.seen.append(obs.cameras["front"])
+        action = [float(image[0, 0, 0]) for image in self.seen[-4:]]
+        return Act(np.array(action), info={"instruction": self.instruction, "big": bytes(obs.info.get("reply", 0))})
+
+
+@pytest.fixture
+def served() -> Iterator[tuple[Engine, LocalDoor]]:
+    engine = Engine(Keeper(), session_limit=50)
+    door = LocalDoor(engine, LIMITS)
+    door.open()
+    engine.start()
+    yield engine, door
+    engine.close()
+    door.close()
+
+
+def request(op: Any, pixel: int = 0, size: int = 64, **info: Any) -> Request:
+    obs = Obs({"front": np.full((size, size, 3), pixel, np.uint8)}, info=info)
+    return Request(op, obs, instruction=f"task {pixel}" if op == "reset" else None, request_id=os.urandom(8).hex())
+
+
+def client(door: LocalDoor) -> ShmTransport:
+    transport = ShmTransport(asdict(door.address))
+    transport.connect(5)
+    return transport
+
+
+def until(fact: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 10
+    while not fact():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_what_the_policy_keeps_is_not_overwritten(served: tuple[Engine, LocalDoor]) -> None:
+    transport = client(served[1])
+    transport.call(request("reset"), 5)
+    for pixel in range(1, 7):
+        act = transport.call(request("act", pixel), 5).act
+        assert act is not None
+    assert act.action.tolist() == [3, 4, 5, 6]
+    transport.close()
+
+
+def test_sessions_do_not_mix(served: tuple[Engine, LocalDoor]) -> None:
+    clients = [client(served[1]) for _ in range(5)]
+    for pixel, one in enumerate(clients):
+        one.call(request("reset", pixel), 5)
+    for _ in range(50):
+        for pixel, one in enumerate(clients):
+            act = one.call(request("act", pixel), 5).act
+            assert act is not None
+            assert act.info["instruction"] == f"task {pixel}"
+            assert set(act.action.tolist()) == {pixel}
+    clients[0].close()
+    until(lambda: len(served[0].sessions) == 4)
+    assert clients[1].call(request("act", 1), 5).error is None
+    for one in clients:
+        one.close()
+
+
+@pytest.mark.parametrize("size", [8, 256, 700, 1100])
+def test_frames_and_replies_of_any_size(served: tuple[Engine, LocalDoor], size: int) -> None:
+    transport = client(served[1])
+    transport.call(request("reset"), 5)
+    for reply in (0, 100_000, 3_000_000):
+        act = transport.call(request("act", 9, size, reply=reply), 5).act
+        assert act is not None
+        assert len(act.info["big"]) == reply
+    transport.close()
+
+
+def test_a_late_reply_is_discarded_and_its_memory_is_not_reused_meanwhile(served: tuple[Engine, LocalDoor]) -> None:
+    Keeper.gate = threading.Event()
+    transport = client(served[1])
+    transport.call(request("reset"), 5)
+    with pytest.raises(DeadlineExceeded):
+        transport.call(request("act", 7, wait=True), 0.05)
+    Keeper.gate.set()
+    act = transport.call(request("act", 8), 5).act
+    assert act is not None
+    assert act.action.tolist() == [7, 8]
+    transport.close()
+
+
+def test_a_killed_client_leaves_nothing(served: tuple[Engine, LocalDoor]) -> None:
+    engine, door = served
+    descriptors = len(os.listdir("/proc/self/fd"))
+    code = (
+        "import sys, time, numpy as np\n"
+        "from vlagents_ray.client.shm import ShmTransport\n"
+        "from vlagents_ray import Obs\n"
+        "from vlagents_ray.wire.messages import Request\n"
+        f"t = ShmTransport({asdict(door.address)!r}); t.connect(5)\n"
+        "obs = Obs({'front': np.zeros((64, 64, 3), np.uint8)})\n"
+        "t.call(Request('reset', obs, request_id='a'), 5)\n"
+        "print('ready', flush=True)\n"
+        "while True: t.call(Request('act', obs, request_id='b'), 5)\n"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline().strip() == "ready"
+        assert len(engine.sessions) == 1
+        process.send_signal(signal.SIGKILL)
+    until(lambda: len(engine.sessions) == 0)
+    until(lambda: len(os.listdir("/proc/self/fd")) <= descriptors)
+
+
+def test_many_sessions_leave_nothing(served: tuple[Engine, LocalDoor]) -> None:
+    def cycle() -> None:
+        transport = client(served[1])
+        transport.call(request("reset"), 5)
+        transport.call(request("act"), 5)
+        transport.close()
+
+    cycle()
+    until(lambda: len(served[0].sessions) == 0)
+    gc.collect()
+    before = len(os.listdir("/proc/self/fd")), threading.active_count(), _mapped()
+    for _ in range(300):
+        cycle()
+    until(lambda: len(served[0].sessions) == 0)
+    assert (len(os.listdir("/proc/self/fd")), threading.active_count()) == before[:2]
+    assert _mapped() <= before[2]
+
+
+def _mapped() -> int:
+    """Memory files of clients that this process maps."""
+    return Path("/proc/self/maps").read_text().count("memfd:vlagents-ray")
+
+
+def test_a_server_that_is_gone_is_noticed(served: tuple[Engine, LocalDoor]) -> None:
+    engine, door = served
+    transport = client(door)
+    transport.call(request("reset"), 5)
+    engine.close()
+    door.close()
+    begun = time.monotonic()
+    with pytest.raises(ConnectionLost):
+        transport.call(request("act"), 30)
+    assert time.monotonic() - begun < 10
+    with pytest.raises(PolicyUnavailable):
+        transport.call(request("act"), 5)
+
+
+def test_a_full_replica_says_so(served: tuple[Engine, LocalDoor]) -> None:
+    clients = [client(served[1]) for _ in range(50)]
+    for one in clients:
+        one.call(request("reset"), 5)
+    with pytest.raises((ConnectionLost, PolicyUnavailable)):
+        client(served[1]).call(request("reset"), 5)
+    for one in clients:
+        assert one.call(request("act"), 5).error is None
+        one.close()
+
+
+def test_faults_are_answered_and_harm_nobody(served: tuple[Engine, LocalDoor]) -> None:
+    good = client(served[1])
+    good.call(request("reset"), 5)
+    pack = LocalAddress.REQUEST.pack
+    frame = encode_request(request("act"))
+
+    def memory(data: bytes, sealed: bool = True) -> int:
+        descriptor = os.memfd_create("test", os.MFD_ALLOW_SEALING)
+        os.write(descriptor, data)
+        if sealed:
+            fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)
+        return descriptor
+
+    def pipe() -> int:
+        read, write = os.pipe()
+        os.close(write)
+        return read
+
+    faults: list[tuple[bytes, int | None, str]] = [
+        (b"x", None, "malformed"),
+        (pack(0, 10), None, "malformed"),  # no such memory
+        (pack(0, 2**40), memory(frame), "malformed"),  # longer than the memory
+        (pack(0, len(frame)), memory(frame, sealed=False), "malformed"),
+        (pack(0, 10), memory(b"garbage..."), "malformed"),
+        (pack(0, 10), pipe(), "malformed"),
+        (pack(0, 10), memory(bytes(2 * LIMITS.body_bytes + 1)), "too_large"),
+        (pack(0, len(frame)), memory(frame), "not_reset"),
+    ]
+    for message, descriptor, code in faults:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as bad:
+            bad.settimeout(5)
+            bad.connect(f"\0{served[1].address.socket}")
+            if descriptor is None:
+                bad.send(message)
+            else:
+                socket.send_fds(bad, [message], [descriptor])
+                os.close(descriptor)
+            answer = bad.recv(2**16)
+            assert f'"code":"{code}"'.encode() in answer, (message, answer)
+        assert good.call(request("act"), 5).error is None
+    good.close()
+
+
+def test_a_client_that_reads_no_replies_is_cut_off(served: tuple[Engine, LocalDoor]) -> None:
+    frame = encode_request(request("act"))
+    descriptor = os.memfd_create("test", os.MFD_ALLOW_SEALING)
+    os.write(descriptor, frame)
+    fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as deaf:
+        deaf.settimeout(10)
+        deaf.connect(f"\0{served[1].address.socket}")
+        socket.send_fds(deaf, [LocalAddress.REQUEST.pack(0, len(frame))], [descriptor])
+
+        def send_many() -> None:
+            for _ in range(100_000):
+                deaf.send(LocalAddress.REQUEST.pack(0, len(frame)))
+
+        with pytest.raises((BrokenPipeError, ConnectionResetError)):
+            send_many()
+    os.close(descriptor)
+    until(lambda: len(served[0].sessions) == 0)
+
+
+def test_only_this_machine_is_reached_and_only_the_same_user_let_in(served: tuple[Engine, LocalDoor]) -> None:
+    local = asdict(served[1].address)
+    assert reaches(local)
+    assert not reaches(local | {"boot_id": "another machine"})
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    assert peer_uid(ours) == os.getuid()
+    ours.close()
+    theirs.close()
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can become another user")
+def test_another_user_is_not_let_in(served: tuple[Engine, LocalDoor]) -> None:
+    code = (
+        "import os, socket, sys\n"
+        "os.setuid(65534)\n"
+        "s = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET); s.settimeout(5)\n"
+        f"s.connect('\\0{served[1].address.socket}')\n"
+        "print(s.recv(10))\n"
+    )
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=True)
+    assert result.stdout.strip() == "b''"
+    assert len(served[0].sessions) == 0

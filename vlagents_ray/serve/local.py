@@ -1,0 +1,181 @@
+"""The door for processes on the same machine: frames in shared memory, a Unix socket for the wake-ups.
+
+A client connects to an abstract Unix socket whose unguessable name stands in the metadata, and hands
+over memory files that it writes its frames into. Neither side leaves a name behind, so that memory
+and socket are gone with their processes, however those end. Only processes of the same user are let
+in. The policy's own thread reads the sockets: a request reaches it without a change of threads.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import mmap
+import os
+import secrets
+import socket
+import struct
+import time
+import uuid
+from collections.abc import Callable
+
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, VLAgentsError
+from vlagents_ray.serve.batching import Rank
+from vlagents_ray.serve.engine import Engine
+from vlagents_ray.wire.frames import decode_request, encode_reply
+from vlagents_ray.wire.messages import Limits, LocalAddress, Reply, boot_id
+
+logger = logging.getLogger(__name__)
+
+_FILES = 8  # memory files of one client; it needs more than one only after deadlines passed
+_INLINE = 64 * 1024  # a longer reply travels in a memory file
+_BACKLOG = 128
+
+
+class LocalDoor:
+    """Listens from `open` on; everything else happens on the policy's thread."""
+
+    def __init__(self, engine: Engine, limits: Limits) -> None:
+        self._engine = engine
+        self._limits = limits
+        self._clients: set[_Client] = set()
+        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+        self.address = LocalAddress(f"vlagents-ray-{secrets.token_hex(16)}", boot_id())
+
+    def open(self) -> None:
+        """Start to listen; before the engine starts."""
+        self._listener.bind(f"\0{self.address.socket}")
+        self._listener.listen(_BACKLOG)
+        self._engine.queue.watch(self._listener, self._accept)
+
+    def close(self) -> None:
+        """Hang up; after the engine has ended."""
+        self._listener.close()
+        for client in list(self._clients):
+            client.release()
+
+    def _accept(self) -> None:
+        connection, _ = self._listener.accept()
+        connection.setblocking(False)
+        if peer_uid(connection) != os.getuid():
+            logger.warning("a process of another user tried the local door")
+            connection.close()
+            return
+        try:
+            client = _Client(connection, self._engine, self._limits, self._clients.discard)
+        except VLAgentsError as error:  # no room for another session
+            connection.send(LocalAddress.REPLY.pack(0, 0) + encode_reply(Reply(error=error)))
+            connection.close()
+            return
+        self._clients.add(client)
+        self._engine.queue.watch(connection, client.ready)
+
+
+class _Client:
+    """One connection, which is a session."""
+
+    def __init__(
+        self, connection: socket.socket, engine: Engine, limits: Limits, gone: Callable[[_Client], None]
+    ) -> None:
+        self._connection = connection
+        self._engine = engine
+        self._limits = limits
+        self._gone = gone
+        self._files: dict[int, mmap.mmap] = {}
+        self._session_id = f"shm-{uuid.uuid4().hex}"
+        engine.sessions.open(self._session_id)
+
+    def ready(self) -> None:
+        """A message, or the end of the connection, is there."""
+        arrived = time.perf_counter()
+        try:
+            message, descriptors, _, _ = socket.recv_fds(self._connection, LocalAddress.REQUEST.size, 1)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            logger.info("local client: %s", error)
+            message, descriptors = b"", []
+        if not message:
+            self._engine.queue.unwatch(self._connection)
+            self.release()
+            return
+        number, request_id = 0, ""
+        try:
+            if len(message) != LocalAddress.REQUEST.size:
+                raise MalformedMessage(f"local: got {len(message)} bytes, want {LocalAddress.REQUEST.size}")
+            number, length = LocalAddress.REQUEST.unpack(message)
+            if descriptors:
+                self._add(number, descriptors.pop())
+            request = decode_request(self._frame(number, length), self._limits)
+            request_id = request.request_id
+            decoded = time.perf_counter()
+
+            def answer(reply: Reply) -> None:
+                total_ms = (time.perf_counter() - arrived) * 1e3
+                reply.timing |= {"decode_ms": (decoded - arrived) * 1e3, "total_ms": total_ms}
+                self._send(number, reply)
+
+            self._engine.submit(self._session_id, request, answer, Rank.ROBOT)
+        except VLAgentsError as error:
+            self._send(number, Reply(request_id, error=error))
+        finally:
+            for descriptor in descriptors:
+                os.close(descriptor)
+
+    def release(self) -> None:
+        """Forget the session and give its memory back."""
+        self._engine.sessions.close(self._session_id)
+        self._connection.close()
+        for memory in self._files.values():
+            memory.close()
+        self._files.clear()
+        self._gone(self)
+
+    def _add(self, number: int, descriptor: int) -> None:
+        try:
+            size = os.fstat(descriptor).st_size
+            if size > 2 * self._limits.body_bytes or (len(self._files) >= _FILES and number not in self._files):
+                raise MessageTooLarge(f"local: a memory file of {size} bytes, {len(self._files)} others are mapped")
+            # A file that could shrink would kill this process when it is read.
+            if not fcntl.fcntl(descriptor, fcntl.F_GET_SEALS) & fcntl.F_SEAL_SHRINK:
+                raise MalformedMessage("local: the memory file is not sealed against shrinking")
+            mapped = mmap.mmap(descriptor, size, prot=mmap.PROT_READ)
+        except (OSError, ValueError) as error:
+            if isinstance(error, VLAgentsError):
+                raise
+            raise MalformedMessage(f"local: not a memory file ({error})") from error
+        finally:
+            os.close(descriptor)
+        if (old := self._files.pop(number, None)) is not None:
+            old.close()
+        self._files[number] = mapped
+
+    def _frame(self, number: int, length: int) -> bytes:
+        memory = self._files.get(number)
+        if memory is None or length > len(memory):
+            raise MalformedMessage(f"local: {length} bytes in memory file {number}, which is not there or shorter")
+        return memory[:length]  # a copy: the policy may keep what the client soon overwrites
+
+    def _send(self, number: int, reply: Reply) -> None:
+        frame = encode_reply(reply)
+        try:
+            if len(frame) <= _INLINE:
+                self._connection.send(LocalAddress.REPLY.pack(number, 0) + frame)
+                return
+            descriptor = os.memfd_create("vlagents-ray-reply")
+            try:
+                os.write(descriptor, frame)
+                header = LocalAddress.REPLY.pack(number, LocalAddress.IN_FILE)
+                socket.send_fds(self._connection, [header], [descriptor])
+            finally:
+                os.close(descriptor)
+        except OSError as error:  # gone, or does not read its replies: hearing of the end is up to `ready`
+            logger.info("local client: %s", error)
+            self._connection.shutdown(socket.SHUT_RDWR)
+
+
+def peer_uid(connection: socket.socket) -> int:
+    """The user of the process at the other end of a Unix socket, as the kernel knows it."""
+    credentials = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+    uid: int = struct.unpack("3i", credentials)[1]
+    return uid
