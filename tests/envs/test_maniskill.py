@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -91,7 +92,6 @@ def test_it_keeps_the_promises_of_an_env() -> None:
     check_env(ManiSkill("PickCube-v1", width=32, height=32, max_steps=6), steps=4)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("task", ["PegInsertionSide-v1", "PlugCharger-v1"])
 def test_an_episode_does_not_depend_on_what_was_played_before(task: str) -> None:
     """PegInsertionSide draws its geometry anew; PlugCharger's contacts survive a reset without reconfiguration."""
@@ -124,9 +124,9 @@ def test_images_have_the_size_asked_for_and_stand_upright() -> None:
             assert image.dtype == np.uint8
             assert image.flags.c_contiguous
             red, green, blue = image.astype(int).transpose(2, 0, 1)
-            cube = np.argwhere((blue > 60) & (blue > 2 * red) & (blue > 2 * green))
+            cube = np.argwhere((blue > red + 40) & (blue > green + 30))
             target = np.argwhere((red > 60) & (red > 2 * green) & (red > 2 * blue))
-            assert len(cube) > 10
+            assert len(cube) > 5
             assert len(target) > 10
             assert target[:, 0].mean() > cube[:, 0].mean()
             columns.append((obs.info["sim_state"][29], cube[:, 1].mean()))  # the cube's y in m, its column
@@ -235,9 +235,7 @@ def test_a_task_that_cannot_be_evaluated_is_refused() -> None:
         ManiSkill("TwoRobotPickCube-v1", width=16, height=16)
 
 
-def test_missing_assets_fail_with_the_command_that_gets_them(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Any, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_missing_assets_fail_with_the_command_that_gets_them(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     class Keyboard:
         def readline(self) -> str:
             pytest.fail("waited for an answer on stdin")
@@ -249,8 +247,6 @@ def test_missing_assets_fail_with_the_command_that_gets_them(
     monkeypatch.setattr("sys.stdin", keyboard)
     with pytest.raises(EnvFailed, match=r"ycb.*python -m mani_skill.utils.download_asset PickSingleYCB-v1"):
         ManiSkill("PickSingleYCB-v1", width=16, height=16)
-    import sys
-
     assert sys.stdin is keyboard
 
 

@@ -2,21 +2,24 @@
 
 A bare round steps the environments in as many processes as the evaluation has workers, with zeros
 as actions and no policy, server or Ray. An evaluated round plays the same episodes through a served
-`noop` policy. Both count from the first reset to the last step; making environments is left out.
+`noop` policy. Both count the steps made while all workers were playing: making environments, and
+waiting for the last worker to start or to finish, are left out; the gaps between episodes are not.
 """
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import os
+import sqlite3
 import statistics
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from multiprocessing.synchronize import Barrier
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -28,6 +31,14 @@ from vlagents_ray.interface import Act
 from vlagents_ray.serve.cluster import deployment, running_server
 
 _START_S = 600.0
+
+
+class Span(NamedTuple):
+    """One episode: when it began and ended, s, and its steps."""
+
+    begun: float
+    ended: float
+    steps: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,9 +103,29 @@ def measure_overhead(
                 video="none",
                 out=Path(folder) / str(number),
             )
-            evaluated.append(evaluate(config).rollout_steps_per_second or 0.0)
+            evaluate(config)
+            evaluated.append(steady_rate(_recorded(config.out), workers))
             tell(f"round {number + 1}/{rounds}: evaluated {evaluated[-1]:.1f} steps/s")
     return Overhead(env, workers, tuple(bare), tuple(evaluated))
+
+
+def steady_rate(episodes: Sequence[Span], workers: int) -> float:
+    """Steps a second from when all `workers` play for the first time until they do for the last.
+
+    Each episode's steps are taken as spread evenly over it. Raises `EnvFailed` if they never all play.
+    """
+    edges = sorted([(e.begun, 1) for e in episodes] + [(e.ended, -1) for e in episodes])
+    playing = 0
+    full: list[float] = []  # moments at which the number of playing workers becomes, or ceases to be, full
+    for moment, change in edges:
+        if workers in (playing, playing + change):
+            full.append(moment)
+        playing += change
+    if len(full) < 2:
+        raise EnvFailed(f"{workers} workers were never all playing; measure more episodes")
+    first, last = full[0], full[-1]
+    inside = sum(e.steps * max(0.0, min(e.ended, last) - max(e.begun, first)) / (e.ended - e.begun) for e in episodes)
+    return inside / (last - first)
 
 
 def bare_rate(env: str, options: Mapping[str, Any], action_dim: int, workers: int, episodes: int) -> float:
@@ -116,28 +147,33 @@ def bare_rate(env: str, options: Mapping[str, Any], action_dim: int, workers: in
     finally:
         for name, value in before.items():
             os.environ.pop(name) if value is None else os.environ.update({name: value})
-    spans = [results.get(timeout=_START_S) for _ in processes]
+    spans: list[Span] = [span for _ in processes for span in results.get(timeout=_START_S)]
     for process in processes:
         process.join(60)
         if process.exitcode != 0:
             raise EnvFailed(f"{env}: a bare process ended with exit code {process.exitcode}")
-    seconds: float = max(span[2] for span in spans) - min(span[1] for span in spans)
-    return sum(int(span[0]) for span in spans) / seconds
+    return steady_rate(spans, workers)
 
 
 def _play(
     name: str, options: dict[str, Any], action_dim: int, seed: int, episodes: int, start: Barrier, results: Any
 ) -> None:
-    steps = 0
+    spans: list[Span] = []
     act = Act(np.zeros(action_dim, np.float32))
     with make_env(name, **options) as env:
         start.wait(_START_S)
-        begun = time.time()
         for episode in range(episodes):
+            begun, steps, done = time.time(), 0, False
             env.reset(seed=seed + episode)
-            done = False
             while not done:
                 _, _, terminated, truncated, _ = env.step(act)
                 steps += 1
                 done = terminated or truncated
-        results.put((steps, begun, time.time()))
+            spans.append(Span(begun, time.time(), steps))
+        results.put(spans)
+
+
+def _recorded(out: Path) -> list[Span]:
+    with contextlib.closing(sqlite3.connect(out / "results.db")) as db:
+        rows = db.execute("SELECT finished - seconds, finished, steps FROM episodes").fetchall()
+    return [Span(*row) for row in rows]

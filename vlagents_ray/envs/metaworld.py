@@ -16,6 +16,7 @@ import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec, check_action
 from vlagents_ray.envs.base import EvalEnv
+from vlagents_ray.envs.headless import prepare_rendering
 from vlagents_ray.envs.probe import EGL_CURE, egl_probe
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset, UnknownEnv
 from vlagents_ray.interface import Act, Obs
@@ -61,7 +62,7 @@ class MetaWorld(EvalEnv):
         """
         if not 1 <= max_steps <= _MAX_STEPS:
             raise ConfigError(f"metaworld: max_steps is {max_steps}, want 1 to {_MAX_STEPS}, where the simulator stops")
-        _choose_opengl()
+        prepare_rendering()
         self._mujoco = require("mujoco")
         known = require("metaworld").ALL_V3_ENVIRONMENTS
         if task not in known:
@@ -146,7 +147,7 @@ class MetaWorld(EvalEnv):
     def tasks(cls) -> list[str]:
         if importlib.util.find_spec("metaworld") is None:
             return []
-        _choose_opengl()
+        prepare_rendering()
         return sorted(require("metaworld").ALL_V3_ENVIRONMENTS)
 
     @classmethod
@@ -203,10 +204,3 @@ class MetaWorld(EvalEnv):
             about_egl = any(word in str(error) for word in ("EGL", "OpenGL", "GLContext", "mjr_makeContext"))
             cure = f"; {EGL_CURE}" if about_egl else ""
             raise EnvFailed(f"metaworld/{self._task} failed to {doing}: {error!r}{cure}") from error
-
-
-def _choose_opengl() -> None:
-    """EGL unless the user chose or there is a display; MuJoCo reads it when it is imported."""
-    if not os.environ.get("MUJOCO_GL") and not os.environ.get("DISPLAY"):
-        os.environ["MUJOCO_GL"] = "egl"
-    os.environ.setdefault("LP_NUM_THREADS", "1")  # workers share the cores: one thread each in Mesa's driver

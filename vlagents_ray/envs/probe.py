@@ -36,7 +36,7 @@ VULKAN_CURE_NVIDIA = (
 )
 EGL_CURE = (
     "install EGL: apt-get install libegl1 libgl1-mesa-dri renders in software; on NVIDIA the driver's graphics part "
-    "(libnvidia-gl), in a container NVIDIA_DRIVER_CAPABILITIES=all"
+    "(libnvidia-gl), in a container NVIDIA_DRIVER_CAPABILITIES=all; MUJOCO_GL must be set before mujoco is imported"
 )
 
 _BOX_XML = """

@@ -7,12 +7,12 @@ import functools
 import gc
 import io
 import logging
-import os
 import re
 import sys
 from collections.abc import Iterator
 from typing import Any
 
+from vlagents_ray.envs.headless import prepare_rendering
 from vlagents_ray.envs.maniskill.tasks import INSTRUCTIONS
 from vlagents_ray.envs.probe import vulkan_cure
 from vlagents_ray.errors import ConfigError, EnvFailed, UnknownEnv
@@ -23,7 +23,7 @@ DEFAULT_CONTROL_MODE = "pd_ee_delta_pose"
 
 def step_limit(task: str) -> int | None:
     """The step limit that ManiSkill registers for `task`; imports ManiSkill and readies the process for it."""
-    os.environ.setdefault("LP_NUM_THREADS", "1")  # workers share the cores: one thread each in Mesa's driver
+    prepare_rendering()
     require("sapien")
     require("mani_skill.envs")
     _prepare_process()

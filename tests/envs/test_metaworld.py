@@ -1,0 +1,159 @@
+"""Meta-World as it really runs: every test here renders through EGL."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from vlagents_ray.contract import CameraSpec, check_observation
+from vlagents_ray.envs.metaworld import MetaWorld
+from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset, UnknownEnv
+from vlagents_ray.interface import Act
+from vlagents_ray.testing import check_env
+
+STILL = Act(np.zeros(4, np.float32))
+
+
+@pytest.fixture(scope="module")
+def reach() -> Iterator[MetaWorld]:
+    with MetaWorld("reach-v3", width=48, height=32) as env:
+        yield env
+
+
+def command(*action: float) -> Act:
+    return Act(np.array(action, dtype=np.float32))
+
+
+def test_it_keeps_the_promises_of_an_env() -> None:
+    check_env(MetaWorld("drawer-open-v3", width=32, height=32, max_steps=6), steps=4)
+
+
+@pytest.mark.parametrize("task", ["assembly-v3", "pick-place-v3", "window-close-v3"])
+def test_each_task_gives_what_its_contract_states(task: str) -> None:
+    with MetaWorld(task, width=40, height=32) as env:
+        obs, _ = env.reset(seed=3)
+        obs, reward, terminated, truncated, info = env.step(STILL)
+        check_observation(obs, env.contract)
+        assert env.contract.cameras == {"corner2": CameraSpec(32, 40)}
+        assert env.contract.control_hz == pytest.approx(80.0)
+        assert env.instruction == task.removesuffix("-v3").replace("-", " ")
+        assert obs.info["sim_state"].shape == (39,)
+        assert np.isfinite(reward)
+        assert (terminated, truncated, info["success"]) == (False, False, False)
+
+
+def test_all_fifty_tasks_are_known_by_name() -> None:
+    assert len(MetaWorld.tasks()) == 50
+    assert "reach-v3" in MetaWorld.tasks()
+
+
+def test_an_episode_does_not_depend_on_what_was_played_before(reach: MetaWorld) -> None:
+    def play(env: MetaWorld, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        first, _ = env.reset(seed=seed)
+        for i in range(10):
+            obs, *_ = env.step(command(1.0, -1.0, 0.5, (-1.0) ** i))
+        return first.cameras["corner2"], first.info["sim_state"], obs.info["sim_state"]
+
+    once = play(reach, 1)
+    play(reach, 2)
+    with MetaWorld("reach-v3", width=48, height=32) as fresh:
+        elsewhere = play(fresh, 1)
+    for again in (play(reach, 1), elsewhere):
+        for a, b in zip(once, again, strict=True):
+            np.testing.assert_array_equal(a, b)
+    assert not np.array_equal(once[1], play(reach, 2)[1])
+
+
+def test_the_image_stands_upright() -> None:
+    """Above is the plain grey background; the nearest corner below shows the white floor."""
+    with MetaWorld("drawer-open-v3", width=60, height=60) as env:
+        image = env.reset(seed=0)[0].cameras["corner2"].astype(int)
+    assert image.shape == (60, 60, 3)
+    assert np.ptp(image[:8], axis=(0, 1)).max() < 20
+    assert image[:8].mean() < 150
+    assert image[-4:, :4].mean() > 200
+
+
+def test_cameras_are_chosen_by_name() -> None:
+    with MetaWorld("reach-v3", width=32, height=32, cameras=("corner", "gripperPOV")) as env:
+        images = env.reset(seed=0)[0].cameras
+        assert set(images) == {"corner", "gripperPOV"}
+        assert not np.array_equal(images["corner"], images["gripperPOV"])
+    with pytest.raises(ConfigError, match=r"no camera \['wrist'\].*corner2"):
+        MetaWorld("reach-v3", cameras=("wrist",))
+
+
+def test_the_gripper_closes_at_one_and_opens_at_minus_one(reach: MetaWorld) -> None:
+    reach.reset(seed=0)
+    for _ in range(30):
+        closed, *_ = reach.step(command(0, 0, 0, 1))
+    for _ in range(30):
+        opened, *_ = reach.step(command(0, 0, 0, -1))
+    assert closed.gripper is not None
+    assert opened.gripper is not None
+    assert closed.gripper < 0.4
+    assert opened.gripper > 0.9
+
+
+def test_a_command_moves_the_hand_along_its_axis(reach: MetaWorld) -> None:
+    for i in range(3):
+        start = reach.reset(seed=0)[0].state["xyz"]
+        action = np.zeros(4, np.float32)
+        action[i] = 1.0
+        for _ in range(10):
+            obs, *_ = reach.step(Act(action))
+        moved = obs.state["xyz"] - start
+        assert 0.03 < moved[i] <= 0.1 + 1e-3  # at most 0.01 m a step
+        assert np.abs(np.delete(moved, i)).max() < 0.02
+
+
+def test_the_step_limit_truncates_and_nothing_terminates() -> None:
+    with MetaWorld("reach-v3", width=16, height=16, max_steps=3) as env:
+        env.reset(seed=0)
+        assert [env.step(STILL)[2:4] for _ in range(3)] == [(False, False), (False, False), (False, True)]
+    with pytest.raises(ConfigError, match="500"):
+        MetaWorld("reach-v3", max_steps=501)
+
+
+@pytest.mark.parametrize("action", [np.zeros(5), np.zeros((2, 4)), np.full(4, np.nan)])
+def test_an_unusable_action_is_refused(reach: MetaWorld, action: np.ndarray) -> None:
+    reach.reset(seed=0)
+    with pytest.raises(InvalidAction):
+        reach.step(Act(action.astype(np.float32)))
+
+
+def test_a_simulator_error_is_an_infrastructure_failure(reach: MetaWorld, monkeypatch: pytest.MonkeyPatch) -> None:
+    reach.reset(seed=0)
+
+    def broken(action: object) -> None:
+        raise RuntimeError("mj_step: unstable")
+
+    monkeypatch.setattr(reach._env, "step", broken)
+    with pytest.raises(EnvFailed, match=r"reach-v3 failed to step.*unstable"):
+        reach.step(STILL)
+
+
+def test_a_description_names_versions_and_backend(reach: MetaWorld) -> None:
+    facts = reach.describe()
+    assert facts["metaworld"] == "3.1.1"
+    assert facts["metres_per_unit"] == 0.01
+    assert facts["render_backend"] == "egl"
+
+
+def test_what_is_unknown_is_named() -> None:
+    with pytest.raises(UnknownEnv, match=r"reach-v2.*reach-v3"):
+        MetaWorld("reach-v2")
+
+
+def test_a_closed_env_says_so() -> None:
+    env = MetaWorld("reach-v3", width=16, height=16)
+    with pytest.raises(NotReset, match="reset"):
+        env.step(STILL)
+    with pytest.raises(ConfigError, match="options"):
+        env.reset(seed=0, options={"goal": 1})
+    env.close()
+    env.close()
+    with pytest.raises(EnvFailed, match="closed"):
+        env.reset(seed=0)

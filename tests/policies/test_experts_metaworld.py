@@ -1,0 +1,40 @@
+"""Meta-World's oracles behind the experts' interface."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vlagents_ray.envs.metaworld import MetaWorld
+from vlagents_ray.errors import ContractMismatch, InvalidObservation
+from vlagents_ray.interface import Obs
+from vlagents_ray.policies.experts import expert_for
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", ["reach-v3", "button-press-topdown-v3"])
+def test_the_oracle_solves_the_task(task: str) -> None:
+    with MetaWorld(task, width=16, height=16) as env:
+        for seed in range(2):
+            obs, _ = env.reset(seed=seed)
+            expert = expert_for(f"metaworld/{task}")
+            expert.reset(obs, env.instruction)
+            success = False
+            for _ in range(100):
+                act = expert.act(obs)
+                assert act.action.shape == (4,)
+                assert np.abs(act.action).max() <= 1.0
+                obs, _, _, _, info = env.step(act)
+                success = success or info["success"]
+            assert success, f"{task}, seed {seed}"
+
+
+def test_without_the_simulators_observation_the_oracle_says_what_it_wants() -> None:
+    expert = expert_for("metaworld/reach-v3")
+    with pytest.raises(InvalidObservation, match=r"sim_state.*\(39,\)"):
+        expert.reset(Obs(), "reach")
+
+
+def test_a_task_without_oracle_is_refused() -> None:
+    with pytest.raises(ContractMismatch, match=r"reach-v2.*reach-v3"):
+        expert_for("metaworld/reach-v2")
