@@ -8,12 +8,15 @@ from pathlib import Path
 import pytest
 from fail_on_skip import pytest_make_collect_report, pytest_runtest_makereport
 
+from vlagents_ray.envs.headless import prepare_rendering
+
 __all__ = ["pytest_make_collect_report", "pytest_runtest_makereport"]
 
 # No test talks to the world; set before anything that reads them is imported.
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("WANDB_MODE", "offline")
+prepare_rendering()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from vlagents_ray.contract import CameraSpec, check_observation
 from vlagents_ray.envs import make_env
-from vlagents_ray.envs.maniskill import ManiSkill
+from vlagents_ray.envs.maniskill import ManiSkill, making
 from vlagents_ray.envs.maniskill.tasks import INSTRUCTIONS, instruction_for
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset, UnknownEnv
 from vlagents_ray.interface import Act, Obs
@@ -226,6 +226,28 @@ def test_what_is_unknown_is_named_with_what_there_is() -> None:
         ManiSkill("PushCube-v1", control_mode="no_such_mode")
     with pytest.raises(ConfigError, match=r"no camera \['wrist'\].*base_camera"):
         ManiSkill("PushCube-v1", cameras=["wrist"])
+
+
+def test_a_step_limit_of_ones_own_is_kept() -> None:
+    with ManiSkill("PushCube-v1", width=16, height=16, max_steps=2) as env:
+        env.reset(seed=0)
+        assert [env.step(command())[3] for _ in range(2)] == [False, True]
+        env.reset(seed=0)
+        assert env.step(command())[3] is False
+    with pytest.raises(UnknownEnv):
+        ManiSkill("PushCub-v1", max_steps=2)
+    with pytest.raises(ConfigError, match="max_steps is 0"):
+        ManiSkill("PushCube-v1", max_steps=0)
+
+
+@pytest.mark.parametrize(("torch_has_cuda", "backend"), [(True, "gpu"), (False, "cpu")])
+def test_the_gpu_renders_where_sapien_and_torch_can_use_it(
+    monkeypatch: pytest.MonkeyPatch, torch_has_cuda: bool, backend: str
+) -> None:
+    monkeypatch.setattr("sapien.Device", lambda _: object())
+    monkeypatch.setattr("torch.cuda.is_available", lambda: torch_has_cuda)
+    assert making.render_backend("auto") == backend
+    assert making.render_backend("cpu") == "cpu"
 
 
 def test_a_task_that_cannot_be_evaluated_is_refused() -> None:

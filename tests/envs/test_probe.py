@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Iterator
 
 import pytest
 
 from vlagents_ray.envs import probe
 from vlagents_ray.envs.maniskill import ManiSkill
+
+needs_sapien = pytest.mark.skipif(importlib.util.find_spec("sapien") is None, reason="sapien is not installed")
 
 
 @pytest.fixture(autouse=True)
@@ -26,15 +29,15 @@ def test_a_frame_is_rendered_and_the_device_named() -> None:
     assert 0.0 < found.seconds < probe.TIMEOUT_S
 
 
+@pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason="mujoco is not installed")
 def test_mujoco_renders_through_egl() -> None:
-    pytest.importorskip("mujoco")
     found = probe.egl_probe()
     assert found.ok, found.error
     assert found.device
 
 
+@needs_sapien
 def test_without_a_vulkan_driver_the_cure_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("sapien")
     monkeypatch.setenv("VK_ICD_FILENAMES", "/nonexistent.json")
     monkeypatch.setenv("VK_DRIVER_FILES", "/nonexistent.json")
     found = probe.render_probe()
@@ -46,30 +49,30 @@ def test_without_a_vulkan_driver_the_cure_is_named(monkeypatch: pytest.MonkeyPat
     assert found.cure in missing
 
 
+@needs_sapien
 def test_a_driver_that_hangs_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("sapien")
     found = probe.render_probe(timeout_s=0.01)
     assert not found.ok
     assert found.error == "no frame within 0.01 s"
 
 
+@needs_sapien
 def test_the_frame_is_rendered_once_a_process(monkeypatch: pytest.MonkeyPatch) -> None:
-    pytest.importorskip("sapien")
     first = probe.render_probe(timeout_s=0.01)
 
     def run(*_: object, **__: object) -> None:
         pytest.fail("a second child")
 
-    monkeypatch.setattr(probe.subprocess, "run", run)
+    monkeypatch.setattr("subprocess.run", run)
     assert probe.render_probe(timeout_s=0.01) is first
 
 
 def test_without_sapien_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(probe.importlib.util, "find_spec", lambda _: None)
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     assert probe.render_probe().cure == "pip install 'vlagents-ray[maniskill]'"
     assert "vlagents-ray[maniskill]" in (ManiSkill.missing() or "")
 
 
 def test_a_machine_with_an_nvidia_driver_gets_its_own_cure(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(probe.shutil, "which", lambda _: "/usr/bin/nvidia-smi")
+    monkeypatch.setattr("shutil.which", lambda _: "/usr/bin/nvidia-smi")
     assert probe.vulkan_cure() == probe.VULKAN_CURE_NVIDIA

@@ -189,6 +189,25 @@ def bench_eval(
         json_file.write_text(json.dumps(found.to_json(), indent=2) + "\n")
 
 
+@bench.command("rtt")
+def bench_rtt(
+    calls: Annotated[int, typer.Option(min=1, help="Round trips by each way.")] = 500,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
+) -> None:
+    """Round trips to a `noop` policy on this machine, by every transport, interleaved."""
+    from vlagents_ray.bench.rtt import measure_rtt
+
+    with _errors():
+        rows = [found.to_json() for found in measure_rtt(calls, out.print)]
+    table = Table("way", "median ms", "95 % interval", "p99 ms", title="two 224x224 RGB cameras, no-op policy")
+    for row in rows:
+        low, high = row["ci95_ms"]
+        table.add_row(row["way"], f"{row['median_ms']:.3f}", f"{low:.3f} to {high:.3f}", f"{row['p99_ms']:.3f}")
+    out.print(table)
+    if json_file is not None:
+        json_file.write_text(json.dumps(rows, indent=2) + "\n")
+
+
 @app.command()
 def policies() -> None:
     """List the policies that can be served by name."""

@@ -62,6 +62,9 @@ class MetaWorld(EvalEnv):
         """
         if not 1 <= max_steps <= _MAX_STEPS:
             raise ConfigError(f"metaworld: max_steps is {max_steps}, want 1 to {_MAX_STEPS}, where the simulator stops")
+        for name, value in (("width", width), ("height", height)):
+            if value < 1:
+                raise ConfigError(f"metaworld: {name} is {value}, want at least 1")
         prepare_rendering()
         self._mujoco = require("mujoco")
         known = require("metaworld").ALL_V3_ENVIRONMENTS

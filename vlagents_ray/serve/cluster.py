@@ -7,6 +7,7 @@ and ports that no other server on the machine uses.
 from __future__ import annotations
 
 import contextlib
+import csv
 import json
 import os
 import random
@@ -102,7 +103,10 @@ def running_server(
         client.deploy_apps(config)
         url = f"http://{'127.0.0.1' if host == '0.0.0.0' else host}:{port}"  # noqa: S104 - compared, not bound
         apps = {app.name: url + (app.route_prefix or "").rstrip("/") for app in config.applications}
-        _wait(serve, apps, time.monotonic() + timeout_s)
+        deadline = time.monotonic() + timeout_s
+        _wait(serve, apps, deadline)
+        if address is None and (stats_port := os.environ.get("RAY_SERVE_HAPROXY_STATS_PORT")):
+            _wait_for_haproxy(serve, apps, int(stats_port), deadline)
         yield Server(url, apps)
 
 
@@ -171,7 +175,10 @@ def _ray(address: str | None, host: str, port: int, num_cpus: int | None, show_l
     if not _is_free(host, port):
         raise ConfigError(f"cannot listen on {host}:{port}: it is taken; choose another --port or --host")
     with tempfile.TemporaryDirectory(prefix="vlagents-ray-") as folder, contextlib.ExitStack() as stack:
-        environment = ingress_environment(Path(folder)) if haproxy_available() else {}
+        # Ray starts its workers with a low priority, which would make a policy wait for whatever else runs here.
+        environment = {"RAY_worker_niceness": "0"}
+        if haproxy_available():
+            environment |= ingress_environment(Path(folder))
         stack.enter_context(_environment(environment))
         ray.init(num_cpus=num_cpus, include_dashboard=False, log_to_driver=show_logs, logging_level="WARNING")
         stack.callback(ray.shutdown)
@@ -250,6 +257,33 @@ def _wait(serve: Any, apps: Mapping[str, str], deadline: float) -> None:
             if time.monotonic() > deadline:
                 raise PolicyUnavailable(f"application {name!r} is not ready: {refusal}")
             time.sleep(0.05)
+
+
+def _wait_for_haproxy(serve: Any, apps: Mapping[str, str], stats_port: int, deadline: float) -> None:
+    """Until HAProxy sends requests straight to every replica.
+
+    Before, they take a detour through Serve's Python proxy, and a WebSocket opened then would take it
+    as long as it lasts.
+    """
+    while True:
+        status = serve.status().applications
+        with urllib.request.urlopen(f"http://127.0.0.1:{stats_port}/stats;csv", timeout=5) as answer:
+            rows = list(csv.DictReader(answer.read().decode().removeprefix("# ").splitlines()))
+        late = []
+        for name in apps:
+            up = [
+                row["status"].startswith("UP")
+                for row in rows
+                if row["pxname"] == f"http-{name}" and row["svname"].startswith("SERVE_REPLICA")
+            ]
+            running = sum(d.replica_states.get("RUNNING", 0) for d in status[name].deployments.values())
+            if not (up and all(up) and (len(up) >= running or len(status[name].deployments) > 1)):
+                late.append(name)
+        if not late:
+            return
+        if time.monotonic() > deadline:
+            raise PolicyUnavailable(f"HAProxy does not reach the replicas of {late}")
+        time.sleep(0.05)
 
 
 def _refusal(url: str) -> str | None:

@@ -65,15 +65,19 @@ class ManiSkill(EvalEnv):
             instruction: None is the task's, see `instruction_for`.
             max_steps: None is the task's own limit.
             sim_backend: "physx_cpu", the faster for a single environment, or "physx_cuda".
-            render_backend: "cpu", "gpu", or "auto": the GPU if SAPIEN can render there.
+            render_backend: "cpu", "gpu", or "auto": the GPU if both SAPIEN and torch can use it.
             shader: ManiSkill's name, e.g. "minimal", "default"; None is the task's own.
             reward_mode: ManiSkill's name; None is the task's own.
             reconfigure: rebuild the scene for each episode. Without it some tasks' dynamics
                 (PlugCharger, PushT) depend on the episode before; it saves about 15 ms a reset.
         """
-        limit = max_steps or making.step_limit(task)
+        own_limit = making.step_limit(task)
+        limit = own_limit if max_steps is None else max_steps
         if limit is None:
             raise ConfigError(f"maniskill/{task} has no step limit of its own; set max_steps")
+        for name, value in (("width", width), ("height", height), ("max_steps", limit)):
+            if value < 1:
+                raise ConfigError(f"maniskill/{task}: {name} is {value}, want at least 1")
         sensors = {"width": width, "height": height} | ({"shader_pack": shader} if shader else {})
         self.max_steps = limit
         self._task = task

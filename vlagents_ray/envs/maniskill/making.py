@@ -35,14 +35,14 @@ def step_limit(task: str) -> int | None:
 
 
 def render_backend(wanted: str) -> str:
-    """`wanted`, or for "auto" the GPU if SAPIEN can render there, else the CPU."""
+    """`wanted`, or for "auto" the GPU if SAPIEN can render there and torch can wait for it, else the CPU."""
     if wanted != "auto":
         return wanted
     try:
         require("sapien").Device("cuda")
     except RuntimeError:  # how SAPIEN says that there is none
         return "cpu"
-    return "gpu"
+    return "gpu" if require("torch").cuda.is_available() else "cpu"
 
 
 def make(task: str, control_mode: str | None, *, sim_backend: str, render_backend: str, **options: Any) -> Any:
