@@ -66,7 +66,6 @@ class MetaWorld(EvalEnv):
             if value < 1:
                 raise ConfigError(f"metaworld: {name} is {value}, want at least 1")
         prepare_rendering()
-        self._mujoco = require("mujoco")
         known = require("metaworld").ALL_V3_ENVIRONMENTS
         if task not in known:
             raise UnknownEnv(f"metaworld has no task {task!r}: want one of {sorted(known)}")
@@ -109,7 +108,7 @@ class MetaWorld(EvalEnv):
         )
         try:
             with self._failing("make its renderer"):
-                self._renderer = self._mujoco.Renderer(self._env.model, height, width)
+                self._renderer = require("mujoco").Renderer(self._env.model, height, width)
         except EnvFailed:
             self.close()
             raise
