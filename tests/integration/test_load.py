@@ -1,0 +1,69 @@
+"""Many clients at once: batches fill up, everybody gets an own answer, replicas are added under load."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from ray import serve
+
+from tests.integration.conftest import serving
+from vlagents_ray import Obs, RemoteAgent
+from vlagents_ray.client.agent import TransportName
+
+CLIENTS, ACTS = 24, 8
+
+
+def play(url: str, transport: TransportName, client: int) -> list[int]:
+    """The sizes of the batches that one client's observations were in."""
+    with RemoteAgent(url, transport=transport, connect_timeout_s=120) as agent:
+        agent.reset(Obs({"front": np.zeros((8, 8, 3), np.uint8)}), f"client {client}")
+        return [int(agent.act(Obs()).info["timing"]["batch_size"]) for _ in range(ACTS)]
+
+
+@pytest.mark.slow
+def test_what_waits_while_a_batch_runs_is_the_next_batch() -> None:
+    """20 ms + 1 ms an observation, 24 clients. Serve's default of 5 requests at a time must not cap the batch."""
+    with serving("noop", config={"base_ms": 20, "per_item_ms": 1}, batch={"max_size": 16}) as server:
+        for transport in ("shm", "websocket", "http"):
+            with ThreadPoolExecutor(CLIENTS) as pool:
+                sizes = list(pool.map(lambda i, t=transport: play(server.url, t, i), range(CLIENTS)))  # type: ignore[misc]
+            flat = [size for one in sizes for size in one]
+            assert len(flat) == CLIENTS * ACTS
+            assert 5 < max(flat) <= 16, (transport, flat)
+
+
+@pytest.mark.slow
+def test_replicas_are_added_under_load_and_sessions_go_on() -> None:
+    autoscaling = {"min_replicas": 1, "max_replicas": 2, "target_ongoing_requests": 2, "upscale_delay_s": 0}
+    with serving("noop", config={"base_ms": 30}, autoscaling=autoscaling) as server:
+        assert replicas() == 1
+        with ThreadPoolExecutor(8) as pool:
+            stop = time.monotonic() + 90
+            jobs = [
+                pool.submit(act_until, server.url, lambda: replicas() == 2 or time.monotonic() > stop) for _ in range(8)
+            ]
+            counts = [job.result() for job in jobs]
+        assert replicas() == 2
+        assert min(counts) > 0
+
+
+def act_until(url: str, done: Callable[[], bool]) -> int:
+    """Act over one WebSocket until `done`; returns how often. An error fails the test."""
+    acts = 0
+    with RemoteAgent(url, transport="websocket") as agent:
+        agent.reset(Obs(), "load")
+        while not done():
+            for _ in range(20):
+                agent.act(Obs())
+                acts += 1
+    return acts
+
+
+def replicas() -> int:
+    """Replicas that run."""
+    (app,) = serve.status().applications.values()
+    return sum(d.replica_states.get("RUNNING", 0) for d in app.deployments.values())
