@@ -66,6 +66,24 @@ def test_the_same_episodes_whatever_the_number_of_workers(ray_home: Path, tmp_pa
     assert found[0] == found[1]
 
 
+@pytest.mark.slow
+@pytest.mark.vulkan
+def test_maniskill_is_solved_whatever_the_number_of_workers(ray_home: Path, tmp_path: Path) -> None:
+    found = []
+    for workers in ("1", "2"):
+        out = tmp_path / workers
+        done = evaluate(
+            ray_home, "maniskill/PushCube-v1", "maniskill/PickCube-v1", "--policy", "scripted", "--episodes", "10",
+            "--workers", workers, "--video", "none", "--out", str(out),
+        )  # fmt: skip
+        assert done.returncode == 0, done.stdout + done.stderr
+        for env in json.loads((out / "summary.json").read_text())["envs"]:
+            assert env["success_once"]["successes"] >= 9, env
+        found.append(rows(out))
+    assert len(found[0]) == 20
+    assert found[0] == found[1]
+
+
 def test_kill_dash_nine_and_resume_leave_each_episode_once(ray_home: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     words = (
