@@ -11,7 +11,8 @@ from typing import Any
 
 import pytest
 
-from vlagents_ray.serve.cluster import Server, deployment, running_server
+from vlagents_ray.serve.cluster import Server, running_server
+from vlagents_ray.serve.files import deployment
 
 SUPPORT = Path(__file__).parent.parent / "support"
 

@@ -23,7 +23,8 @@ import pytest
 from tests.integration.conftest import serving
 from vlagents_ray import ConfigError, Obs, RemoteAgent
 from vlagents_ray.envs import make_env
-from vlagents_ray.serve.cluster import deployment, free_port, read_deployment, running_server
+from vlagents_ray.serve.cluster import free_port, running_server
+from vlagents_ray.serve.files import deployment, listens_at, read_deployment
 
 COMMAND = [str(Path(sys.executable).parent / "vlagents-ray")]
 ROOT = Path(__file__).parent.parent.parent
@@ -196,6 +197,14 @@ def test_a_wrong_deployment_file_is_refused_before_anything_starts(tmp_path: Pat
     file.write_text(text)
     with pytest.raises(ConfigError, match=word):
         read_deployment(str(file))
+
+
+def test_a_file_says_where_to_listen_and_nobody_is_let_in_by_default(tmp_path: Path) -> None:
+    file = tmp_path / "d.yaml"
+    file.write_text(application("{policy: noop}"))
+    assert listens_at(read_deployment(str(file))) == ("127.0.0.1", 8000)
+    file.write_text(application("{policy: noop}") + "\nhttp_options: {host: 0.0.0.0, port: 8123}")
+    assert listens_at(read_deployment(str(file))) == ("0.0.0.0", 8123)  # noqa: S104 - what a file may ask for
 
 
 def test_every_shipped_deployment_file_is_valid() -> None:

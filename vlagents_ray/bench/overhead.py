@@ -28,7 +28,8 @@ from vlagents_ray.errors import EnvFailed
 from vlagents_ray.evaluate import EvalConfig, evaluate
 from vlagents_ray.evaluate.pool import THREAD_VARIABLES
 from vlagents_ray.interface import Act
-from vlagents_ray.serve.cluster import deployment, running_server
+from vlagents_ray.serve.cluster import running_server
+from vlagents_ray.serve.files import deployment
 
 _START_S = 600.0
 

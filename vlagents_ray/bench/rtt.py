@@ -16,7 +16,8 @@ import numpy as np
 
 from vlagents_ray.client.agent import RemoteAgent, TransportName
 from vlagents_ray.interface import Obs
-from vlagents_ray.serve.cluster import Server, deployment, running_server
+from vlagents_ray.serve.cluster import Server, running_server
+from vlagents_ray.serve.files import deployment
 from vlagents_ray.wire.frames import JPEG, RAW, ImageCodec
 
 _WARM_UP = 20

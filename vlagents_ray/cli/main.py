@@ -20,7 +20,8 @@ from rich.table import Table
 
 from vlagents_ray.cli.settings import parse_settings
 from vlagents_ray.errors import ConfigError, VLAgentsError
-from vlagents_ray.serve.cluster import read_deployment, running_server
+from vlagents_ray.serve.cluster import running_server
+from vlagents_ray.serve.files import listens_at, read_deployment
 
 if TYPE_CHECKING:
     from ray.serve.schema import ServeDeploySchema
@@ -44,8 +45,10 @@ Address = Annotated[
 @app.command()
 def serve(
     source: Annotated[str, typer.Argument(help="A registered policy, 'module:Class', or a deployment file (.yaml).")],
-    host: Annotated[str, typer.Option(help="Where to listen; 0.0.0.0 lets other machines in.")] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=1, max=65535)] = 8000,
+    host: Annotated[
+        str | None, typer.Option(help="0.0.0.0 lets other machines in; default: the file's, 127.0.0.1.")
+    ] = None,
+    port: Annotated[int | None, typer.Option(min=1, max=65535, help="Default: the file's, or 8000.")] = None,
     settings: Set = [],  # noqa: B006 - typer reads it
     serve_set: Annotated[
         list[str], typer.Option("--serve-set", metavar="KEY=VALUE", help="A setting of the server: batch.max_size=8.")
@@ -55,6 +58,8 @@ def serve(
     """Serve a policy until Ctrl-C."""
     with _errors():
         config = read_deployment(source, _server_args(settings, serve_set))
+        stated_host, stated_port = listens_at(config)
+        host, port = host or stated_host, port or stated_port
         with running_server(config, host=host, port=port, address=address, show_logs=True) as server:
             for name, url in server.apps.items():
                 out.print(f"serving [bold]{name}[/] at {url}  (docs: {url}/docs, Ctrl-C stops)", highlight=False)

@@ -12,7 +12,6 @@ from ray.serve import Application
 from vlagents_ray.serve.config import ServerArgs
 from vlagents_ray.serve.deployment import PolicyReplica
 
-IMPORT_PATH = "vlagents_ray.serve.app:build"
 DEPLOYMENT = "Policy"
 
 

@@ -1,4 +1,4 @@
-"""Start Ray and Serve here, or use a running cluster, and deploy what a deployment file says.
+"""Start Ray and Serve here, or use a running cluster, and serve a deployment as long as it is wanted.
 
 A server of our own gets HAProxy in front of its replicas where its binary is installed, with files
 and ports that no other server on the machine uses.
@@ -22,15 +22,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import yaml
-from pydantic import ValidationError
 from ray.serve.schema import ServeDeploySchema
 
 from vlagents_ray.errors import ConfigError, PolicyUnavailable
-from vlagents_ray.registry import names, policy_class
-from vlagents_ray.serve.config import ServerArgs
 
-IMPORT_PATH = "vlagents_ray.serve.app:build"
 _SHUTDOWN_S = 30.0
 _PORTS = (30_000, 32_700)  # of HAProxy and the like
 _BLOCKS = (20_000, 30_000)
@@ -43,29 +38,6 @@ class Server:
 
     url: str  # http://host:port
     apps: Mapping[str, str] = field(default_factory=dict)  # application -> its URL
-
-
-def deployment(policy: str, **args: Any) -> ServeDeploySchema:
-    """The deployment of one policy, as if read from a file."""
-    return _checked({"applications": [_application(policy, {"policy": policy, **args})]}, f"policy {policy!r}")
-
-
-def read_deployment(source: str, overrides: Mapping[str, Any] | None = None) -> ServeDeploySchema:
-    """A deployment from a YAML file, or of a policy by its name (`overrides` are its args)."""
-    path = Path(source)
-    if path.suffix in (".yaml", ".yml"):
-        if not path.is_file():
-            raise ConfigError(f"deployment file {source!r} does not exist")
-        if overrides:
-            raise ConfigError(f"{source!r} holds the settings; edit it instead of giving {sorted(overrides)}")
-        try:
-            document = yaml.safe_load(path.read_text())
-        except yaml.YAMLError as error:
-            raise ConfigError(f"{source}: not YAML ({error})") from error
-        return _checked(document, source)
-    if ":" not in source and source not in names("policies"):
-        policy_class(source)  # raises with the list of what there is
-    return deployment(source, **(overrides or {}))
 
 
 @contextlib.contextmanager
@@ -214,27 +186,6 @@ def _is_free(host: str, port: int) -> bool:
         except OSError:
             return False
         return True
-
-
-def _application(name: str, args: dict[str, Any]) -> dict[str, Any]:
-    short = name.rpartition(":")[2]
-    return {"name": short, "route_prefix": "/", "import_path": IMPORT_PATH, "args": args}
-
-
-def _checked(document: object, source: str) -> ServeDeploySchema:
-    """The document as Serve's schema, with our own args checked before anything is started."""
-    try:
-        config = ServeDeploySchema.model_validate(document)
-        for app in config.applications:
-            if app.import_path == IMPORT_PATH:
-                args = ServerArgs(**app.args)
-                cls = policy_class(args.policy)
-                if not (app.runtime_env or {}):
-                    cls.from_config(args.config)
-    except ValidationError as error:
-        lines = [f"- {'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors()]
-        raise ConfigError(f"{source}:\n" + "\n".join(lines)) from error
-    return config
 
 
 def _wait(serve: Any, apps: Mapping[str, str], deadline: float) -> None:
