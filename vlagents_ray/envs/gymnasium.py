@@ -15,6 +15,7 @@ import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec, check_action
 from vlagents_ray.envs.base import EvalEnv
+from vlagents_ray.envs.headless import prepare_rendering
 from vlagents_ray.envs.mapping import RENDER, Pick, as_image, bounds, parts, plain, uniform
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, MissingDependency, NotReset, UnknownEnv
 from vlagents_ray.interface import Act, Obs
@@ -76,6 +77,7 @@ class Gymnasium(EvalEnv):
         """
         if task is None:
             raise UnknownEnv("gymnasium: got no id, want one, as in 'gymnasium/Pendulum-v1'")
+        prepare_rendering()
         known = _KNOWN.get(task, {})
         self._id = task
         self._module = module
