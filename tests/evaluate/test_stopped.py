@@ -14,7 +14,7 @@ from subprocess import Popen
 
 import pytest
 from eval_fakes import wait_for
-from ray_processes import end, processes, ray_folder
+from ray_processes import end, processes, ray_folder, wait_for_end
 
 from vlagents_ray.evaluate import EvalConfig
 
@@ -76,7 +76,7 @@ def test_a_stopped_and_resumed_evaluation_has_each_episode_exactly_once(
         else:
             os.killpg(evaluation.pid, number)  # as a terminal does
         assert evaluation.wait(60) == code
-    wait_for(lambda: not processes(ray_folder, "Rollout"))
+    wait_for_end(ray_folder, "Rollout")
     if number == signal.SIGKILL:
         end(ray_folder)
     wait_for(lambda: not processes(ray_folder))

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 from eval_fakes import wait_for
-from ray_processes import end, processes, ray_folder
+from ray_processes import end, processes, ray_folder, wait_for_end
 
 from tests.integration.conftest import serving
 
@@ -94,7 +94,7 @@ def test_kill_dash_nine_and_resume_leave_each_episode_once(ray_home: Path, tmp_p
     ) as first:  # fmt: skip
         wait_for(lambda: len(rows(out)) >= 5, 120)
         first.send_signal(signal.SIGKILL)
-    wait_for(lambda: not processes(ray_home, "Rollout") and not processes(ray_home, "haproxy"), 60)
+    wait_for_end(ray_home, "Rollout", "bin/haproxy")
     end(ray_home)
     before = rows(out)
     assert 5 <= len(before) < 200

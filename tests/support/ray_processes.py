@@ -39,6 +39,24 @@ def processes(folder: Path, named: str = "") -> list[int]:
     return found
 
 
+def wait_for_end(folder: Path, *named: str) -> None:
+    """Until no process of that Ray that is `named` so is left; says which are if they do not end."""
+    try:
+        wait_for(lambda: not any(processes(folder, name) for name in named))
+    except TimeoutError as error:
+        left = {pid: _said(pid) for name in named for pid in processes(folder, name)}
+        raise AssertionError(f"still running: {left}") from error
+
+
+def _said(pid: int) -> str:
+    try:
+        command = (Path("/proc") / str(pid) / "cmdline").read_bytes().replace(b"\0", b" ")
+        state = (Path("/proc") / str(pid) / "status").read_text().partition("State:")[2].split("\n")[0]
+    except OSError:
+        return "just ended"
+    return f"{command[:200].decode(errors='replace')} ({state.strip()})"
+
+
 def end(folder: Path) -> None:
     """Kill what is left of that Ray: two agents of a killed one take a minute to notice."""
     for pid in processes(folder):
