@@ -11,6 +11,7 @@ import pytest
 from tests.integration.conftest import serving
 from tests.integration.test_sessions import obs
 from vlagents_ray import ConnectionLost, RemoteAgent
+from vlagents_ray.client.agent import TransportName
 from vlagents_ray.serve.cluster import Server
 
 
@@ -41,8 +42,9 @@ def test_http_sessions_stay_on_their_replica(server: Server) -> None:
         agent.close()
 
 
-def test_a_dead_replica_ends_its_own_sessions_and_no_others(server: Server) -> None:
-    agents = [RemoteAgent("serve://Reacher") for _ in range(8)]
+@pytest.mark.parametrize("transport", ["handle", "shm"])
+def test_a_dead_replica_ends_its_own_sessions_and_no_others(server: Server, transport: TransportName) -> None:
+    agents = [RemoteAgent("serve://Reacher", transport=transport) for _ in range(8)]
     pids = opened(agents)
     assert len(set(pids)) > 1, "all sessions on one replica"
     check(agents, pids, 5)

@@ -107,8 +107,9 @@ def test_a_message_over_the_websockets_limit_says_what_to_do(server: Server) -> 
         agent.reset(huge)
 
 
-def test_shared_memory_is_chosen_on_one_machine(server: Server) -> None:
-    with RemoteAgent(server.url) as agent:
+@pytest.mark.parametrize("inside", [False, True])
+def test_shared_memory_is_chosen_on_one_machine(server: Server, inside: bool) -> None:
+    with RemoteAgent("serve://Reacher" if inside else server.url) as agent:
         assert agent.transport == "auto"
         agent.reset(obs(1), "x")
         assert agent.transport == "shm"

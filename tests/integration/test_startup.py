@@ -30,7 +30,7 @@ COMMAND = [str(Path(sys.executable).parent / "vlagents-ray")]
 ROOT = Path(__file__).parent.parent.parent
 
 
-def until(fact: Callable[[], bool], what: str, timeout_s: float = 60.0) -> None:
+def until(fact: Callable[[], bool], what: str, timeout_s: float = 120.0) -> None:
     deadline = time.monotonic() + timeout_s
     while not fact():
         assert time.monotonic() < deadline, f"not in time: {what}"
@@ -87,8 +87,8 @@ def test_health_is_503_while_the_policy_loads_and_clients_wait_for_it(tmp_path: 
     thread, watcher = threading.Thread(target=robot), threading.Thread(target=watch)
     watcher.start()
     with running_server(deployment("served_agents:Gated", config={"gate": str(gate)}), port=port):
-        watcher.join(60)
-        thread.join(60)
+        watcher.join(120)
+        thread.join(120)
         assert answers == [503, {}]
         assert health(url) == 200
 

@@ -90,7 +90,7 @@ def measure_overhead(
     bare: list[float] = []
     evaluated: list[float] = []
     policy = deployment("noop", config={"action_dim": action_dim})
-    with running_server(policy, num_cpus=cpus) as server, tempfile.TemporaryDirectory() as folder:
+    with running_server(policy, num_cpus=cpus), tempfile.TemporaryDirectory() as folder:
         for number in range(rounds):
             bare.append(bare_rate(env, options, action_dim, workers, episodes))
             tell(f"round {number + 1}/{rounds}: bare {bare[-1]:.1f} steps/s")
@@ -98,7 +98,7 @@ def measure_overhead(
                 envs=[env],
                 env_options=options,
                 policy="noop",
-                policy_url=server.apps["noop"],
+                policy_url="serve://noop",
                 episodes=episodes * workers,
                 workers=workers,
                 video="none",

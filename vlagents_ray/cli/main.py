@@ -115,9 +115,7 @@ def run_evaluation(policy: str, settings: dict[str, Any], fields: dict[str, Any]
             check(config)  # what is wrong is said before anything starts
             # Ray's CPUs are bookkeeping here: the number of workers that the user asked for must fit.
             cpus = max(os.cpu_count() or 1, math.ceil(config.workers * config.cpus_per_worker))
-            server = stack.enter_context(running_server(deployed, address=address, num_cpus=cpus))
-            if address is None:  # on one machine a WebSocket with raw pixels costs a fifth of a Serve handle
-                config = config.model_copy(update={"policy_url": server.apps[name]})
+            stack.enter_context(running_server(deployed, address=address, num_cpus=cpus))
         try:
             summary = evaluate(config, progress=progress_for(out))
         except EvaluationInterrupted as interrupted:

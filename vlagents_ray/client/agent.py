@@ -8,6 +8,7 @@ import uuid
 from typing import TYPE_CHECKING, Any, Literal, get_args
 from urllib.parse import urlsplit
 
+from vlagents_ray.client.http import http_url
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, NotReset, PolicyFailed
 from vlagents_ray.interface import Act, Agent, Obs
@@ -25,7 +26,8 @@ class RemoteAgent(Agent):
 
     `url` is `http(s)://HOST:PORT[/APP]`, `ws(s)://…` or, inside a Ray cluster, `serve://APP`.
     `transport` "auto" takes the fastest that there is: shared memory to a server of the same user on
-    this machine, else a WebSocket; `agent.transport` says which, once connected.
+    this machine, else a WebSocket, or inside the cluster a Serve handle; `agent.transport` says which,
+    once connected.
     `codec` "auto" sends raw pixels to this machine and JPEG to others; "raw", "jpeg" or an
     `ImageCodec` with quality and subsampling force one.
 
@@ -134,13 +136,14 @@ def _choose(url: str, transport: str, codec: ImageCodec | str) -> Transport:
     scheme = urlsplit(url).scheme
     if transport not in get_args(TransportName):
         raise ConfigError(f"transport: got {transport!r}, want one of {list(get_args(TransportName))}")
-    if transport != "auto" and (scheme == "serve") != (transport == "handle"):
+    inside = scheme == "serve"
+    if transport in (("http", "websocket") if inside else ("handle",)):
         raise ConfigError(f"transport {transport!r} does not reach {url!r}; 'handle' and serve://APP go together")
-    if scheme == "serve":
+    chosen = _codec(url, codec)
+    if transport == "handle":
         from vlagents_ray.client.handle import HandleTransport
 
-        return HandleTransport(url.removeprefix("serve://").rstrip("/"))
-    chosen = _codec(url, codec)
+        return HandleTransport(urlsplit(url).netloc)
     if transport == "http":
         from vlagents_ray.client.http import HttpTransport
 
@@ -149,6 +152,8 @@ def _choose(url: str, transport: str, codec: ImageCodec | str) -> Transport:
         from vlagents_ray.client.websocket import WebSocketTransport
 
         return WebSocketTransport(url, chosen)
+    if not inside:
+        http_url(url)  # raises for what is no URL of ours, before anything is tried
     from vlagents_ray.client.auto import AutoTransport
 
     return AutoTransport(url, chosen, only_shm=transport == "shm")

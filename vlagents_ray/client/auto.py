@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import time
 from typing import Any
+from urllib.parse import urlsplit
 
+from vlagents_ray.client.handle import HandleTransport
 from vlagents_ray.client.http import HttpTransport
 from vlagents_ray.client.shm import ShmTransport, reaches
 from vlagents_ray.client.transport import Transport
@@ -15,7 +17,7 @@ from vlagents_ray.wire.messages import Reply, Request
 
 
 class AutoTransport:
-    """Shared memory if the server runs on this machine for this user, a WebSocket otherwise."""
+    """Shared memory if the policy runs on this machine for this user; else a WebSocket, or a Serve handle."""
 
     def __init__(self, url: str, codec: ImageCodec, *, only_shm: bool = False) -> None:
         self._url = url
@@ -31,29 +33,21 @@ class AutoTransport:
     def connect(self, timeout_s: float) -> dict[str, Any]:
         """The server's metadata, once it answers and the chosen transport is connected."""
         deadline = time.monotonic() + timeout_s
-        door = HttpTransport(self._url, self._codec)
-        try:
-            metadata = door.connect(timeout_s)
-        finally:
-            door.close()
+        parts = urlsplit(self._url)
+        inside = HandleTransport(parts.netloc) if parts.scheme == "serve" else None
+        door = inside or HttpTransport(self._url, self._codec)
+        metadata = door.connect(timeout_s)
         left_s = max(1.0, deadline - time.monotonic())
-        local = metadata.get("local")
-        if local and reaches(local):
-            transport = ShmTransport(local)
-            try:
-                transport.connect(left_s)
-            except PolicyUnavailable:  # another user, or a container with a network of its own
-                if self._only_shm:
-                    raise
-            else:
-                self._chosen = transport
-                return metadata
-        elif self._only_shm:
-            raise ConfigError(
-                f"{self._url}: transport 'shm' needs a server on this machine; its metadata names another"
-            )
-        self._chosen = WebSocketTransport(self._url, self._codec)
-        self._chosen.connect(left_s)
+        near = self._near(metadata.get("local"), left_s)
+        if near is not None or inside is None:
+            door.close()
+        if near is not None:
+            self._chosen = near
+        elif inside is not None:
+            self._chosen = inside
+        else:
+            self._chosen = WebSocketTransport(self._url, self._codec)
+            self._chosen.connect(left_s)
         return metadata
 
     def call(self, request: Request, timeout_s: float) -> Reply:
@@ -67,3 +61,17 @@ class AutoTransport:
         if self._chosen is not None:
             self._chosen.close()
             self._chosen = None
+
+    def _near(self, local: dict[str, Any] | None, timeout_s: float) -> ShmTransport | None:
+        if not local or not reaches(local):
+            if self._only_shm:
+                raise ConfigError(f"{self._url}: transport 'shm' needs the policy on this machine; it is on another")
+            return None
+        transport = ShmTransport(local)
+        try:
+            transport.connect(timeout_s)
+        except PolicyUnavailable:  # another user's, or in a container with a network of its own
+            if self._only_shm:
+                raise
+            return None
+        return transport

@@ -125,6 +125,9 @@ def ingress_environment(folder: Path) -> dict[str, str]:
         "RAY_SERVE_DIRECT_INGRESS_MIN_HTTP_PORT": str(replicas),
         "RAY_SERVE_DIRECT_INGRESS_MAX_HTTP_PORT": str(replicas + _REPLICA_PORTS),
         "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(free_port()),
+        # When replicas change, a new HAProxy takes over and the old one keeps the connections it has: for a day,
+        # not for two minutes, after which it would cut every robot's WebSocket.
+        "RAY_SERVE_HAPROXY_HARD_STOP_AFTER_S": "86400",
         # HAProxy learns of a leaving replica within a second; the default holds every stop for 30 s.
         "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S": "1",
     }
