@@ -129,6 +129,9 @@ def check_command(words: list[str], where: str) -> None:
     else:
         command = ["bash", "-c", f"type {shlex.quote(name)}"]
     done = subprocess.run(command, check=False, capture_output=True, text=True, env=ENV, timeout=60)
+    if name == "vlagents-ray" and re.search(r"Usage:.*COMMAND", done.stdout):  # a command of commands, as `bench` is
+        command = [name, *arguments[:2], "--help"]
+        done = subprocess.run(command, check=False, capture_output=True, text=True, env=ENV, timeout=60)
     assert done.returncode == 0, f"{where}\n{done.stdout}{done.stderr}"
     if name == "vlagents-ray":
         known = set(re.findall(r"--[\w-]+", done.stdout))
