@@ -25,6 +25,7 @@ from typing import Any
 from ray.serve.schema import ServeDeploySchema
 
 from vlagents_ray.errors import ConfigError, PolicyUnavailable
+from vlagents_ray.serve.reaper import MARK, reaped
 
 _SHUTDOWN_S = 30.0
 _PORTS = (30_000, 32_700)  # of HAProxy and the like
@@ -151,9 +152,10 @@ def _ray(address: str | None, host: str, port: int, num_cpus: int | None, show_l
         raise ConfigError(f"cannot listen on {host}:{port}: it is taken; choose another --port or --host")
     with tempfile.TemporaryDirectory(prefix="vlagents-ray-") as folder, contextlib.ExitStack() as stack:
         # Ray starts its workers with a low priority, which would make a policy wait for whatever else runs here.
-        environment = {"RAY_worker_niceness": "0"}
+        environment = {"RAY_worker_niceness": "0", MARK: folder}
         if haproxy_available():
             environment |= ingress_environment(Path(folder))
+        stack.enter_context(reaped(Path(folder)))
         stack.enter_context(_environment(environment))
         ray.init(num_cpus=num_cpus, include_dashboard=False, log_to_driver=show_logs, logging_level="WARNING")
         stack.callback(ray.shutdown)
@@ -162,14 +164,22 @@ def _ray(address: str | None, host: str, port: int, num_cpus: int | None, show_l
 
 @contextlib.contextmanager
 def _environment(values: Mapping[str, str]) -> Iterator[None]:
-    """Set variables that are not set already, for processes started inside the context."""
-    added = {key: value for key, value in values.items() if key not in os.environ}
-    os.environ.update(added)
+    """Set variables for processes started inside the context; what the user has set stays.
+
+    A process that another server's process started has inherited that server's files and ports: those
+    are replaced.
+    """
+    inherited = MARK in os.environ
+    before = {key: os.environ.get(key) for key in values if inherited or key not in os.environ}
+    os.environ.update({key: values[key] for key in before})
     try:
         yield
     finally:
-        for key in added:
-            os.environ.pop(key, None)
+        for key, value in before.items():
+            if value is None:
+                os.environ.pop(key, None)
+            else:
+                os.environ[key] = value
 
 
 def _free_block(size: int) -> int:

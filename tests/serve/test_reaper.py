@@ -1,0 +1,50 @@
+"""What a killed driver leaves is cleaned up, and what an orderly one leaves is not touched."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from vlagents_ray.serve.reaper import marked
+
+DRIVER = """
+import os, subprocess, sys, time
+from pathlib import Path
+from vlagents_ray.serve.reaper import MARK, reaped
+folder = sys.argv[1]
+with reaped(Path(folder)):
+    child = subprocess.Popen(["sleep", "100"], env=os.environ | {MARK: folder}, start_new_session=True)
+    print(child.pid, flush=True)
+    if sys.argv[2] == "killed":
+        time.sleep(100)
+"""
+
+
+@pytest.mark.parametrize("end", ["killed", "orderly"])
+def test_only_a_killed_driver_takes_its_cluster_along(tmp_path: Path, end: str) -> None:
+    folder = tmp_path / "cluster"
+    folder.mkdir()
+    with subprocess.Popen(
+        [sys.executable, "-c", DRIVER, str(folder), end], stdout=subprocess.PIPE, text=True
+    ) as driver:
+        assert driver.stdout is not None
+        child = int(driver.stdout.readline())
+        assert marked(str(folder)) == [child]
+        if end == "killed":
+            driver.send_signal(signal.SIGKILL)
+        driver.wait(30)
+    if end == "orderly":
+        assert marked(str(folder)) == [child]
+        assert folder.exists()
+        os.kill(child, signal.SIGKILL)
+        return
+    deadline = time.monotonic() + 30
+    while marked(str(folder)) or folder.exists():
+        assert time.monotonic() < deadline, "the reaper left something"
+        time.sleep(0.05)
