@@ -219,7 +219,8 @@ class BatchQueue:
                     key.data()
                 except Exception:
                     logger.exception("a local client's door failed")
-                    self._selector.unregister(key.fileobj)
+                    with contextlib.suppress(KeyError, ValueError):  # it may have been unwatched, or closed, already
+                        self._selector.unregister(key.fileobj)
             if here or self.depth() > 0 or self._closed:
                 return True
             if not events:

@@ -183,5 +183,5 @@ def _require_sendable(reply: Reply) -> None:
 def _synchronize() -> None:
     """Wait for the GPU, so that `inference_ms` is the truth."""
     torch = sys.modules.get("torch")
-    if torch is not None and torch.cuda.is_available() and torch.cuda.is_initialized():
+    if torch is not None and torch.cuda.is_initialized():
         torch.cuda.synchronize()

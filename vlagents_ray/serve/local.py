@@ -8,6 +8,7 @@ in. The policy's own thread reads the sockets: a request reaches it without a ch
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
 import logging
 import mmap
@@ -171,7 +172,8 @@ class _Client:
                 os.close(descriptor)
         except OSError as error:  # gone, or does not read its replies: hearing of the end is up to `ready`
             logger.info("local client: %s", error)
-            self._connection.shutdown(socket.SHUT_RDWR)
+            with contextlib.suppress(OSError):  # gone altogether
+                self._connection.shutdown(socket.SHUT_RDWR)
 
 
 def peer_uid(connection: socket.socket) -> int:
