@@ -11,13 +11,14 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from eval_fakes import wait_for
 
 from vlagents_ray.client.shm import ShmTransport, reaches
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable
@@ -69,13 +70,6 @@ def client(door: LocalDoor) -> ShmTransport:
     return transport
 
 
-def until(fact: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 10
-    while not fact():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
 def test_what_the_policy_keeps_is_not_overwritten(served: tuple[Engine, LocalDoor]) -> None:
     transport = client(served[1])
     transport.call(request("reset"), 5)
@@ -97,7 +91,7 @@ def test_sessions_do_not_mix(served: tuple[Engine, LocalDoor]) -> None:
             assert act.info["instruction"] == f"task {pixel}"
             assert set(act.action.tolist()) == {pixel}
     clients[0].close()
-    until(lambda: len(served[0].sessions) == 4)
+    wait_for(lambda: len(served[0].sessions) == 4)
     assert clients[1].call(request("act", 1), 5).error is None
     for one in clients:
         one.close()
@@ -146,8 +140,8 @@ def test_a_killed_client_leaves_nothing(served: tuple[Engine, LocalDoor]) -> Non
         assert process.stdout.readline().strip() == "ready"
         assert len(engine.sessions) == 1
         process.send_signal(signal.SIGKILL)
-    until(lambda: len(engine.sessions) == 0)
-    until(lambda: len(os.listdir("/proc/self/fd")) <= descriptors)
+    wait_for(lambda: len(engine.sessions) == 0)
+    wait_for(lambda: len(os.listdir("/proc/self/fd")) <= descriptors)
 
 
 def test_many_sessions_leave_nothing(served: tuple[Engine, LocalDoor]) -> None:
@@ -158,12 +152,12 @@ def test_many_sessions_leave_nothing(served: tuple[Engine, LocalDoor]) -> None:
         transport.close()
 
     cycle()
-    until(lambda: len(served[0].sessions) == 0)
+    wait_for(lambda: len(served[0].sessions) == 0)
     gc.collect()
     before = len(os.listdir("/proc/self/fd")), threading.active_count(), _mapped()
     for _ in range(300):
         cycle()
-    until(lambda: len(served[0].sessions) == 0)
+    wait_for(lambda: len(served[0].sessions) == 0)
     assert (len(os.listdir("/proc/self/fd")), threading.active_count()) == before[:2]
     assert _mapped() <= before[2]
 
@@ -258,7 +252,7 @@ def test_a_client_that_reads_no_replies_is_cut_off(served: tuple[Engine, LocalDo
         with pytest.raises((BrokenPipeError, ConnectionResetError)):
             send_many()
     os.close(descriptor)
-    until(lambda: len(served[0].sessions) == 0)
+    wait_for(lambda: len(served[0].sessions) == 0)
 
 
 def test_only_this_machine_is_reached_and_only_the_same_user_let_in(served: tuple[Engine, LocalDoor]) -> None:

@@ -17,8 +17,8 @@ from vlagents_ray.errors import InvalidInput, NotReset, PolicyFailed, PolicyUnav
 from vlagents_ray.interface import Act, Agent
 from vlagents_ray.serve.batching import BatchQueue, Rank, Ticket
 from vlagents_ray.serve.sessions import AgentCopies, Session, SessionTable
-from vlagents_ray.wire.frames import encode_reply
 from vlagents_ray.wire.messages import Reply, Request
+from vlagents_ray.wire.tree import Writer
 
 logger = logging.getLogger(__name__)
 
@@ -119,7 +119,7 @@ class Engine:
         if not isinstance(info, dict):
             raise PolicyFailed(f"reset: the policy returned {type(info).__name__}, want a dict")
         reply = Reply(ticket.request.request_id, info=info, timing=_timing(ticket.arrived, begun, time.perf_counter()))
-        _require_sendable(reply)
+        _require_sendable(info)
         session.agent = agent
         ticket.answer(reply)
 
@@ -149,7 +149,7 @@ class Engine:
                 raise PolicyFailed(f"act: the policy returned {type(result).__name__}, want an Act")
             act = Act(check_action(result.action, self.contract), bool(result.done), result.info)
             if act.info:
-                _require_sendable(Reply(act=act))
+                _require_sendable(act.info)
         except Exception as error:  # noqa: BLE001 - becomes the reply
             return Reply(request_id, error=self._explain(error, ticket))
         return Reply(request_id, act=act)
@@ -172,10 +172,10 @@ def _timing(arrived: float, begun: float, ended: float) -> dict[str, Any]:
     return {"queue_ms": (begun - arrived) * 1e3, "inference_ms": (ended - begun) * 1e3}
 
 
-def _require_sendable(reply: Reply) -> None:
-    """An answer that cannot travel fails its own session, here, and nothing later."""
+def _require_sendable(info: dict[str, Any]) -> None:
+    """An answer that cannot travel fails its own session, here, and nothing later; no array is copied for it."""
     try:
-        encode_reply(reply)
+        Writer().value(info)
     except InvalidInput as error:
         raise PolicyFailed(f"the policy's answer cannot be sent: {error}") from error
 
