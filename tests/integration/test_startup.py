@@ -10,15 +10,15 @@ import subprocess
 import sys
 import tempfile
 import threading
-import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import psutil
 import pytest
+from eval_fakes import wait_for
 
 from tests.integration.conftest import serving
 from vlagents_ray import ConfigError, Obs, RemoteAgent
@@ -28,13 +28,6 @@ from vlagents_ray.serve.files import deployment, listens_at, read_deployment
 
 COMMAND = [str(Path(sys.executable).parent / "vlagents-ray")]
 ROOT = Path(__file__).parent.parent.parent
-
-
-def until(fact: Callable[[], bool], what: str, timeout_s: float = 120.0) -> None:
-    deadline = time.monotonic() + timeout_s
-    while not fact():
-        assert time.monotonic() < deadline, f"not in time: {what}"
-        time.sleep(0.05)
 
 
 def health(url: str) -> int | None:
@@ -79,7 +72,7 @@ def test_health_is_503_while_the_policy_loads_and_clients_wait_for_it(tmp_path: 
             answers.append(agent.reset(Obs(), "x"))
 
     def watch() -> None:
-        until(lambda: health(url) == 503, "503 while loading")
+        wait_for(lambda: health(url) == 503)
         answers.append(503)
         thread.start()
         gate.touch()
@@ -106,7 +99,7 @@ def test_two_servers_on_one_machine_do_not_meet() -> None:
     ):
         for port, dim in zip(ports, (3, 5), strict=True):
             with RemoteAgent(f"http://127.0.0.1:{port}", connect_timeout_s=120) as agent:
-                until(lambda url=agent.url: health(url) == 200, "healthy")  # type: ignore[misc]
+                wait_for(lambda url=agent.url: health(url) == 200)  # type: ignore[misc]
                 agent.reset(Obs(), "x")
                 for _ in range(20):
                     assert agent.act(Obs()).action.shape == (dim,)
@@ -149,7 +142,7 @@ def test_serve_deploy_takes_the_same_file(tmp_path: Path) -> None:
     try:
         ray(str(bin_dir / "serve"), "deploy", "-a", f"http://127.0.0.1:{dashboard}", str(file))
         url = f"http://127.0.0.1:{serve_port}"
-        until(lambda: health(url) == 200, "the deployment", 120)
+        wait_for(lambda: health(url) == 200)
         with urllib.request.urlopen(f"{url}/v1/metadata", timeout=5) as answer:
             assert json.load(answer)["policy"] == "scripted"
         with RemoteAgent(url) as agent, make_env("tabletop") as env:
