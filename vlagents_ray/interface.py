@@ -100,6 +100,13 @@ class Agent:
         """
         return {}
 
+    def observe(self, obs: Obs) -> None:
+        """Remember an observation that no action is wanted for.
+
+        Policies with a history override it: a session that had to begin again on another replica is
+        `reset` with its first observation and then shown the last ones that it had acted on.
+        """
+
     def act(self, obs: Obs) -> Act:
         """One action, or one chunk of actions, for this observation."""
         raise NotImplementedError(f"{type(self).__name__} must define act(obs) -> Act")

@@ -7,7 +7,7 @@ import pytest
 from vlagents_ray import ConfigError, NotReset, Obs, PolicyUnavailable, RemoteAgent
 from vlagents_ray.client import agent as module
 from vlagents_ray.client.agent import TransportName
-from vlagents_ray.wire.frames import JPEG, RAW, ImageCodec
+from vlagents_ray.wire.observations import JPEG, RAW, ImageCodec
 
 
 @pytest.mark.parametrize(

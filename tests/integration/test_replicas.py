@@ -10,7 +10,7 @@ import pytest
 
 from tests.integration.conftest import serving
 from tests.integration.test_sessions import obs
-from vlagents_ray import ConnectionLost, RemoteAgent
+from vlagents_ray import ConnectionLost, NotReset, RemoteAgent
 from vlagents_ray.client.agent import TransportName
 from vlagents_ray.serve.cluster import Server
 
@@ -44,7 +44,7 @@ def test_http_sessions_stay_on_their_replica(server: Server) -> None:
 
 @pytest.mark.parametrize("transport", ["handle", "shm"])
 def test_a_dead_replica_ends_its_own_sessions_and_no_others(server: Server, transport: TransportName) -> None:
-    agents = [RemoteAgent("serve://Reacher", transport=transport) for _ in range(8)]
+    agents = [RemoteAgent("serve://Reacher", transport=transport, resume=False) for _ in range(8)]
     pids = opened(agents)
     assert len(set(pids)) > 1, "all sessions on one replica"
     check(agents, pids, 5)
@@ -52,6 +52,8 @@ def test_a_dead_replica_ends_its_own_sessions_and_no_others(server: Server, tran
     for i, agent in enumerate(agents):
         if pids[i] == pids[0]:
             with pytest.raises(ConnectionLost):
+                agent.act(obs(0))
+            with pytest.raises(NotReset):
                 agent.act(obs(0))
         else:
             assert agent.act(obs(0)).info["instruction"] == f"task {i}"

@@ -16,7 +16,7 @@ from vlagents_ray import NotReset, Obs, PolicyUnavailable, RemoteAgent
 from vlagents_ray.client.agent import TransportName
 from vlagents_ray.errors import MessageTooLarge
 from vlagents_ray.serve.cluster import Server
-from vlagents_ray.wire.frames import JPEG
+from vlagents_ray.wire.observations import JPEG
 
 TRANSPORTS: list[TransportName] = ["shm", "websocket", "http", "handle"]
 

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import time
+from collections import deque
 from pathlib import Path
 
 import numpy as np
 
 from vlagents_ray import Act, Agent, Obs
+from vlagents_ray.contract import Contract
 
 
 class Reacher(Agent):
@@ -34,6 +36,25 @@ class Reacher(Agent):
             np.array([self.counts["act"], total, self.first], np.float32),
             info={"instruction": self.instruction, "pid": os.getpid(), "value": obs.info["value"]},
         )
+
+
+class Remembering(Agent):
+    """Looks at the last three observations, and says so in its contract."""
+
+    contract = Contract(history=3)
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
+        self.instruction, self.seed = instruction, kwargs.get("seed")
+        self.seen = deque([obs.info["value"]], maxlen=3)
+        return {"pid": os.getpid()}
+
+    def observe(self, obs: Obs) -> None:
+        self.seen.append(obs.info["value"])
+
+    def act(self, obs: Obs) -> Act:
+        self.observe(obs)
+        info = {"instruction": self.instruction, "seed": self.seed, "pid": os.getpid()}
+        return Act(np.array(self.seen, np.float32), info=info)
 
 
 class Gated(Agent):

@@ -21,15 +21,13 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.wire.frames import (
-    JPEG,
-    RAW,
-    ImageCodec,
     decode_reply,
     decode_request,
     encode_reply,
     encode_request,
 )
 from vlagents_ray.wire.messages import Limits, Reply, Request
+from vlagents_ray.wire.observations import JPEG, RAW, ImageCodec
 
 names = st.text(min_size=1, max_size=8).filter(lambda name: name != "$")
 arrays = hnp.arrays(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -12,8 +13,8 @@ from vlagents_ray.client.shm import ShmTransport, reaches
 from vlagents_ray.client.transport import Transport
 from vlagents_ray.client.websocket import WebSocketTransport
 from vlagents_ray.errors import ConfigError, NotReset, PolicyUnavailable
-from vlagents_ray.wire.frames import ImageCodec
 from vlagents_ray.wire.messages import Reply, Request
+from vlagents_ray.wire.observations import ImageCodec
 
 
 class AutoTransport:
@@ -29,6 +30,11 @@ class AutoTransport:
     def name(self) -> str:
         """What was chosen; "auto" before."""
         return "auto" if self._chosen is None else self._chosen.name
+
+    @property
+    def holds_sessions(self) -> bool:
+        """As what was chosen."""
+        return self._chosen is not None and self._chosen.holds_sessions
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
         """The server's metadata, once it answers and the chosen transport is connected."""
@@ -50,14 +56,14 @@ class AutoTransport:
             self._chosen.connect(left_s)
         return metadata
 
-    def call(self, request: Request, timeout_s: float) -> Reply:
+    def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
         """By the chosen transport."""
         if self._chosen is None:
             raise NotReset("not connected; reset first")
-        return self._chosen.call(request, timeout_s)
+        return self._chosen.call(requests, timeout_s)
 
     def close(self) -> None:
-        """End the session; the next connection chooses anew, since the server may have moved."""
+        """End the connection; the next one chooses anew, since the server may have moved."""
         if self._chosen is not None:
             self._chosen.close()
             self._chosen = None

@@ -8,19 +8,22 @@ from __future__ import annotations
 
 import pickle
 import uuid
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from vlagents_ray.errors import ConfigError, ConnectionLost, DeadlineExceeded, PolicyUnavailable
-from vlagents_ray.wire.frames import RAW, decode_reply, encode_request
+from vlagents_ray.wire.frames import decode_replies, encode_requests
 from vlagents_ray.wire.messages import Reply, Request
+from vlagents_ray.wire.observations import RAW
 
 
 class HandleTransport:
     """Raw frames as plasma objects, read in place by the replica if it is on this node."""
 
     name = "handle"
+    holds_sessions = False
 
     def __init__(self, app: str) -> None:
         self._app = app
@@ -49,33 +52,29 @@ class HandleTransport:
         found: dict[str, Any] = metadata
         return found
 
-    def call(self, request: Request, timeout_s: float) -> Reply:
+    def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
         """One actor call; the frame lies in plasma and is freed with the reply."""
         import ray
 
-        frame = ray.put(np.frombuffer(encode_request(request, RAW), np.uint8))
-        pending = self._replica.handle_request.remote(self._header(request), self._session, frame)
+        frame = ray.put(np.frombuffer(encode_requests(requests, RAW), np.uint8))
+        pending = call_replica(self._replica, "call", self._session, frame, request_id=requests[0].request_id)
         try:
-            return decode_reply(ray.get(pending, timeout=timeout_s))
+            return decode_replies(ray.get(pending, timeout=timeout_s))
         except ray.exceptions.GetTimeoutError as error:
             ray.cancel(pending)
             raise DeadlineExceeded(f"serve://{self._app}: no answer within {timeout_s:g} s") from error
         except ray.exceptions.RayActorError as error:
-            raise ConnectionLost(
-                f"serve://{self._app}: the session's replica is gone; reset with a new agent"
-            ) from error
+            raise ConnectionLost(f"serve://{self._app}: the session's replica is gone; reset again") from error
 
     def close(self) -> None:
-        """End the session."""
-        if self._replica is None:
-            return
-        frame = np.frombuffer(encode_request(Request("close")), np.uint8)
-        self._replica.handle_request.remote(self._header(Request("close")), self._session, frame)
+        """Forget the replica."""
         self._replica = None
 
-    def _header(self, request: Request) -> bytes:
-        """What Serve's own router sends ahead of a method call to the replica it chose."""
-        from ray.serve._private.common import RequestMetadata
 
-        request_id = request.request_id or uuid.uuid4().hex
-        return pickle.dumps(RequestMetadata(request_id=request_id, internal_request_id=request_id, call_method="call"))
+def call_replica(replica: Any, method: str, *args: Any, request_id: str = "") -> Any:
+    """A method of a certain replica, which a Serve handle cannot call: what Serve's own router sends to one."""
+    from ray.serve._private.common import RequestMetadata
+
+    request_id = request_id or uuid.uuid4().hex
+    metadata = RequestMetadata(request_id=request_id, internal_request_id=request_id, call_method=method)
+    return replica.handle_request.remote(pickle.dumps(metadata), *args)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import http.client
 import json
 import select
@@ -10,6 +9,7 @@ import socket
 import ssl
 import time
 import uuid
+from collections.abc import Sequence
 from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
@@ -21,24 +21,24 @@ from vlagents_ray.errors import (
     UnknownApp,
     VLAgentsError,
 )
-from vlagents_ray.wire.frames import CONTENT_TYPE, ImageCodec, decode_reply, encode_request, read_error
+from vlagents_ray.wire.frames import CONTENT_TYPE, decode_replies, encode_requests, read_error
 from vlagents_ray.wire.messages import REQUEST_ID_HEADER, SESSION_HEADER, Reply, Request
+from vlagents_ray.wire.observations import ImageCodec
 
-_CLOSE_S = 2.0
 _UNKNOWN_APP_S = 10.0  # a starting server knows no path until its first replica exists
 
 
 class HttpTransport:
-    """HTTP/1.1, one session id for the life of the object; survives a dropped connection."""
+    """HTTP/1.1; the header that names a session brings all requests of this object to one replica."""
 
     name = "http"
+    holds_sessions = False
 
     def __init__(self, url: str, codec: ImageCodec) -> None:
         self._url = http_url(url)
         self._codec = codec
         self._session = uuid.uuid4().hex
         self._connection: http.client.HTTPConnection | None = None
-        self._begun = False  # does the server hold a session for us?
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
         """The server's metadata, as soon as it answers; retries while it is not ready."""
@@ -68,31 +68,23 @@ class HttpTransport:
             raise ConfigError(f"{self._url.geturl()}: answers, but is no vlagents_ray server ({body[:80]!r})")
         return metadata
 
-    def call(self, request: Request, timeout_s: float) -> Reply:
-        """One POST; a reply that is not a frame is the server's or the proxy's refusal."""
+    def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
+        """One POST; what is not a frame of replies is the server's or the proxy's refusal."""
         headers = {
             SESSION_HEADER: self._session,
-            REQUEST_ID_HEADER: request.request_id,
+            REQUEST_ID_HEADER: requests[0].request_id,
             "content-type": CONTENT_TYPE,
             "accept": CONTENT_TYPE,
         }
-        frame = encode_request(request, self._codec)
-        status, kind, body = self._exchange("POST", f"/v1/{request.op}", frame, headers, timeout_s)
+        frame = encode_requests(requests, self._codec)
+        status, kind, body = self._exchange("POST", f"/v1/{requests[0].op}", frame, headers, timeout_s)
         if status == 200:
-            self._begun = True
-            return decode_reply(body)
-        return Reply(request.request_id, error=_refusal(status, kind, body))
+            return decode_replies(body)
+        refusal = _refusal(status, kind, body)
+        return [Reply(request.request_id, error=refusal) for request in requests]
 
     def close(self) -> None:
-        """End the session and close the connection; a server that is gone is not waited for."""
-        if self._begun:
-            self._begun = False
-            with contextlib.suppress(VLAgentsError):  # it forgets idle sessions anyway
-                self._exchange("POST", "/v1/close", b"", {SESSION_HEADER: self._session}, _CLOSE_S)
-        self._session = uuid.uuid4().hex
-        self._hang_up()
-
-    def _hang_up(self) -> None:
+        """Close the connection."""
         if self._connection is not None:
             self._connection.close()
             self._connection = None
@@ -106,15 +98,15 @@ class HttpTransport:
             answer = connection.getresponse()
             return answer.status, answer.headers.get("content-type", ""), answer.read()
         except TimeoutError as error:
-            self._hang_up()
+            self.close()
             raise DeadlineExceeded(f"{self._url.geturl()}: no answer within {timeout_s:g} s") from error
         except (OSError, http.client.HTTPException) as error:
-            self._hang_up()
+            self.close()
             raise ConnectionLost(f"{self._url.geturl()}: {type(error).__name__}: {error}") from error
 
     def _open(self, timeout_s: float) -> http.client.HTTPConnection:
         if self._connection is not None and _closed_by_peer(self._connection.sock):
-            self._hang_up()
+            self.close()
         if self._connection is None:
             secure = self._url.scheme == "https"
             cls = http.client.HTTPSConnection if secure else http.client.HTTPConnection

@@ -7,12 +7,15 @@ import mmap
 import os
 import socket
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from vlagents_ray.client.transport import is_answer
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable
-from vlagents_ray.wire.frames import RAW, decode_reply, request_parts
+from vlagents_ray.wire.frames import decode_replies, request_parts
 from vlagents_ray.wire.messages import LocalAddress, Reply, Request, boot_id
+from vlagents_ray.wire.observations import RAW
 
 _MESSAGE_BYTES = 128 * 1024  # the longest reply that comes in a message, and some
 _PAGE = mmap.PAGESIZE
@@ -33,9 +36,10 @@ def reaches(local: dict[str, Any]) -> bool:
 
 
 class ShmTransport:
-    """Raw frames written once, into memory that the server reads; a session as long as the connection."""
+    """Raw frames written once, into memory that the server reads; sessions last as long as the connection."""
 
     name = "shm"
+    holds_sessions = True
 
     def __init__(self, local: dict[str, Any]) -> None:
         self._address = LocalAddress(**local)
@@ -48,18 +52,18 @@ class ShmTransport:
         self._open(timeout_s)
         return {}
 
-    def call(self, request: Request, timeout_s: float) -> Reply:
+    def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
         """One frame into free memory, a message to the server, its reply back; late ones are discarded."""
         deadline = time.monotonic() + timeout_s
         connection = self._open(timeout_s)
-        parts = request_parts(request, RAW)
+        parts = request_parts(requests, RAW)
         length = sum(map(len, parts))
         memory, descriptor = self._memory(length)
         at = 0
         for part in parts:
             memory.map[at : at + len(part)] = part
             at += len(part)
-        memory.busy = request.request_id
+        memory.busy = requests[0].request_id
         message = LocalAddress.REQUEST.pack(memory.number, length)
         try:
             connection.settimeout(timeout_s)
@@ -70,9 +74,9 @@ class ShmTransport:
                     socket.send_fds(connection, [message], [descriptor])
             while True:
                 connection.settimeout(max(1e-4, deadline - time.monotonic()))
-                reply = self._receive(connection)
-                if reply.request_id == request.request_id:
-                    return reply
+                replies = self._receive(connection)
+                if is_answer(replies, requests):
+                    return replies
         except TimeoutError as error:
             raise DeadlineExceeded(f"shm: no answer within {timeout_s:g} s") from error
         except OSError as error:
@@ -80,7 +84,7 @@ class ShmTransport:
             raise ConnectionLost(f"shm: {error}; reset before the next act") from error
 
     def close(self) -> None:
-        """End the session and give its memory back."""
+        """Hang up and give the memory back."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None
@@ -119,7 +123,7 @@ class ShmTransport:
             self._memories.append(memory)
         return memory, descriptor
 
-    def _receive(self, connection: socket.socket) -> Reply:
+    def _receive(self, connection: socket.socket) -> list[Reply]:
         ancillary = socket.CMSG_SPACE(4)
         size, control, _, _ = connection.recvmsg_into([self._buffer], ancillary)
         if size == 0:
@@ -134,4 +138,4 @@ class ShmTransport:
             frame = bytes(memoryview(self._buffer)[LocalAddress.REPLY.size : size])
         if number < len(self._memories):
             self._memories[number].busy = ""
-        return decode_reply(frame)
+        return decode_replies(frame)

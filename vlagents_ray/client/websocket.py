@@ -4,21 +4,25 @@ from __future__ import annotations
 
 import contextlib
 import time
+from collections.abc import Sequence
 from typing import Any
 
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from vlagents_ray.client.http import HttpTransport, http_url
+from vlagents_ray.client.transport import is_answer
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, MessageTooLarge, PolicyUnavailable
-from vlagents_ray.wire.frames import ImageCodec, decode_reply, encode_request
+from vlagents_ray.wire.frames import decode_replies, encode_requests
 from vlagents_ray.wire.messages import STREAM_BYTES, Reply, Request
+from vlagents_ray.wire.observations import ImageCodec
 
 
 class WebSocketTransport:
-    """A session that ends with its connection: after a break, `act` needs a new `reset`."""
+    """Sessions end with the connection."""
 
     name = "websocket"
+    holds_sessions = True
 
     def __init__(self, url: str, codec: ImageCodec) -> None:
         base = http_url(url)
@@ -40,10 +44,10 @@ class WebSocketTransport:
         self._stream(max(1.0, deadline - time.monotonic()))
         return metadata
 
-    def call(self, request: Request, timeout_s: float) -> Reply:
-        """One frame out, its reply back; replies to requests given up earlier are discarded."""
+    def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
+        """One frame out, its replies back; replies to requests given up earlier are discarded."""
         deadline = time.monotonic() + timeout_s
-        frame = encode_request(request, self._codec)
+        frame = encode_requests(requests, self._codec)
         if len(frame) > STREAM_BYTES:  # the server would only hang up
             raise MessageTooLarge(
                 f"{self._url}: got {len(frame)} bytes, the limit of a WebSocket message is {STREAM_BYTES}; "
@@ -54,9 +58,9 @@ class WebSocketTransport:
             socket.send(frame)
             while True:
                 data = socket.recv(timeout=max(0.0, deadline - time.monotonic()), decode=False)
-                reply = decode_reply(data)
-                if reply.request_id == request.request_id:
-                    return reply
+                replies = decode_replies(data)
+                if is_answer(replies, requests):
+                    return replies
         except TimeoutError as error:
             raise DeadlineExceeded(f"{self._url}: no answer within {timeout_s:g} s") from error
         except (ConnectionClosed, OSError) as error:
@@ -64,7 +68,7 @@ class WebSocketTransport:
             raise ConnectionLost(f"{self._url}: {error}; reset before the next act") from error
 
     def close(self) -> None:
-        """Close the connection, and so the session."""
+        """Close the connection, and so its sessions."""
         self._socket = None
         self._open.close()
 

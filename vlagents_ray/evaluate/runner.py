@@ -220,4 +220,6 @@ def _remote_agents(config: EvalConfig) -> AgentFactory:
         timeout_s=config.policy_timeout_s,
         connect_timeout_s=config.connect_timeout_s,
         codec=config.codec,
+        rank="simulation",
+        resume=False,  # an episode that was interrupted is played again, so that its result depends on its key alone
     )

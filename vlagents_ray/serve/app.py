@@ -13,6 +13,7 @@ from vlagents_ray.serve.config import ServerArgs
 from vlagents_ray.serve.deployment import PolicyReplica
 
 DEPLOYMENT = "Policy"
+_OUTSIDE = {"replicas", "autoscaling", "resources"}  # a replica does not know them, nor restarts when they change
 
 
 def build(args: ServerArgs) -> Application:
@@ -43,4 +44,4 @@ def build(args: ServerArgs) -> Application:
             request_router_class="ray.serve.experimental.consistent_hash_router.ConsistentHashRouter"
         )
     replica = serve.ingress()(PolicyReplica)
-    return serve.deployment(**options)(replica).bind(args.model_dump(mode="json"))
+    return serve.deployment(**options)(replica).bind(args.model_dump(mode="json", exclude=_OUTSIDE))

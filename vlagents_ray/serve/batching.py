@@ -49,6 +49,7 @@ class Ticket:
     request: Request
     done: Callable[[Reply], None]
     rank: Rank = Rank.ROBOT
+    owner: str = ""  # the connection that it came by
     arrived: float = field(default_factory=time.perf_counter)  # s
     cancelled: bool = False  # answered, or nobody waits for the answer any more
 
@@ -113,12 +114,13 @@ class BatchQueue:
         if self._failure is not None:
             raise self._failure
 
-    def put(self, ticket: Ticket) -> None:
-        """Queue a request. Raises `PolicyUnavailable` after `close`."""
+    def put(self, *tickets: Ticket) -> None:
+        """Queue requests, those put together for one batch if there is room. `PolicyUnavailable` after `close`."""
         with self._lock:
             if self._closed:
                 raise PolicyUnavailable("the replica is stopping; connect again")
-            self._waiting[ticket.rank].append(ticket)
+            for ticket in tickets:
+                self._waiting[ticket.rank].append(ticket)
             self._wake()
 
     def watch(self, file: HasFileno, ready: Callable[[], None]) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import importlib.metadata
+import json
 import logging
 import os
 from dataclasses import asdict
@@ -16,16 +17,19 @@ from starlette.applications import Starlette
 
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.registry import policy_class
-from vlagents_ray.serve.batching import Rank
-from vlagents_ray.serve.calls import ask
+from vlagents_ray.serve.calls import Sender
 from vlagents_ray.serve.config import ServerArgs
 from vlagents_ray.serve.engine import Engine
 from vlagents_ray.serve.ingress import build_ingress
 from vlagents_ray.serve.local import LocalDoor
-from vlagents_ray.wire.frames import decode_request, encode_reply
+from vlagents_ray.serve.moving import Strays, export
+from vlagents_ray.serve.peers import Peers
+from vlagents_ray.wire.frames import decode_requests, encode_replies
 from vlagents_ray.wire.messages import PROTOCOL_VERSION, Reply
 
 logger = logging.getLogger(__name__)
+
+_WATCH_S = 0.25
 
 
 class PolicyReplica:
@@ -44,7 +48,9 @@ class PolicyReplica:
             max_batch_size=self._args.batch.max_size,
             session_limit=self._args.sessions.limit,
             session_idle_s=self._args.sessions.idle_s,
+            version=json.dumps([self._args.policy, self._args.config], sort_keys=True),
         )
+        self._strays = self._engine.strays = Strays(self._engine, Peers())
         self._local = LocalDoor(self._engine, self._limits) if hasattr(os, "memfd_create") else None
         if self._local is not None:
             self._local.open()
@@ -53,6 +59,7 @@ class PolicyReplica:
             await self._loading
         else:
             self._loading.add_done_callback(_log_failure)
+        self._watching = asyncio.ensure_future(self._watch_for_the_end())
 
     def __serve_build_asgi_app__(self) -> Starlette:
         return build_ingress(self._engine, self.metadata, self._limits)
@@ -80,26 +87,58 @@ class PolicyReplica:
         return self.metadata(), ray.get_runtime_context().current_actor
 
     async def call(self, session_id: str, frame: np.ndarray) -> bytes:
-        """One request from inside the cluster: a frame as (N,) uint8, read in place from plasma."""
-        request_id = ""
+        """A frame of requests from inside the cluster, (N,) uint8, read in place from plasma."""
+        sender = Sender(self._engine, session_id, connected=False)
         try:
-            request = decode_request(frame.data, self._limits)
-            request_id = request.request_id
-            reply = await ask(self._engine, session_id, request, Rank.SIMULATION)
+            replies = await sender.ask(decode_requests(frame.data, self._limits))
         except VLAgentsError as error:
-            reply = Reply(request_id, error=error)
-        return encode_reply(reply)
+            replies = [Reply(error=error)]
+        return encode_replies(replies)
+
+    async def export_session(self, session_id: str) -> dict[str, Any] | None:
+        """For another replica, which got a request of this session."""
+        return await asyncio.to_thread(export, self._engine, session_id)
+
+    async def import_session(self, session_id: str, state: dict[str, Any]) -> bool:
+        """From another replica, which stops."""
+        if self._engine.draining:
+            return False
+        try:
+            await asyncio.to_thread(self._engine.adopt, session_id, state)
+        except VLAgentsError as error:
+            logger.info("session %s: not taken over: %s", session_id, error)
+            return False
+        return True
 
     def check_health(self) -> None:
         """Called by Serve; a replica whose policy did not load, or died, is replaced."""
         if self._loading.done():
             self._engine.require_ready()
 
+    async def _watch_for_the_end(self) -> None:
+        """Tell clients to go elsewhere, if there is an elsewhere, as soon as Serve wants this replica to stop."""
+        while not _stopping():
+            await asyncio.sleep(_WATCH_S)
+        self._engine.draining = await asyncio.to_thread(_others_run)
+
     async def __del__(self) -> None:
-        if hasattr(self, "_engine"):
-            await asyncio.to_thread(self._engine.close)
-            if self._local is not None:
-                self._local.close()
+        if not hasattr(self, "_engine"):
+            return
+        if hasattr(self, "_watching"):
+            self._watching.cancel()
+        if self._engine.draining:
+            await asyncio.to_thread(self._strays.hand_over)
+        self._strays.close()
+        await asyncio.to_thread(self._engine.close)
+        if self._local is not None:
+            self._local.close()
+
+
+def _stopping() -> bool:
+    """Has Serve begun to stop this replica? It tells the load balancer, but has no hook for the user's class."""
+    worker = ray._private.worker.global_worker
+    actor = worker.actors.get(worker.actor_id)
+    return bool(actor._replica_impl._shutting_down)
 
 
 def _others_run() -> bool:

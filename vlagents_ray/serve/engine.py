@@ -10,10 +10,10 @@ import logging
 import sys
 import time
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 from vlagents_ray.contract import Contract, check_action, check_observation, require_match
-from vlagents_ray.errors import InvalidInput, NotReset, PolicyFailed, PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import InvalidInput, NotReset, PolicyFailed, PolicyUnavailable, UnknownSession, VLAgentsError
 from vlagents_ray.interface import Act, Agent
 from vlagents_ray.serve.batching import BatchQueue, Rank, Ticket
 from vlagents_ray.serve.sessions import AgentCopies, Session, SessionTable
@@ -23,16 +23,33 @@ from vlagents_ray.wire.tree import Writer
 logger = logging.getLogger(__name__)
 
 
+class FindsStrays(Protocol):
+    """Fetches sessions that are at another replica: `vlagents_ray.serve.moving.Strays`."""
+
+    def fetch(self, session_id: str, then: Callable[[], None]) -> bool:
+        """Call `then` when it was tried; False if it will not be."""
+        ...
+
+
 class Engine:
     """Serves an agent to many sessions. `start` loads it; `close` ends it."""
 
     def __init__(
-        self, agent: Agent, *, max_batch_size: int = 16, session_limit: int = 1000, session_idle_s: float = 600.0
+        self,
+        agent: Agent,
+        *,
+        max_batch_size: int = 16,
+        session_limit: int = 1000,
+        session_idle_s: float = 600.0,
+        version: str = "",
     ) -> None:
         self._agent = agent
+        self._version = version  # of policy and settings: sessions move between equal ones only
         self._copies: AgentCopies | None = None
         self._unready: VLAgentsError | None = PolicyUnavailable("the policy is loading; try again")
         self.contract: Contract | None = None
+        self.strays: FindsStrays | None = None  # where to look for a session that is not here
+        self.draining = False  # the replica will stop, and others will go on: clients are told
         self.sessions = SessionTable(session_limit, session_idle_s)
         self.queue = BatchQueue(
             self._run, max_batch_size, prepare=self._prepare, idle=self.sessions.drop_idle, idle_s=session_idle_s / 10
@@ -60,23 +77,40 @@ class Engine:
         self.queue.close(timeout_s=30)
         self._agent.close()
 
-    def submit(
-        self, session_id: str, request: Request, done: Callable[[Reply], None], rank: Rank = Rank.ROBOT
-    ) -> Ticket:
-        """Queue a request whose answer goes to `done`. What is wrong with it is raised here, at once."""
+    def ticket(self, session_id: str, request: Request, done: Callable[[Reply], None], owner: str = "") -> Ticket:
+        """A request made ready for the queue, its answer to go to `done`. What is wrong with it is raised here.
+
+        `owner` is the connection that the session ends with; empty for a caller without one.
+        """
         self.require_ready()
         if request.op == "act":
-            if self.sessions.get(session_id).agent is None:
+            session = self.sessions.get(session_id)
+            if session.agent is None:
                 raise NotReset(f"session {session_id!r}: act before a successful reset; reset first")
+            session.owner = owner
         elif request.op == "reset" and request.contract is not None:
             require_match(self.contract, Contract.from_json(request.contract))
-        if request.obs is not None:
-            check_observation(request.obs, self.contract)
+        for obs in (*request.history, request.obs):
+            if obs is not None:
+                check_observation(obs, self.contract)
         if request.op == "reset":
-            self.sessions.open(session_id)
-        ticket = Ticket(session_id, request, done, rank)
+            self.sessions.open(session_id, owner)
+        return Ticket(session_id, request, done, Rank[request.rank.upper()], owner)
+
+    def submit(self, session_id: str, request: Request, done: Callable[[Reply], None], owner: str = "") -> Ticket:
+        """Queue a request: `ticket`, and put it."""
+        ticket = self.ticket(session_id, request, done, owner)
         self.queue.put(ticket)
         return ticket
+
+    def adopt(self, session_id: str, state: dict[str, Any]) -> None:
+        """Go on with a session that another replica gave up: the `info` of its answer to "export"."""
+        self.require_ready()
+        if self._copies is None or state["version"] != (self._version, self._copies.fingerprint):
+            raise UnknownSession(f"session {session_id!r}: of another version of the policy; reset it")
+        agent = self._copies.load(state["agent"])
+        session = self.sessions.open(session_id)
+        session.agent, session.steps = agent, state["steps"]
 
     def _prepare(self) -> None:
         self._agent.initialize()
@@ -86,7 +120,7 @@ class Engine:
 
     def _run(self, batch: Sequence[Ticket]) -> None:
         """Answer every ticket of a batch. Runs on the policy's thread."""
-        acting: list[tuple[Ticket, Agent]] = []
+        acting: list[tuple[Ticket, Session]] = []
         started = time.perf_counter()
         for ticket in batch:
             try:
@@ -94,6 +128,8 @@ class Engine:
                     acting.append((ticket, self._ready(ticket)))
                 elif ticket.request.op == "reset":
                     self._reset(ticket)
+                elif ticket.request.op == "export":
+                    self._export(ticket)
                 else:
                     self.sessions.close(ticket.session_id)
                     ticket.answer(Reply(ticket.request.request_id, info={}))
@@ -102,15 +138,35 @@ class Engine:
         if acting:
             self._act(acting, started)
 
-    def _ready(self, ticket: Ticket) -> Agent:
+    def _ready(self, ticket: Ticket) -> Session:
         session: Session = self.sessions.get(ticket.session_id)
         if session.agent is None:  # a reset ahead of it in the queue failed
             raise NotReset(f"session {ticket.session_id!r}: its last reset failed; reset again")
-        return session.agent
+        step = ticket.request.step
+        if step is not None and step != session.steps:
+            raise UnknownSession(
+                f"session {ticket.session_id!r}: has {session.steps} acts behind it here, {step} as its client "
+                f"knows; an answer was lost: reset it"
+            )
+        return session
+
+    def _export(self, ticket: Ticket) -> None:
+        """Give the session up, to whoever asked: all that another replica needs to go on with it."""
+        session = self.sessions.get(ticket.session_id)
+        if session.agent is None or self._copies is None:
+            raise UnknownSession(f"session {ticket.session_id!r}: not reset yet")
+        state = {
+            "agent": self._copies.dump(session.agent),
+            "steps": session.steps,
+            "version": (self._version, self._copies.fingerprint),
+        }
+        self.sessions.close(ticket.session_id)
+        ticket.answer(Reply(ticket.request.request_id, info=state))
 
     def _reset(self, ticket: Ticket) -> None:
-        session = self.sessions.open(ticket.session_id)
+        session = self.sessions.open(ticket.session_id, ticket.owner)
         session.agent = None
+        session.steps = 0
         if self._copies is None or ticket.request.obs is None:  # start() and the decoder have seen to both
             raise PolicyFailed("reset without an initialized policy or an observation")
         begun = time.perf_counter()
@@ -118,29 +174,34 @@ class Engine:
         info = agent.reset(ticket.request.obs, ticket.request.instruction, **ticket.request.kwargs)
         if not isinstance(info, dict):
             raise PolicyFailed(f"reset: the policy returned {type(info).__name__}, want a dict")
-        reply = Reply(ticket.request.request_id, info=info, timing=_timing(ticket.arrived, begun, time.perf_counter()))
+        for obs in ticket.request.history:
+            agent.observe(obs)
+        reply = Reply(
+            ticket.request.request_id, info=info, step=0, timing=_timing(ticket.arrived, begun, time.perf_counter())
+        )
         _require_sendable(info)
         session.agent = agent
         ticket.answer(reply)
 
-    def _act(self, acting: list[tuple[Ticket, Agent]], started: float) -> None:
+    def _act(self, acting: list[tuple[Ticket, Session]], started: float) -> None:
         observations = [ticket.request.obs for ticket, _ in acting]
         begun = time.perf_counter()
         results: Sequence[Act | Exception]
         try:
-            results = self._agent.act_batch(observations, [agent for _, agent in acting])  # type: ignore[arg-type]
+            agents = [session.agent for _, session in acting]
+            results = self._agent.act_batch(observations, agents)  # type: ignore[arg-type]
             _synchronize()
             if len(results) != len(acting):
                 raise PolicyFailed(f"act_batch: got {len(acting)} observations, returned {len(results)} actions")
         except Exception as error:  # noqa: BLE001 - becomes the replies
             results = [error] * len(acting)
         ended = time.perf_counter()
-        for (ticket, _), result in zip(acting, results, strict=True):
-            reply = self._answer(ticket, result)
+        for (ticket, session), result in zip(acting, results, strict=True):
+            reply = self._answer(ticket, session, result)
             reply.timing = {**_timing(ticket.arrived, begun, ended), "batch_size": len(acting)}
             ticket.answer(reply)
 
-    def _answer(self, ticket: Ticket, result: Act | Exception) -> Reply:
+    def _answer(self, ticket: Ticket, session: Session, result: Act | Exception) -> Reply:
         request_id = ticket.request.request_id
         try:
             if isinstance(result, Exception):
@@ -152,7 +213,8 @@ class Engine:
                 _require_sendable(act.info)
         except Exception as error:  # noqa: BLE001 - becomes the reply
             return Reply(request_id, error=self._explain(error, ticket))
-        return Reply(request_id, act=act)
+        session.steps += 1
+        return Reply(request_id, act=act, step=session.steps)
 
     def _explain(self, error: Exception, ticket: Ticket) -> VLAgentsError:
         """The error as the caller may see it; what the policy itself raised stays in the log."""

@@ -27,17 +27,19 @@ from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable, UnknownApp, VLAgentsError
-from vlagents_ray.serve.calls import ask
+from vlagents_ray.serve.calls import Sender
 from vlagents_ray.serve.docs import docs_page
 from vlagents_ray.serve.engine import Engine
-from vlagents_ray.wire.frames import CONTENT_TYPE, decode_request, encode_reply
+from vlagents_ray.wire.frames import CONTENT_TYPE, check_request, decode_requests, encode_replies
 from vlagents_ray.wire.messages import (
     DEADLINE_HEADER,
     OPS,
+    RANK_HEADER,
     REQUEST_ID_HEADER,
     SESSION_HEADER,
     Limits,
     Op,
+    RankName,
     Reply,
     Request,
 )
@@ -95,14 +97,14 @@ class _Door:
             arrived = time.perf_counter()
             request_id = _request_id(http)
             try:
-                session_id = _session_id(http)
-                request = await self._read(op, http)
-                request.request_id = request.request_id or request_id
-                request_id = request.request_id
+                sender = Sender(self._engine, _session_id(http), connected=False)
+                requests = await self._read(op, http)
+                if isinstance(requests[0], Request):
+                    request_id = requests[0].request_id = requests[0].request_id or request_id
                 decoded = time.perf_counter()
-                reply = await ask(self._engine, session_id, request)
-                if reply.error is not None:
-                    raise reply.error
+                replies = await sender.ask(requests)
+                if len(replies) == 1 and (error := replies[0].error) is not None:
+                    raise error
             except ClientDisconnect:
                 return Response(status_code=499)
             except VLAgentsError as error:
@@ -110,14 +112,14 @@ class _Door:
             except Exception:
                 logger.exception("%s failed (request %s)", op, request_id)
                 return _problem(VLAgentsError("internal error; the server's log has the details"), request_id)
-            reply.timing |= {"decode_ms": (decoded - arrived) * 1e3, "total_ms": (time.perf_counter() - arrived) * 1e3}
-            if CONTENT_TYPE in http.headers.get("accept", ""):
-                return Response(encode_reply(reply), media_type=CONTENT_TYPE)
-            return JSONResponse(reply_to_json(reply))
+            _add_timing(replies, arrived, decoded)
+            if CONTENT_TYPE in http.headers.get("accept", "") or len(replies) > 1:
+                return Response(encode_replies(replies), media_type=CONTENT_TYPE)
+            return JSONResponse(reply_to_json(replies[0]))
 
         return handle
 
-    async def _read(self, op: Op, http: HttpRequest) -> Request:
+    async def _read(self, op: Op, http: HttpRequest) -> list[Request | Reply]:
         kind = http.headers.get("content-type", "").partition(";")[0].strip().lower()
         declared = http.headers.get("content-length", "")
         if declared.isdigit() and int(declared) > self._limits.body_bytes:
@@ -129,19 +131,29 @@ class _Door:
         else:
             body = await self._body(http)
             if kind == CONTENT_TYPE:
-                request = await self._decode(body)
-                if request.op != op:
-                    raise MalformedMessage(f"op: the frame says {request.op!r}, the path says {op!r}")
-            elif kind == "application/json":
+                return self._checked(op, await self._decode(body), http)
+            if kind == "application/json":
                 request = request_from_parts(op, body, {}, self._limits)
             else:
                 raise MalformedMessage(
                     f"content-type: got {kind or 'none'!r}, "
                     f"want multipart/form-data, application/json or {CONTENT_TYPE}"
                 )
-        if deadline := http.headers.get(DEADLINE_HEADER):
-            request.deadline_ms = _positive(deadline)
-        return request
+        return self._checked(op, [request], http)
+
+    def _checked(self, op: Op, requests: list[Request | Reply], http: HttpRequest) -> list[Request | Reply]:
+        deadline, rank = http.headers.get(DEADLINE_HEADER), http.headers.get(RANK_HEADER)
+        for request in requests:
+            if not isinstance(request, Request):
+                continue
+            if request.op != op:
+                raise MalformedMessage(f"op: the frame says {request.op!r}, the path says {op!r}")
+            if deadline:
+                request.deadline_ms = _positive(deadline)
+            if rank:
+                request.rank = cast(RankName, rank)
+                check_request(request, self._limits)
+        return requests
 
     async def _read_form(self, op: Op, http: HttpRequest) -> Request:
         limits = self._limits
@@ -178,50 +190,54 @@ class _Door:
             chunks.append(chunk)
         return b"".join(chunks)
 
-    async def _decode(self, frame: bytes) -> Request:
+    async def _decode(self, frame: bytes) -> list[Request | Reply]:
         if len(frame) > _INLINE_BYTES:
-            return await asyncio.to_thread(decode_request, frame, self._limits)
-        return decode_request(frame, self._limits)
+            return await asyncio.to_thread(decode_requests, frame, self._limits)
+        return decode_requests(frame, self._limits)
 
     async def stream(self, socket: WebSocket) -> None:
-        """One session; a broken request is answered and leaves the session as it was."""
+        """Sessions that end with the connection; a broken request is answered and leaves them as they were."""
         await socket.accept()
-        session_id = f"ws-{uuid.uuid4().hex}"
-        try:
-            self._engine.sessions.open(session_id)
-        except PolicyUnavailable as error:
-            await socket.send_bytes(encode_reply(Reply(error=error)))
+        if len(self._engine.sessions) >= self._engine.sessions.limit:
+            full = PolicyUnavailable(f"this replica holds {len(self._engine.sessions)} sessions, its limit")
+            await socket.send_bytes(encode_replies([Reply(error=full)]))
             await socket.close(_TRY_AGAIN_LATER)
             return
+        sender = Sender(self._engine)
         try:
             while True:
                 message = await socket.receive()
                 if message["type"] == "websocket.disconnect":
                     return
-                reply = await self._answer(session_id, message.get("bytes"))
-                await socket.send_bytes(encode_reply(reply))
+                replies = await self._answer(sender, message.get("bytes"))
+                await socket.send_bytes(encode_replies(replies))
         except WebSocketDisconnect:
             return
         finally:
-            self._engine.sessions.close(session_id)
+            sender.release()
 
-    async def _answer(self, session_id: str, frame: bytes | None) -> Reply:
+    async def _answer(self, sender: Sender, frame: bytes | None) -> list[Reply]:
         arrived = time.perf_counter()
-        request_id = ""
         try:
             if frame is None:
                 raise MalformedMessage("stream: got a text message, want a binary frame")
-            request = await self._decode(frame)
-            request_id = request.request_id = request.request_id or uuid.uuid4().hex
+            requests = await self._decode(frame)
             decoded = time.perf_counter()
-            reply = await ask(self._engine, session_id, request)
+            replies = await sender.ask(requests)
         except VLAgentsError as error:
-            return Reply(request_id, error=error)
+            return [Reply(error=error)]
         except Exception:
-            logger.exception("stream failed (session %s, request %s)", session_id, request_id)
-            return Reply(request_id, error=VLAgentsError("internal error; the server's log has the details"))
-        reply.timing |= {"decode_ms": (decoded - arrived) * 1e3, "total_ms": (time.perf_counter() - arrived) * 1e3}
-        return reply
+            request_id = uuid.uuid4().hex
+            logger.exception("stream failed (request %s)", request_id)
+            return [Reply(request_id, error=VLAgentsError("internal error; the server's log has the details"))]
+        _add_timing(replies, arrived, decoded)
+        return replies
+
+
+def _add_timing(replies: list[Reply], arrived: float, decoded: float) -> None:
+    now = time.perf_counter()
+    for reply in replies:
+        reply.timing |= {"decode_ms": (decoded - arrived) * 1e3, "total_ms": (now - arrived) * 1e3}
 
 
 def _session_id(http: HttpRequest) -> str:

@@ -17,13 +17,12 @@ import secrets
 import socket
 import struct
 import time
-import uuid
 from collections.abc import Callable
 
-from vlagents_ray.errors import MalformedMessage, MessageTooLarge, VLAgentsError
-from vlagents_ray.serve.batching import Rank
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable, VLAgentsError
+from vlagents_ray.serve.calls import Sender
 from vlagents_ray.serve.engine import Engine
-from vlagents_ray.wire.frames import decode_request, encode_reply
+from vlagents_ray.wire.frames import decode_requests, encode_replies
 from vlagents_ray.wire.messages import Limits, LocalAddress, Reply, boot_id
 
 logger = logging.getLogger(__name__)
@@ -62,12 +61,12 @@ class LocalDoor:
             logger.warning("a process of another user tried the local door")
             connection.close()
             return
-        try:
-            client = _Client(connection, self._engine, self._limits, self._clients.discard)
-        except VLAgentsError as error:  # no room for another session
-            connection.send(LocalAddress.REPLY.pack(0, 0) + encode_reply(Reply(error=error)))
+        if len(self._clients) >= self._engine.sessions.limit:
+            full = PolicyUnavailable(f"this replica has {len(self._clients)} local clients, its limit of sessions")
+            connection.send(LocalAddress.REPLY.pack(0, 0) + encode_replies([Reply(error=full)]))
             connection.close()
             return
+        client = _Client(connection, self._engine, self._limits, self._clients.discard)
         self._clients.add(client)
         self._engine.queue.watch(connection, client.ready)
 
@@ -83,8 +82,7 @@ class _Client:
         self._limits = limits
         self._gone = gone
         self._files: dict[int, mmap.mmap] = {}
-        self._session_id = f"shm-{uuid.uuid4().hex}"
-        engine.sessions.open(self._session_id)
+        self._sender = Sender(engine)
 
     def ready(self) -> None:
         """A message, or the end of the connection, is there."""
@@ -100,32 +98,35 @@ class _Client:
             self._engine.queue.unwatch(self._connection)
             self.release()
             return
-        number, request_id = 0, ""
+        number = 0
         try:
             if len(message) != LocalAddress.REQUEST.size:
                 raise MalformedMessage(f"local: got {len(message)} bytes, want {LocalAddress.REQUEST.size}")
             number, length = LocalAddress.REQUEST.unpack(message)
             if descriptors:
                 self._add(number, descriptors.pop())
-            request = decode_request(self._frame(number, length), self._limits)
-            request_id = request.request_id
+            requests = decode_requests(self._frame(number, length), self._limits)
             decoded = time.perf_counter()
 
-            def answer(reply: Reply) -> None:
-                total_ms = (time.perf_counter() - arrived) * 1e3
-                reply.timing |= {"decode_ms": (decoded - arrived) * 1e3, "total_ms": total_ms}
-                self._send(number, reply)
+            def answer(replies: list[Reply]) -> None:
+                timing = {
+                    "decode_ms": (decoded - arrived) * 1e3,
+                    "total_ms": (time.perf_counter() - arrived) * 1e3,
+                }
+                for reply in replies:
+                    reply.timing |= timing
+                self._send(number, replies)
 
-            self._engine.submit(self._session_id, request, answer, Rank.ROBOT)
+            self._sender.send(requests, answer)
         except VLAgentsError as error:
-            self._send(number, Reply(request_id, error=error))
+            self._send(number, [Reply(error=error)])
         finally:
             for descriptor in descriptors:
                 os.close(descriptor)
 
     def release(self) -> None:
         """Forget the session and give its memory back."""
-        self._engine.sessions.close(self._session_id)
+        self._sender.release()
         self._connection.close()
         for memory in self._files.values():
             memory.close()
@@ -157,8 +158,8 @@ class _Client:
             raise MalformedMessage(f"local: {length} bytes in memory file {number}, which is not there or shorter")
         return memory[:length]  # a copy: the policy may keep what the client soon overwrites
 
-    def _send(self, number: int, reply: Reply) -> None:
-        frame = encode_reply(reply)
+    def _send(self, number: int, replies: list[Reply]) -> None:
+        frame = encode_replies(replies)
         try:
             if len(frame) <= _INLINE:
                 self._connection.send(LocalAddress.REPLY.pack(number, 0) + frame)

@@ -9,10 +9,14 @@ A copy shares what is heavy or cannot be copied and has its own of everything el
 - shared and made read-only: numpy arrays over 64 MiB, so that writing into one raises instead of
   leaking into other sessions;
 - copied: all other attributes, whatever their depth.
+
+A session can move to another replica of the same policy: what it has of its own travels, what it
+shares is found there again, by its place among the shared objects.
 """
 
 from __future__ import annotations
 
+import hashlib
 import io
 import logging
 import pickle
@@ -20,6 +24,7 @@ import sys
 import threading
 import time
 import types
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -38,29 +43,30 @@ _PLAIN = (
 )
 
 
-class _Snapshot(pickle.Pickler):
-    """Pickles an agent in memory, leaving out by reference what its copies share."""
+class _Shared:
+    """The objects that the sessions of a replica share, in the order in which pickling met them."""
 
-    def __init__(self, file: io.BytesIO, named: list[Any]) -> None:
-        super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)
-        self.shared: dict[int, Any] = {id(item): item for item in named}
+    def __init__(self) -> None:
+        self.objects: list[Any] = []
         self.refused: set[str] = set()
+        self._numbers: dict[int, int] = {}
         torch = sys.modules.get("torch")
         self._parameter: type | None = torch.nn.Parameter if torch is not None else None
 
-    def persistent_id(self, obj: Any) -> int | None:
-        """A key into `shared`, or None for what is copied."""
-        key = id(obj)
-        if key in self.shared:
-            return key
-        if type(obj) in _PLAIN:
-            return None
-        if not self._is_shared(obj):
-            return None
-        self.shared[key] = obj
-        return key
+    def number(self, obj: Any) -> int | None:
+        """The place of an object, if it is shared."""
+        return self._numbers.get(id(obj))
 
-    def _is_shared(self, obj: Any) -> bool:
+    def add(self, obj: Any) -> int:
+        """Share an object from now on."""
+        number = self._numbers.get(id(obj))
+        if number is None:
+            number = self._numbers[id(obj)] = len(self.objects)
+            self.objects.append(obj)
+        return number
+
+    def must_have(self, obj: Any) -> bool:
+        """Is this one that copies share whether named or not? A large array becomes read-only."""
         if isinstance(obj, _BY_REFERENCE) or (self._parameter is not None and isinstance(obj, self._parameter)):
             return True
         if isinstance(obj, np.ndarray):
@@ -77,38 +83,81 @@ class _Snapshot(pickle.Pickler):
             return True
         return False
 
+    def fingerprint(self) -> str:
+        """Equal in replicas whose shared objects correspond, place by place, as far as their kinds tell."""
+        kinds = [
+            (type(obj).__module__, type(obj).__qualname__, getattr(obj, "__qualname__", ""), str(_shape(obj)))
+            for obj in self.objects
+        ]
+        return hashlib.sha256(repr(kinds).encode()).hexdigest()
 
-class _Restore(pickle.Unpickler):
-    def __init__(self, data: bytes, shared: dict[int, Any]) -> None:
-        super().__init__(io.BytesIO(data))
+
+class _Pickler(pickle.Pickler):
+    """Pickles an agent in memory, leaving out what is shared; with `found`, also what should be."""
+
+    def __init__(self, file: io.BytesIO, shared: _Shared, *, find: bool) -> None:
+        super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)
         self._shared = shared
+        self._find = find
+
+    def persistent_id(self, obj: Any) -> int | None:
+        """The place of a shared object, or None for what is copied."""
+        number = self._shared.number(obj)
+        if number is None and self._find and type(obj) not in _PLAIN and self._shared.must_have(obj):
+            number = self._shared.add(obj)
+        return number
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, data: bytes, shared: _Shared) -> None:
+        super().__init__(io.BytesIO(data))
+        self._objects = shared.objects
 
     def persistent_load(self, pid: Any) -> Any:
-        return self._shared[pid]
+        return self._objects[pid]
 
 
 class AgentCopies:
     """Makes copies of an initialized agent, each independent of the others."""
 
     def __init__(self, agent: Agent) -> None:
-        file = io.BytesIO()
-        named = [getattr(agent, name) for name in agent.shared if hasattr(agent, name)]
-        snapshot = _Snapshot(file, [item for item in named if type(item) not in _PLAIN or item])
-        snapshot.dump(agent)
-        self._data = file.getvalue()
-        self._shared = snapshot.shared
-        if snapshot.refused:
+        self._shared = _Shared()
+        for name in agent.shared:
+            item = getattr(agent, name, None)
+            if type(item) not in _PLAIN or item:
+                self._shared.add(item)
+        self._pristine = self._dump(agent, find=True)
+        self.fingerprint = self._shared.fingerprint()
+        if self._shared.refused:
             logger.warning(
                 "%s: sessions share objects of %s, which cannot be copied; if one of them holds an episode's "
                 "state, create it in reset() instead of initialize()",
                 type(agent).__name__,
-                sorted(snapshot.refused),
+                sorted(self._shared.refused),
             )
 
     def make(self) -> Agent:
         """A pristine copy: what the agent was when `initialize` returned."""
-        agent: Agent = _Restore(self._data, self._shared).load()
+        return self.load(self._pristine)
+
+    def dump(self, agent: Agent) -> bytes:
+        """What a copy has of its own, for `load` in another replica; raises whatever pickling it raises."""
+        return self._dump(agent, find=False)
+
+    def load(self, data: bytes) -> Agent:
+        """The copy that `dump` wrote here, or in a replica with the same fingerprint."""
+        agent: Agent = _Unpickler(data, self._shared).load()
         return agent
+
+    def _dump(self, agent: Agent, *, find: bool) -> bytes:
+        file = io.BytesIO()
+        _Pickler(file, self._shared, find=find).dump(agent)
+        return file.getvalue()
+
+
+def _shape(obj: Any) -> tuple[int, ...] | None:
+    shape = getattr(obj, "shape", None)
+    return tuple(shape) if isinstance(shape, tuple) else None
 
 
 @dataclass(slots=True)
@@ -117,6 +166,8 @@ class Session:
 
     id: str
     agent: Agent | None = None  # None until its first `reset` succeeded
+    owner: str = ""  # the connection that it ends with; empty: it ends when closed, or idle for long
+    steps: int = 0  # acts since its last reset
     used: float = field(default_factory=time.monotonic)
 
 
@@ -125,7 +176,7 @@ class SessionTable:
 
     def __init__(self, limit: int, idle_s: float) -> None:
         self._sessions: dict[str, Session] = {}
-        self._limit = limit
+        self.limit = limit
         self._idle_s = idle_s
         self._lock = threading.Lock()
 
@@ -143,26 +194,40 @@ class SessionTable:
         session.used = time.monotonic()
         return session
 
-    def open(self, session_id: str) -> Session:
-        """The session, made if it is new; `PolicyUnavailable` when the replica is full."""
+    def open(self, session_id: str, owner: str = "") -> Session:
+        """The session, made if it is new, now `owner`'s; `PolicyUnavailable` when the replica is full."""
         with self._lock:
             session = self._sessions.get(session_id)
             if session is None:
-                if len(self._sessions) >= self._limit:
+                if len(self._sessions) >= self.limit:
                     self._drop_idle()
-                if len(self._sessions) >= self._limit:
+                if len(self._sessions) >= self.limit:
                     raise PolicyUnavailable(
-                        f"this replica holds {self._limit} sessions, its limit; "
+                        f"this replica holds {self.limit} sessions, its limit; "
                         f"close one, or raise sessions.limit or the number of replicas"
                     )
                 session = self._sessions[session_id] = Session(session_id)
         session.used = time.monotonic()
+        session.owner = owner
         return session
 
     def close(self, session_id: str) -> None:
         """Forget the session; unknown ids are none."""
         with self._lock:
             self._sessions.pop(session_id, None)
+
+    def close_owned(self, owner: str, session_ids: Iterable[str]) -> None:
+        """Forget those of the sessions that are still `owner`'s."""
+        with self._lock:
+            for session_id in session_ids:
+                session = self._sessions.get(session_id)
+                if session is not None and session.owner == owner:
+                    del self._sessions[session_id]
+
+    def ids(self) -> list[str]:
+        """All sessions."""
+        with self._lock:
+            return list(self._sessions)
 
     def drop_idle(self) -> None:
         """Forget sessions that sent nothing for longer than the idle time."""

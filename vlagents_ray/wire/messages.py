@@ -14,10 +14,14 @@ PROTOCOL_VERSION = 1
 SESSION_HEADER = "x-session-id"
 REQUEST_ID_HEADER = "x-request-id"
 DEADLINE_HEADER = "x-deadline-ms"
+RANK_HEADER = "x-rank"
+NAME_CHARACTERS = 128  # of a session's or a request's id, at most
 STREAM_BYTES = 16 * 2**20  # of one WebSocket message: what uvicorn takes, and Serve does not let us change
 
-Op = Literal["reset", "act", "close"]
-OPS: tuple[Op, ...] = ("reset", "act", "close")
+Op = Literal["reset", "act", "close", "export"]
+OPS: tuple[Op, ...] = ("reset", "act", "close")  # "export" is for other replicas, and in no message
+RankName = Literal["robot", "simulation"]  # whose requests go first
+RANKS: tuple[RankName, ...] = ("robot", "simulation")
 
 
 @dataclass(slots=True)
@@ -29,6 +33,10 @@ class Request:
     instruction: str | None = None  # reset only
     kwargs: dict[str, Any] = field(default_factory=dict)  # reset only: `seed`, ...
     contract: dict[str, Any] | None = None  # reset only: the robot's or env's side, compared by the server
+    history: list[Obs] = field(default_factory=list)  # reset only: what the session saw since, oldest first
+    session: str = ""  # which of its sessions the sender means; empty: the only one of its connection
+    rank: RankName = "robot"
+    step: int | None = None  # act only: how many acts the session has behind it, as far as the sender knows
     request_id: str = ""
     deadline_ms: float | None = None  # the answer is useless after this long, counted from its arrival
 
@@ -41,6 +49,8 @@ class Reply:
     act: Act | None = None
     info: dict[str, Any] | None = None  # what `Agent.reset` returned
     error: VLAgentsError | None = None
+    step: int | None = None  # acts that the session has behind it, this one included
+    draining: bool = False  # the replica will stop: connect again, and the session follows
     timing: dict[str, float] = field(default_factory=dict)  # ms, by stage
 
 
@@ -55,6 +65,8 @@ class Limits:
     depth: int = 8  # nesting of `info` and `kwargs`
     items: int = 10_000  # values in `info` and `kwargs` together
     text: int = 16_384  # characters of an instruction
+    requests: int = 4096  # in one frame
+    history: int = 256  # observations that come with a reset
 
 
 DEFAULT_LIMITS = Limits()

@@ -14,8 +14,9 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, VLAgentsError
-from vlagents_ray.wire.frames import check_request, read_obs
+from vlagents_ray.wire.frames import check_request
 from vlagents_ray.wire.messages import Limits, Op, Reply, Request
+from vlagents_ray.wire.observations import read_obs
 from vlagents_ray.wire.tree import Reader
 
 PROBLEM_TYPE = "application/problem+json"

@@ -1,0 +1,191 @@
+"""Sessions outlive their replica: moved when it stops, begun again when it is killed."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from eval_fakes import wait_for
+from ray.serve.schema import ServeDeploySchema
+
+from tests.integration.test_sessions import TRANSPORTS, obs, url
+from vlagents_ray import RemoteAgent
+from vlagents_ray.client.agent import TransportName
+from vlagents_ray.images import encode_jpeg
+from vlagents_ray.serve.cluster import Server, running_server
+from vlagents_ray.serve.files import deployment
+
+
+def deployed(replicas: int) -> ServeDeploySchema:
+    """Two policies; `replicas` of the first, as `serve deploy` with another `num_replicas` would have it."""
+    reacher = deployment("served_agents:Reacher", replicas=3).model_dump(exclude_unset=True)
+    remembering = deployment("served_agents:Remembering", replicas=2).model_dump(exclude_unset=True)
+    reacher["applications"][0]["deployments"] = [{"name": "Policy", "num_replicas": replicas}]
+    remembering["applications"][0]["route_prefix"] = "/remembering"
+    return ServeDeploySchema(applications=reacher["applications"] + remembering["applications"])
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Server]:
+    with running_server(deployed(3), num_cpus=4) as server:
+        yield server
+
+
+def scale(replicas: int) -> None:
+    from ray.serve.context import _get_global_client
+
+    client = _get_global_client()
+    assert client is not None
+    client.deploy_apps(deployed(replicas))
+    wait_for(lambda: states().get("RUNNING") == replicas, 60)
+
+
+def states() -> dict[str, int]:
+    """Replicas of the first policy by what they do."""
+    from ray import serve
+
+    return dict(serve.status().applications["Reacher"].deployments["Policy"].replica_states)
+
+
+def test_sessions_go_on_when_replicas_stop(server: Server) -> None:
+    """Exactly where they were: three replicas become one under busy sessions and idle ones, on every transport."""
+    scale(3)
+    busy = {(t, i): RemoteAgent(url(server, t), transport=t) for t in TRANSPORTS for i in range(3)}
+    idle = {(t, i): RemoteAgent(url(server, t), transport=t) for t in TRANSPORTS for i in range(3, 6)}
+    agents = busy | idle
+    counts = dict.fromkeys(agents, 0)
+    pids = {key: agent.reset(obs(key[1]), f"{key}")["pid"] for key, agent in agents.items()}
+    assert len(set(pids.values())) == 3
+
+    def act(key: tuple[str, int]) -> None:
+        counts[key] += 1
+        act = agents[key].act(obs(0, 10 * counts[key]))
+        assert act.info["instruction"] == f"{key}"
+        assert act.action.tolist() == [counts[key], 5 * counts[key] * (counts[key] + 1), key[1]]
+        assert "resumed" not in act.info, "the session began again instead of moving"
+        pids[key] = act.info["pid"]
+
+    for _ in range(20):
+        for key in agents:
+            act(key)
+    scaling = threading.Thread(target=scale, args=(1,))
+    scaling.start()
+    while scaling.is_alive() or states() != {"RUNNING": 1}:
+        for key in busy:
+            act(key)
+    scaling.join()
+    for _ in range(5):
+        for key in agents:
+            act(key)
+    assert len(set(pids.values())) == 1
+    for agent in agents.values():
+        agent.close()
+
+
+def test_any_http_client_keeps_its_session_when_its_replica_stops(server: Server) -> None:
+    """Without a line about moving in the client: the session's id is enough."""
+    scale(3)
+    names = [f"curl-{i}" for i in range(9)]
+    image = encode_jpeg(np.zeros((8, 8, 3), np.uint8))
+
+    def post(op: str, name: str, document: dict) -> dict:
+        connection = http.client.HTTPConnection(urlsplit(server.url).netloc, timeout=30)
+        headers = {"content-type": "multipart/form-data; boundary=b", "x-session-id": name}
+        head = b"--b\r\ncontent-disposition: form-data; name="
+        camera = head + b"cameras.front; filename=f.jpg\r\n\r\n" + image
+        text = head + b"obs\r\n\r\n" + json.dumps(document).encode()
+        connection.request("POST", f"/v1/{op}", text + b"\r\n" + camera + b"\r\n--b--\r\n", headers)
+        answer = connection.getresponse()
+        body = answer.read()
+        connection.close()
+        assert answer.status == 200, body
+        return dict(json.loads(body))
+
+    def replicas() -> int:
+        return len({post("reset", name, {"instruction": name})["info"]["pid"] for name in names})
+
+    wait_for(lambda: replicas() > 1, 30)  # the load balancer hears of new replicas a little later
+    for value in range(3):
+        for name in names:
+            assert post("act", name, {"info": {"value": value}})["action"][0] == value + 1
+    scale(1)
+    for name in names:
+        answer = post("act", name, {"info": {"value": 0}})
+        assert (answer["action"][:2], answer["info"]["instruction"]) == ([4, 3], name)
+
+
+@pytest.mark.parametrize("transport", TRANSPORTS)
+def test_killed_replicas_sessions_act_again_within_seconds(server: Server, transport: TransportName) -> None:
+    scale(2)
+    agents = [RemoteAgent(url(server, transport), transport=transport, timeout_s=20) for _ in range(16)]
+    pids = [agent.reset(obs(i), f"task {i}")["pid"] for i, agent in enumerate(agents)]
+    results: list[list[tuple[float, bool]]] = [[] for _ in agents]
+    stop = threading.Event()
+
+    def play(i: int) -> None:
+        while not stop.is_set():
+            begun = time.monotonic()
+            act = agents[i].act(obs(0, i))
+            assert act.info["instruction"] == f"task {i}"
+            assert act.info["value"] == i
+            assert act.action[2] == i
+            results[i].append((time.monotonic() - begun, act.info.get("resumed", False)))
+            time.sleep(0.02)
+
+    threads = [threading.Thread(target=play, args=(i,)) for i in range(16)]
+    for thread in threads:
+        thread.start()
+    wait_for(lambda: all(len(result) > 5 for result in results), 30)
+    os.kill(pids[0], signal.SIGKILL)
+    killed = {i for i in range(16) if pids[i] == pids[0]}
+    wait_for(lambda: all(any(resumed for _, resumed in results[i]) for i in killed), 30)
+    counts = [len(result) for result in results]
+    wait_for(lambda: all(len(result) > count + 5 for result, count in zip(results, counts, strict=True)), 30)
+    stop.set()
+    for thread in threads:
+        thread.join()
+    longest = max(seconds for result in results for seconds, _ in result)
+    print(f"{transport}: {len(killed)} of 16 sessions were on the killed replica; longest act {longest:.2f} s")
+    assert longest < 10
+    for agent in agents:
+        agent.close()
+
+
+def test_what_a_policy_remembers_is_shown_to_it_again(server: Server) -> None:
+    with RemoteAgent(server.apps["Remembering"]) as agent:
+        pid = agent.reset(obs(0, 1), "put the cup down", seed=7)["pid"]
+        for value in (2, 3, 4):
+            assert agent.act(obs(0, value)).info["pid"] == pid
+        os.kill(pid, signal.SIGKILL)
+        act = agent.act(obs(0, 5))
+        assert act.info["resumed"]
+        assert act.info["pid"] != pid
+        assert act.action.tolist() == [3, 4, 5]
+        assert (act.info["instruction"], act.info["seed"]) == ("put the cup down", 7)
+
+
+def test_sessions_of_one_connection_act_in_one_message(server: Server) -> None:
+    for transport in TRANSPORTS:
+        with RemoteAgent(url(server, transport), transport=transport) as agent:
+            envs = agent.sessions(8)
+            infos = agent.reset_batch([obs(i) for i in range(8)], [f"task {i}" for i in range(8)], envs)
+            assert len({info["pid"] for info in infos if isinstance(info, dict)}) == 1
+            for step in range(1, 4):
+                acts = agent.act_batch([obs(0, i) for i in range(8)], envs)
+                for i, act in enumerate(acts):
+                    assert not isinstance(act, Exception)
+                    assert act.action.tolist() == [step, step * i, i]
+                    assert act.info["instruction"] == f"task {i}"
+            envs[3].close()
+            acts = agent.act_batch([obs(0, i) for i in (2, 4)], [envs[2], envs[4]])
+            assert [act.action[0] for act in acts if not isinstance(act, Exception)] == [4, 4]
+            for env in envs:
+                env.close()

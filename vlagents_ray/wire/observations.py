@@ -1,0 +1,105 @@
+"""An observation as a node of a frame's header: cameras and arrays become blobs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray import images
+from vlagents_ray.errors import InvalidInput, InvalidObservation, MalformedMessage, MessageTooLarge
+from vlagents_ray.interface import Obs
+from vlagents_ray.wire.messages import Limits
+from vlagents_ray.wire.tree import Reader, Writer
+
+_OBS_KEYS = {"cameras", "gripper", "state", "info"}
+
+
+@dataclass(frozen=True, slots=True)
+class ImageCodec:
+    """How cameras are written: raw pixels, or JPEG. Lossy coding is the caller's choice."""
+
+    name: str = "jpeg"  # "jpeg" or "raw"
+    quality: int = 85
+    subsampling: str = "444"
+
+    def __post_init__(self) -> None:
+        if self.name not in ("jpeg", "raw"):
+            raise InvalidInput(f"codec: got {self.name!r}, want 'jpeg' or 'raw'")
+
+
+RAW = ImageCodec("raw")
+JPEG = ImageCodec("jpeg")
+
+
+def read_obs(node: Any, reader: Reader, limits: Limits) -> Obs:
+    """An observation from its JSON form, in which cameras and state parts may be references or lists."""
+    if not isinstance(node, dict):
+        raise MalformedMessage(f"obs: got {type(node).__name__}, want an object")
+    unknown = node.keys() - _OBS_KEYS
+    if unknown:
+        raise MalformedMessage(f"obs: unknown keys {sorted(unknown)}, want some of {sorted(_OBS_KEYS)}")
+    cameras, state = node.get("cameras") or {}, node.get("state") or {}
+    info, gripper = node.get("info") or {}, node.get("gripper")
+    for name, value in (("cameras", cameras), ("state", state), ("info", info)):
+        if not isinstance(value, dict):
+            raise MalformedMessage(f"obs.{name}: got {type(value).__name__}, want an object")
+    if max(len(cameras), len(state)) > limits.cameras:
+        raise MessageTooLarge(f"obs: got {len(cameras)} cameras and {len(state)} states, the limit is {limits.cameras}")
+    if gripper is not None and not is_number(gripper):
+        raise InvalidObservation(f"gripper: got {str(gripper)[:40]!r}, want a number in [0, 1] where 1 = open")
+    return Obs(
+        cameras={name: _read_camera(name, image, reader, limits) for name, image in cameras.items()},
+        gripper=None if gripper is None else float(gripper),
+        state={name: _read_state(name, part, reader, limits) for name, part in state.items()},
+        info=reader.value(info),
+    )
+
+
+def _read_camera(name: str, node: Any, reader: Reader, limits: Limits) -> np.ndarray:
+    image = reader.blob(node)
+    if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+        got = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
+        raise InvalidObservation(f"camera {name!r}: got {got}, want (H, W, 3) uint8 RGB")
+    if image.shape[0] * image.shape[1] > limits.pixels:
+        raise MessageTooLarge(f"camera {name!r}: got {image.shape[:2]} pixels, the limit is {limits.pixels}")
+    return image
+
+
+def _read_state(name: str, node: Any, reader: Reader, limits: Limits) -> np.ndarray:
+    part = reader.blob(node) if isinstance(node, dict) else node
+    if isinstance(part, list):
+        if len(part) > limits.state_values:
+            raise MessageTooLarge(f"state {name!r}: got {len(part)} values, the limit is {limits.state_values}")
+        if not all(is_number(x) for x in part):
+            raise InvalidObservation(f"state {name!r}: want a list of numbers")
+        return np.asarray(part, dtype=np.float32)
+    if not isinstance(part, np.ndarray) or part.ndim != 1 or part.dtype.kind not in "fiu":
+        got = f"{part.shape} {part.dtype}" if isinstance(part, np.ndarray) else type(part).__name__
+        raise InvalidObservation(f"state {name!r}: got {got}, want (D,) float32")
+    if part.size > limits.state_values:
+        raise MessageTooLarge(f"state {name!r}: got {part.size} values, the limit is {limits.state_values}")
+    return part.astype(np.float32, copy=False)
+
+
+def write_obs(obs: Obs, writer: Writer, codec: ImageCodec) -> dict[str, Any]:
+    """The node of an observation, which is left as it is; raw images and arrays are views, not copies."""
+    if codec.name == "raw":
+        cameras = {name: writer.array(image) for name, image in obs.cameras.items()}
+    else:
+        cameras = {
+            name: writer.image(images.encode_jpeg(image, codec.quality, codec.subsampling))
+            for name, image in obs.cameras.items()
+        }
+    return {
+        "cameras": cameras,
+        "gripper": None if obs.gripper is None else float(obs.gripper),
+        "state": {name: writer.array(np.asarray(part, np.float32)) for name, part in obs.state.items()},
+        "info": writer.value(obs.info),
+    }
+
+
+def is_number(value: object) -> bool:
+    """A number, and no bool, which JSON and Python tell apart differently."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
