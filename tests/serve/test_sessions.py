@@ -174,3 +174,60 @@ def test_idle_sessions_are_forgotten() -> None:
     table.open("new")
     table.drop_idle()
     assert len(table) == 1
+
+
+class Networked(Agent):
+    """Weights that are shared, state that is not."""
+
+    shared = ("table",)
+
+    def initialize(self) -> None:
+        self.table = {"a": 1}
+        self.model = torch.nn.Linear(3, 2)
+        self.lock = threading.Lock()
+        self.state = torch.zeros(3)
+        self.seen: list[np.ndarray] = []
+
+
+def test_a_session_goes_on_in_another_replica_with_its_state_and_the_other_ones_weights() -> None:
+    here, there = Networked(), Networked()
+    ours, theirs = copies(here), copies(there)
+    assert ours.fingerprint == theirs.fingerprint
+    session = ours.make()
+    assert isinstance(session, Networked)
+    session.state += 5
+    session.seen.append(np.arange(3))
+    data = ours.dump(session)
+    assert len(data) < 2000  # no weights in it
+    moved = theirs.load(data)
+    assert isinstance(moved, Networked)
+    assert moved.state.tolist() == [5, 5, 5]
+    assert moved.seen[0].tolist() == [0, 1, 2]
+    assert moved.model.weight is there.model.weight
+    assert moved.table is there.table
+    assert moved.lock is there.lock
+
+
+def test_what_a_session_may_not_carry_stays_where_it_is() -> None:
+    ours = copies(Networked())
+    session = ours.make()
+    session.window = threading.Lock()  # type: ignore[attr-defined]
+    with pytest.raises(TypeError):
+        ours.dump(session)
+
+
+def test_another_version_of_a_policy_has_another_fingerprint() -> None:
+    wider = Networked()
+    wider.initialize()
+    wider.model = torch.nn.Linear(4, 2)
+    assert AgentCopies(wider).fingerprint != copies(Networked()).fingerprint
+
+
+def test_a_connection_ends_its_own_sessions_only() -> None:
+    table = SessionTable(limit=10, idle_s=60)
+    for name in ("a", "b"):
+        table.open(name, "left")
+    table.open("b", "right")  # its client came again, by another connection
+    table.open("c")
+    table.close_owned("left", ["a", "b", "c", "d"])
+    assert table.ids() == ["b", "c"]

@@ -20,11 +20,16 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 from vlagents_ray.interface import Act, Obs
+from vlagents_ray.wire.container import pack
 from vlagents_ray.wire.frames import (
+    decode_replies,
     decode_reply,
     decode_request,
+    decode_requests,
+    encode_replies,
     encode_reply,
     encode_request,
+    encode_requests,
 )
 from vlagents_ray.wire.messages import Limits, Reply, Request
 from vlagents_ray.wire.observations import JPEG, RAW, ImageCodec
@@ -203,3 +208,63 @@ def test_a_body_over_the_limit_is_too_large() -> None:
 def test_what_the_wire_cannot_carry_is_named_by_the_sender(value: object) -> None:
     with pytest.raises(InvalidInput):
         encode_request(Request("act", Obs(info={"x": value})))
+
+
+@given(st.lists(observations, min_size=1, max_size=4))
+def test_requests_that_share_a_frame_come_back_in_order(seen: list[Obs]) -> None:
+    sent = [
+        Request("act", obs, session=f"s{i}", rank="simulation", step=i, request_id=f"r{i}")
+        for i, obs in enumerate(seen)
+    ]
+    got = decode_requests(encode_requests(sent))
+    assert len(got) == len(sent)
+    for i, (one, obs) in enumerate(zip(got, seen, strict=True)):
+        assert isinstance(one, Request)
+        assert (one.session, one.rank, one.step, one.request_id) == (f"s{i}", "simulation", i, f"r{i}")
+        assert one.obs is not None
+        assert same(obs.cameras, one.obs.cameras)
+        assert same(obs.info, one.obs.info)
+
+
+def test_a_wrong_request_in_a_frame_is_answered_alone() -> None:
+    good, bad = Request("act", Obs(), request_id="a"), Request("act", None, request_id="b")
+    got = decode_requests(encode_requests([good, bad, good]))
+    assert [type(one) for one in got] == [Request, Reply, Request]
+    assert isinstance(got[1], Reply)
+    assert (got[1].request_id, type(got[1].error)) == ("b", MalformedMessage)
+
+
+def test_replies_that_share_a_frame_come_back_in_order() -> None:
+    sent = [Reply("a", Act(np.ones(3)), step=4), Reply("b", error=MissingCamera("wrist", have=[])), Reply("c", info={})]
+    sent[0].draining = True
+    got = decode_replies(encode_replies(sent))
+    assert [reply.request_id for reply in got] == ["a", "b", "c"]
+    assert (got[0].step, got[0].draining, got[1].draining) == (4, True, False)
+    assert type(got[1].error) is MissingCamera
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        ({"rank": "king"}, MalformedMessage),
+        ({"step": -1}, MalformedMessage),
+        ({"step": True}, MalformedMessage),
+        ({"session": "x" * 200}, MessageTooLarge),
+        ({"session": 7}, MalformedMessage),
+        ({"history": {"a": 1}}, MalformedMessage),
+        ({"history": [{}] * 300}, MessageTooLarge),
+        ({"op": "export"}, MalformedMessage),
+    ],
+)
+def test_fields_of_a_request_are_checked(change: dict, error: type[VLAgentsError]) -> None:
+    frame = b"".join(pack({"op": "act", "obs": {}, **change}, []))
+    with pytest.raises(error):
+        decode_request(frame)
+
+
+@pytest.mark.parametrize("requests", [{}, [], [1], None])
+def test_a_frame_of_requests_is_a_list(requests: object) -> None:
+    with pytest.raises(MalformedMessage):
+        decode_requests(b"".join(pack({"requests": requests}, [])))
+    with pytest.raises(MessageTooLarge):
+        decode_requests(b"".join(pack({"requests": [{}] * 5}, [])), Limits(requests=4))
