@@ -1,0 +1,58 @@
+"""Sessions come and go by the thousand, and nothing of them stays."""
+
+from __future__ import annotations
+
+import gc
+import os
+from collections.abc import Iterator
+
+import numpy as np
+import psutil
+import pytest
+
+from tests.integration.conftest import serving
+from vlagents_ray import Obs, RemoteAgent
+from vlagents_ray.client.agent import TransportName
+from vlagents_ray.serve.cluster import Server
+
+# 10,000 in all; VLAGENTS_SESSIONS=N opens N by each transport
+SESSIONS: dict[TransportName, int] = {"shm": 7000, "websocket": 1200, "http": 1200, "handle": 600}
+MIB = 2**20
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Server]:
+    with serving("served_agents:Accountant") as server:
+        yield server
+
+
+@pytest.mark.parametrize("transport", SESSIONS)
+def test_sessions_opened_and_closed_leave_nothing(server: Server, transport: TransportName) -> None:
+    frame = Obs({"front": np.zeros((64, 64, 3), np.uint8)})
+    where = f"serve://{next(iter(server.apps))}" if transport == "handle" else server.url
+
+    def session() -> dict[str, int]:
+        with RemoteAgent(where, transport=transport) as agent:
+            held = agent.reset(frame)
+            agent.act(frame)
+        return held
+
+    number = int(os.environ.get("VLAGENTS_SESSIONS", SESSIONS[transport]))
+    for _ in range(number // 10):  # pools fill, allocators settle
+        before = session()
+    gc.collect()
+    me = psutil.Process()
+    mine = me.num_fds(), me.num_threads(), me.memory_info().rss
+    for _ in range(number):
+        after = session()
+    gc.collect()
+    grown = {name: after[name] - before[name] for name in before}
+    own = (me.num_fds() - mine[0], me.num_threads() - mine[1], me.memory_info().rss - mine[2])
+    print(f"{transport}: {number} sessions: the server's growth {grown}, the client's {own}")
+    assert grown["descriptors"] <= 2
+    assert grown["threads"] <= 2
+    assert grown["maps"] <= 1
+    assert grown["resident"] < 4 * MIB
+    assert own[0] <= 2
+    assert own[1] <= 2
+    assert own[2] < 4 * MIB
