@@ -31,10 +31,12 @@ if TYPE_CHECKING:
 
     from vlagents_ray.contract import Contract
 
-# Documented keys of `Obs.info`; any other key the wire can carry is allowed too.
+# Documented keys of `Obs.info` and `Act.info`; any other key the wire can carry is allowed too.
 GOAL_IMAGE = "goal_image"  # (H, W, 3) uint8 RGB, for goal-conditioned policies
 DEPTH = "depth"  # {camera: (H, W) float32, metres; or uint16, millimetres}
 HIGH_RES = "high_res"  # {camera: (H, W, 3) uint8 RGB}, for the record only, never for the policy
+SAMPLES = "samples"  # in an observation: how many draws from its action distribution the policy shall return, N
+DISTRIBUTION = "distribution"  # in the Act: {"mean", "std": shaped as the action; "samples": (N, *action)} float32
 
 
 @dataclass(slots=True)

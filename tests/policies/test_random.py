@@ -9,7 +9,7 @@ import pytest
 
 from vlagents_ray import Obs
 from vlagents_ray.errors import ConfigError, NotReset
-from vlagents_ray.policies.random import Random
+from vlagents_ray.policies.random import Random, RandomConfig
 from vlagents_ray.testing import check_agent
 
 
@@ -50,3 +50,17 @@ def test_act_before_reset_is_refused() -> None:
 def test_a_wrong_setting_is_refused(config: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):
         Random.from_config(config)
+
+
+def test_samples_of_the_distribution_change_no_action() -> None:
+    plain, asked = Random(RandomConfig(chunk=2, low=-2, high=4)), Random(RandomConfig(chunk=2, low=-2, high=4))
+    for agent in (plain, asked):
+        agent.reset(Obs(), None, seed=5)
+    for _ in range(3):
+        act = asked.act(Obs(info={"samples": 4000}))
+        assert act.action.tolist() == plain.act(Obs()).action.tolist()
+        told = act.info["distribution"]
+        assert told["samples"].shape == (4000, 2, 7)
+        assert told["mean"].shape == told["std"].shape == (2, 7)
+        assert np.abs(told["samples"].mean(0) - told["mean"]).max() < 0.15
+        assert np.abs(told["samples"].std(0) - told["std"]).max() < 0.15

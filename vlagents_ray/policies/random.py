@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, ClassVar
 
 import numpy as np
@@ -10,7 +11,7 @@ from typing_extensions import Self
 
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import NotReset
-from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act, Agent, Obs
 
 
 class RandomConfig(BaseModel, extra="forbid"):
@@ -30,7 +31,10 @@ class RandomConfig(BaseModel, extra="forbid"):
 
 
 class Random(Agent):
-    """Actions uniform in [low, high], a pure function of the config's seed and the episode's."""
+    """Actions uniform in [low, high], a pure function of the config's seed and the episode's.
+
+    Asked for samples (`obs.info["samples"] = N`), it also returns its distribution, as RL fine-tuning needs.
+    """
 
     Config: ClassVar[type] = RandomConfig
     shared: ClassVar[tuple[str, ...]] = ("config",)
@@ -38,6 +42,7 @@ class Random(Agent):
     def __init__(self, config: RandomConfig | None = None) -> None:
         self.config = config or RandomConfig()
         self._rng: np.random.Generator | None = None
+        self._draws: np.random.Generator | None = None  # of samples, so that asking for them changes no action
 
     @property
     def contract(self) -> Contract:
@@ -47,12 +52,20 @@ class Random(Agent):
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin the episode of `kwargs["seed"]` (an int, 0 if not given)."""
         # numpy takes no negative seed; each int64 has its own number modulo 2**64
-        self._rng = np.random.default_rng([self.config.seed, int(kwargs.get("seed") or 0) % 2**64])
+        seed = [self.config.seed, int(kwargs.get("seed") or 0) % 2**64]
+        self._rng, self._draws = np.random.default_rng(seed), np.random.default_rng([*seed, 1])
         return {}
 
     def act(self, obs: Obs) -> Act:
-        if self._rng is None:
+        if self._rng is None or self._draws is None:
             raise NotReset("random: act before reset; call reset(obs, instruction, seed=...) first")
-        shape = (self.config.chunk, self.config.action_dim)
-        action = self._rng.uniform(self.config.low, self.config.high, shape).astype(np.float32)
-        return Act(action[0] if self.config.chunk == 1 else action)
+        low, high, chunk = self.config.low, self.config.high, self.config.chunk
+        shape = (self.config.action_dim,) if chunk == 1 else (chunk, self.config.action_dim)
+        act = Act(self._rng.uniform(low, high, shape).astype(np.float32))
+        if samples := int(obs.info.get(SAMPLES) or 0):
+            act.info[DISTRIBUTION] = {
+                "mean": np.full(shape, (low + high) / 2, np.float32),
+                "std": np.full(shape, (high - low) / math.sqrt(12), np.float32),
+                "samples": self._draws.uniform(low, high, (samples, *shape)).astype(np.float32),
+            }
+        return act
