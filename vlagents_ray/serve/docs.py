@@ -8,7 +8,7 @@ from typing import Any
 
 from vlagents_ray.errors import BY_CODE
 from vlagents_ray.wire.frames import CONTENT_TYPE
-from vlagents_ray.wire.messages import DEADLINE_HEADER, REQUEST_ID_HEADER, SESSION_HEADER
+from vlagents_ray.wire.messages import DEADLINE_HEADER, RANK_HEADER, REQUEST_ID_HEADER, SESSION_HEADER
 
 _STYLE = """
 :root { color-scheme: light dark; font: 16px/1.5 system-ui, sans-serif; }
@@ -50,11 +50,13 @@ with RemoteAgent("http://HOST:8000") as agent:
 <code>cameras.&lt;name&gt;</code> for each camera; or <code>application/json</code> without cameras; or one frame,
 <code>{CONTENT_TYPE}</code>. The answer is JSON, or a frame if <code>Accept</code> asks for it.</td></tr>
 <tr><td><code>POST /v1/close</code></td><td>Ends the session.</td></tr>
-<tr><td><code>WS /v1/stream</code></td><td>Binary frames; the connection is the session.</td></tr>
+<tr><td><code>WS /v1/stream</code></td><td>Binary frames; sessions end with the connection.</td></tr>
 <tr><td><code>GET /v1/metadata</code></td><td>Policy, checkpoint, contract, protocol version.</td></tr>
 <tr><td><code>GET /healthz</code></td><td>200 when the policy can act, 503 until then.</td></tr>
 </table>
-<p>Headers: <code>{DEADLINE_HEADER}</code>, after which an answer is useless (504, and the request is dropped if it has
+<p>A replica that stops hands its sessions over: the next request of the same session id goes on where it was.</p>
+<p>Headers: <code>{RANK_HEADER}</code>, <code>robot</code> (the default, goes first) or <code>simulation</code>;
+<code>{DEADLINE_HEADER}</code>, after which an answer is useless (504, and the request is dropped if it has
 not begun); <code>{REQUEST_ID_HEADER}</code>, which comes back with the answer and stands in the server's log.</p>
 <h2>Errors</h2>
 <p><code>application/problem+json</code> with a stable <code>code</code>:</p>
