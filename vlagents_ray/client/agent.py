@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import ipaddress
 import time
 import uuid
 from typing import TYPE_CHECKING, Any, Literal, get_args
 from urllib.parse import urlsplit
 
 from vlagents_ray.client.http import http_url
+from vlagents_ray.client.link import CodecChoice, Link, Wish
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, NotReset, PolicyFailed
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.wire.frames import JPEG, RAW, ImageCodec
+from vlagents_ray.wire.codecs import RAW, ImageCodec
 from vlagents_ray.wire.messages import PROTOCOL_VERSION, Op, Reply, Request
 
 if TYPE_CHECKING:
@@ -28,8 +28,12 @@ class RemoteAgent(Agent):
     `transport` "auto" takes the fastest that there is: shared memory to a server of the same user on
     this machine, else a WebSocket, or inside the cluster a Serve handle; `agent.transport` says which,
     once connected.
-    `codec` "auto" sends raw pixels to this machine and JPEG to others; "raw", "jpeg" or an
-    `ImageCodec` with quality and subsampling force one.
+    Over a network, `codec` "auto" measures the link when the first images are sent (0.3 s at most,
+    unless ten round trips take longer) and writes them as raw pixels, JPEG or PNG, whichever is the
+    fastest to encode, send and decode; "exact" leaves out JPEG, which changes the pixels a little;
+    "raw", "lossless" (PNG), "jpeg" or an `ImageCodec` with quality and subsampling force one.
+    `agent.codec` says which is used, `agent.link` what was measured. Shared memory and the handle
+    carry raw pixels.
 
     `connect_timeout_s` is how long `initialize` (called by the first `reset`) waits for a server
     that is still loading; `timeout_s` is how long a `reset` or `act` may take. Nothing is ever
@@ -43,12 +47,13 @@ class RemoteAgent(Agent):
         transport: TransportName = "auto",
         timeout_s: float = 30.0,
         connect_timeout_s: float = 60.0,
-        codec: ImageCodec | Literal["auto", "raw", "jpeg"] = "auto",
+        codec: ImageCodec | Wish = "auto",
     ) -> None:
         self.url = url
         self._timeout_s = timeout_s
         self._connect_timeout_s = connect_timeout_s
-        self._transport: Transport = _choose(url, transport, codec)
+        self._codec = CodecChoice(codec)
+        self._transport: Transport = _choose(url, transport, self._codec)
         self._metadata: dict[str, Any] | None = None
         self._contract: Contract | None = None
 
@@ -56,6 +61,16 @@ class RemoteAgent(Agent):
     def transport(self) -> str:
         """What carries the requests: "shm", "websocket", "http" or "handle"; "auto" until connected."""
         return self._transport.name
+
+    @property
+    def codec(self) -> ImageCodec | None:
+        """How cameras are written; None until the first images call for a choice."""
+        return RAW if self.transport in ("shm", "handle") else self._codec.codec
+
+    @property
+    def link(self) -> Link | None:
+        """Round trip (s) and bandwidth (bytes/s) to the server; None unless they were measured to choose a codec."""
+        return self._codec.link
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -132,14 +147,13 @@ class RemoteAgent(Agent):
         return reply
 
 
-def _choose(url: str, transport: str, codec: ImageCodec | str) -> Transport:
+def _choose(url: str, transport: str, codec: CodecChoice) -> Transport:
     scheme = urlsplit(url).scheme
     if transport not in get_args(TransportName):
         raise ConfigError(f"transport: got {transport!r}, want one of {list(get_args(TransportName))}")
     inside = scheme == "serve"
     if transport in (("http", "websocket") if inside else ("handle",)):
         raise ConfigError(f"transport {transport!r} does not reach {url!r}; 'handle' and serve://APP go together")
-    chosen = _codec(url, codec)
     if transport == "handle":
         from vlagents_ray.client.handle import HandleTransport
 
@@ -147,28 +161,13 @@ def _choose(url: str, transport: str, codec: ImageCodec | str) -> Transport:
     if transport == "http":
         from vlagents_ray.client.http import HttpTransport
 
-        return HttpTransport(url, chosen)
+        return HttpTransport(url, codec)
     if transport == "websocket":
         from vlagents_ray.client.websocket import WebSocketTransport
 
-        return WebSocketTransport(url, chosen)
+        return WebSocketTransport(url, codec)
     if not inside:
         http_url(url)  # raises for what is no URL of ours, before anything is tried
     from vlagents_ray.client.auto import AutoTransport
 
-    return AutoTransport(url, chosen, only_shm=transport == "shm")
-
-
-def _codec(url: str, codec: ImageCodec | str) -> ImageCodec:
-    if isinstance(codec, ImageCodec):
-        return codec
-    if codec == "auto":
-        return RAW if _is_loopback(urlsplit(url).hostname or "") else JPEG
-    return ImageCodec(codec)
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
+    return AutoTransport(url, codec, only_shm=transport == "shm")

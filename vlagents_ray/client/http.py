@@ -13,16 +13,19 @@ import uuid
 from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
+from vlagents_ray.client.link import CodecChoice
 from vlagents_ray.errors import (
     ConfigError,
     ConnectionLost,
     DeadlineExceeded,
+    MessageTooLarge,
     PolicyUnavailable,
     UnknownApp,
     VLAgentsError,
 )
-from vlagents_ray.wire.frames import CONTENT_TYPE, ImageCodec, decode_reply, encode_request, read_error
+from vlagents_ray.wire.frames import CONTENT_TYPE, decode_reply, encode_request, read_error
 from vlagents_ray.wire.messages import REQUEST_ID_HEADER, SESSION_HEADER, Reply, Request
+from vlagents_ray.wire.probe import probe
 
 _CLOSE_S = 2.0
 _UNKNOWN_APP_S = 10.0  # a starting server knows no path until its first replica exists
@@ -33,7 +36,7 @@ class HttpTransport:
 
     name = "http"
 
-    def __init__(self, url: str, codec: ImageCodec) -> None:
+    def __init__(self, url: str, codec: CodecChoice) -> None:
         self._url = http_url(url)
         self._codec = codec
         self._session = uuid.uuid4().hex
@@ -76,12 +79,18 @@ class HttpTransport:
             "content-type": CONTENT_TYPE,
             "accept": CONTENT_TYPE,
         }
-        frame = encode_request(request, self._codec)
+        frame = encode_request(request, self._codec.of(request.obs, lambda size: self._probe(size, timeout_s)))
         status, kind, body = self._exchange("POST", f"/v1/{request.op}", frame, headers, timeout_s)
         if status == 200:
             self._begun = True
             return decode_reply(body)
         return Reply(request.request_id, error=_refusal(status, kind, body))
+
+    def _probe(self, size: int, timeout_s: float) -> None:
+        headers = {SESSION_HEADER: self._session, "content-type": "application/octet-stream"}
+        status, kind, body = self._exchange("POST", "/v1/probe", probe(size), headers, timeout_s)
+        if status != 200:
+            raise _refusal(status, kind, body)
 
     def close(self) -> None:
         """End the session and close the connection; a server that is gone is not waited for."""
@@ -90,6 +99,7 @@ class HttpTransport:
             with contextlib.suppress(VLAgentsError):  # it forgets idle sessions anyway
                 self._exchange("POST", "/v1/close", b"", {SESSION_HEADER: self._session}, _CLOSE_S)
         self._session = uuid.uuid4().hex
+        self._codec.forget()
         self._hang_up()
 
     def _hang_up(self) -> None:
@@ -153,6 +163,8 @@ def _refusal(status: int, kind: str, body: bytes) -> VLAgentsError:
     if "json" in kind and isinstance(document := _json(body), dict):
         return read_error(document)
     text = body[:200].decode(errors="replace").strip()
+    if status == 413:
+        return MessageTooLarge(f"a proxy takes no body as large ({text}); raise its limit, or send JPEG")
     if status == 404:
         return UnknownApp(f"no application at this path ({text}); check the URL")
     if status == 500 or status in (502, 503, 504):  # the proxy's own: no replica is ready

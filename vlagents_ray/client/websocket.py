@@ -10,9 +10,11 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidSta
 from websockets.sync.client import ClientConnection, connect
 
 from vlagents_ray.client.http import HttpTransport, http_url
-from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, MessageTooLarge, PolicyUnavailable
-from vlagents_ray.wire.frames import ImageCodec, decode_reply, encode_request
+from vlagents_ray.client.link import CodecChoice
+from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, MalformedMessage, MessageTooLarge, PolicyUnavailable
+from vlagents_ray.wire.frames import decode_reply, encode_request
 from vlagents_ray.wire.messages import STREAM_BYTES, Reply, Request
+from vlagents_ray.wire.probe import is_answer, probe
 
 
 class WebSocketTransport:
@@ -20,7 +22,7 @@ class WebSocketTransport:
 
     name = "websocket"
 
-    def __init__(self, url: str, codec: ImageCodec) -> None:
+    def __init__(self, url: str, codec: CodecChoice) -> None:
         base = http_url(url)
         scheme = "wss" if base.scheme == "https" else "ws"
         self._base = base.geturl()
@@ -43,7 +45,7 @@ class WebSocketTransport:
     def call(self, request: Request, timeout_s: float) -> Reply:
         """One frame out, its reply back; replies to requests given up earlier are discarded."""
         deadline = time.monotonic() + timeout_s
-        frame = encode_request(request, self._codec)
+        frame = encode_request(request, self._codec.of(request.obs, lambda size: self._probe(size, timeout_s)))
         if len(frame) > STREAM_BYTES:  # the server would only hang up
             raise MessageTooLarge(
                 f"{self._url}: got {len(frame)} bytes, the limit of a WebSocket message is {STREAM_BYTES}; "
@@ -63,8 +65,25 @@ class WebSocketTransport:
             self.close()
             raise ConnectionLost(f"{self._url}: {error}; reset before the next act") from error
 
+    def _probe(self, size: int, timeout_s: float) -> None:
+        socket = self._stream(timeout_s)
+        try:
+            socket.send(probe(size))
+            data = socket.recv(timeout=timeout_s, decode=False)
+        except TimeoutError as error:
+            self.close()  # its answer may come later, and would be taken for another's
+            raise DeadlineExceeded(
+                f"{self._url}: no answer to a probe of {size} bytes within {timeout_s:g} s"
+            ) from error
+        except (ConnectionClosed, OSError) as error:
+            self.close()
+            raise ConnectionLost(f"{self._url}: {error}; reset before the next act") from error
+        if not is_answer(data):
+            raise decode_reply(data).error or MalformedMessage(f"{self._url}: got another answer to a probe")
+
     def close(self) -> None:
         """Close the connection, and so the session."""
+        self._codec.forget()
         self._socket = None
         self._open.close()
 

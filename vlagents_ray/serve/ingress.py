@@ -1,7 +1,8 @@
 """The robots' door: HTTP and WebSocket on one port, as an ASGI application over an engine.
 
     POST /v1/reset, /v1/act, /v1/close   multipart/form-data, application/json, or one binary frame
-    WS   /v1/stream                      one session a connection, binary frames
+    POST /v1/probe                       any bytes, answered at once, for measuring the link
+    WS   /v1/stream                      one session a connection, binary frames or probes
     GET  /healthz, /v1/metadata, /docs
 
 Errors over HTTP are problem+json with a stable code; over WebSocket they are reply frames.
@@ -42,6 +43,7 @@ from vlagents_ray.wire.messages import (
     Request,
 )
 from vlagents_ray.wire.plain import CAMERA_PREFIX, PROBLEM_TYPE, problem, reply_to_json, request_from_parts
+from vlagents_ray.wire.probe import answer, is_probe
 
 logger = logging.getLogger(__name__)
 
@@ -56,6 +58,7 @@ def build_ingress(engine: Engine, metadata: Callable[[], dict[str, Any]], limits
     return Starlette(
         routes=[
             *(Route(f"/v1/{op}", door.endpoint(op), methods=["POST"]) for op in OPS),
+            Route("/v1/probe", door.probe, methods=["POST"]),
             WebSocketRoute("/v1/stream", door.stream),
             Route("/v1/metadata", door.show_metadata),
             Route("/healthz", door.health),
@@ -79,6 +82,15 @@ class _Door:
 
     async def docs(self, http: HttpRequest) -> Response:
         return self._when_ready(http, lambda: HTMLResponse(docs_page(self._metadata())))
+
+    async def probe(self, http: HttpRequest) -> Response:
+        """Neither a session nor the policy hears of it."""
+        try:
+            return Response(answer(await self._body(http)), media_type="application/octet-stream")
+        except ClientDisconnect:
+            return Response(status_code=499)
+        except VLAgentsError as error:
+            return _problem(error, _request_id(http))
 
     def _when_ready(self, http: HttpRequest, answer: Callable[[], Response]) -> Response:
         try:
@@ -198,6 +210,9 @@ class _Door:
                 message = await socket.receive()
                 if message["type"] == "websocket.disconnect":
                     return
+                if is_probe(message.get("bytes") or b""):
+                    await socket.send_bytes(answer(message["bytes"]))
+                    continue
                 reply = await self._answer(session_id, message.get("bytes"))
                 await socket.send_bytes(encode_reply(reply))
         except WebSocketDisconnect:
