@@ -25,7 +25,6 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.wire.frames import CONTENT_TYPE, decode_reply, encode_request, read_error
 from vlagents_ray.wire.messages import REQUEST_ID_HEADER, SESSION_HEADER, Reply, Request
-from vlagents_ray.wire.probe import probe
 
 _CLOSE_S = 2.0
 _UNKNOWN_APP_S = 10.0  # a starting server knows no path until its first replica exists
@@ -79,16 +78,16 @@ class HttpTransport:
             "content-type": CONTENT_TYPE,
             "accept": CONTENT_TYPE,
         }
-        frame = encode_request(request, self._codec.of(request.obs, lambda size: self._probe(size, timeout_s)))
+        frame = encode_request(request, self._codec.of(request.obs, lambda probe: self._probe(probe, timeout_s)))
         status, kind, body = self._exchange("POST", f"/v1/{request.op}", frame, headers, timeout_s)
         if status == 200:
             self._begun = True
             return decode_reply(body)
         return Reply(request.request_id, error=_refusal(status, kind, body))
 
-    def _probe(self, size: int, timeout_s: float) -> None:
+    def _probe(self, probe: bytes, timeout_s: float) -> None:
         headers = {SESSION_HEADER: self._session, "content-type": "application/octet-stream"}
-        status, kind, body = self._exchange("POST", "/v1/probe", probe(size), headers, timeout_s)
+        status, kind, body = self._exchange("POST", "/v1/probe", probe, headers, timeout_s)
         if status != 200:
             raise _refusal(status, kind, body)
 

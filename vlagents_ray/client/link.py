@@ -3,29 +3,33 @@
 from __future__ import annotations
 
 import contextlib
+import statistics
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
 from vlagents_ray.errors import MessageTooLarge
 from vlagents_ray.interface import Obs
-from vlagents_ray.wire.codecs import JPEG, LOSSLESS, RAW, ImageCodec, decode_files, encode_files
-from vlagents_ray.wire.probe import LEAST_BYTES
+from vlagents_ray.wire.codecs import JPEG, LOSSLESS, RAW, ImageCodec
+from vlagents_ray.wire.frames import request_parts
+from vlagents_ray.wire.messages import Request
+from vlagents_ray.wire.probe import LEAST_BYTES, bytes_probe, frame_probe
 
 Wish = Literal["auto", "exact", "raw", "lossless", "jpeg"]
+Send = Callable[[bytes], None]  # sends a probe and waits for its answer
 
-_BUDGET_S = 0.25  # of probing, unless the round trip alone is so long that ten take more
+_BUDGET_S = 0.15  # of either measurement, unless the round trip alone is so long that ten take more
 _ROUND_TRIPS = 10
 _TINY = 5  # probes that measure the round trip, the first of which may have to warm up the server
 _GROWTH = 4
 _SIZES = tuple(16 * 1024 * _GROWTH**n for n in range(4))  # bytes; 1 MiB is a common limit of proxies for one request
-_ABOVE = 4  # round trips that a probe's bytes must take before they say something of the bandwidth
-_REPEATS = 4  # of the largest probe, of which the best counts: the first find TCP still opening its window
-_TIMES_CODED = 3  # each way of coding, of which the best counts
-_HOPELESS = 2  # a way this many times slower than the best is not timed again
+_TELLING_S = 0.005  # a probe that takes less says too little: links let a burst pass before they slow down
+_ABOVE = 5  # nor does one that takes less than so many round trips
+_REPEATS = 3  # of the largest probe, of which the best counts: the first find TCP still opening its window
+_ROUNDS = 9  # in which each codec has its turn; the first only warms up
+_HOPELESS = 2  # a codec this many times slower than the best has no further turn
+_WORTH = 0.9  # of the time without loss, at most: what JPEG must take, for it changes the pixels
 _RESIZED = 2  # times as large or small: when the images' size calls for another choice
 
 
@@ -41,16 +45,17 @@ class Link:
         return self.round_trip_s + size / self.bandwidth
 
 
-def measure(probe: Callable[[int], None], clock: Callable[[], float] = time.perf_counter) -> Link:
-    """The link over which `probe(n)` sends n bytes and waits for a short answer.
+def measure(send: Send, clock: Callable[[], float] = time.perf_counter) -> Link:
+    """The link over which `send` carries probes.
 
-    Takes a quarter of a second at most where a round trip is short, or ten round trips and one probe.
-    A probe grows only while the last one was too short to tell, so a slow link carries few bytes.
+    Takes 0.15 s at most where a round trip is short, or ten round trips and one probe. A probe grows
+    only while the last one was too short to tell, so a slow link carries few bytes.
     """
 
     def seconds(size: int) -> float:
+        message = bytes_probe(size)
         begun = clock()
-        probe(size)
+        send(message)
         return clock() - begun
 
     seconds(LEAST_BYTES)
@@ -61,7 +66,7 @@ def measure(probe: Callable[[int], None], clock: Callable[[], float] = time.perf
     with contextlib.suppress(MessageTooLarge):  # a server that takes no more: what is known by then has to do
         for size in _SIZES:
             taken_s, sent = seconds(size), size
-            if taken_s > (1 + _ABOVE) * round_trip_s or clock() + _GROWTH * taken_s > end:
+            if taken_s > max(_ABOVE * round_trip_s, _TELLING_S) or clock() + _GROWTH * taken_s > end:
                 break
         for _ in range(_REPEATS):
             if clock() + taken_s > end:
@@ -71,54 +76,70 @@ def measure(probe: Callable[[int], None], clock: Callable[[], float] = time.perf
 
 
 def fastest(
-    cameras: Sequence[np.ndarray], link: Link, candidates: Iterable[ImageCodec], clock: Callable[[], float]
+    obs: Obs,
+    candidates: Sequence[ImageCodec],
+    link: Link,
+    send: Send,
+    clock: Callable[[], float] = time.perf_counter,
+    most_bytes: float = float("inf"),
 ) -> ImageCodec:
-    """The candidate that takes the least time to encode, send and decode (estimated here) these images."""
-    raw_bytes = sum(image.nbytes for image in cameras)
-    best, best_s = RAW, float("inf")
-    for codec in candidates:
-        total_s = link.seconds(raw_bytes) if codec.name == "raw" else float("inf")
-        for _ in range(_TIMES_CODED if codec.name != "raw" else 0):
+    """The candidate by which `obs` is encoded, sent and decoded in the least time.
+
+    They take turns with frames of this very observation, which the server decodes and answers at
+    once. One whose bytes alone would take the link far longer than the best is not sent; no message
+    over `most_bytes` is. Takes 0.15 s, or ten round trips, or as long as each candidate takes once.
+    """
+    taken: dict[ImageCodec, list[float]] = {codec: [] for codec in candidates}
+    least_s = float("inf")
+    end = clock() + max(_BUDGET_S, _ROUND_TRIPS * link.round_trip_s)
+    request = Request("act", obs)
+    for turn in range(_ROUNDS):
+        for codec in [codec for codec, seconds in taken.items() if len(seconds) == turn]:
             begun = clock()
-            files = encode_files(cameras, codec)
-            decode_files(files, raw_bytes)
-            total_s = min(total_s, clock() - begun + link.seconds(sum(map(len, files))))
-            if total_s > _HOPELESS * best_s:
-                break
-        if total_s < best_s:
-            best, best_s = codec, total_s
-    return best
+            if turn and begun + taken[codec][-1] > end:
+                continue
+            message = frame_probe(request_parts(request, codec))
+            if len(message) > most_bytes or link.seconds(len(message)) > _HOPELESS * least_s:
+                continue
+            with contextlib.suppress(MessageTooLarge):
+                send(message)
+                taken[codec].append(clock() - begun)
+        least_s = min((min(seconds) for seconds in taken.values() if seconds), default=least_s)
+        taken = {codec: seconds for codec, seconds in taken.items() if seconds and min(seconds) <= _HOPELESS * least_s}
+    typical = {codec: statistics.median(seconds[1:] or seconds) for codec, seconds in taken.items()}
+    weighed = {codec: seconds if codec.exact else seconds / _WORTH for codec, seconds in typical.items()}
+    return min(weighed, key=lambda codec: weighed[codec], default=candidates[0])
 
 
 class CodecChoice:
     """How one session's cameras are written: as the user wishes, or as the link has it.
 
-    "auto" takes the fastest of raw, JPEG and PNG; "exact" the faster of raw and PNG.
+    "auto" takes the fastest of JPEG, PNG and raw; "exact" the faster of PNG and raw.
     """
 
     def __init__(self, wish: Wish | ImageCodec) -> None:
         self.link: Link | None = None
         self.codec: ImageCodec | None = None
-        self._candidates: tuple[ImageCodec, ...] = ()
+        self._candidates: tuple[ImageCodec, ...] = ()  # those that promise to be short come first
         if isinstance(wish, ImageCodec):
             self.codec = wish
         elif wish == "auto":
-            self._candidates = (RAW, JPEG, LOSSLESS)
+            self._candidates = (JPEG, LOSSLESS, RAW)
         elif wish == "exact":
-            self._candidates = (RAW, LOSSLESS)
+            self._candidates = (LOSSLESS, RAW)
         else:
             self.codec = ImageCodec(wish)
         self._size = 0  # bytes of the images for which it was chosen
 
-    def of(self, obs: Obs | None, probe: Callable[[int], None]) -> ImageCodec:
-        """The codec for an observation; `probe` measures the link, once and only if it decides."""
-        if not self._candidates:
+    def of(self, obs: Obs | None, send: Send, most_bytes: float = float("inf")) -> ImageCodec:
+        """The codec for an observation; probes are sent only if it has yet to be chosen."""
+        if not self._candidates or obs is None:
             return self.codec or RAW
-        cameras = list(obs.cameras.values()) if obs is not None else []
-        size = sum(image.nbytes for image in cameras)
+        size = sum(image.nbytes for image in obs.cameras.values())
         if size and (self.codec is None or not self._size / _RESIZED <= size <= self._size * _RESIZED):
-            self.link = self.link or measure(probe)
-            self.codec = fastest(cameras, self.link, self._candidates, time.perf_counter)
+            self.link = self.link or measure(send)
+            cameras = Obs(obs.cameras)
+            self.codec = fastest(cameras, self._candidates, self.link, send, most_bytes=most_bytes)
             self._size = size
         return self.codec or RAW
 

@@ -14,7 +14,7 @@ from vlagents_ray.client.link import CodecChoice
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, MalformedMessage, MessageTooLarge, PolicyUnavailable
 from vlagents_ray.wire.frames import decode_reply, encode_request
 from vlagents_ray.wire.messages import STREAM_BYTES, Reply, Request
-from vlagents_ray.wire.probe import is_answer, probe
+from vlagents_ray.wire.probe import is_answer
 
 
 class WebSocketTransport:
@@ -45,7 +45,8 @@ class WebSocketTransport:
     def call(self, request: Request, timeout_s: float) -> Reply:
         """One frame out, its reply back; replies to requests given up earlier are discarded."""
         deadline = time.monotonic() + timeout_s
-        frame = encode_request(request, self._codec.of(request.obs, lambda size: self._probe(size, timeout_s)))
+        codec = self._codec.of(request.obs, lambda probe: self._probe(probe, timeout_s), STREAM_BYTES)
+        frame = encode_request(request, codec)
         if len(frame) > STREAM_BYTES:  # the server would only hang up
             raise MessageTooLarge(
                 f"{self._url}: got {len(frame)} bytes, the limit of a WebSocket message is {STREAM_BYTES}; "
@@ -65,15 +66,15 @@ class WebSocketTransport:
             self.close()
             raise ConnectionLost(f"{self._url}: {error}; reset before the next act") from error
 
-    def _probe(self, size: int, timeout_s: float) -> None:
+    def _probe(self, probe: bytes, timeout_s: float) -> None:
         socket = self._stream(timeout_s)
         try:
-            socket.send(probe(size))
+            socket.send(probe)
             data = socket.recv(timeout=timeout_s, decode=False)
         except TimeoutError as error:
             self.close()  # its answer may come later, and would be taken for another's
             raise DeadlineExceeded(
-                f"{self._url}: no answer to a probe of {size} bytes within {timeout_s:g} s"
+                f"{self._url}: no answer to a probe of {len(probe)} bytes within {timeout_s:g} s"
             ) from error
         except (ConnectionClosed, OSError) as error:
             self.close()

@@ -52,8 +52,9 @@ with RemoteAgent("http://HOST:8000") as agent:
 <tr><td><code>POST /v1/close</code></td><td>Ends the session.</td></tr>
 <tr><td><code>WS /v1/stream</code></td><td>Binary frames; the connection is the session. A message that begins with
 <code>VLA?</code> is a probe.</td></tr>
-<tr><td><code>POST /v1/probe</code></td><td>For measuring the link: <code>VLA?</code> and any bytes, which reach neither
-a session nor the policy. The answer, at once, is <code>VLA!</code> and their number, 64 bits, little-endian.</td></tr>
+<tr><td><code>POST /v1/probe</code></td><td>For measuring the link: <code>VLA?</code>, four zero bytes and any others,
+which reach neither a session nor the policy. The answer, at once, is <code>VLA!</code> and the number of bytes, 64
+bits, little-endian. With a one in place of the first zero a frame follows, which is decoded first.</td></tr>
 <tr><td><code>GET /v1/metadata</code></td><td>Policy, checkpoint, contract, protocol version.</td></tr>
 <tr><td><code>GET /healthz</code></td><td>200 when the policy can act, 503 until then.</td></tr>
 </table>

@@ -1,7 +1,7 @@
 """The robots' door: HTTP and WebSocket on one port, as an ASGI application over an engine.
 
     POST /v1/reset, /v1/act, /v1/close   multipart/form-data, application/json, or one binary frame
-    POST /v1/probe                       any bytes, answered at once, for measuring the link
+    POST /v1/probe                       answered at once, for measuring the link
     WS   /v1/stream                      one session a connection, binary frames or probes
     GET  /healthz, /v1/metadata, /docs
 
@@ -43,7 +43,7 @@ from vlagents_ray.wire.messages import (
     Request,
 )
 from vlagents_ray.wire.plain import CAMERA_PREFIX, PROBLEM_TYPE, problem, reply_to_json, request_from_parts
-from vlagents_ray.wire.probe import answer, is_probe
+from vlagents_ray.wire.probe import answer, is_probe, probed_frame
 
 logger = logging.getLogger(__name__)
 
@@ -86,11 +86,16 @@ class _Door:
     async def probe(self, http: HttpRequest) -> Response:
         """Neither a session nor the policy hears of it."""
         try:
-            return Response(answer(await self._body(http)), media_type="application/octet-stream")
+            return Response(await self._probed(await self._body(http)), media_type="application/octet-stream")
         except ClientDisconnect:
             return Response(status_code=499)
         except VLAgentsError as error:
             return _problem(error, _request_id(http))
+
+    async def _probed(self, message: bytes) -> bytes:
+        if (frame := probed_frame(message)) is not None:
+            await self._decode(frame)
+        return answer(message)
 
     def _when_ready(self, http: HttpRequest, answer: Callable[[], Response]) -> Response:
         try:
@@ -210,15 +215,19 @@ class _Door:
                 message = await socket.receive()
                 if message["type"] == "websocket.disconnect":
                     return
-                if is_probe(message.get("bytes") or b""):
-                    await socket.send_bytes(answer(message["bytes"]))
-                    continue
-                reply = await self._answer(session_id, message.get("bytes"))
-                await socket.send_bytes(encode_reply(reply))
+                await socket.send_bytes(await self._reply_to(session_id, message.get("bytes")))
         except WebSocketDisconnect:
             return
         finally:
             self._engine.sessions.close(session_id)
+
+    async def _reply_to(self, session_id: str, message: bytes | None) -> bytes:
+        if message is None or not is_probe(message):
+            return encode_reply(await self._answer(session_id, message))
+        try:
+            return await self._probed(message)
+        except VLAgentsError as error:
+            return encode_reply(Reply(error=error))
 
     async def _answer(self, session_id: str, frame: bytes | None) -> Reply:
         arrived = time.perf_counter()
