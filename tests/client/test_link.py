@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import links
 import numpy as np
 import pytest
-from pictures import photograph
+from pictures import photograph, rendered
 
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.client.agent import TransportName
@@ -17,6 +17,7 @@ from vlagents_ray.errors import MessageTooLarge
 from vlagents_ray.wire.codecs import JPEG, LOSSLESS, RAW
 
 OBS = Obs({"front": photograph(seed=1), "wrist": photograph(seed=2)})
+FLAT = Obs({"front": rendered(), "wrist": rendered()})  # PNG makes it many times smaller
 CANDIDATES = (JPEG, LOSSLESS, RAW)
 
 
@@ -95,7 +96,7 @@ def test_the_choice_stands_until_images_change_much_or_the_connection_is_new() -
     choice.of(Obs(state={"joints": np.zeros(7)}), sent.append)
     choice.of(None, sent.append)
     assert len(sent) == once
-    choice.of(Obs({"front": photograph(448, 448)}), sent.append)
+    choice.of(Obs({"front": photograph(480, 640)}), sent.append)
     assert len(sent) > once
     assert choice.link is chosen
     choice.forget()
@@ -130,8 +131,8 @@ def test_a_network_gets_jpeg_unless_pixels_must_arrive_as_they_are(rate: str, tr
             bits = {"1gbit": 1e9, "100mbit": 1e8}[rate]
             assert 0.3 * bits < agent.link.bandwidth * 8 < 1.5 * bits  # a busy machine does not fill a fast link
         with RemoteAgent(url, transport=transport, codec="exact") as agent:
-            agent.reset(OBS, "look")
-            assert agent.codec == (LOSSLESS if rate == "100mbit" else RAW)
+            agent.reset(FLAT, "look")
+            assert agent.codec == LOSSLESS if rate == "100mbit" else agent.codec in (LOSSLESS, RAW)
 
 
 def test_the_choice_is_the_fastest_of_all_over_a_true_link() -> None:

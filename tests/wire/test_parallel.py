@@ -38,7 +38,8 @@ def test_results_come_in_the_order_of_the_items(count: int) -> None:
     items = list(range(count))
     for _ in range(40):  # either way, and after the choice
         assert parallel.run(lambda x: x * x, items, "squares") == [x * x for x in items]
-    assert parallel._run(lambda x: x * x, items, parallel=True) == [x * x for x in items]
+    if items:
+        assert parallel._run(lambda x: x * x, items, parallel=True) == [x * x for x in items]
 
 
 @pytest.mark.parametrize("parallel_", [False, True])

@@ -36,7 +36,7 @@ class _Batch(Generic[Item, Result]):
         self._lock = threading.Lock()
         self._left = len(items)
         self._results: dict[int, Result] = {}
-        self._errors: dict[int, Exception] = {}
+        self._errors: dict[int, BaseException] = {}
         self._done = threading.Event()
 
     def work(self) -> None:
@@ -48,7 +48,7 @@ class _Batch(Generic[Item, Result]):
                 return
             try:
                 self._results[index] = self._function(self._items[index])
-            except Exception as error:  # noqa: BLE001 - raised in the caller's thread
+            except BaseException as error:  # noqa: BLE001 - raised in the caller's thread
                 self._errors[index] = error
             with self._lock:
                 self._left -= 1
