@@ -7,6 +7,7 @@ on its first calls, and from then on goes the faster one.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import queue
@@ -92,8 +93,9 @@ class _Helpers:
             return
         elsewhere = os.sched_getaffinity(0) - {_sched_getcpu()}
         if elsewhere and elsewhere != self._elsewhere:
-            for thread in self._threads:
-                os.sched_setaffinity(thread, elsewhere)
+            with contextlib.suppress(OSError):  # forbidden here: they run where the kernel likes
+                for thread in self._threads:
+                    os.sched_setaffinity(thread, elsewhere)
             self._elsewhere = elsewhere
 
     @staticmethod
