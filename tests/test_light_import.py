@@ -11,7 +11,7 @@ import pytest
 import vlagents_ray
 
 PACKAGE = Path(vlagents_ray.__file__).parent
-LIGHT = ("contract.py", "errors.py", "images.py", "interface.py", "registry.py", "client/*.py", "wire/*.py")
+LIGHT = ("contract.py", "errors.py", "images.py", "interface.py", "png.py", "registry.py", "client/*.py", "wire/*.py")
 HEAVY = {"ray", "torch", "pydantic", "starlette", "fastapi", "gymnasium", "PIL", "yaml", "typer", "rich", "av"}
 ROUNDS = 5
 TIMES_NUMPY = 4  # how much longer than numpy, which it imports, the package may take to import

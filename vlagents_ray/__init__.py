@@ -19,7 +19,7 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.wire.observations import ImageCodec
+from vlagents_ray.wire.codecs import ImageCodec
 
 __all__ = [
     "Act",

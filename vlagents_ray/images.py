@@ -12,20 +12,25 @@ import warnings
 import numpy as np
 import simplejpeg
 
+from vlagents_ray import png
 from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, MissingDependency
 
 MAX_PIXELS = 4096 * 4096  # of one image, unless the caller says otherwise
 JPEG_MAGIC = b"\xff\xd8\xff"
-PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 
 
 def encode_jpeg(image: np.ndarray, quality: int = 85, subsampling: str = "444") -> bytes:
     """JPEG of an (H, W, 3) uint8 RGB image. `subsampling` is "444", "422", "420" or "440"."""
-    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-        raise InvalidObservation(f"image: got {image.shape} {image.dtype}, want (H, W, 3) uint8 RGB")
+    _check(image)
     pixels = np.ascontiguousarray(image)
     data: bytes = simplejpeg.encode_jpeg(pixels, quality=quality, colorspace="RGB", colorsubsampling=subsampling)
     return data
+
+
+def encode_png(image: np.ndarray) -> bytes:
+    """PNG of an (H, W, 3) uint8 RGB image: every pixel comes back as it was."""
+    _check(image)
+    return png.encode(image)
 
 
 def decode(data: bytes | memoryview, max_pixels: int = MAX_PIXELS) -> np.ndarray:
@@ -37,7 +42,7 @@ def decode(data: bytes | memoryview, max_pixels: int = MAX_PIXELS) -> np.ndarray
     head = bytes(data[:8])
     if head.startswith(JPEG_MAGIC):
         return _decode_jpeg(data, max_pixels)
-    if head == PNG_MAGIC:
+    if head == png.MAGIC:
         return _decode_png(data, max_pixels)
     raise MalformedMessage(f"image: got {len(data)} bytes starting {head[:4]!r}, want a JPEG or PNG file")
 
@@ -49,13 +54,22 @@ def _decode_jpeg(data: bytes | memoryview, max_pixels: int) -> np.ndarray:
         raise MalformedMessage(f"image: not a readable JPEG ({error})") from error
     _limit(height, width, max_pixels)
     try:  # strict (its default) refuses truncated data, which libjpeg would fill with grey
-        image: np.ndarray = simplejpeg.decode_jpeg(data, colorspace="RGB")
+        # The library's defaults, "fast" transform and upsampling, save a twentieth of the time and cost up to 1.3 dB.
+        image: np.ndarray = simplejpeg.decode_jpeg(data, colorspace="RGB", fastdct=False, fastupsample=False)
     except ValueError as error:
         raise MalformedMessage(f"image: broken JPEG ({error})") from error
     return image
 
 
 def _decode_png(data: bytes | memoryview, max_pixels: int) -> np.ndarray:
+    if (size := png.size(data)) is not None:  # as our own clients write it
+        _limit(*size, max_pixels)
+        try:
+            image = png.decode(data, *size)
+        except ValueError as error:
+            raise MalformedMessage(f"image: broken PNG ({error})") from error
+        if image is not None:
+            return image
     try:
         from PIL import Image
     except ModuleNotFoundError as error:
@@ -72,6 +86,11 @@ def _decode_png(data: bytes | memoryview, max_pixels: int) -> np.ndarray:
         if isinstance(error, MessageTooLarge):
             raise
         raise MalformedMessage(f"image: broken PNG ({error})") from error
+
+
+def _check(image: np.ndarray) -> None:
+    if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or image.size == 0:
+        raise InvalidObservation(f"image: got {image.shape} {image.dtype}, want (H, W, 3) uint8 RGB")
 
 
 def _limit(height: int, width: int, max_pixels: int) -> None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import pytest
 
 from vlagents_ray import ConfigError, NotReset, Obs, PolicyUnavailable, RemoteAgent
-from vlagents_ray.client import agent as module
-from vlagents_ray.client.agent import TransportName
-from vlagents_ray.wire.observations import JPEG, RAW, ImageCodec
+from vlagents_ray.client.link import Wish
+from vlagents_ray.client.ways import TransportName
+from vlagents_ray.errors import InvalidInput
+from vlagents_ray.wire.codecs import JPEG, LOSSLESS, RAW, ImageCodec
 
 
 @pytest.mark.parametrize(
@@ -42,19 +43,25 @@ def test_what_does_not_go_together_is_refused_at_once(url: str, transport: Trans
 
 
 @pytest.mark.parametrize(
-    ("url", "codec", "chosen"),
+    ("codec", "forced"),
     [
-        ("http://127.0.0.1:8000", "auto", RAW),
-        ("http://localhost:8000", "auto", RAW),
-        ("http://[::1]:8000", "auto", RAW),
-        ("http://10.0.0.2:8000", "auto", JPEG),
-        ("http://gpu-box:8000", "auto", JPEG),
-        ("http://gpu-box:8000", "raw", RAW),
-        ("http://127.0.0.1:8000", ImageCodec("jpeg", 50), ImageCodec("jpeg", 50)),
+        ("auto", None),
+        ("exact", None),
+        ("raw", RAW),
+        ("lossless", LOSSLESS),
+        ("jpeg", JPEG),
+        (ImageCodec("jpeg", 50, "420"), ImageCodec("jpeg", 50, "420")),
     ],
 )
-def test_loopback_carries_raw_pixels_and_networks_jpeg(url: str, codec: ImageCodec, chosen: ImageCodec) -> None:
-    assert module._codec(url, codec) == chosen
+def test_a_codec_is_forced_or_waits_for_the_link(codec: ImageCodec | Wish, forced: ImageCodec | None) -> None:
+    agent = RemoteAgent("http://gpu-box:8000", codec=codec)
+    assert agent.codec == forced
+    assert agent.link is None
+
+
+def test_an_unknown_codec_is_refused_at_once() -> None:
+    with pytest.raises(InvalidInput, match="want one of"):
+        RemoteAgent("http://gpu-box:8000", codec="webp")
 
 
 def test_act_before_reset_needs_no_server_to_be_wrong() -> None:

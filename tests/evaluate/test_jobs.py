@@ -52,6 +52,8 @@ def test_what_changes_the_outcome_changes_the_key(config: Callable[..., EvalConf
         {"retries": 0},
         {"threads": 4},
         {"resume": True},
+        {"codec": "raw"},
+        {"codec": "lossless"},
     ],
 )
 def test_what_does_not_change_the_outcome_keeps_the_key(

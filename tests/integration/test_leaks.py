@@ -12,7 +12,7 @@ import pytest
 
 from tests.integration.conftest import serving
 from vlagents_ray import Obs, RemoteAgent
-from vlagents_ray.client.agent import TransportName
+from vlagents_ray.client.ways import TransportName
 from vlagents_ray.serve.cluster import Server
 
 # 10,000 in all; VLAGENTS_SESSIONS=N opens N by each transport

@@ -12,7 +12,7 @@ from ray import serve
 
 from tests.integration.conftest import serving
 from vlagents_ray import Obs, RemoteAgent
-from vlagents_ray.client.agent import TransportName
+from vlagents_ray.client.ways import TransportName
 
 CLIENTS, ACTS = 24, 8
 

@@ -18,7 +18,7 @@ from ray.serve.schema import ServeDeploySchema
 
 from tests.integration.test_sessions import TRANSPORTS, obs, url
 from vlagents_ray import RemoteAgent
-from vlagents_ray.client.agent import TransportName
+from vlagents_ray.client.ways import TransportName
 from vlagents_ray.images import encode_jpeg
 from vlagents_ray.serve.cluster import Server, running_server
 from vlagents_ray.serve.files import deployment

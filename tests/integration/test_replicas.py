@@ -11,7 +11,7 @@ import pytest
 from tests.integration.conftest import serving
 from tests.integration.test_sessions import obs
 from vlagents_ray import ConnectionLost, NotReset, RemoteAgent
-from vlagents_ray.client.agent import TransportName
+from vlagents_ray.client.ways import TransportName
 from vlagents_ray.serve.cluster import Server
 
 

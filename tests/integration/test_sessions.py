@@ -13,10 +13,10 @@ import pytest
 
 from tests.integration.conftest import serving
 from vlagents_ray import NotReset, Obs, PolicyUnavailable, RemoteAgent
-from vlagents_ray.client.agent import TransportName
+from vlagents_ray.client.ways import TransportName
 from vlagents_ray.errors import MessageTooLarge
 from vlagents_ray.serve.cluster import Server
-from vlagents_ray.wire.observations import JPEG
+from vlagents_ray.wire.codecs import JPEG, RAW
 
 TRANSPORTS: list[TransportName] = ["shm", "websocket", "http", "handle"]
 
@@ -94,6 +94,16 @@ def test_jpeg_reaches_the_policy_as_pixels(server: Server) -> None:
     with RemoteAgent(server.url, codec=JPEG, transport="websocket") as agent:
         agent.reset(obs(128), "x")
         assert abs(agent.act(obs(0)).action[2] - 128) <= 2
+
+
+@pytest.mark.parametrize("transport", ["websocket", "http"])
+def test_the_link_is_measured_through_serves_own_proxy(server: Server, transport: TransportName) -> None:
+    image = np.random.default_rng(0).integers(0, 255, (224, 224, 3), np.uint8)
+    with RemoteAgent(server.url, transport=transport) as agent:
+        agent.reset(Obs({"front": image}, info={"value": 0}), "x")
+        assert agent.codec == RAW  # loopback carries such an image in less time than JPEG takes
+        assert agent.link is not None
+        assert agent.link.bandwidth > 125e6
 
 
 def test_a_message_over_the_websockets_limit_says_what_to_do(server: Server) -> None:

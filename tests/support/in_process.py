@@ -8,6 +8,7 @@ from typing import Any
 
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.connection import Connection
+from vlagents_ray.client.link import CodecChoice
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable
 from vlagents_ray.interface import Agent
 from vlagents_ray.serve.calls import Sender
@@ -32,7 +33,7 @@ class Replicas:
     def agent(self, **options: Any) -> RemoteAgent:
         """A client of them."""
         agent = RemoteAgent("http://127.0.0.1:9", **options)
-        agent._connection = Connection(agent.url, InProcess(self), 5.0, 5.0)
+        agent._connection = Connection(agent.url, InProcess(self), CodecChoice("raw"), 5.0, 5.0)
         return agent
 
     def close(self) -> None:

@@ -20,6 +20,7 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 from vlagents_ray.interface import Act, Obs
+from vlagents_ray.wire.codecs import JPEG, RAW, ImageCodec
 from vlagents_ray.wire.container import pack
 from vlagents_ray.wire.frames import (
     decode_replies,
@@ -32,7 +33,6 @@ from vlagents_ray.wire.frames import (
     encode_requests,
 )
 from vlagents_ray.wire.messages import Limits, Reply, Request
-from vlagents_ray.wire.observations import JPEG, RAW, ImageCodec
 
 names = st.text(min_size=1, max_size=8).filter(lambda name: name != "$")
 arrays = hnp.arrays(

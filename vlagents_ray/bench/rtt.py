@@ -14,11 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.client.agent import RemoteAgent, TransportName
+from vlagents_ray.client.agent import RemoteAgent
+from vlagents_ray.client.ways import TransportName
 from vlagents_ray.interface import Obs
 from vlagents_ray.serve.cluster import Server, running_server
 from vlagents_ray.serve.files import deployment
-from vlagents_ray.wire.observations import JPEG, RAW, ImageCodec
+from vlagents_ray.wire.codecs import JPEG, RAW, ImageCodec
 
 _WARM_UP = 20
 _ROUND = 25  # calls of one transport before it is the next one's turn

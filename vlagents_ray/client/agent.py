@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import ipaddress
 import time
 import uuid
 from collections import deque
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, Literal, get_args
-from urllib.parse import urlsplit
+from typing import TYPE_CHECKING, Any
 
 from vlagents_ray.client.connection import Connection
 from vlagents_ray.client.episode import Episode, copied
-from vlagents_ray.client.http import http_url
+from vlagents_ray.client.link import CodecChoice, Link, Wish
+from vlagents_ray.client.ways import TransportName, choose
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import (
     ConfigError,
@@ -24,15 +23,13 @@ from vlagents_ray.errors import (
     UnknownSession,
 )
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.wire.codecs import RAW, ImageCodec
 from vlagents_ray.wire.messages import RANKS, RankName, Reply, Request
-from vlagents_ray.wire.observations import JPEG, RAW, ImageCodec
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    from vlagents_ray.client.transport import Transport
 
-TransportName = Literal["auto", "shm", "websocket", "http", "handle"]
 _GONE = (ConnectionLost, PolicyUnavailable, UnknownSession)  # the session may go on elsewhere
 _FIRST_PAUSE_S = 0.02
 _LONGEST_PAUSE_S = 0.5
@@ -45,8 +42,12 @@ class RemoteAgent(Agent):
     `transport` "auto" takes the fastest that there is: shared memory to a server of the same user on
     this machine, else a WebSocket, or inside the cluster a Serve handle; `agent.transport` says which,
     once connected.
-    `codec` "auto" sends raw pixels to this machine and JPEG to others; "raw", "jpeg" or an
-    `ImageCodec` with quality and subsampling force one.
+    Over a network, `codec` "auto" measures the link when the first images are sent (0.3 s at most,
+    unless ten round trips take longer) and writes them as raw pixels, JPEG or PNG, whichever is the
+    fastest to encode, send and decode; "exact" leaves out JPEG, which changes the pixels a little;
+    "raw", "lossless" (PNG), "jpeg" or an `ImageCodec` with quality and subsampling force one.
+    `agent.codec` says which is used, `agent.link` what was measured. Shared memory and the handle
+    carry raw pixels.
     `rank` is the class of its requests: a "robot" goes before a "simulation".
 
     `connect_timeout_s` is how long `initialize` (called by the first `reset`) waits for a server
@@ -66,14 +67,15 @@ class RemoteAgent(Agent):
         transport: TransportName = "auto",
         timeout_s: float = 30.0,
         connect_timeout_s: float = 60.0,
-        codec: ImageCodec | Literal["auto", "raw", "jpeg"] = "auto",
+        codec: ImageCodec | Wish = "auto",
         rank: RankName = "robot",
         resume: bool = True,
     ) -> None:
         if rank not in RANKS:
             raise ConfigError(f"rank: got {rank!r}, want one of {list(RANKS)}")
-        way = _choose(url, transport, codec)
-        self._join(Connection(url, way, timeout_s, connect_timeout_s), rank, resume)
+        choice = CodecChoice(codec)
+        way = choose(url, transport, choice)
+        self._join(Connection(url, way, choice, timeout_s, connect_timeout_s), rank, resume)
 
     def _join(self, connection: Connection, rank: RankName, resume: bool) -> None:
         self._connection = connection
@@ -100,6 +102,16 @@ class RemoteAgent(Agent):
     def transport(self) -> str:
         """What carries the requests: "shm", "websocket", "http" or "handle"; "auto" until connected."""
         return self._connection.transport.name
+
+    @property
+    def codec(self) -> ImageCodec | None:
+        """How cameras are written; None until the first images call for a choice."""
+        return RAW if self.transport in ("shm", "handle") else self._connection.codec.codec
+
+    @property
+    def link(self) -> Link | None:
+        """Round trip (s) and bandwidth (bytes/s) to the server; None unless they were measured to choose a codec."""
+        return self._connection.codec.link
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -290,45 +302,3 @@ class RemoteAgent(Agent):
 def _may_go_on(request: Request, reply: Reply) -> bool:
     """Is this an answer that a living replica would not give? A reset that is refused, as by a full one, stays so."""
     return isinstance(reply.error, ConnectionLost if request.op == "reset" else _GONE)
-
-
-def _choose(url: str, transport: str, codec: ImageCodec | str) -> Transport:
-    scheme = urlsplit(url).scheme
-    if transport not in get_args(TransportName):
-        raise ConfigError(f"transport: got {transport!r}, want one of {list(get_args(TransportName))}")
-    inside = scheme == "serve"
-    if transport in (("http", "websocket") if inside else ("handle",)):
-        raise ConfigError(f"transport {transport!r} does not reach {url!r}; 'handle' and serve://APP go together")
-    chosen = _codec(url, codec)
-    if transport == "handle":
-        from vlagents_ray.client.handle import HandleTransport
-
-        return HandleTransport(urlsplit(url).netloc)
-    if transport == "http":
-        from vlagents_ray.client.http import HttpTransport
-
-        return HttpTransport(url, chosen)
-    if transport == "websocket":
-        from vlagents_ray.client.websocket import WebSocketTransport
-
-        return WebSocketTransport(url, chosen)
-    if not inside:
-        http_url(url)  # raises for what is no URL of ours, before anything is tried
-    from vlagents_ray.client.auto import AutoTransport
-
-    return AutoTransport(url, chosen, only_shm=transport == "shm")
-
-
-def _codec(url: str, codec: ImageCodec | str) -> ImageCodec:
-    if isinstance(codec, ImageCodec):
-        return codec
-    if codec == "auto":
-        return RAW if _is_loopback(urlsplit(url).hostname or "") else JPEG
-    return ImageCodec(codec)
-
-
-def _is_loopback(host: str) -> bool:
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

@@ -9,18 +9,18 @@ from urllib.parse import urlsplit
 
 from vlagents_ray.client.handle import HandleTransport
 from vlagents_ray.client.http import HttpTransport
+from vlagents_ray.client.link import CodecChoice
 from vlagents_ray.client.shm import ShmTransport, reaches
 from vlagents_ray.client.transport import Transport
 from vlagents_ray.client.websocket import WebSocketTransport
 from vlagents_ray.errors import ConfigError, NotReset, PolicyUnavailable
 from vlagents_ray.wire.messages import Reply, Request
-from vlagents_ray.wire.observations import ImageCodec
 
 
 class AutoTransport:
     """Shared memory if the policy runs on this machine for this user; else a WebSocket, or a Serve handle."""
 
-    def __init__(self, url: str, codec: ImageCodec, *, only_shm: bool = False) -> None:
+    def __init__(self, url: str, codec: CodecChoice, *, only_shm: bool = False) -> None:
         self._url = url
         self._codec = codec
         self._only_shm = only_shm

@@ -12,6 +12,7 @@ from vlagents_ray.errors import ConfigError, ConnectionLost, PolicyUnavailable, 
 from vlagents_ray.wire.messages import PROTOCOL_VERSION, Reply, Request
 
 if TYPE_CHECKING:
+    from vlagents_ray.client.link import CodecChoice
     from vlagents_ray.client.transport import Transport
 
 _CLOSE_S = 2.0
@@ -23,9 +24,12 @@ class Connection:
     Used by one thread at a time.
     """
 
-    def __init__(self, url: str, transport: Transport, timeout_s: float, connect_timeout_s: float) -> None:
+    def __init__(
+        self, url: str, transport: Transport, codec: CodecChoice, timeout_s: float, connect_timeout_s: float
+    ) -> None:
         self.url = url
         self.transport = transport
+        self.codec = codec
         self.timeout_s = timeout_s
         self.metadata: dict[str, Any] | None = None
         self.contract: Contract | None = None

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import ConfigError, ConnectionLost, DeadlineExceeded, PolicyUnavailable
+from vlagents_ray.wire.codecs import RAW
 from vlagents_ray.wire.frames import decode_replies, encode_requests
 from vlagents_ray.wire.messages import Reply, Request
-from vlagents_ray.wire.observations import RAW
 
 
 class HandleTransport:

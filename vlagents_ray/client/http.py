@@ -13,17 +13,18 @@ from collections.abc import Sequence
 from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
+from vlagents_ray.client.link import CodecChoice
 from vlagents_ray.errors import (
     ConfigError,
     ConnectionLost,
     DeadlineExceeded,
+    MessageTooLarge,
     PolicyUnavailable,
     UnknownApp,
     VLAgentsError,
 )
 from vlagents_ray.wire.frames import CONTENT_TYPE, decode_replies, encode_requests, read_error
 from vlagents_ray.wire.messages import REQUEST_ID_HEADER, SESSION_HEADER, Reply, Request
-from vlagents_ray.wire.observations import ImageCodec
 
 _UNKNOWN_APP_S = 10.0  # a starting server knows no path until its first replica exists
 
@@ -34,7 +35,7 @@ class HttpTransport:
     name = "http"
     holds_sessions = False
 
-    def __init__(self, url: str, codec: ImageCodec) -> None:
+    def __init__(self, url: str, codec: CodecChoice) -> None:
         self._url = http_url(url)
         self._codec = codec
         self._session = uuid.uuid4().hex
@@ -76,15 +77,26 @@ class HttpTransport:
             "content-type": CONTENT_TYPE,
             "accept": CONTENT_TYPE,
         }
-        frame = encode_requests(requests, self._codec)
+        codec = self._codec.of(requests[0].obs, lambda probe: self._probe(probe, timeout_s))
+        frame = encode_requests(requests, codec)
         status, kind, body = self._exchange("POST", f"/v1/{requests[0].op}", frame, headers, timeout_s)
         if status == 200:
             return decode_replies(body)
         refusal = _refusal(status, kind, body)
         return [Reply(request.request_id, error=refusal) for request in requests]
 
+    def _probe(self, probe: bytes, timeout_s: float) -> None:
+        headers = {SESSION_HEADER: self._session, "content-type": "application/octet-stream"}
+        status, kind, body = self._exchange("POST", "/v1/probe", probe, headers, timeout_s)
+        if status != 200:
+            raise _refusal(status, kind, body)
+
     def close(self) -> None:
-        """Close the connection."""
+        """Close the connection; the next one may be to another replica, over another link."""
+        self._codec.forget()
+        self._hang_up()
+
+    def _hang_up(self) -> None:
         if self._connection is not None:
             self._connection.close()
             self._connection = None
@@ -98,15 +110,15 @@ class HttpTransport:
             answer = connection.getresponse()
             return answer.status, answer.headers.get("content-type", ""), answer.read()
         except TimeoutError as error:
-            self.close()
+            self._hang_up()
             raise DeadlineExceeded(f"{self._url.geturl()}: no answer within {timeout_s:g} s") from error
         except (OSError, http.client.HTTPException) as error:
-            self.close()
+            self._hang_up()
             raise ConnectionLost(f"{self._url.geturl()}: {type(error).__name__}: {error}") from error
 
     def _open(self, timeout_s: float) -> http.client.HTTPConnection:
         if self._connection is not None and _closed_by_peer(self._connection.sock):
-            self.close()
+            self._hang_up()
         if self._connection is None:
             secure = self._url.scheme == "https"
             cls = http.client.HTTPSConnection if secure else http.client.HTTPConnection
@@ -145,6 +157,8 @@ def _refusal(status: int, kind: str, body: bytes) -> VLAgentsError:
     if "json" in kind and isinstance(document := _json(body), dict):
         return read_error(document)
     text = body[:200].decode(errors="replace").strip()
+    if status == 413:
+        return MessageTooLarge(f"a proxy takes no body as large ({text}); raise its limit, or send JPEG")
     if status == 404:
         return UnknownApp(f"no application at this path ({text}); check the URL")
     if status == 500 or status in (502, 503, 504):  # the proxy's own: no replica is ready

@@ -13,9 +13,9 @@ from typing import Any
 
 from vlagents_ray.client.transport import is_answer
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable
+from vlagents_ray.wire.codecs import RAW
 from vlagents_ray.wire.frames import decode_replies, request_parts
 from vlagents_ray.wire.messages import LocalAddress, Reply, Request, boot_id
-from vlagents_ray.wire.observations import RAW
 
 _MESSAGE_BYTES = 128 * 1024  # the longest reply that comes in a message, and some
 _PAGE = mmap.PAGESIZE

@@ -11,11 +11,12 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidSta
 from websockets.sync.client import ClientConnection, connect
 
 from vlagents_ray.client.http import HttpTransport, http_url
+from vlagents_ray.client.link import CodecChoice
 from vlagents_ray.client.transport import is_answer
-from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, MessageTooLarge, PolicyUnavailable
-from vlagents_ray.wire.frames import decode_replies, encode_requests
+from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, MalformedMessage, MessageTooLarge, PolicyUnavailable
+from vlagents_ray.wire.frames import decode_replies, decode_reply, encode_requests
 from vlagents_ray.wire.messages import STREAM_BYTES, Reply, Request
-from vlagents_ray.wire.observations import ImageCodec
+from vlagents_ray.wire.probe import is_answer as is_probe_answer
 
 
 class WebSocketTransport:
@@ -24,7 +25,7 @@ class WebSocketTransport:
     name = "websocket"
     holds_sessions = True
 
-    def __init__(self, url: str, codec: ImageCodec) -> None:
+    def __init__(self, url: str, codec: CodecChoice) -> None:
         base = http_url(url)
         scheme = "wss" if base.scheme == "https" else "ws"
         self._base = base.geturl()
@@ -47,7 +48,8 @@ class WebSocketTransport:
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
         """One frame out, its replies back; replies to requests given up earlier are discarded."""
         deadline = time.monotonic() + timeout_s
-        frame = encode_requests(requests, self._codec)
+        codec = self._codec.of(requests[0].obs, lambda probe: self._probe(probe, timeout_s), STREAM_BYTES)
+        frame = encode_requests(requests, codec)
         if len(frame) > STREAM_BYTES:  # the server would only hang up
             raise MessageTooLarge(
                 f"{self._url}: got {len(frame)} bytes, the limit of a WebSocket message is {STREAM_BYTES}; "
@@ -67,8 +69,25 @@ class WebSocketTransport:
             self.close()
             raise ConnectionLost(f"{self._url}: {error}; reset before the next act") from error
 
+    def _probe(self, probe: bytes, timeout_s: float) -> None:
+        socket = self._stream(timeout_s)
+        try:
+            socket.send(probe)
+            data = socket.recv(timeout=timeout_s, decode=False)
+        except TimeoutError as error:
+            self.close()  # its answer may come later, and would be taken for another's
+            raise DeadlineExceeded(
+                f"{self._url}: no answer to a probe of {len(probe)} bytes within {timeout_s:g} s"
+            ) from error
+        except (ConnectionClosed, OSError) as error:
+            self.close()
+            raise ConnectionLost(f"{self._url}: {error}; reset before the next act") from error
+        if not is_probe_answer(data):
+            raise decode_reply(data).error or MalformedMessage(f"{self._url}: got another answer to a probe")
+
     def close(self) -> None:
         """Close the connection, and so its sessions."""
+        self._codec.forget()
         self._socket = None
         self._open.close()
 

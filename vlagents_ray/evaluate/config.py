@@ -21,7 +21,7 @@ from pydantic import (
 )
 from typing_extensions import Self
 
-from vlagents_ray.client.agent import TransportName
+from vlagents_ray.client.ways import TransportName
 
 Video = Literal["none", "failures", "all"]
 Name = Annotated[str, Field(min_length=1)]
@@ -41,7 +41,9 @@ class EvalConfig(BaseModel):
     checkpoint: str | None = None
     execute: PositiveInt | None = None  # rows executed of each action chunk; None = all
     seed: NonNegativeInt = 0  # episode i of an env uses seed + i
-    codec: Literal["auto", "raw", "jpeg"] = "auto"  # "auto": raw pixels to this machine, JPEG to others
+    # How images reach a policy over a network. JPEG changes them a little, so it has to be asked for; the others
+    # do not, and "exact" takes the faster of raw and lossless, so that results never depend on the link.
+    codec: Literal["exact", "raw", "lossless", "jpeg"] = "exact"
 
     # How much of it, and how.
     episodes: PositiveInt = 10  # per env
@@ -100,7 +102,7 @@ def outcome_settings(config: EvalConfig, env: str) -> dict[str, Any]:
         "policy_config": config.policy_config,
         "checkpoint": config.checkpoint,
         "execute": config.execute,
-        "codec": config.codec,
+        "codec": "jpeg" if config.codec == "jpeg" else "exact",
     }
 
 

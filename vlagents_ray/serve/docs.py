@@ -50,7 +50,11 @@ with RemoteAgent("http://HOST:8000") as agent:
 <code>cameras.&lt;name&gt;</code> for each camera; or <code>application/json</code> without cameras; or one frame,
 <code>{CONTENT_TYPE}</code>. The answer is JSON, or a frame if <code>Accept</code> asks for it.</td></tr>
 <tr><td><code>POST /v1/close</code></td><td>Ends the session.</td></tr>
-<tr><td><code>WS /v1/stream</code></td><td>Binary frames; sessions end with the connection.</td></tr>
+<tr><td><code>WS /v1/stream</code></td><td>Binary frames; sessions end with the connection. A message that begins with
+<code>VLA?</code> is a probe.</td></tr>
+<tr><td><code>POST /v1/probe</code></td><td>For measuring the link: <code>VLA?</code>, four zero bytes and any others,
+which reach neither a session nor the policy. The answer, at once, is <code>VLA!</code> and the number of bytes, 64
+bits, little-endian. With a one in place of the first zero, a frame follows, which is decoded first.</td></tr>
 <tr><td><code>GET /v1/metadata</code></td><td>Policy, checkpoint, contract, protocol version.</td></tr>
 <tr><td><code>GET /healthz</code></td><td>200 when the policy can act, 503 until then.</td></tr>
 </table>

@@ -1,7 +1,8 @@
 """The robots' door: HTTP and WebSocket on one port, as an ASGI application over an engine.
 
     POST /v1/reset, /v1/act, /v1/close   multipart/form-data, application/json, or one binary frame
-    WS   /v1/stream                      one session a connection, binary frames
+    POST /v1/probe                       answered at once, for measuring the link
+    WS   /v1/stream                      sessions that end with the connection; binary frames or probes
     GET  /healthz, /v1/metadata, /docs
 
 Errors over HTTP are problem+json with a stable code; over WebSocket they are reply frames.
@@ -44,6 +45,7 @@ from vlagents_ray.wire.messages import (
     Request,
 )
 from vlagents_ray.wire.plain import CAMERA_PREFIX, PROBLEM_TYPE, problem, reply_to_json, request_from_parts
+from vlagents_ray.wire.probe import answer, is_probe, probed_frame
 
 logger = logging.getLogger(__name__)
 
@@ -58,6 +60,7 @@ def build_ingress(engine: Engine, metadata: Callable[[], dict[str, Any]], limits
     return Starlette(
         routes=[
             *(Route(f"/v1/{op}", door.endpoint(op), methods=["POST"]) for op in OPS),
+            Route("/v1/probe", door.probe, methods=["POST"]),
             WebSocketRoute("/v1/stream", door.stream),
             Route("/v1/metadata", door.show_metadata),
             Route("/healthz", door.health),
@@ -81,6 +84,22 @@ class _Door:
 
     async def docs(self, http: HttpRequest) -> Response:
         return self._when_ready(http, lambda: HTMLResponse(docs_page(self._metadata())))
+
+    async def probe(self, http: HttpRequest) -> Response:
+        """Neither a session nor the policy hears of it."""
+        try:
+            return Response(await self._probed(await self._body(http)), media_type="application/octet-stream")
+        except ClientDisconnect:
+            return Response(status_code=499)
+        except VLAgentsError as error:
+            return _problem(error, _request_id(http))
+
+    async def _probed(self, message: bytes) -> bytes:
+        if (frame := probed_frame(message)) is not None:
+            for request in await self._decode(frame):
+                if isinstance(request, Reply) and request.error is not None:
+                    raise request.error
+        return answer(message)
 
     def _when_ready(self, http: HttpRequest, answer: Callable[[], Response]) -> Response:
         try:
@@ -209,12 +228,19 @@ class _Door:
                 message = await socket.receive()
                 if message["type"] == "websocket.disconnect":
                     return
-                replies = await self._answer(sender, message.get("bytes"))
-                await socket.send_bytes(encode_replies(replies))
+                await socket.send_bytes(await self._reply_to(sender, message.get("bytes")))
         except WebSocketDisconnect:
             return
         finally:
             sender.release()
+
+    async def _reply_to(self, sender: Sender, message: bytes | None) -> bytes:
+        if message is None or not is_probe(message):
+            return encode_replies(await self._answer(sender, message))
+        try:
+            return await self._probed(message)
+        except VLAgentsError as error:
+            return encode_replies([Reply(error=error)])
 
     async def _answer(self, sender: Sender, frame: bytes | None) -> list[Reply]:
         arrived = time.perf_counter()

@@ -2,35 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from vlagents_ray import images
-from vlagents_ray.errors import InvalidInput, InvalidObservation, MalformedMessage, MessageTooLarge
+from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge
 from vlagents_ray.interface import Obs
+from vlagents_ray.wire.codecs import ImageCodec, encode_files
 from vlagents_ray.wire.messages import Limits
 from vlagents_ray.wire.tree import Reader, Writer
 
 _OBS_KEYS = {"cameras", "gripper", "state", "info"}
-
-
-@dataclass(frozen=True, slots=True)
-class ImageCodec:
-    """How cameras are written: raw pixels, or JPEG. Lossy coding is the caller's choice."""
-
-    name: str = "jpeg"  # "jpeg" or "raw"
-    quality: int = 85
-    subsampling: str = "444"
-
-    def __post_init__(self) -> None:
-        if self.name not in ("jpeg", "raw"):
-            raise InvalidInput(f"codec: got {self.name!r}, want 'jpeg' or 'raw'")
-
-
-RAW = ImageCodec("raw")
-JPEG = ImageCodec("jpeg")
 
 
 def read_obs(node: Any, reader: Reader, limits: Limits) -> Obs:
@@ -49,6 +31,7 @@ def read_obs(node: Any, reader: Reader, limits: Limits) -> Obs:
         raise MessageTooLarge(f"obs: got {len(cameras)} cameras and {len(state)} states, the limit is {limits.cameras}")
     if gripper is not None and not is_number(gripper):
         raise InvalidObservation(f"gripper: got {str(gripper)[:40]!r}, want a number in [0, 1] where 1 = open")
+    reader.decode_images(cameras.values())
     return Obs(
         cameras={name: _read_camera(name, image, reader, limits) for name, image in cameras.items()},
         gripper=None if gripper is None else float(gripper),
@@ -88,10 +71,8 @@ def write_obs(obs: Obs, writer: Writer, codec: ImageCodec) -> dict[str, Any]:
     if codec.name == "raw":
         cameras = {name: writer.array(image) for name, image in obs.cameras.items()}
     else:
-        cameras = {
-            name: writer.image(images.encode_jpeg(image, codec.quality, codec.subsampling))
-            for name, image in obs.cameras.items()
-        }
+        files = encode_files(list(obs.cameras.values()), codec)
+        cameras = {name: writer.image(file) for name, file in zip(obs.cameras, files, strict=True)}
     return {
         "cameras": cameras,
         "gripper": None if obs.gripper is None else float(obs.gripper),

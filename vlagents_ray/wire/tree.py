@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from vlagents_ray import images
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
+from vlagents_ray.wire.codecs import decode_files
 from vlagents_ray.wire.messages import Limits
 
 Buffer = bytes | memoryview
@@ -73,6 +73,17 @@ class Reader:
         self._blobs = blobs
         self._limits = limits
         self._items = 0
+        self._images: dict[int, np.ndarray] = {}  # by blob, decoded ahead
+
+    def decode_images(self, nodes: Iterable[Any]) -> None:
+        """Decode the images that `nodes` refer to at once; `blob` has them ready then."""
+        references = [_reference(node) for node in nodes]
+        found = [reference[1] for reference in references if reference[:1] == ["img"] and len(reference) == 2]
+        distinct = list(dict.fromkeys(index for index in found if type(index) is int))
+        if not distinct:
+            return
+        files = [self._get(index) for index in distinct]
+        self._images = dict(zip(distinct, decode_files(files, self._limits.pixels), strict=True))
 
     def value(self, node: Any, depth: int = 0) -> Any:
         """The value of a JSON node; `MalformedMessage` or `MessageTooLarge` if it is not one."""
@@ -91,17 +102,22 @@ class Reader:
 
     def blob(self, node: Any) -> Any:
         """The array, image or bytes that `{"$": [...]}` refers to."""
-        reference = node.get("$") if isinstance(node, dict) else None
-        if not isinstance(reference, list) or not reference or len(node) != 1:
+        reference = _reference(node)
+        if not reference or len(node) != 1:
             raise MalformedMessage(f"reference: got {str(node)[:80]}, want {{'$': [kind, blob, ...]}}")
         kind, *rest = reference
         if kind == "nd" and len(rest) == 3:
             return self._array(self._get(rest[0]), rest[1], rest[2])
         if kind == "img" and len(rest) == 1:
-            return images.decode(self._get(rest[0]), self._limits.pixels)
+            return self._image(rest[0])
         if kind == "bin" and len(rest) == 1:
             return bytes(self._get(rest[0]))
         raise MalformedMessage(f"reference: got {str(reference)[:80]}, want 'nd', 'img' or 'bin'")
+
+    def _image(self, index: Any) -> np.ndarray:
+        data = self._get(index)
+        image = self._images.get(index)
+        return decode_files([data], self._limits.pixels)[0] if image is None else image
 
     def _nest(self, depth: int) -> None:
         if depth >= self._limits.depth:
@@ -125,3 +141,9 @@ class Reader:
         if math.prod(shape) * kind.itemsize != len(data):
             raise MalformedMessage(f"array: got {len(data)} bytes, want {shape} of {dtype}")
         return np.frombuffer(data, kind).reshape(shape)
+
+
+def _reference(node: Any) -> list[Any]:
+    """The list in `{"$": [kind, blob, ...]}`; empty for anything else."""
+    reference = node.get("$") if isinstance(node, dict) else None
+    return reference if isinstance(reference, list) else []

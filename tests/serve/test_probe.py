@@ -1,0 +1,90 @@
+"""Probes are answered at once, and reach neither a session nor the policy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.serve.engine import Engine
+from vlagents_ray.serve.ingress import build_ingress
+from vlagents_ray.wire.codecs import LOSSLESS
+from vlagents_ray.wire.frames import decode_reply, encode_request, request_parts
+from vlagents_ray.wire.messages import Limits, Request
+from vlagents_ray.wire.probe import LEAST_BYTES, bytes_probe, frame_probe, is_answer
+
+OBS = Obs({"front": np.zeros((32, 48, 3), np.uint8)})
+FRAME = frame_probe(request_parts([Request("act", OBS)], LOSSLESS))
+BROKEN = FRAME[:-60] + bytes(60)
+
+
+class Untouched(Agent):
+    """Its error would be the answer to a probe that reached it."""
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        raise RuntimeError("a probe reached the policy")
+
+
+@pytest.fixture(scope="module")
+def engine() -> Iterator[Engine]:
+    engine = Engine(Untouched())
+    engine.start()
+    yield engine
+    engine.close()
+
+
+@pytest.fixture(scope="module")
+def client(engine: Engine) -> Iterator[TestClient]:
+    with TestClient(build_ingress(engine, dict, Limits(body_bytes=100_000))) as client:
+        yield client
+
+
+@pytest.mark.parametrize("message", [bytes_probe(0), bytes_probe(5_000), bytes_probe(100_000), FRAME])
+def test_a_probe_is_answered_by_both_doors(client: TestClient, engine: Engine, message: bytes) -> None:
+    before = len(engine.sessions)
+    posted = client.post("/v1/probe", content=message)
+    assert posted.status_code == 200
+    assert len(engine.sessions) == before
+    with client.websocket_connect("/v1/stream") as socket:
+        socket.send_bytes(message)
+        streamed = socket.receive_bytes()
+    assert posted.content == streamed
+    assert is_answer(streamed)
+    assert int.from_bytes(streamed[4:], "little") == len(message)
+
+
+@pytest.mark.parametrize(
+    ("message", "code"),
+    [
+        (b"", "malformed"),
+        (b"VLA?\0\0", "malformed"),
+        (b"VLA?\2\0\0\0", "malformed"),
+        (b"not a probe", "malformed"),
+        (BROKEN, "malformed"),
+        (bytes_probe(100_001), "too_large"),
+    ],
+)
+def test_what_is_no_probe_is_refused_by_name(client: TestClient, message: bytes, code: str) -> None:
+    answer = client.post("/v1/probe", content=message)
+    assert answer.json()["code"] == code
+    assert answer.headers["content-type"] == "application/problem+json"
+
+
+def test_a_broken_probe_leaves_the_stream_as_it_was(client: TestClient) -> None:
+    with client.websocket_connect("/v1/stream") as socket:
+        socket.send_bytes(BROKEN)
+        error = decode_reply(socket.receive_bytes()).error
+        assert error is not None
+        assert error.code == "malformed"
+        socket.send_bytes(encode_request(Request("reset", OBS, request_id="r")))
+        assert decode_reply(socket.receive_bytes()).error is None
+
+
+def test_a_probe_has_the_size_asked_for() -> None:
+    assert [len(bytes_probe(size)) for size in (0, LEAST_BYTES, 1000)] == [LEAST_BYTES, LEAST_BYTES, 1000]

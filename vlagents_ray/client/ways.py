@@ -1,0 +1,42 @@
+"""Which transport reaches which URL."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal, get_args
+from urllib.parse import urlsplit
+
+from vlagents_ray.client.http import http_url
+from vlagents_ray.client.link import CodecChoice
+from vlagents_ray.errors import ConfigError
+
+if TYPE_CHECKING:
+    from vlagents_ray.client.transport import Transport
+
+TransportName = Literal["auto", "shm", "websocket", "http", "handle"]
+
+
+def choose(url: str, transport: str, codec: CodecChoice) -> Transport:
+    """The transport for a URL; `ConfigError` if they do not go together."""
+    scheme = urlsplit(url).scheme
+    if transport not in get_args(TransportName):
+        raise ConfigError(f"transport: got {transport!r}, want one of {list(get_args(TransportName))}")
+    inside = scheme == "serve"
+    if transport in (("http", "websocket") if inside else ("handle",)):
+        raise ConfigError(f"transport {transport!r} does not reach {url!r}; 'handle' and serve://APP go together")
+    if transport == "handle":
+        from vlagents_ray.client.handle import HandleTransport
+
+        return HandleTransport(urlsplit(url).netloc)
+    if transport == "http":
+        from vlagents_ray.client.http import HttpTransport
+
+        return HttpTransport(url, codec)
+    if transport == "websocket":
+        from vlagents_ray.client.websocket import WebSocketTransport
+
+        return WebSocketTransport(url, codec)
+    if not inside:
+        http_url(url)  # raises for what is no URL of ours, before anything is tried
+    from vlagents_ray.client.auto import AutoTransport
+
+    return AutoTransport(url, codec, only_shm=transport == "shm")
