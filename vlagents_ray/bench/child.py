@@ -25,8 +25,16 @@ class ChildFailed(VLAgentsError):
 class Child:
     """One such process. What it writes on standard error is kept, and shown if it fails."""
 
-    def __init__(self, name: str, command: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
+    def __init__(
+        self,
+        name: str,
+        command: Sequence[str],
+        environment: Mapping[str, str] | None = None,
+        *,
+        end_s: float = _END_S,
+    ) -> None:
         self.name = name
+        self._end_s = end_s  # how long it may take to end when it is told to
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
         self._process = subprocess.Popen(  # noqa: S603 - the bench's own scripts
             list(command),
@@ -80,7 +88,7 @@ class Child:
             with contextlib.suppress(OSError):
                 self._process.stdin.close()
         try:
-            self._process.wait(_END_S)
+            self._process.wait(self._end_s)
         except subprocess.TimeoutExpired:
             self._process.kill()
             self._process.wait()

@@ -1,4 +1,4 @@
-"""Clients of ours that act as fast as they are answered, several to a process: `python -m vlagents_ray.bench.load JSON`.
+"""Several clients of ours in a process, which act as fast as they are answered: `… -m vlagents_ray.bench.load`.
 
 All clients of a benchmark live in a few such processes, or Ray actors, and begin at the same moment of
 the machine's monotonic clock.
@@ -12,7 +12,6 @@ import sys
 import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 from vlagents_ray.bench.client import connect
 from vlagents_ray.bench.observing import observation

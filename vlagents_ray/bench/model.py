@@ -32,7 +32,7 @@ class Size:
     patch: int  # pixels; one token for each patch of each camera
 
 
-# pi0 has 3.3 billion parameters (arXiv 2410.24164), OpenVLA 7 billion (arXiv 2406.09246) with Llama 2's width and heads.
+# pi0 has 3.3 billion parameters (arXiv 2410.24164); OpenVLA 7 billion, with Llama 2's width (arXiv 2406.09246).
 SIZES: Mapping[str, Size] = {
     "tiny": Size(layers=2, width=64, heads=2, patch=56),
     "pi0": Size(layers=29, width=3072, heads=24, patch=14),

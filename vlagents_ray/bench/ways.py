@@ -93,7 +93,7 @@ def peer_ways(names: Sequence[str], python: Path) -> tuple[list[PeerWay], dict[s
         return [], {}, {}
     cure = "`vlagents-ray bench peers-setup` makes an environment for them"
     if not python.is_file():
-        return [], {name: f"no Python at {python}; {cure}, --peers-python names another" for name in wanted}, {}
+        return [], dict.fromkeys(wanted, f"no Python at {python}; {cure}, --peers-python names another"), {}
     versions = installed(python, sorted({d for way in PEER_WAYS for d in way.distributions}))
     found, skipped = [], {}
     for way in PEER_WAYS:

@@ -20,7 +20,7 @@ from openpi_client import msgpack_numpy
 from openpi_client.websocket_client_policy import WebsocketClientPolicy
 
 
-def infer(obs: dict[str, Any]) -> dict[str, Any]:
+def infer(_obs: dict[str, Any]) -> dict[str, Any]:
     """A policy that does nothing: a chunk of one action."""
     return {"actions": np.zeros((1, 7), np.float32), "policy_timing": {"infer_ms": 0.0}}
 
@@ -55,8 +55,8 @@ def serve(host: str, port: int) -> None:
     asyncio.run(forever())
 
 
-def drive(host: str, port: int, path: str, mode: str, out: TextIO) -> None:
-    """Its own client; `mode` has no meaning."""
+def drive(host: str, port: int, path: str, _mode: str, out: TextIO) -> None:
+    """Its own client."""
     arrays = peer.observation(path)
     obs = {
         "observation/image": arrays["camera_0"],

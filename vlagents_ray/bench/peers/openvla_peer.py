@@ -43,8 +43,8 @@ def serve(host: str, port: int) -> None:
     uvicorn.run(app, host=host, port=port)
 
 
-def drive(host: str, port: int, path: str, mode: str, out: TextIO) -> None:
-    """The client of its documentation; `mode` has no meaning."""
+def drive(host: str, port: int, path: str, _mode: str, out: TextIO) -> None:
+    """The client of its documentation."""
     arrays = peer.observation(path)
     obs = {
         "image": arrays["camera_0"],
