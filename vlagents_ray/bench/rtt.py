@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from vlagents_ray.serve.files import deployment
 __all__ = ["RoundTripsOfAll", "measure_rtt", "observation"]
 
 POLICY = "vlagents_ray.bench.policy:Measured"
+LOOPBACK = "127.0.0.1"
 ROUND = 25  # calls of one way before it is the next one's turn
 
 
@@ -79,7 +81,7 @@ def measure(
     versions: Mapping[str, str],
     tell: Callable[[str], None],
     *,
-    host: str = "127.0.0.1",
+    host: str = LOOPBACK,
     prefix: Sequence[str] = (),
 ) -> RoundTripsOfAll:
     """All ways against servers on `host`; the commands of the clients begin with `prefix`."""
@@ -90,10 +92,13 @@ def measure(
         for peer in others:  # before Ray, whose start is what takes the time
             way = peer_connected(peer, peers_python, host, free_port(host), obs, prefix)
             drivers[peer.name] = stack.enter_context(way)
-        server = stack.enter_context(running_server(deployment(POLICY), host=host))
+        # Serve's HAProxy looks for replicas on the loopback address: one that listens on another alone is not found.
+        listens = host if host == LOOPBACK else "0.0.0.0"  # noqa: S104 - in a network namespace of its own
+        server = stack.enter_context(running_server(deployment(POLICY), host=listens))
         (app,) = server.apps
+        url = f"http://{host}:{urlsplit(server.url).port}"
         for one in own:
-            drivers[one.name] = stack.enter_context(connected(one, server.url, app, prefix))
+            drivers[one.name] = stack.enter_context(connected(one, url, app, prefix))
         if not drivers:
             raise ConfigError("nothing to measure: want a transport or a peer")
         said = {name: driver.ready() for name, driver in drivers.items()}

@@ -1,0 +1,94 @@
+"""`vlagents-ray bench` as users run it, very small."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from ray_processes import processes, ray_folder
+
+from vlagents_ray.bench.ways import ways
+
+COMMAND = str(Path(sys.executable).parent / "vlagents-ray")
+
+
+@pytest.fixture(name="ray_home")
+def own_ray_folder() -> Iterator[Path]:
+    with ray_folder() as folder:
+        yield folder
+        assert not processes(folder), "left running"
+
+
+def bench(ray_home: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [COMMAND, "bench", *words], capture_output=True, text=True, timeout=180, check=False,
+        env=os.environ | {"RAY_TMPDIR": str(ray_home), "COLUMNS": "200"},
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_every_way_is_measured_and_shared_memory_is_the_fastest_to_a_local_process(
+    ray_home: Path, tmp_path: Path
+) -> None:
+    file, plot = tmp_path / "rtt.json", tmp_path / "rtt.svg"
+    words = ["--calls", "50", "--peers", "openpi", "--peers-python", str(tmp_path / "none")]
+    done = bench(ray_home, "rtt", *words, "--json", str(file), "--plot", str(plot))
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads(file.read_text())
+    medians = {way["way"]: way["median_ms"] for way in found["ways"]}
+    assert set(medians) == {way.name for way in ways()[0]}
+    assert all(way["calls"] == 50 for way in found["ways"])
+    local = {name: ms for name, ms in medians.items() if "actor" not in name}
+    assert min(local, key=lambda name: local[name]) == "shm"
+    lost = {way["way"]: way["psnr_db"] for way in found["ways"]}
+    assert lost["shm"] is None
+    assert lost["websocket, jpeg"] > 30
+    assert "peers-setup" in found["skipped"]["openpi"]
+    assert "skipped openpi" in done.stdout
+    assert plot.stat().st_size > 1000
+
+
+@pytest.mark.slow
+def test_throughput_against_the_ideal_and_against_the_bare_policy(ray_home: Path, tmp_path: Path) -> None:
+    file = tmp_path / "throughput.json"
+    few = ["--clients", "1,8", "--seconds", "0.5", "--rounds", "1", "--json", str(file)]
+    done = bench(ray_home, "throughput", *few, "--transports", "shm,handle", "--robot-seconds", "1")
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads(file.read_text())
+    assert set(found["transports"]) == {"shm", "handle"}
+    for row in found["transports"].values():
+        assert 0 < row["of_ideal"] <= 1.05
+        assert [point["clients"] for point in row["curve"]] == [1, 8]
+        assert row["curve"][1]["mean_batch"] > 1
+        assert row["robot"]["calls"] > 0
+    done = bench(ray_home, "throughput", *few, "--transports", "shm", "--model", "tiny", "--robot-seconds", "0")
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads(file.read_text())
+    assert found["bare_rounds"][0] > 0
+    assert found["transports"]["shm"]["actions_per_s"] > 0
+    assert "bare, measured in the same run" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["rtt", "--peers", "nobody"], "nobody"),
+        (["rtt", "--transports", "smoke"], "smoke"),
+        (["rtt", "--plot", "a.gif"], ".png"),
+        (["throughput", "--clients", "few"], "few"),
+        (["throughput", "--config", "{"], "JSON"),
+        (["throughput", "--config", '{"base_ms": 1}'], "--policy"),
+        (["throughput", "--model", "huge"], "size"),
+        (["report", "--readme", "nowhere.md"], "nowhere.md"),
+    ],
+)
+def test_mistakes_are_told_in_a_line(ray_home: Path, words: list[str], text: str) -> None:
+    done = bench(ray_home, *words)
+    assert done.returncode == 2, done.stdout + done.stderr
+    assert text in done.stderr
+    assert "Traceback" not in done.stderr + done.stdout
