@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from vlagents_ray.bench.markdown import BEGIN, END, replaced, section
-from vlagents_ray.bench.targets import outcomes
+from vlagents_ray.bench.targets import DEFAULT, JPEG, outcomes
 from vlagents_ray.errors import ConfigError
 
 
@@ -34,7 +34,7 @@ RESULTS: dict[str, Any] = {
     "skipped": {},
     "rtt": {
         **round_trips(
-            {"plasma, Ray actor": 0.15, "shm": 0.11, "websocket, jpeg": 1.2, "websocket, default": 0.6, "http, jpeg": 1.7},
+            {"plasma, Ray actor": 0.15, "shm": 0.11, JPEG: 1.2, DEFAULT: 0.6, "http, jpeg": 1.7},
             THEIRS,
         ),
         "skipped": {"vla-eval": "not installed"},

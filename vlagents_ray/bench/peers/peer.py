@@ -10,6 +10,7 @@ from __future__ import annotations
 import ctypes
 import json
 import os
+import select
 import signal
 import socket
 import sys
@@ -74,8 +75,15 @@ def observation(path: str) -> dict[str, np.ndarray]:
         return {name: arrays[name] for name in arrays.files}
 
 
+def _stdin_has_ended() -> bool:
+    """Has whoever started this process gone? It may have before the kernel was asked to tell."""
+    poller = select.poll()
+    poller.register(0, select.POLLIN)
+    return any(events & select.POLLHUP for _, events in poller.poll(0))
+
+
 def wait_for_port(host: str, port: int) -> None:
-    """Until somebody listens there; `TimeoutError` after a minute."""
+    """Until somebody listens there; `TimeoutError` after a minute. Ends this process if its standard input ends."""
     deadline = time.monotonic() + _START_S
     while True:
         try:
@@ -83,6 +91,8 @@ def wait_for_port(host: str, port: int) -> None:
         except OSError:
             if time.monotonic() > deadline:
                 raise TimeoutError(f"nobody listens on {host}:{port}") from None
+            if _stdin_has_ended():
+                sys.exit(0)
             time.sleep(0.1)
         else:
             return
