@@ -108,10 +108,9 @@ def measure_throughput(plan: Plan, tell: Callable[[str], None] = lambda _: None)
 class _Part:
     """Some of the clients: a process or an actor."""
 
-    def __init__(self, start: Callable[[dict[str, Any]], Any], result: Callable[[Any, float], Any], size: int) -> None:
+    def __init__(self, start: Callable[[dict[str, Any]], Any], result: Callable[[Any, float], Any]) -> None:
         self.start = start
         self.result = result
-        self.size = size
 
 
 class _Fleet:
@@ -123,14 +122,14 @@ class _Fleet:
 
     def run(self, clients: int, seconds: float) -> list[list[Call]]:
         """So many simulations act for so long, spread over the parts; their calls."""
-        shares = [clients // len(self._parts) + (i < clients % len(self._parts)) for i in range(len(self._parts))]
-        return self._together(list(zip(self._parts, shares, strict=True)), seconds)
+        return self._together(self._spread(clients), seconds)
 
     def robot_run(self, clients: int, seconds: float) -> list[Call]:
         """The robot's calls among `clients` - 1 simulations."""
-        count = clients - 1
-        shares = [count // len(self._parts) + (i < count % len(self._parts)) for i in range(len(self._parts))]
-        return self._together([(self._robot, 1), *zip(self._parts, shares, strict=True)], seconds)[0]
+        return self._together([(self._robot, 1), *self._spread(clients - 1)], seconds)[0]
+
+    def _spread(self, clients: int) -> list[tuple[_Part, int]]:
+        return list(zip(self._parts, _shares(clients, len(self._parts)), strict=True))
 
     @staticmethod
     def _together(shares: Sequence[tuple[_Part, int]], seconds: float) -> list[list[Call]]:
@@ -143,8 +142,7 @@ class _Fleet:
 @contextlib.contextmanager
 def _fleet(way: Way, url: str, app: str, clients: int) -> Iterator[_Fleet]:
     parts = min(_PROCESSES, clients)
-    sizes = [clients // parts + (i < clients % parts) for i in range(parts)]
-    ranks = [[ROBOT], *[[SIMULATION] * size for size in sizes]]
+    ranks = [[ROBOT], *([SIMULATION] * size for size in _shares(clients, parts))]
     with contextlib.ExitStack() as stack:
         make = _actor if way.actor else _process
         address = f"serve://{app}" if way.actor else url
@@ -158,7 +156,7 @@ def _process(way: Way, url: str, ranks: list[str]) -> Iterator[_Part]:
     command = [sys.executable, "-m", "vlagents_ray.bench.load", settings]
     with Child(f"clients by {way.name}", command, our_environment()) as child:
         child.hear(START_S)
-        yield _Part(lambda spec: child.tell(json.dumps(spec)), lambda _, late: child.hear(late), len(ranks))
+        yield _Part(lambda spec: child.tell(json.dumps(spec)), lambda _, late: child.hear(late))
 
 
 @contextlib.contextmanager
@@ -168,9 +166,7 @@ def _actor(way: Way, url: str, ranks: list[str]) -> Iterator[_Part]:
     actor = ray.remote(num_cpus=0)(Load).remote(url, way.transport, way.codec, ranks)
     try:
         ray.get(actor.ready.remote(), timeout=START_S)
-        yield _Part(
-            lambda spec: actor.run.remote(**spec), lambda pending, late: ray.get(pending, timeout=late), len(ranks)
-        )
+        yield _Part(lambda spec: actor.run.remote(**spec), lambda pending, late: ray.get(pending, timeout=late))
     finally:
         ray.get(actor.close.remote(), timeout=START_S)
         ray.kill(actor)
@@ -182,6 +178,11 @@ def _bare(plan: Plan) -> Iterator[Child]:
     with Child("the bare policy", [sys.executable, "-m", _BARE, settings], our_environment()) as child:
         child.hear(10 * START_S)  # it may have weights to load
         yield child
+
+
+def _shares(clients: int, parts: int) -> list[int]:
+    """As evenly as it goes, the first parts have one more."""
+    return [clients // parts + (i < clients % parts) for i in range(parts)]
 
 
 def _one_each(found: Sequence[Way]) -> list[Way]:
