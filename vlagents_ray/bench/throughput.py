@@ -168,7 +168,8 @@ def _actor(way: Way, url: str, ranks: list[str]) -> Iterator[_Part]:
         ray.get(actor.ready.remote(), timeout=START_S)
         yield _Part(lambda spec: actor.run.remote(**spec), lambda pending, late: ray.get(pending, timeout=late))
     finally:
-        ray.get(actor.close.remote(), timeout=START_S)
+        with contextlib.suppress(ray.exceptions.RayError):  # one that never connected has told why already
+            ray.get(actor.close.remote(), timeout=START_S)
         ray.kill(actor)
 
 

@@ -17,7 +17,6 @@ from vlagents_ray.bench.child import Child
 from vlagents_ray.client.agent import TransportName
 from vlagents_ray.errors import ConfigError
 
-DEFAULT_DIR = Path(".venv-peers")
 SCRIPTS = Path(__file__).parent / "peers"
 REQUIREMENTS = SCRIPTS / "requirements.txt"
 START_S = 90.0
@@ -182,7 +181,8 @@ def connected(way: Way, url: str, app: str, prefix: Sequence[str] = ()) -> Itera
         try:
             yield ActorDriver(actor)
         finally:
-            ray.get(actor.close.remote(), timeout=_CALL_S)
+            with contextlib.suppress(ray.exceptions.RayError):  # one that never connected has told why already
+                ray.get(actor.close.remote(), timeout=_CALL_S)
             ray.kill(actor)
         return
     settings = json.dumps({"url": url, "transport": way.transport, "codec": way.codec})
