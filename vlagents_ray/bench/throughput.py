@@ -39,6 +39,7 @@ class Plan:
 
     policy: str = SLOW_NOOP[0]
     config: Mapping[str, Any] = field(default_factory=lambda: SLOW_NOOP[1])
+    num_gpus: float = 0  # that Ray gives to the replica
     batch: int = 16
     clients: Sequence[int] = (1, 2, 4, 8, 16, 32)  # the last, the most, is measured in each round
     seconds: float = 2.0  # of each measurement
@@ -62,7 +63,12 @@ def measure_throughput(plan: Plan, tell: Callable[[str], None] = lambda _: None)
     """All that the plan asks for, as plain JSON values."""
     found, skipped = ways(plan.transports)
     chosen = _one_each(found)
-    served = deployment(plan.policy, config=dict(plan.config), batch={"max_size": plan.batch})
+    served = deployment(
+        plan.policy,
+        config=dict(plan.config),
+        batch={"max_size": plan.batch},
+        resources={"num_gpus": plan.num_gpus},
+    )
     with contextlib.ExitStack() as stack:
         bare = None if plan.ideal else stack.enter_context(_bare(plan))
         server = stack.enter_context(running_server(served))

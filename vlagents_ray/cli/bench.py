@@ -95,7 +95,10 @@ def bench_throughput(
     model: Annotated[
         str | None, typer.Option(help="A transformer with random weights, in the policy's place: tiny, pi0, openvla.")
     ] = None,
-    device: Annotated[str, typer.Option(help="Where the transformer runs.")] = "cpu",
+    device: Annotated[str, typer.Option(help="Where the transformer runs: cpu, cuda.")] = "cpu",
+    num_gpus: Annotated[
+        float | None, typer.Option(min=0, help="That Ray gives to the replica; default: 1 for --device cuda, else 0.")
+    ] = None,
     json_file: Json = None,
 ) -> None:
     """Actions a second of many clients on one replica, against the ideal, or the bare policy in the same run."""
@@ -110,7 +113,7 @@ def bench_throughput(
         if not counts or counts[0] < 1:
             raise ConfigError(f"--clients: got {clients!r}, want numbers from 1 on")
         plan: Plan = Plan(
-            **chosen, batch=batch, clients=counts, seconds=seconds, rounds=rounds, robot_seconds=robot_seconds,
+            **chosen, num_gpus=float(device.startswith("cuda")) if num_gpus is None else num_gpus, batch=batch, clients=counts, seconds=seconds, rounds=rounds, robot_seconds=robot_seconds,
             transports=_list(transports),
         )  # fmt: skip
         found = measure_throughput(plan, _tell)
