@@ -54,24 +54,25 @@ def test_every_way_is_measured_and_shared_memory_is_the_fastest_to_a_local_proce
 
 
 @pytest.mark.slow
-def test_throughput_against_the_ideal_and_against_the_bare_policy(ray_home: Path, tmp_path: Path) -> None:
+def test_throughput_comes_near_the_bare_policy_and_never_above_it(ray_home: Path, tmp_path: Path) -> None:
+    """Written out as a class, `noop` is a policy of unknown speed, which is measured bare; it sleeps, so that the
+    two cores of a busy machine do not matter."""
     file = tmp_path / "throughput.json"
-    few = ["--clients", "1,8", "--seconds", "0.5", "--rounds", "1", "--json", str(file)]
-    done = bench(ray_home, "throughput", *few, "--transports", "shm,handle", "--robot-seconds", "1")
+    policy = ["--policy", "vlagents_ray.policies.noop:Noop", "--config", '{"base_ms": 40, "per_item_ms": 5}']
+    few = ["--clients", "1,8", "--batch", "4", "--seconds", "1", "--rounds", "1", "--robot-seconds", "1"]
+    done = bench(ray_home, "throughput", *policy, *few, "--transports", "shm,handle", "--json", str(file))
     assert done.returncode == 0, done.stdout + done.stderr
     found = json.loads(file.read_text())
+    assert found["ideal_actions_per_s"] == found["bare_rounds"][0]
+    assert 40 < found["bare_rounds"][0] <= 4 / 0.060
     assert set(found["transports"]) == {"shm", "handle"}
     for row in found["transports"].values():
-        assert 0 < row["of_ideal"] <= 1.05
+        assert 0.3 < row["of_ideal"] <= 1.1
         assert [point["clients"] for point in row["curve"]] == [1, 8]
-        assert row["curve"][1]["mean_batch"] > 1
+        assert row["curve"][0]["mean_batch"] == 1
+        assert 1 < row["curve"][1]["mean_batch"] <= 4
         assert row["robot"]["calls"] > 0
-    done = bench(ray_home, "throughput", *few, "--transports", "shm", "--model", "tiny", "--robot-seconds", "0")
-    assert done.returncode == 0, done.stdout + done.stderr
-    found = json.loads(file.read_text())
-    assert found["bare_rounds"][0] > 0
-    assert found["transports"]["shm"]["actions_per_s"] > 0
-    assert "bare, measured in the same run" in done.stdout
+    assert "of the ideal; a robot among simulations waits" in done.stdout
 
 
 @pytest.mark.parametrize(

@@ -114,8 +114,8 @@ def bench_throughput(
             raise ConfigError(f"--clients: got {clients!r}, want numbers from 1 on")
         gpus = float(device.startswith("cuda")) if num_gpus is None else num_gpus
         plan: Plan = Plan(
-            **chosen, num_gpus=gpus, batch=batch, clients=counts, seconds=seconds, rounds=rounds, robot_seconds=robot_seconds,
-            transports=_list(transports),
+            **chosen, num_gpus=gpus, batch=batch, clients=counts, seconds=seconds, rounds=rounds,
+            robot_seconds=robot_seconds, transports=_list(transports),
         )  # fmt: skip
         found = measure_throughput(plan, _tell)
     show_throughput(found)
