@@ -79,7 +79,7 @@ def _throughput(part: Mapping[str, Any]) -> str:
     head = (
         "",
         f"of the ideal, {part['clients']} clients",
-        *(f"{k} clients" for k in counts),
+        *(f"K = {k}" for k in counts),
         "a robot waits, p50 / p99 ms",
     )
     rows = []
@@ -91,7 +91,7 @@ def _throughput(part: Mapping[str, Any]) -> str:
         rows.append((name, f"{row['of_ideal']:.3f}", *rates, waits))
     what = f"`{part['policy']}`" + "".join(f", {key} {value}" for key, value in part["config"].items())
     text = (
-        f"Actions a second of one replica ({what}, batches of {part['batch']} at most; ideal "
+        f"Actions a second of one replica by K clients ({what}, batches of {part['batch']} at most; ideal "
         f"{part['ideal_actions_per_s']:.0f}, {part['ideal_is']}), and what a robot among simulations waits:"
     )
     return f"{text}\n\n{_table(head, rows)}"
