@@ -228,8 +228,10 @@ def _point(plan: Plan, fleet: _Fleet, clients: int) -> dict[str, Any]:
     }
 
 
-def _waiting(calls: Sequence[Call]) -> dict[str, Any]:
-    """What the robot waited for: its round trip, and all of it but its own batch's inference."""
+def _waiting(calls: Sequence[Call]) -> dict[str, Any] | None:
+    """What the robot waited for: its round trip, and all of it but its own batch's inference. None without a call."""
+    if not calls:
+        return None
     round_trip = np.array([call[1] for call in calls])
     wait = round_trip - np.array([call[2] for call in calls])
     return {
