@@ -90,6 +90,12 @@ def test_a_driver_that_breaks_tells_why(fake: PeerWay, obs: Path) -> None:
         driver.ready()
 
 
+def test_lines_that_come_together_are_heard_one_by_one() -> None:
+    with Child("two lines", ["sh", "-c", "echo 1; echo 2; cat"]) as child:
+        assert [child.hear(10), child.hear(10)] == [1, 2]
+        assert child.ask("[3]", 10) == [3]
+
+
 def test_silence_and_nonsense_are_errors() -> None:
     with (
         Child("mute", ["sleep", "60"], end_s=0.1) as mute,

@@ -35,6 +35,7 @@ class Child:
     ) -> None:
         self.name = name
         self._end_s = end_s  # how long it may take to end when it is told to
+        self._heard = b""  # what came after the last whole line
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
         self._process = subprocess.Popen(  # noqa: S603 - the bench's own scripts
             list(command),
@@ -56,14 +57,18 @@ class Child:
         if stream is None:
             raise ChildFailed(f"{self.name}: has no standard output")
         deadline = time.monotonic() + timeout_s
-        ready, _, _ = select.select([stream], [], [], max(0.0, deadline - time.monotonic()))
-        if not ready:
-            raise ChildFailed(f"{self.name}: no answer within {timeout_s:g} s\n{self._last_words()}".rstrip())
-        line = stream.readline()
-        if not line:
-            self._process.wait(_END_S)
-            status = self._process.returncode
-            raise ChildFailed(f"{self.name}: ended with exit status {status}\n{self._last_words()}".rstrip())
+        while b"\n" not in self._heard:
+            ready, _, _ = select.select([stream], [], [], max(0.0, deadline - time.monotonic()))
+            if not ready:
+                raise ChildFailed(f"{self.name}: no answer within {timeout_s:g} s\n{self._last_words()}".rstrip())
+            more = os.read(stream.fileno(), 2**16)
+            if not more:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    self._process.wait(_END_S)
+                status = self._process.returncode
+                raise ChildFailed(f"{self.name}: ended with exit status {status}\n{self._last_words()}".rstrip())
+            self._heard += more
+        line, _, self._heard = self._heard.partition(b"\n")
         try:
             return json.loads(line)
         except ValueError as error:
