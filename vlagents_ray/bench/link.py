@@ -187,6 +187,7 @@ def main() -> None:
     """The process inside: its settings as JSON; lines of JSON with "tell", and one with "result" or "error"."""
     die_with_parent()
     out = own_stdout()
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started all this with it ignored
     _interrupt_with_stdin()
 
     def say(**line: Any) -> None:
