@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import signal
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+from eval_fakes import wait_for
 
 from vlagents_ray.bench.link import enter, measure_link, refused, shaping
 from vlagents_ray.errors import ConfigError
@@ -29,6 +32,25 @@ def test_missing_tools_are_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(ConfigError, match="ip, tc, unshare, nsenter not found; install iproute2 and util-linux"):
         enter()
+
+
+def test_both_namespaces_end_with_a_bench_that_was_killed() -> None:
+    """The client's is held by a process, the server's by the bench itself."""
+    try:
+        command = enter()
+    except ConfigError as error:
+        assert "run it as root" in str(error)  # noqa: PT017 - a machine without namespaces has only this to show
+        return
+    code = (
+        "import time\nfrom vlagents_ray.bench.link import Link\n"
+        "with Link('1gbit', None) as link:\n    print(link.prefix[1], flush=True)\n    time.sleep(60)"
+    )
+    with subprocess.Popen([*command, sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as bench:
+        assert bench.stdout is not None
+        namespace = Path(bench.stdout.readline().strip().removeprefix("--net="))
+        assert namespace.exists()
+        bench.send_signal(signal.SIGKILL)
+    wait_for(lambda: not namespace.exists())
 
 
 @pytest.mark.slow
