@@ -59,7 +59,7 @@ def test_throughput_comes_near_the_bare_policy_and_never_above_it(ray_home: Path
     two cores of a busy machine do not matter."""
     file = tmp_path / "throughput.json"
     policy = ["--policy", "vlagents_ray.policies.noop:Noop", "--config", '{"base_ms": 40, "per_item_ms": 5}']
-    few = ["--clients", "1,8", "--batch", "4", "--seconds", "1", "--rounds", "1", "--robot-seconds", "1"]
+    few = ["--clients", "8", "--batch", "4", "--seconds", "0.6", "--rounds", "1", "--robot-seconds", "0.6"]
     done = bench(ray_home, "throughput", *policy, *few, "--transports", "shm,handle", "--json", str(file))
     assert done.returncode == 0, done.stdout + done.stderr
     found = json.loads(file.read_text())
@@ -68,28 +68,7 @@ def test_throughput_comes_near_the_bare_policy_and_never_above_it(ray_home: Path
     assert set(found["transports"]) == {"shm", "handle"}
     for row in found["transports"].values():
         assert 0.3 < row["of_ideal"] <= 1.1
-        assert [point["clients"] for point in row["curve"]] == [1, 8]
-        assert row["curve"][0]["mean_batch"] == 1
-        assert 1 < row["curve"][1]["mean_batch"] <= 4
+        assert [point["clients"] for point in row["curve"]] == [8]
+        assert 1 < row["curve"][0]["mean_batch"] <= 4
         assert row["robot"]["calls"] > 0
     assert "of the ideal; a robot among simulations waits" in done.stdout
-
-
-@pytest.mark.parametrize(
-    ("words", "text"),
-    [
-        (["rtt", "--peers", "nobody"], "nobody"),
-        (["rtt", "--transports", "smoke"], "smoke"),
-        (["rtt", "--plot", "a.gif"], ".png"),
-        (["throughput", "--clients", "few"], "few"),
-        (["throughput", "--config", "{"], "JSON"),
-        (["throughput", "--config", '{"base_ms": 1}'], "--policy"),
-        (["throughput", "--model", "huge"], "size"),
-        (["report", "--readme", "nowhere.md"], "nowhere.md"),
-    ],
-)
-def test_mistakes_are_told_in_a_line(ray_home: Path, words: list[str], text: str) -> None:
-    done = bench(ray_home, *words)
-    assert done.returncode == 2, done.stdout + done.stderr
-    assert text in done.stderr
-    assert "Traceback" not in done.stderr + done.stdout
