@@ -3,6 +3,7 @@
 #   make setup [PYTHON=...] [TORCH_INDEX_URL=...] [TORCH_CUDA=1]     the environment, in .venv
 #   make demo                                                       serve a policy, evaluate it, show the table
 #   make test                                                       lint, types, layers, tests
+#   make bench                                                      measure, and write the README's figures anew
 #
 # Torch comes from wherever pip looks (its settings, PIP_INDEX_URL, PIP_FIND_LINKS). TORCH_INDEX_URL names
 # another index for torch alone: PyTorch's own install page gives the one with CPU-only wheels.
@@ -11,7 +12,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := setup
-.PHONY: setup demo test fmt lint type clean
+.PHONY: setup demo bench test fmt lint type clean
 
 VENV ?= .venv
 TORCH ?= torch==2.13.0
@@ -30,6 +31,11 @@ setup: $(STAMP)
 
 demo: setup
 	$(BIN)/vlagents-ray demo
+
+# Some minutes; the other policy servers get an environment of their own, in .venv-peers.
+bench: setup
+	$(BIN)/vlagents-ray bench peers-setup
+	$(BIN)/vlagents-ray bench report
 
 test: lint type
 	@echo '== tests'

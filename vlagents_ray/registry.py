@@ -39,6 +39,7 @@ _EXTRAS = {
     "yaml": "serve",
     "typer": "serve",
     "rich": "serve",
+    "matplotlib": "bench",
     "gymnasium": "sim",
     "av": "sim",
     "mani_skill": "maniskill",

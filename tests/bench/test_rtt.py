@@ -1,31 +1,83 @@
-"""The benchmark of round trips measures every way to the policy."""
+"""Which ways are measured, which are not and why; and that they take turns."""
 
 from __future__ import annotations
 
-import numpy as np
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+
 import pytest
 
-from vlagents_ray.bench.rtt import WAYS, RoundTrips, measure_rtt, observation
+from vlagents_ray.bench.client import connect
+from vlagents_ray.bench.observing import observation
+from vlagents_ray.bench.rtt import in_turns
+from vlagents_ray.bench.ways import WAYS, Driver, installed, peer_ways, ways
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.images import encode_jpeg
 
 
-def test_the_interval_holds_the_median() -> None:
-    trips = RoundTrips("x", np.arange(1, 102, dtype=float))
-    low, high = trips.interval
-    assert trips.median == 51
-    assert (low, high) == (41, 62)  # order statistics of 101 calls at 95 %
-    assert RoundTrips("x", np.array([3.0])).interval == (3, 3)
+class Turns:
+    """Notes whose turn it is."""
+
+    def __init__(self, name: str, log: list[str]) -> None:
+        self.name, self.log = name, log
+
+    def ready(self) -> dict[str, object]:
+        return {}
+
+    def measure(self, calls: int) -> list[float]:
+        self.log.append(self.name)
+        return [float(len(self.log))] * calls
 
 
 def test_the_observation_compresses_as_a_photograph_does() -> None:
-    from vlagents_ray.images import encode_jpeg
-
     image = observation().cameras["camera_0"]
     assert 0.05 < len(encode_jpeg(image)) / image.nbytes < 0.5
 
 
-@pytest.mark.slow
-def test_every_way_is_measured_and_shared_memory_is_the_fastest() -> None:
-    found = {trips.name: trips for trips in measure_rtt(calls=60)}
-    assert set(found) == {way.name for way in WAYS}
-    assert all(len(trips.ms) == 60 for trips in found.values())
-    assert min(found, key=lambda name: found[name].median) == "shm"
+def test_all_take_turns_in_short_rounds_and_nobody_is_always_the_first() -> None:
+    log: list[str] = []
+    drivers: Mapping[str, Driver] = {name: Turns(name, log) for name in "abc"}
+    found = in_turns(drivers, 60, lambda _: None)
+    assert {name: trips.rounds.shape for name, trips in found.items()} == dict.fromkeys("abc", (3, 25))
+    assert [sorted(log[i : i + 3]) for i in (0, 3, 6)] == [["a", "b", "c"]] * 3
+    assert len(set(log[::3])) > 1
+    assert in_turns(drivers, 10, lambda _: None)["a"].rounds.shape == (1, 10)
+
+
+def test_ways_have_names_of_their_own() -> None:
+    assert len({way.name for way in WAYS}) == len(WAYS)
+    found, skipped = ways()
+    assert {way.name for way in found} | set(skipped) == {way.name for way in WAYS}
+    assert [way.transport for way in ways(["shm"])[0]] == ["shm", "shm"]
+    with pytest.raises(ConfigError, match="carrier pigeon"):
+        ways(["carrier pigeon"])
+
+
+def test_a_codec_is_written_in_words() -> None:
+    assert connect("http://127.0.0.1:1", "websocket", "jpeg 90 420", rank="robot").transport == "websocket"
+    with pytest.raises(ValueError, match="codec"):
+        connect("http://127.0.0.1:1", "websocket", "gif")
+
+
+def test_peers_are_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"vlagent'.*want some of"):
+        peer_ways(["vlagent"], tmp_path)
+    assert peer_ways([], tmp_path) == ([], {}, {})
+
+
+def test_a_peer_that_is_not_installed_is_skipped_by_name_with_the_cure(tmp_path: Path) -> None:
+    found, skipped, _ = peer_ways(["openpi"], tmp_path / "python")
+    assert found == []
+    assert "peers-setup" in skipped["openpi"]
+    found, skipped, _ = peer_ways(["vlagents"], Path(sys.executable))  # rpyc conflicts with nothing, but is not here
+    assert found == []
+    assert set(skipped) == {"vlagents"}
+    assert "vlagents, rpyc not installed" in skipped["vlagents"]
+    assert "peers-setup" in skipped["vlagents"]
+
+
+def test_versions_are_those_of_the_other_python() -> None:
+    assert set(installed(Path(sys.executable), ["numpy", "no-such-thing"])) == {"numpy"}
+    with pytest.raises(ConfigError, match="peers-python"):
+        installed(Path("/bin/false"), ["numpy"])

@@ -4,6 +4,8 @@ A bare round steps the environments in as many processes as the evaluation has w
 as actions and no policy, server or Ray. An evaluated round plays the same episodes through a served
 `noop` policy. Both count the steps made while all workers were playing: making environments, and
 waiting for the last worker to start or to finish, are left out; the gaps between episodes are not.
+CPU time is that of the same span: of all bare processes, or of everything that an evaluation runs (its own
+process, workers, replica, HAProxy and Ray's daemons).
 """
 
 from __future__ import annotations
@@ -23,6 +25,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vlagents_ray.bench.cpu import CpuSampler
 from vlagents_ray.envs import make_env
 from vlagents_ray.errors import EnvFailed
 from vlagents_ray.evaluate import EvalConfig, evaluate
@@ -30,6 +33,7 @@ from vlagents_ray.evaluate.pool import THREAD_VARIABLES
 from vlagents_ray.interface import Act
 from vlagents_ray.serve.cluster import running_server
 from vlagents_ray.serve.files import deployment
+from vlagents_ray.serve.reaper import MARK, marked
 
 _START_S = 600.0
 
@@ -42,34 +46,62 @@ class Span(NamedTuple):
     steps: int
 
 
+class Rate(NamedTuple):
+    """What one round gave."""
+
+    steps_per_s: float
+    cpu_ms_per_step: float
+
+
+class Steady(NamedTuple):
+    """The span in which all workers play: s of `time.time()`, and the steps of all in it."""
+
+    first: float
+    last: float
+    steps: float
+
+    @property
+    def rate(self) -> float:
+        """Steps a second."""
+        return self.steps / (self.last - self.first)
+
+
 @dataclass(frozen=True, slots=True)
 class Overhead:
-    """Steps a second of each round, in the order measured; round i of both ran one after the other."""
+    """Each round, in the order measured; round i of both ran one after the other."""
 
     env: str
     workers: int
-    bare: tuple[float, ...]
-    evaluated: tuple[float, ...]
+    bare: tuple[Rate, ...]
+    evaluated: tuple[Rate, ...]
 
     @property
     def ratios(self) -> tuple[float, ...]:
         """Evaluated over bare, by round."""
-        return tuple(e / b for e, b in zip(self.evaluated, self.bare, strict=True))
+        return tuple(e.steps_per_s / b.steps_per_s for e, b in zip(self.evaluated, self.bare, strict=True))
 
     @property
     def ratio(self) -> float:
         """Their median."""
         return statistics.median(self.ratios)
 
+    @property
+    def added_cpu_ms(self) -> tuple[float, ...]:
+        """CPU time that the evaluation adds to a step, ms, by round."""
+        return tuple(e.cpu_ms_per_step - b.cpu_ms_per_step for e, b in zip(self.evaluated, self.bare, strict=True))
+
     def to_json(self) -> dict[str, Any]:
         """As plain JSON values."""
         return {
             "env": self.env,
             "workers": self.workers,
-            "bare_steps_per_second": self.bare,
-            "evaluated_steps_per_second": self.evaluated,
-            "ratios": self.ratios,
+            "bare_steps_per_second": [r.steps_per_s for r in self.bare],
+            "evaluated_steps_per_second": [r.steps_per_s for r in self.evaluated],
+            "ratios": list(self.ratios),
             "median_ratio": self.ratio,
+            "bare_cpu_ms_per_step": [r.cpu_ms_per_step for r in self.bare],
+            "evaluated_cpu_ms_per_step": [r.cpu_ms_per_step for r in self.evaluated],
+            "median_added_cpu_ms_per_step": statistics.median(self.added_cpu_ms),
         }
 
 
@@ -87,13 +119,13 @@ def measure_overhead(
     with make_env(env, **options) as one:
         action_dim = one.contract.action.dim or 1
     cpus = max(os.cpu_count() or 1, workers)
-    bare: list[float] = []
-    evaluated: list[float] = []
+    bare: list[Rate] = []
+    evaluated: list[Rate] = []
     policy = deployment("noop", config={"action_dim": action_dim})
     with running_server(policy, num_cpus=cpus), tempfile.TemporaryDirectory() as folder:
         for number in range(rounds):
             bare.append(bare_rate(env, options, action_dim, workers, episodes))
-            tell(f"round {number + 1}/{rounds}: bare {bare[-1]:.1f} steps/s")
+            tell(f"round {number + 1}/{rounds}: bare {bare[-1].steps_per_s:.1f} steps/s")
             config = EvalConfig(
                 envs=[env],
                 env_options=options,
@@ -104,14 +136,16 @@ def measure_overhead(
                 video="none",
                 out=Path(folder) / str(number),
             )
-            evaluate(config)
-            evaluated.append(steady_rate(_recorded(config.out), workers))
-            tell(f"round {number + 1}/{rounds}: evaluated {evaluated[-1]:.1f} steps/s")
+            with CpuSampler(lambda: marked(os.environ[MARK])) as cpu:  # the cluster's own mark
+                evaluate(config)
+            playing = steady(_recorded(config.out), workers)
+            evaluated.append(Rate(playing.rate, cpu.between(playing.first, playing.last) * 1e3 / playing.steps))
+            tell(f"round {number + 1}/{rounds}: evaluated {evaluated[-1].steps_per_s:.1f} steps/s")
     return Overhead(env, workers, tuple(bare), tuple(evaluated))
 
 
-def steady_rate(episodes: Sequence[Span], workers: int) -> float:
-    """Steps a second from when all `workers` play for the first time until they do for the last.
+def steady(episodes: Sequence[Span], workers: int) -> Steady:
+    """From when all `workers` play for the first time until they do for the last.
 
     Each episode's steps are taken as spread evenly over it. Raises `EnvFailed` if they never all play.
     """
@@ -126,11 +160,11 @@ def steady_rate(episodes: Sequence[Span], workers: int) -> float:
         raise EnvFailed(f"{workers} workers were never all playing; measure more episodes")
     first, last = full[0], full[-1]
     inside = sum(e.steps * max(0.0, min(e.ended, last) - max(e.begun, first)) / (e.ended - e.begun) for e in episodes)
-    return inside / (last - first)
+    return Steady(first, last, inside)
 
 
-def bare_rate(env: str, options: Mapping[str, Any], action_dim: int, workers: int, episodes: int) -> float:
-    """Steps a second of `workers` processes together, each playing `episodes` episodes of zeros."""
+def bare_rate(env: str, options: Mapping[str, Any], action_dim: int, workers: int, episodes: int) -> Rate:
+    """`workers` processes together, each playing `episodes` episodes of zeros."""
     context = multiprocessing.get_context("spawn")
     start = context.Barrier(workers)
     results = context.Queue()
@@ -148,12 +182,14 @@ def bare_rate(env: str, options: Mapping[str, Any], action_dim: int, workers: in
     finally:
         for name, value in before.items():
             os.environ.pop(name) if value is None else os.environ.update({name: value})
-    spans: list[Span] = [span for _ in processes for span in results.get(timeout=_START_S)]
+    played: list[tuple[list[Span], float]] = [results.get(timeout=_START_S) for _ in processes]
     for process in processes:
         process.join(60)
         if process.exitcode != 0:
             raise EnvFailed(f"{env}: a bare process ended with exit code {process.exitcode}")
-    return steady_rate(spans, workers)
+    spans = [span for one, _ in played for span in one]
+    steps = sum(span.steps for span in spans)
+    return Rate(steady(spans, workers).rate, sum(cpu for _, cpu in played) * 1e3 / steps)
 
 
 def _play(
@@ -163,6 +199,7 @@ def _play(
     act = Act(np.zeros(action_dim, np.float32))
     with make_env(name, **options) as env:
         start.wait(_START_S)
+        used = time.process_time()
         for episode in range(episodes):
             begun, steps, done = time.time(), 0, False
             env.reset(seed=seed + episode)
@@ -171,7 +208,7 @@ def _play(
                 steps += 1
                 done = terminated or truncated
             spans.append(Span(begun, time.time(), steps))
-        results.put(spans)
+        results.put((spans, time.process_time() - used))
 
 
 def _recorded(out: Path) -> list[Span]:

@@ -1,130 +1,126 @@
-"""Round trips of one `act`: every transport of ours, interleaved on one server of a `noop` policy.
+"""Round trips of one `act`: every transport of ours, and the peers' servers, interleaved in one run.
 
-The observation is that of the paper's measurement: two 224x224 RGB cameras and seven joints. All
-transports take turns in short rounds, so that whatever else the machine does hits them alike.
+The observation is that of the paper's measurement: two 224x224 RGB cameras and seven joints. All ways
+take turns in short rounds, in an order drawn anew each time, so that whatever else the machine does hits
+them alike. Every client is a process of its own (those that need Ray, an actor); every server stays up
+and idle while it is not its turn.
 """
 
 from __future__ import annotations
 
 import contextlib
-import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+import random
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 
-from vlagents_ray.client.agent import RemoteAgent
-from vlagents_ray.client.ways import TransportName
-from vlagents_ray.interface import Obs
-from vlagents_ray.serve.cluster import Server, running_server
+from vlagents_ray.bench.observing import observation, save
+from vlagents_ray.bench.statistics import RoundTrips, ratios
+from vlagents_ray.bench.ways import Driver, PeerWay, Way, connected, peer_connected, peer_ways, ways
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.serve.cluster import free_port, running_server
 from vlagents_ray.serve.files import deployment
-from vlagents_ray.wire.codecs import JPEG, RAW, ImageCodec
 
-_WARM_UP = 20
-_ROUND = 25  # calls of one transport before it is the next one's turn
+__all__ = ["RoundTripsOfAll", "measure_rtt", "observation"]
 
-
-@dataclass(frozen=True, slots=True)
-class Way:
-    """One way to the policy."""
-
-    transport: TransportName
-    codec: ImageCodec
-
-    @property
-    def name(self) -> str:
-        """For the table."""
-        coded = self.transport in ("websocket", "http")
-        return f"{self.transport}, {self.codec.name}" if coded else self.transport
-
-
-WAYS = (
-    Way("shm", RAW),
-    Way("websocket", RAW),
-    Way("websocket", JPEG),
-    Way("http", RAW),
-    Way("http", JPEG),
-    Way("handle", RAW),
-)
+POLICY = "vlagents_ray.bench.policy:Measured"
+LOOPBACK = "127.0.0.1"
+ROUND = 25  # calls of one way before it is the next one's turn
 
 
 @dataclass(frozen=True, slots=True)
-class RoundTrips:
-    """Milliseconds of each call by one way."""
+class RoundTripsOfAll:
+    """What was measured, what was not and why."""
 
-    name: str
-    ms: np.ndarray  # (N,) float64
-
-    @property
-    def median(self) -> float:
-        """Half of the calls took less."""
-        return float(np.median(self.ms))
-
-    @property
-    def interval(self) -> tuple[float, float]:
-        """95 % confidence interval of the median, from order statistics, without assuming a distribution."""
-        ordered = np.sort(self.ms)
-        n = len(ordered)
-        half = 0.98 * np.sqrt(n)  # 1.96 standard deviations of a binomial with p = 1/2
-        low, high = int(max(0, np.floor(n / 2 - half))), int(min(n - 1, np.ceil(n / 2 + half)))
-        return float(ordered[low]), float(ordered[high])
+    ours: tuple[RoundTrips, ...]
+    theirs: tuple[RoundTrips, ...] = ()
+    skipped: Mapping[str, str] = field(default_factory=dict)
+    versions: Mapping[str, str] = field(default_factory=dict)  # of the peers' packages
+    psnr_db: Mapping[str, float | None] = field(default_factory=dict)  # of what the policy saw, by way; None: all of it
 
     def to_json(self) -> dict[str, Any]:
         """As plain JSON values."""
-        p99 = float(np.quantile(self.ms, 0.99))
         return {
-            "way": self.name,
-            "calls": len(self.ms),
-            "median_ms": self.median,
-            "ci95_ms": self.interval,
-            "p99_ms": p99,
+            "ways": [{**trips.to_json(), "psnr_db": self.psnr_db.get(trips.name)} for trips in self.ours],
+            "peers": [trips.to_json() for trips in self.theirs],
+            "ratios": ratios(self.ours, self.theirs),
+            "skipped": dict(self.skipped),
+            "versions": dict(self.versions),
         }
 
 
-def observation(size: int = 224, cameras: int = 2) -> Obs:
-    """Cameras with smooth structure and some noise, as photographs have; seven joints; a gripper."""
-    rng = np.random.default_rng(0)
-    y, x = np.mgrid[0:size, 0:size] / size
-    images = {}
-    for number in range(cameras):
-        waves = [np.sin(2 * np.pi * (a * x + b * y) + number) for a, b in rng.uniform(-4, 4, (6, 2))]
-        base = np.stack([sum(waves[i : i + 2]) for i in (0, 2, 4)], axis=-1)
-        images[f"camera_{number}"] = np.clip(128 + 50 * base + rng.normal(0, 6, base.shape), 0, 255).astype(np.uint8)
-    return Obs(images, 0.5, {"joints": np.zeros(7, np.float32)})
+def measure_rtt(
+    calls: int = 500,
+    *,
+    transports: Sequence[str] = (),
+    peers: Sequence[str] = (),
+    peers_python: Path = Path("python"),
+    tell: Callable[[str], None] = lambda _: None,
+) -> RoundTripsOfAll:
+    """`calls` round trips by each way (rounded up to whole rounds), on servers started for them.
+
+    `transports` are those of ours, by default all. `peers` are names from `vlagents_ray.bench.ways.PEERS`, or
+    "all"; one that is not installed for `peers_python` is in `skipped`, with the cure.
+    """
+    own, skipped = ways(transports)
+    others, absent, versions = peer_ways(peers, peers_python)
+    return measure(own, others, calls, peers_python, skipped | absent, versions, tell)
 
 
-def measure_rtt(calls: int = 500, tell: Callable[[str], None] = lambda _: None) -> list[RoundTrips]:
-    """`calls` round trips by each way, on a server started for them."""
-    obs = observation()
-    taken: dict[str, list[float]] = {way.name: [] for way in WAYS}
-    with running_server(deployment("noop")) as server, _agents(server) as agents:
-        for agent in agents.values():
-            agent.reset(obs, "measure")
-            for _ in range(_WARM_UP):
-                agent.act(obs)
-        done = 0
-        while done < calls:
-            for name, agent in agents.items():
-                for _ in range(min(_ROUND, calls - done)):
-                    begun = time.perf_counter()
-                    agent.act(obs)
-                    taken[name].append((time.perf_counter() - begun) * 1e3)
-            done += _ROUND
-            tell(f"{min(done, calls)} of {calls} calls by each way")
-    return [RoundTrips(name, np.array(ms)) for name, ms in taken.items()]
-
-
-@contextlib.contextmanager
-def _agents(server: Server) -> Iterator[dict[str, RemoteAgent]]:
+def measure(
+    own: Sequence[Way],
+    others: Sequence[PeerWay],
+    calls: int,
+    peers_python: Path,
+    skipped: Mapping[str, str],
+    versions: Mapping[str, str],
+    tell: Callable[[str], None],
+    *,
+    host: str = LOOPBACK,
+    prefix: Sequence[str] = (),
+) -> RoundTripsOfAll:
+    """All ways against servers on `host`; the commands of the clients begin with `prefix`."""
+    drivers: dict[str, Driver] = {}
     with contextlib.ExitStack() as stack:
-        yield {
-            way.name: stack.enter_context(
-                RemoteAgent(
-                    "serve://noop" if way.transport == "handle" else server.url,
-                    transport=way.transport,
-                    codec=way.codec,
-                )
-            )
-            for way in WAYS
-        }
+        obs = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "observation.npz"
+        save(observation(), obs)
+        for peer in others:  # before Ray, whose start is what takes the time
+            way = peer_connected(peer, peers_python, host, free_port(host), obs, prefix)
+            drivers[peer.name] = stack.enter_context(way)
+        # Serve's HAProxy looks for replicas on the loopback address: one that listens on another alone is not found.
+        listens = host if host == LOOPBACK else "0.0.0.0"  # noqa: S104 - in a network namespace of its own
+        server = stack.enter_context(running_server(deployment(POLICY), host=listens))
+        (app,) = server.apps
+        url = f"http://{host}:{urlsplit(server.url).port}"
+        for one in own:
+            drivers[one.name] = stack.enter_context(connected(one, url, app, prefix))
+        if not drivers:
+            raise ConfigError("nothing to measure: want a transport or a peer")
+        said = {name: driver.ready() for name, driver in drivers.items()}
+        found = in_turns(drivers, calls, tell)
+    return RoundTripsOfAll(
+        tuple(found[one.name] for one in own),
+        tuple(found[peer.name] for peer in others),
+        skipped,
+        versions,
+        {one.name: said[one.name]["psnr_db"] for one in own},
+    )
+
+
+def in_turns(drivers: Mapping[str, Driver], calls: int, tell: Callable[[str], None]) -> dict[str, RoundTrips]:
+    """Rounds of at most 25 calls of each until everyone has made `calls`; the order is drawn anew each time."""
+    each = min(ROUND, calls)
+    rounds = -(-calls // each)
+    taken: dict[str, list[list[float]]] = {name: [] for name in drivers}
+    order = list(drivers)
+    for number in range(rounds):
+        random.Random(number).shuffle(order)
+        for name in order:
+            taken[name].append(drivers[name].measure(each))
+        tell(f"{(number + 1) * each} of {rounds * each} calls by each way")
+    return {name: RoundTrips(name, np.array(ms)) for name, ms in taken.items()}

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import math
 import os
-import signal
-import sys
 import threading
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from pydantic import ValidationError
-from rich.console import Console
 from rich.table import Table
 
+from vlagents_ray.cli.bench import bench
+from vlagents_ray.cli.console import err, out
+from vlagents_ray.cli.console import errors as _errors
 from vlagents_ray.cli.settings import parse_settings
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.serve.cluster import running_server
@@ -32,9 +29,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Serve Vision-Language-Action models with Ray, and evaluate them in parallel simulation.",
 )
-out = Console()
-err = Console(stderr=True)
-
 Policy = Annotated[str, typer.Option(help="A registered name, a deployment file, or the URL of a running server.")]
 Set = Annotated[list[str], typer.Option("--set", metavar="KEY=VALUE", help="A setting of the policy, repeatable.")]
 Address = Annotated[
@@ -162,53 +156,7 @@ def demo(
         run_evaluation("scripted", {}, {**fields, "workers": 2, "out": _fresh(out_dir)})
 
 
-bench = typer.Typer(no_args_is_help=True, help="Measure on this machine what the README claims.")
 app.add_typer(bench, name="bench")
-
-
-@bench.command("eval")
-def bench_eval(
-    env: Annotated[str, typer.Argument(help="The environment to step.")] = "tabletop",
-    workers: Annotated[int, typer.Option(min=1)] = 2,
-    episodes: Annotated[int, typer.Option(min=1, help="For each worker and round.")] = 8,
-    rounds: Annotated[int, typer.Option(min=1)] = 3,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
-    env_set: Annotated[list[str], typer.Option("--env-set", metavar="KEY=VALUE")] = [],  # noqa: B006
-) -> None:
-    """Steps a second of an evaluation against those of the bare environments."""
-    from vlagents_ray.bench.overhead import measure_overhead
-
-    with _errors():
-        options = parse_settings(env_set, "--env-set")
-        found = measure_overhead(
-            env, workers=workers, episodes=episodes, rounds=rounds, env_options=options, tell=out.print
-        )
-    table = Table("round", "bare steps/s", "evaluated steps/s", "ratio", title=f"{env}, {workers} workers")
-    for number, row in enumerate(zip(found.bare, found.evaluated, found.ratios, strict=True), 1):
-        table.add_row(str(number), f"{row[0]:.1f}", f"{row[1]:.1f}", f"{row[2]:.3f}")
-    out.print(table)
-    out.print(f"median ratio {found.ratio:.3f}")
-    if json_file is not None:
-        json_file.write_text(json.dumps(found.to_json(), indent=2) + "\n")
-
-
-@bench.command("rtt")
-def bench_rtt(
-    calls: Annotated[int, typer.Option(min=1, help="Round trips by each way.")] = 500,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
-) -> None:
-    """Round trips to a `noop` policy on this machine, by every transport, interleaved."""
-    from vlagents_ray.bench.rtt import measure_rtt
-
-    with _errors():
-        rows = [found.to_json() for found in measure_rtt(calls, out.print)]
-    table = Table("way", "median ms", "95 % interval", "p99 ms", title="two 224x224 RGB cameras, no-op policy")
-    for row in rows:
-        low, high = row["ci95_ms"]
-        table.add_row(row["way"], f"{row['median_ms']:.3f}", f"{low:.3f} to {high:.3f}", f"{row['p99_ms']:.3f}")
-    out.print(table)
-    if json_file is not None:
-        json_file.write_text(json.dumps(rows, indent=2) + "\n")
 
 
 @app.command()
@@ -264,31 +212,3 @@ def _fresh(folder: Path) -> Path:
         number += 1
         candidate = folder.with_name(f"{folder.name}-{number}")
     return candidate
-
-
-@contextlib.contextmanager
-def _errors() -> Iterator[None]:
-    """Errors of this package as one message on stderr: exit code 1, 2 for wrong settings, 130 for Ctrl-C.
-
-    SIGTERM is treated as Ctrl-C, so that what was started is taken down in order.
-    """
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
-    try:
-        yield
-    except ValidationError as error:
-        lines = [f"- {'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors()]
-        _fail("wrong settings:\n" + "\n".join(lines), 2)
-    except ConfigError as error:
-        _fail(str(error), 2)
-    except VLAgentsError as error:
-        _fail(f"{type(error).__name__}: {error}", 1)
-    except KeyboardInterrupt as error:
-        _fail(str(error) or "interrupted", 130)
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-def _fail(message: str, code: int) -> NoReturn:
-    sys.stdout.flush()
-    err.print(f"[bold red]error[/] {message}", highlight=False, soft_wrap=True)
-    raise typer.Exit(code)

@@ -1,0 +1,28 @@
+"""Mistakes on the command line of `vlagents-ray bench` are told before anything starts."""
+
+from __future__ import annotations
+
+import pytest
+from typer.testing import CliRunner
+
+from vlagents_ray.cli.main import app
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["rtt", "--peers", "nobody"], "nobody"),
+        (["rtt", "--transports", "smoke"], "smoke"),
+        (["rtt", "--plot", "a.gif"], ".png"),
+        (["throughput", "--clients", "few"], "few"),
+        (["throughput", "--config", "{"], "JSON"),
+        (["throughput", "--config", '{"base_ms": 1}'], "--policy"),
+        (["throughput", "--model", "huge"], "size"),
+        (["report", "--readme", "nowhere.md"], "nowhere.md"),
+    ],
+)
+def test_mistakes_are_told_in_a_line(words: list[str], text: str) -> None:
+    done = CliRunner().invoke(app, ["bench", *words])
+    assert done.exit_code == 2, done.output
+    assert text in done.stderr
+    assert "Traceback" not in done.output

@@ -1,0 +1,74 @@
+"""`vlagents-ray bench` as users run it, very small."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from ray_processes import processes, ray_folder
+
+from vlagents_ray.bench.ways import ways
+
+COMMAND = str(Path(sys.executable).parent / "vlagents-ray")
+
+
+@pytest.fixture(name="ray_home")
+def own_ray_folder() -> Iterator[Path]:
+    with ray_folder() as folder:
+        yield folder
+        assert not processes(folder), "left running"
+
+
+def bench(ray_home: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [COMMAND, "bench", *words], capture_output=True, text=True, timeout=180, check=False,
+        env=os.environ | {"RAY_TMPDIR": str(ray_home), "COLUMNS": "200"},
+    )  # fmt: skip
+
+
+@pytest.mark.slow
+def test_every_way_is_measured_and_shared_memory_is_the_fastest_to_a_local_process(
+    ray_home: Path, tmp_path: Path
+) -> None:
+    file, plot = tmp_path / "rtt.json", tmp_path / "rtt.svg"
+    words = ["--calls", "50", "--peers", "openpi", "--peers-python", str(tmp_path / "none")]
+    done = bench(ray_home, "rtt", *words, "--json", str(file), "--plot", str(plot))
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads(file.read_text())
+    medians = {way["way"]: way["median_ms"] for way in found["ways"]}
+    assert set(medians) == {way.name for way in ways()[0]}
+    assert all(way["calls"] == 50 for way in found["ways"])
+    local = {name: ms for name, ms in medians.items() if "actor" not in name}
+    assert min(local, key=lambda name: local[name]) == "shm"
+    lost = {way["way"]: way["psnr_db"] for way in found["ways"]}
+    assert lost["shm"] is None
+    assert lost["websocket, jpeg"] > 30
+    assert "peers-setup" in found["skipped"]["openpi"]
+    assert "skipped openpi" in done.stdout
+    assert plot.stat().st_size > 1000
+
+
+@pytest.mark.slow
+def test_throughput_comes_near_the_bare_policy_and_never_above_it(ray_home: Path, tmp_path: Path) -> None:
+    """Written out as a class, `noop` is a policy of unknown speed, which is measured bare; it sleeps, so that the
+    two cores of a busy machine do not matter."""
+    file = tmp_path / "throughput.json"
+    policy = ["--policy", "vlagents_ray.policies.noop:Noop", "--config", '{"base_ms": 40, "per_item_ms": 5}']
+    few = ["--clients", "8", "--batch", "4", "--seconds", "0.6", "--rounds", "1", "--robot-seconds", "0.6"]
+    done = bench(ray_home, "throughput", *policy, *few, "--transports", "shm,handle", "--json", str(file))
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads(file.read_text())
+    assert found["ideal_actions_per_s"] == found["bare_rounds"][0]
+    assert 40 < found["bare_rounds"][0] <= 4 / 0.060
+    assert set(found["transports"]) == {"shm", "handle"}
+    for row in found["transports"].values():
+        assert 0.3 < row["of_ideal"] <= 1.1
+        assert [point["clients"] for point in row["curve"]] == [8]
+        assert 1 < row["curve"][0]["mean_batch"] <= 4
+        assert row["robot"]["calls"] > 0
+    assert "of the ideal; a robot among simulations waits" in done.stdout

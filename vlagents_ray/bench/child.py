@@ -1,0 +1,113 @@
+"""A process that obeys the line protocol of `peers/peer.py`, and never outlives this one."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import subprocess
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from vlagents_ray.errors import VLAgentsError
+
+_END_S = 10.0
+_KEPT = 2000  # characters of its standard error that are shown when it fails
+
+
+class ChildFailed(VLAgentsError):
+    """A process of the bench, ours or a peer's, ended or did not answer; the message has its last words."""
+
+
+class Child:
+    """One such process. What it writes on standard error is kept, and shown if it fails."""
+
+    def __init__(
+        self,
+        name: str,
+        command: Sequence[str],
+        environment: Mapping[str, str] | None = None,
+        *,
+        end_s: float = _END_S,
+    ) -> None:
+        self.name = name
+        self._end_s = end_s  # how long it may take to end when it is told to
+        self._heard = b""  # what came after the last whole line
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
+        self._process = subprocess.Popen(  # noqa: S603 - the bench's own scripts
+            list(command),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            env={**os.environ, **(environment or {})},
+            start_new_session=True,  # Ctrl-C is for the bench, which ends its children in order
+        )
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._process.pid
+
+    def hear(self, timeout_s: float) -> Any:
+        """The next line that it says, decoded. Raises `ChildFailed` if it ends or stays silent."""
+        stream = self._process.stdout
+        if stream is None:
+            raise ChildFailed(f"{self.name}: has no standard output")
+        deadline = time.monotonic() + timeout_s
+        while b"\n" not in self._heard:
+            ready, _, _ = select.select([stream], [], [], max(0.0, deadline - time.monotonic()))
+            if not ready:
+                raise ChildFailed(f"{self.name}: no answer within {timeout_s:g} s\n{self._last_words()}".rstrip())
+            more = os.read(stream.fileno(), 2**16)
+            if not more:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    self._process.wait(_END_S)
+                status = self._process.returncode
+                raise ChildFailed(f"{self.name}: ended with exit status {status}\n{self._last_words()}".rstrip())
+            self._heard += more
+        line, _, self._heard = self._heard.partition(b"\n")
+        try:
+            return json.loads(line)
+        except ValueError as error:
+            raise ChildFailed(f"{self.name}: said {line[:80]!r}, want a line of JSON") from error
+
+    def tell(self, line: str) -> None:
+        """Send a line, without waiting for the answer."""
+        if self._process.stdin is None:
+            raise ChildFailed(f"{self.name}: has no standard input")
+        with contextlib.suppress(BrokenPipeError):  # `hear` will say why
+            self._process.stdin.write(line.encode() + b"\n")
+            self._process.stdin.flush()
+
+    def ask(self, line: str, timeout_s: float) -> Any:
+        """Send a line and return the answer."""
+        self.tell(line)
+        return self.hear(timeout_s)
+
+    def close(self) -> None:
+        """End its standard input, which ends it; kill it if that does not."""
+        if self._process.stdin is not None:
+            with contextlib.suppress(OSError):
+                self._process.stdin.close()
+        try:
+            self._process.wait(self._end_s)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+        self._errors.close()
+
+    def __enter__(self) -> Child:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def _last_words(self) -> str:
+        self._errors.seek(0, os.SEEK_END)
+        self._errors.seek(max(0, self._errors.tell() - _KEPT))
+        return self._errors.read().decode(errors="replace").strip()

@@ -1,0 +1,6 @@
+"""Other policy servers, each in processes of its own and with a Python of its own.
+
+A `<name>_peer.py` is a script, run by its path with the peers' Python: it imports the peer's packages, numpy, the
+standard library and `peer.py` beside it, never `vlagents_ray`. `serve HOST PORT` is the peer's server with a policy
+that does nothing; `drive HOST PORT OBS.npz MODE` is its own client, which obeys the line protocol of `peer.py`.
+"""

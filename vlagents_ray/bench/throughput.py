@@ -1,0 +1,243 @@
+"""Actions a second that many clients get from one replica, against what the policy alone could give.
+
+The default policy takes 20 ms for a batch and 1 ms for each observation in it, without using the CPU: with 16 in
+a batch, 444 actions a second are the ideal. A policy whose speed is not known is measured bare, in the same
+run. All transports take turns. Among simulations, a robot is measured, which asks at random moments.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.bench.child import Child
+from vlagents_ray.bench.load import ROBOT, SIMULATION, Call, Load
+from vlagents_ray.bench.ways import START_S, Way, our_environment, ways
+from vlagents_ray.serve.cluster import running_server
+from vlagents_ray.serve.files import deployment
+
+DEFAULT_TRANSPORTS = ("plasma", "handle", "shm", "websocket")
+BASE_MS, PER_ITEM_MS = 20.0, 1.0
+SLOW_NOOP = ("noop", {"base_ms": BASE_MS, "per_item_ms": PER_ITEM_MS})
+_PROCESSES = 4  # that the clients share, besides the robot's
+_WARM_S = 0.5
+_LATE_S = 60.0
+_BARE = "vlagents_ray.bench.bare"
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What is measured."""
+
+    policy: str = SLOW_NOOP[0]
+    config: Mapping[str, Any] = field(default_factory=lambda: SLOW_NOOP[1])
+    num_gpus: float = 0  # that Ray gives to the replica
+    batch: int = 16
+    clients: Sequence[int] = (1, 2, 4, 8, 16, 32)  # the last, the most, is measured in each round
+    seconds: float = 2.0  # of each measurement
+    rounds: int = 3
+    robot_seconds: float = 10.0
+    transports: Sequence[str] = DEFAULT_TRANSPORTS
+
+    @property
+    def ideal(self) -> Callable[[int], float] | None:
+        """Actions a second of K clients if everything but the policy took no time; None if it is to be measured."""
+        if self.policy != "noop":
+            return None
+        base = float(self.config.get("base_ms", 0.0))
+        each = float(self.config.get("per_item_ms", 0.0))
+        if base + each == 0:
+            return None
+        return lambda clients: min(clients, self.batch) * 1e3 / (base + each * min(clients, self.batch))
+
+
+def measure_throughput(plan: Plan, tell: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+    """All that the plan asks for, as plain JSON values."""
+    found, skipped = ways(plan.transports)
+    chosen = _one_each(found)
+    served = deployment(
+        plan.policy,
+        config=dict(plan.config),
+        batch={"max_size": plan.batch},
+        resources={"num_gpus": plan.num_gpus},
+    )
+    with contextlib.ExitStack() as stack:
+        bare = None if plan.ideal else stack.enter_context(_bare(plan))
+        server = stack.enter_context(running_server(served))
+        (app,) = server.apps
+        fleets = {way.transport: stack.enter_context(_fleet(way, server.url, app, max(plan.clients))) for way in chosen}
+        rates: dict[str, list[float]] = {name: [] for name in fleets}
+        bare_rates = []
+        for number in range(plan.rounds):
+            if bare is not None:
+                bare_rates.append(float(bare.ask(str(plan.seconds), plan.seconds + START_S)))
+            for name, fleet in fleets.items():
+                rates[name].append(rate_of(fleet.run(max(plan.clients), plan.seconds)))
+            tell(f"round {number + 1} of {plan.rounds}: {', '.join(f'{n} {r[-1]:.0f}/s' for n, r in rates.items())}")
+        best = plan.ideal(max(plan.clients)) if plan.ideal else statistics.median(bare_rates)
+        rows = {}
+        for name, fleet in fleets.items():
+            curve = [_point(plan, fleet, k) for k in plan.clients]
+            tell(f"{name}: clients from {min(plan.clients)} to {max(plan.clients)}")
+            robot = _waiting(fleet.robot_run(max(plan.clients), plan.robot_seconds)) if plan.robot_seconds else None
+            if robot is not None:
+                tell(f"{name}: a robot among simulations waits {robot['wait_p50_ms']:.1f} ms")
+            median = statistics.median(rates[name])
+            rows[name] = {
+                "actions_per_s": median,
+                "rounds": rates[name],
+                "of_ideal": median / best,
+                "curve": curve,
+                "robot": robot,
+            }
+    return {
+        "policy": plan.policy,
+        "config": dict(plan.config),
+        "batch": plan.batch,
+        "clients": max(plan.clients),
+        "ideal_actions_per_s": best,
+        "ideal_is": "bare, measured in the same run" if bare_rates else "by arithmetic",
+        "bare_rounds": bare_rates,
+        "transports": rows,
+        "skipped": skipped,
+    }
+
+
+class _Part:
+    """Some of the clients: a process or an actor."""
+
+    def __init__(self, start: Callable[[dict[str, Any]], Any], result: Callable[[Any, float], Any]) -> None:
+        self.start = start
+        self.result = result
+
+
+class _Fleet:
+    """All clients of one transport: one robot in a part of its own, simulations in the others."""
+
+    def __init__(self, parts: Sequence[_Part], robot: _Part) -> None:
+        self._parts = parts
+        self._robot = robot
+
+    def run(self, clients: int, seconds: float) -> list[list[Call]]:
+        """So many simulations act for so long, spread over the parts; their calls."""
+        return self._together(self._spread(clients), seconds)
+
+    def robot_run(self, clients: int, seconds: float) -> list[Call]:
+        """The robot's calls among `clients` - 1 simulations."""
+        return self._together([(self._robot, 1), *self._spread(clients - 1)], seconds)[0]
+
+    def _spread(self, clients: int) -> list[tuple[_Part, int]]:
+        return list(zip(self._parts, _shares(clients, len(self._parts)), strict=True))
+
+    @staticmethod
+    def _together(shares: Sequence[tuple[_Part, int]], seconds: float) -> list[list[Call]]:
+        begin = time.monotonic() + _WARM_S
+        spec = {"begin": begin, "end": begin + seconds}
+        pending = [(part, part.start({"active": share, **spec})) for part, share in shares if share]
+        return [calls for part, handle in pending for calls in part.result(handle, seconds + _LATE_S)]
+
+
+@contextlib.contextmanager
+def _fleet(way: Way, url: str, app: str, clients: int) -> Iterator[_Fleet]:
+    parts = min(_PROCESSES, clients)
+    ranks = [[ROBOT], *([SIMULATION] * size for size in _shares(clients, parts))]
+    with contextlib.ExitStack() as stack:
+        make = _actor if way.actor else _process
+        address = f"serve://{app}" if way.actor else url
+        made = [stack.enter_context(make(way, address, one)) for one in ranks]
+        yield _Fleet(made[1:], made[0])
+
+
+@contextlib.contextmanager
+def _process(way: Way, url: str, ranks: list[str]) -> Iterator[_Part]:
+    settings = json.dumps({"url": url, "transport": way.transport, "codec": way.codec, "ranks": ranks})
+    command = [sys.executable, "-m", "vlagents_ray.bench.load", settings]
+    with Child(f"clients by {way.name}", command, our_environment()) as child:
+        child.hear(START_S)
+        yield _Part(lambda spec: child.tell(json.dumps(spec)), lambda _, late: child.hear(late))
+
+
+@contextlib.contextmanager
+def _actor(way: Way, url: str, ranks: list[str]) -> Iterator[_Part]:
+    import ray
+
+    actor = ray.remote(num_cpus=0)(Load).remote(url, way.transport, way.codec, ranks)
+    try:
+        ray.get(actor.ready.remote(), timeout=START_S)
+        yield _Part(lambda spec: actor.run.remote(**spec), lambda pending, late: ray.get(pending, timeout=late))
+    finally:
+        with contextlib.suppress(ray.exceptions.RayError):  # one that never connected has told why already
+            ray.get(actor.close.remote(), timeout=START_S)
+        ray.kill(actor)
+
+
+@contextlib.contextmanager
+def _bare(plan: Plan) -> Iterator[Child]:
+    settings = json.dumps({"policy": plan.policy, "config": dict(plan.config), "batch": plan.batch})
+    with Child("the bare policy", [sys.executable, "-m", _BARE, settings], our_environment()) as child:
+        child.hear(10 * START_S)  # it may have weights to load
+        yield child
+
+
+def _shares(clients: int, parts: int) -> list[int]:
+    """As evenly as it goes, the first parts have one more."""
+    return [clients // parts + (i < clients % parts) for i in range(parts)]
+
+
+def _one_each(found: Sequence[Way]) -> list[Way]:
+    """One way a transport: the first that the table has, where it is not an actor's only; networks as they choose."""
+    first: dict[str, Way] = {}
+    for way in found:
+        kept = first.get(way.transport)
+        if kept is None or (kept.actor and not way.actor) or way.codec == "auto":
+            first[way.transport] = way
+    return list(first.values())
+
+
+def rate_of(calls: Sequence[Sequence[Call]]) -> float:
+    """Actions a second: the slope of the line through all ends of calls.
+
+    They come in batches, so that counting them in a time would be wrong by up to a batch. 0 for fewer than two calls.
+    """
+    ends = np.sort([call[0] for one in calls for call in one])
+    if len(ends) < 2 or ends[0] == ends[-1]:
+        return 0.0
+    return float(np.polyfit(ends - ends[0], np.arange(len(ends)), 1)[0])
+
+
+def _point(plan: Plan, fleet: _Fleet, clients: int) -> dict[str, Any]:
+    calls = fleet.run(clients, plan.seconds)
+    rate = rate_of(calls)
+    flat = [call for one in calls for call in one]
+    return {
+        "clients": clients,
+        "actions_per_s": rate,
+        "of_ideal": rate / plan.ideal(clients) if plan.ideal else None,
+        # Each call counts its batch once for each of the batch's members: the harmonic mean is the batches' own.
+        "mean_batch": len(flat) / sum(1 / size for *_, size in flat) if flat else None,
+        "p50_ms": float(np.median([call[1] for call in flat])) if flat else None,
+        "p99_ms": float(np.quantile([call[1] for call in flat], 0.99)) if flat else None,
+    }
+
+
+def _waiting(calls: Sequence[Call]) -> dict[str, Any] | None:
+    """What the robot waited for: its round trip, and all of it but its own batch's inference. None without a call."""
+    if not calls:
+        return None
+    round_trip = np.array([call[1] for call in calls])
+    wait = round_trip - np.array([call[2] for call in calls])
+    return {
+        "calls": len(calls),
+        "wait_p50_ms": float(np.median(wait)),
+        "wait_p99_ms": float(np.quantile(wait, 0.99)),
+        "round_trip_p50_ms": float(np.median(round_trip)),
+        "round_trip_p99_ms": float(np.quantile(round_trip, 0.99)),
+    }

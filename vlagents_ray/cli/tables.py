@@ -1,0 +1,72 @@
+"""The tables of `vlagents-ray bench`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from rich.markup import escape
+from rich.table import Table
+
+from vlagents_ray.cli.console import out
+
+if TYPE_CHECKING:
+    from vlagents_ray.bench.overhead import Overhead
+
+
+def show_overhead(found: Overhead) -> None:
+    """A row for each round."""
+    table = Table("round", "bare steps/s", "evaluated steps/s", "ratio", "bare CPU ms/step", "evaluated CPU ms/step")
+    table.title = f"{found.env}, {found.workers} workers"
+    for number, (bare, ours, ratio) in enumerate(zip(found.bare, found.evaluated, found.ratios, strict=True), 1):
+        table.add_row(
+            str(number), f"{bare.steps_per_s:.1f}", f"{ours.steps_per_s:.1f}", f"{ratio:.3f}",
+            f"{bare.cpu_ms_per_step:.3f}", f"{ours.cpu_ms_per_step:.3f}",
+        )  # fmt: skip
+    out.print(table)
+
+
+def show_round_trips(found: Mapping[str, Any], title: str) -> None:
+    """A row for each way, the fastest first; beside ours, the ratios to the peers."""
+    theirs = [peer["way"] for peer in found["peers"]]
+    table = Table("way", "median ms", "95 % interval", "p99 ms", *(f"/ {name}" for name in theirs))
+    table.title = f"{title}: two 224x224 RGB cameras, no-op policy"
+    for row in sorted([*found["ways"], *found["peers"]], key=lambda one: float(one["median_ms"])):
+        low, high = row["ci95_ms"]
+        ratios = found["ratios"].get(row["way"], {})
+        cells = []
+        for name in theirs:
+            one = ratios.get(name)
+            cells.append(f"{one['ratio']:.2f} ({one['ci95'][0]:.2f}-{one['ci95'][1]:.2f})" if one else "")
+        table.add_row(
+            row["way"], f"{row['median_ms']:.3f}", f"{low:.3f} to {high:.3f}", f"{row['p99_ms']:.3f}", *cells,
+            style="dim" if row["way"] in theirs else None,
+        )  # fmt: skip
+    out.print(table)
+    for name, reason in found["skipped"].items():
+        out.print(f"[yellow]skipped {escape(name)}[/]: {escape(reason)}", highlight=False, soft_wrap=True)
+
+
+def show_throughput(found: Mapping[str, Any]) -> None:
+    """A row for each number of clients, and a sentence for each transport."""
+    table = Table("transport", "clients", "actions/s", "of ideal", "mean batch", "p50 ms", "p99 ms")
+    table.title = f"{found['policy']}, ideal {found['ideal_actions_per_s']:.0f} actions/s ({found['ideal_is']})"
+    for name, row in found["transports"].items():
+        for point in row["curve"]:
+            numbers = [point[key] for key in ("of_ideal", "mean_batch", "p50_ms", "p99_ms")]
+            cells = ["" if number is None else f"{number:.3g}" for number in numbers]
+            table.add_row(name, str(point["clients"]), f"{point['actions_per_s']:.1f}", *cells)
+        table.add_section()
+    out.print(table)
+    for name, row in found["transports"].items():
+        robot = row["robot"]
+        waits = (
+            f"; a robot among simulations waits {robot['wait_p50_ms']:.1f} ms (p99 {robot['wait_p99_ms']:.1f})"
+            if robot
+            else ""
+        )
+        out.print(
+            f"{name}: {row['actions_per_s']:.1f} actions/s, {row['of_ideal']:.3f} of the ideal{waits}", highlight=False
+        )
+    for name, reason in found["skipped"].items():
+        out.print(f"[yellow]skipped {escape(name)}[/]: {escape(reason)}", highlight=False, soft_wrap=True)
