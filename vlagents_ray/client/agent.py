@@ -107,8 +107,10 @@ class RemoteAgent(Agent):
     def act(self, obs: Obs) -> Act:
         """The next action, (D,) float32, or chunk of actions, (H, D).
 
-        `act.info["timing"]` holds milliseconds by stage: `queue_ms`, `inference_ms`, `decode_ms`
-        and `total_ms` on the server, `round_trip_ms` here.
+        `act.info["timing"]` holds milliseconds by stage: on the server, from the last byte of the
+        request, `decode_ms`, `queue_ms`, `inference_ms` (until the device is done), `encode_ms` and
+        `total_ms`, which is the sum and what lies between; here `round_trip_ms` and, as the rest of
+        it, `wire_ms`: this side's coding, the network, proxies. `batch_size` is no time.
         """
         begun = time.perf_counter()
         if self._metadata is None:
@@ -116,7 +118,9 @@ class RemoteAgent(Agent):
         reply = self._call("act", obs)
         if reply.act is None:
             raise PolicyFailed("act: the server's reply holds no action")
-        reply.act.info["timing"] = {**reply.timing, "round_trip_ms": (time.perf_counter() - begun) * 1e3}
+        timing = reply.act.info["timing"] = {**reply.timing, "round_trip_ms": (time.perf_counter() - begun) * 1e3}
+        if "total_ms" in timing:
+            timing["wire_ms"] = timing["round_trip_ms"] - timing["total_ms"]
         return reply.act
 
     def close(self) -> None:

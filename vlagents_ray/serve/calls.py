@@ -6,14 +6,14 @@ import asyncio
 from typing import TYPE_CHECKING
 
 from vlagents_ray.errors import DeadlineExceeded
-from vlagents_ray.serve.batching import Rank
 from vlagents_ray.wire.messages import Reply, Request
 
 if TYPE_CHECKING:
     from vlagents_ray.serve.engine import Engine
+    from vlagents_ray.serve.stats import Visit
 
 
-async def ask(engine: Engine, session_id: str, request: Request, rank: Rank = Rank.ROBOT) -> Reply:
+async def ask(engine: Engine, session_id: str, request: Request, visit: Visit) -> Reply:
     """Submit a request and wait for its reply, no longer than its deadline.
 
     A caller that stops waiting (deadline, disconnect) takes its request out of the queue, unless
@@ -25,7 +25,7 @@ async def ask(engine: Engine, session_id: str, request: Request, rank: Rank = Ra
     def deliver(reply: Reply) -> None:  # on the policy's thread
         loop.call_soon_threadsafe(_settle, future, reply)
 
-    ticket = engine.submit(session_id, request, deliver, rank)
+    ticket = engine.submit(session_id, request, deliver, visit.rank, transport=visit.transport)
     timer = None
     if request.deadline_ms is not None:
         late = DeadlineExceeded(f"no action within {request.deadline_ms:g} ms")

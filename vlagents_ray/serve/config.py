@@ -17,6 +17,22 @@ class BatchArgs(_Closed):
     """The batch queue of one replica."""
 
     max_size: int = Field(default=16, ge=1, description="observations in one forward pass, at most")
+    sizes: list[int] | None = Field(
+        default=None,
+        description="for compiled models: the only batch sizes to run, ascending; smaller batches are padded up to "
+        "the next one. The largest is max_size, which may then be left out",
+    )
+
+    @model_validator(mode="after")
+    def _consistent(self) -> BatchArgs:
+        if self.sizes is None:
+            return self
+        if not self.sizes or self.sizes[0] < 1 or self.sizes != sorted(set(self.sizes)):
+            raise ValueError(f"sizes: got {self.sizes}, want ascending positive numbers, such as [1, 2, 4, 8, 16]")
+        if "max_size" in self.model_fields_set and self.max_size != self.sizes[-1]:
+            raise ValueError(f"max_size {self.max_size} is not the largest of sizes {self.sizes}; leave it out")
+        self.max_size = self.sizes[-1]
+        return self
 
 
 class SessionArgs(_Closed):

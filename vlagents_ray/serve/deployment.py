@@ -22,7 +22,8 @@ from vlagents_ray.serve.config import ServerArgs
 from vlagents_ray.serve.engine import Engine
 from vlagents_ray.serve.ingress import build_ingress
 from vlagents_ray.serve.local import LocalDoor
-from vlagents_ray.wire.frames import decode_request, encode_reply
+from vlagents_ray.serve.stats import Visit
+from vlagents_ray.wire.frames import decode_request
 from vlagents_ray.wire.messages import PROTOCOL_VERSION, Reply
 
 logger = logging.getLogger(__name__)
@@ -42,6 +43,7 @@ class PolicyReplica:
         self._engine = Engine(
             agent,
             max_batch_size=self._args.batch.max_size,
+            batch_sizes=self._args.batch.sizes or (),
             session_limit=self._args.sessions.limit,
             session_idle_s=self._args.sessions.idle_s,
         )
@@ -81,14 +83,16 @@ class PolicyReplica:
 
     async def call(self, session_id: str, frame: np.ndarray) -> bytes:
         """One request from inside the cluster: a frame as (N,) uint8, read in place from plasma."""
+        visit = Visit(self._engine.stats, "handle", Rank.SIMULATION)
         request_id = ""
         try:
             request = decode_request(frame.data, self._limits)
+            visit.decoded(request)
             request_id = request.request_id
-            reply = await ask(self._engine, session_id, request, Rank.SIMULATION)
+            reply = await ask(self._engine, session_id, request, visit)
         except VLAgentsError as error:
             reply = Reply(request_id, error=error)
-        return encode_reply(reply)
+        return visit.frame(reply)
 
     def check_health(self) -> None:
         """Called by Serve; a replica whose policy did not load, or died, is replaced."""

@@ -16,7 +16,9 @@ from vlagents_ray.contract import Contract, check_action, check_observation, req
 from vlagents_ray.errors import InvalidInput, NotReset, PolicyFailed, PolicyUnavailable, VLAgentsError
 from vlagents_ray.interface import Act, Agent
 from vlagents_ray.serve.batching import BatchQueue, Rank, Ticket
+from vlagents_ray.serve.padding import Padding
 from vlagents_ray.serve.sessions import AgentCopies, Session, SessionTable
+from vlagents_ray.serve.stats import Stats
 from vlagents_ray.wire.messages import Reply, Request
 from vlagents_ray.wire.tree import Writer
 
@@ -27,10 +29,20 @@ class Engine:
     """Serves an agent to many sessions. `start` loads it; `close` ends it."""
 
     def __init__(
-        self, agent: Agent, *, max_batch_size: int = 16, session_limit: int = 1000, session_idle_s: float = 600.0
+        self,
+        agent: Agent,
+        *,
+        max_batch_size: int = 16,
+        batch_sizes: Sequence[int] = (),
+        session_limit: int = 1000,
+        session_idle_s: float = 600.0,
     ) -> None:
+        """With `batch_sizes` the policy is only given batches of these; the largest is `max_batch_size`."""
         self._agent = agent
         self._copies: AgentCopies | None = None
+        self._batch_sizes = batch_sizes
+        self._padding = Padding((), lambda: agent)  # until the agent can be copied
+        self.stats = Stats()
         self._unready: VLAgentsError | None = PolicyUnavailable("the policy is loading; try again")
         self.contract: Contract | None = None
         self.sessions = SessionTable(session_limit, session_idle_s)
@@ -61,9 +73,19 @@ class Engine:
         self._agent.close()
 
     def submit(
-        self, session_id: str, request: Request, done: Callable[[Reply], None], rank: Rank = Rank.ROBOT
+        self,
+        session_id: str,
+        request: Request,
+        done: Callable[[Reply], None],
+        rank: Rank = Rank.ROBOT,
+        *,
+        owner: str = "",
+        transport: str = "",
     ) -> Ticket:
-        """Queue a request whose answer goes to `done`. What is wrong with it is raised here, at once."""
+        """Queue a request whose answer goes to `done`. What is wrong with it is raised here, at once.
+
+        `owner` is the connection, if it carries more than this session; owners take turns.
+        """
         self.require_ready()
         if request.op == "act":
             if self.sessions.get(session_id).agent is None:
@@ -73,8 +95,8 @@ class Engine:
         if request.obs is not None:
             check_observation(request.obs, self.contract)
         if request.op == "reset":
-            self.sessions.open(session_id)
-        ticket = Ticket(session_id, request, done, rank)
+            self.sessions.open(session_id, transport)
+        ticket = Ticket(session_id, request, done, rank, owner=owner, transport=transport)
         self.queue.put(ticket)
         return ticket
 
@@ -82,6 +104,7 @@ class Engine:
         self._agent.initialize()
         self.contract = self._agent.contract
         self._copies = AgentCopies(self._agent)
+        self._padding = Padding(self._batch_sizes, self._copies.make)
         self._copies.make()  # an agent that cannot be copied must fail now, not at the first reset
 
     def _run(self, batch: Sequence[Ticket]) -> None:
@@ -109,7 +132,7 @@ class Engine:
         return session.agent
 
     def _reset(self, ticket: Ticket) -> None:
-        session = self.sessions.open(ticket.session_id)
+        session = self.sessions.open(ticket.session_id, ticket.transport)
         session.agent = None
         if self._copies is None or ticket.request.obs is None:  # start() and the decoder have seen to both
             raise PolicyFailed("reset without an initialized policy or an observation")
@@ -122,19 +145,26 @@ class Engine:
         _require_sendable(info)
         session.agent = agent
         ticket.answer(reply)
+        self._padding.remember(ticket.request)
 
     def _act(self, acting: list[tuple[Ticket, Agent]], started: float) -> None:
         observations = [ticket.request.obs for ticket, _ in acting]
+        agents = [agent for _, agent in acting]
+        padding = self._padding.sessions(len(acting))
+        observations += observations[-1:] * len(padding)
         begun = time.perf_counter()
         results: Sequence[Act | Exception]
         try:
-            results = self._agent.act_batch(observations, [agent for _, agent in acting])  # type: ignore[arg-type]
+            results = self._agent.act_batch(observations, agents + padding)  # type: ignore[arg-type]
             _synchronize()
-            if len(results) != len(acting):
-                raise PolicyFailed(f"act_batch: got {len(acting)} observations, returned {len(results)} actions")
+            if len(results) != len(observations):
+                raise PolicyFailed(f"act_batch: got {len(observations)} observations, returned {len(results)} actions")
         except Exception as error:  # noqa: BLE001 - becomes the replies
-            results = [error] * len(acting)
+            results = [error] * len(observations)
         ended = time.perf_counter()
+        self.stats.batch(len(acting), len(observations))
+        self._padding.judge(results[len(acting) :])
+        results = results[: len(acting)]
         for (ticket, _), result in zip(acting, results, strict=True):
             reply = self._answer(ticket, result)
             reply.timing = {**_timing(ticket.arrived, begun, ended), "batch_size": len(acting)}

@@ -24,12 +24,14 @@ from starlette.requests import ClientDisconnect
 from starlette.requests import Request as HttpRequest
 from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
+from starlette.types import Message
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable, UnknownApp, VLAgentsError
 from vlagents_ray.serve.calls import ask
 from vlagents_ray.serve.docs import docs_page
 from vlagents_ray.serve.engine import Engine
+from vlagents_ray.serve.stats import Visit
 from vlagents_ray.wire.frames import CONTENT_TYPE, decode_request, encode_reply
 from vlagents_ray.wire.messages import (
     DEADLINE_HEADER,
@@ -41,7 +43,7 @@ from vlagents_ray.wire.messages import (
     Reply,
     Request,
 )
-from vlagents_ray.wire.plain import CAMERA_PREFIX, PROBLEM_TYPE, problem, reply_to_json, request_from_parts
+from vlagents_ray.wire.plain import CAMERA_PREFIX, PROBLEM_TYPE, problem, request_from_parts
 
 logger = logging.getLogger(__name__)
 
@@ -92,28 +94,29 @@ class _Door:
         """The handler of `POST /v1/<op>`."""
 
         async def handle(http: HttpRequest) -> Response:
-            arrived = time.perf_counter()
+            visit = Visit(self._engine.stats, "http", op=op)
             request_id = _request_id(http)
             try:
                 session_id = _session_id(http)
-                request = await self._read(op, http)
+                request = await self._read(op, _timed(http, visit))
+                visit.decoded(request)
                 request.request_id = request.request_id or request_id
                 request_id = request.request_id
-                decoded = time.perf_counter()
-                reply = await ask(self._engine, session_id, request)
+                reply = await ask(self._engine, session_id, request, visit)
                 if reply.error is not None:
                     raise reply.error
+                if CONTENT_TYPE in http.headers.get("accept", ""):
+                    return Response(visit.frame(reply), media_type=CONTENT_TYPE)
+                return Response(visit.document(reply), media_type="application/json")
             except ClientDisconnect:
+                visit.refused("disconnected")
                 return Response(status_code=499)
-            except VLAgentsError as error:
+            except Exception as error:
+                if not isinstance(error, VLAgentsError):
+                    logger.exception("%s failed (request %s)", op, request_id)
+                    error = VLAgentsError("internal error; the server's log has the details")
+                visit.refused(error.code)
                 return _problem(error, request_id)
-            except Exception:
-                logger.exception("%s failed (request %s)", op, request_id)
-                return _problem(VLAgentsError("internal error; the server's log has the details"), request_id)
-            reply.timing |= {"decode_ms": (decoded - arrived) * 1e3, "total_ms": (time.perf_counter() - arrived) * 1e3}
-            if CONTENT_TYPE in http.headers.get("accept", ""):
-                return Response(encode_reply(reply), media_type=CONTENT_TYPE)
-            return JSONResponse(reply_to_json(reply))
 
         return handle
 
@@ -188,7 +191,7 @@ class _Door:
         await socket.accept()
         session_id = f"ws-{uuid.uuid4().hex}"
         try:
-            self._engine.sessions.open(session_id)
+            self._engine.sessions.open(session_id, "websocket")
         except PolicyUnavailable as error:
             await socket.send_bytes(encode_reply(Reply(error=error)))
             await socket.close(_TRY_AGAIN_LATER)
@@ -198,30 +201,39 @@ class _Door:
                 message = await socket.receive()
                 if message["type"] == "websocket.disconnect":
                     return
-                reply = await self._answer(session_id, message.get("bytes"))
-                await socket.send_bytes(encode_reply(reply))
+                visit = Visit(self._engine.stats, "websocket")
+                reply = await self._answer(session_id, message.get("bytes"), visit)
+                await socket.send_bytes(visit.frame(reply))
         except WebSocketDisconnect:
             return
         finally:
             self._engine.sessions.close(session_id)
 
-    async def _answer(self, session_id: str, frame: bytes | None) -> Reply:
-        arrived = time.perf_counter()
+    async def _answer(self, session_id: str, frame: bytes | None, visit: Visit) -> Reply:
         request_id = ""
         try:
             if frame is None:
                 raise MalformedMessage("stream: got a text message, want a binary frame")
             request = await self._decode(frame)
+            visit.decoded(request)
             request_id = request.request_id = request.request_id or uuid.uuid4().hex
-            decoded = time.perf_counter()
-            reply = await ask(self._engine, session_id, request)
+            return await ask(self._engine, session_id, request, visit)
         except VLAgentsError as error:
             return Reply(request_id, error=error)
         except Exception:
             logger.exception("stream failed (session %s, request %s)", session_id, request_id)
             return Reply(request_id, error=VLAgentsError("internal error; the server's log has the details"))
-        reply.timing |= {"decode_ms": (decoded - arrived) * 1e3, "total_ms": (time.perf_counter() - arrived) * 1e3}
-        return reply
+
+
+def _timed(http: HttpRequest, visit: Visit) -> HttpRequest:
+    """The request, whose visit begins when its body is here: how long that took is the network's."""
+
+    async def receive() -> Message:
+        message = await http.receive()
+        visit.arrived = time.perf_counter()
+        return message
+
+    return HttpRequest(http.scope, receive)
 
 
 def _session_id(http: HttpRequest) -> str:

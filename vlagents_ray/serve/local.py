@@ -16,13 +16,13 @@ import os
 import secrets
 import socket
 import struct
-import time
 import uuid
 from collections.abc import Callable
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, VLAgentsError
 from vlagents_ray.serve.batching import Rank
 from vlagents_ray.serve.engine import Engine
+from vlagents_ray.serve.stats import Visit
 from vlagents_ray.wire.frames import decode_request, encode_reply
 from vlagents_ray.wire.messages import Limits, LocalAddress, Reply, boot_id
 
@@ -84,11 +84,11 @@ class _Client:
         self._gone = gone
         self._files: dict[int, mmap.mmap] = {}
         self._session_id = f"shm-{uuid.uuid4().hex}"
-        engine.sessions.open(self._session_id)
+        engine.sessions.open(self._session_id, "shm")
 
     def ready(self) -> None:
         """A message, or the end of the connection, is there."""
-        arrived = time.perf_counter()
+        visit = Visit(self._engine.stats, "shm", Rank.ROBOT)
         try:
             message, descriptors, _, _ = socket.recv_fds(self._connection, LocalAddress.REQUEST.size, 1)
         except BlockingIOError:
@@ -108,17 +108,15 @@ class _Client:
             if descriptors:
                 self._add(number, descriptors.pop())
             request = decode_request(self._frame(number, length), self._limits)
+            visit.decoded(request)
             request_id = request.request_id
-            decoded = time.perf_counter()
 
             def answer(reply: Reply) -> None:
-                total_ms = (time.perf_counter() - arrived) * 1e3
-                reply.timing |= {"decode_ms": (decoded - arrived) * 1e3, "total_ms": total_ms}
-                self._send(number, reply)
+                self._send(number, visit.frame(reply))
 
-            self._engine.submit(self._session_id, request, answer, Rank.ROBOT)
+            self._engine.submit(self._session_id, request, answer, visit.rank, transport=visit.transport)
         except VLAgentsError as error:
-            self._send(number, Reply(request_id, error=error))
+            self._send(number, visit.frame(Reply(request_id, error=error)))
         finally:
             for descriptor in descriptors:
                 os.close(descriptor)
@@ -157,8 +155,7 @@ class _Client:
             raise MalformedMessage(f"local: {length} bytes in memory file {number}, which is not there or shorter")
         return memory[:length]  # a copy: the policy may keep what the client soon overwrites
 
-    def _send(self, number: int, reply: Reply) -> None:
-        frame = encode_reply(reply)
+    def _send(self, number: int, frame: bytes) -> None:
         try:
             if len(frame) <= _INLINE:
                 self._connection.send(LocalAddress.REPLY.pack(number, 0) + frame)

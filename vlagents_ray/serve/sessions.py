@@ -20,6 +20,7 @@ import sys
 import threading
 import time
 import types
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -118,6 +119,7 @@ class Session:
     id: str
     agent: Agent | None = None  # None until its first `reset` succeeded
     used: float = field(default_factory=time.monotonic)
+    transport: str = ""  # the door that it came through
 
 
 class SessionTable:
@@ -143,7 +145,7 @@ class SessionTable:
         session.used = time.monotonic()
         return session
 
-    def open(self, session_id: str) -> Session:
+    def open(self, session_id: str, transport: str = "") -> Session:
         """The session, made if it is new; `PolicyUnavailable` when the replica is full."""
         with self._lock:
             session = self._sessions.get(session_id)
@@ -155,9 +157,14 @@ class SessionTable:
                         f"this replica holds {self._limit} sessions, its limit; "
                         f"close one, or raise sessions.limit or the number of replicas"
                     )
-                session = self._sessions[session_id] = Session(session_id)
+                session = self._sessions[session_id] = Session(session_id, transport=transport)
         session.used = time.monotonic()
         return session
+
+    def by_transport(self) -> dict[str, int]:
+        """How many came through which door."""
+        with self._lock:
+            return Counter(session.transport for session in self._sessions.values())
 
     def close(self, session_id: str) -> None:
         """Forget the session; unknown ids are none."""

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import struct
+import time
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -122,8 +123,13 @@ def check_request(request: Request, limits: Limits) -> Request:
     return request
 
 
-def encode_reply(reply: Reply) -> bytes:
-    """A reply as one frame."""
+def encode_reply(reply: Reply, *, arrived: float | None = None) -> bytes:
+    """A reply as one frame.
+
+    With `arrived`, the `time.perf_counter()` at which its request was here, `reply.timing` also gets
+    `encode_ms` and `total_ms`, in ms and true up to the joining of the frame's parts.
+    """
+    begun = time.perf_counter()
     writer = Writer()
     header: dict[str, Any] = {"request_id": reply.request_id}
     if reply.error is not None:
@@ -136,9 +142,13 @@ def encode_reply(reply: Reply) -> bytes:
         }
     if reply.info is not None:
         header["info"] = writer.value(reply.info)
-    if reply.timing:
-        header["timing"] = reply.timing
-    return b"".join(_parts(header, writer.blobs))
+    head = _head(header, writer.blobs)
+    if arrived is not None:
+        ended = time.perf_counter()
+        reply.timing |= {"encode_ms": (ended - begun) * 1e3, "total_ms": (ended - arrived) * 1e3}
+    if reply.timing:  # last and apart, so that it can tell what the rest has cost
+        head = f'{head[:-1]},"timing":{json.dumps(reply.timing, separators=(",", ":"))}}}'
+    return b"".join(_assemble(head.encode(), writer.blobs))
 
 
 def decode_reply(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> Reply:
@@ -236,8 +246,15 @@ def _is_number(value: object) -> bool:
 
 
 def _parts(header: dict[str, Any], blobs: list[Buffer]) -> list[Buffer]:
+    return _assemble(_head(header, blobs).encode(), blobs)
+
+
+def _head(header: dict[str, Any], blobs: list[Buffer]) -> str:
     header["blobs"] = [len(blob) for blob in blobs]
-    head = json.dumps(header, separators=(",", ":")).encode()
+    return json.dumps(header, separators=(",", ":"))
+
+
+def _assemble(head: bytes, blobs: list[Buffer]) -> list[Buffer]:
     parts: list[Buffer] = [_PREFIX.pack(b"VLA", PROTOCOL_VERSION, len(head)), head]
     at = _PREFIX.size + len(head)
     for blob in blobs:

@@ -1,0 +1,126 @@
+"""What each request and each batch cost: told in the reply, and kept for whoever exports it.
+
+On a request's way this is two readings of the clock and one append; `vlagents_ray.serve.metrics`
+takes what was appended out again, on a thread of its own.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections import deque
+from typing import Any, NamedTuple
+
+from vlagents_ray.serve.batching import BatchQueue
+from vlagents_ray.serve.waiting import Rank
+from vlagents_ray.wire.frames import encode_reply
+from vlagents_ray.wire.messages import Reply, Request
+from vlagents_ray.wire.plain import reply_to_json
+
+_KEPT = 20_000  # requests, and batches, between two collections; the oldest are dropped
+
+Handled = tuple[str, str, Rank, str, float, dict[str, float]]
+"""A request: op, transport, class, "ok" or the error's code, total ms, ms by stage."""
+
+Batch = tuple[int, int]
+"""Observations in a forward pass, and rows of it, padding included."""
+
+
+class Stats:
+    """Bounded; keeps nothing until `keep` is called. Any thread may write."""
+
+    def __init__(self) -> None:
+        self._handled: deque[Handled] = deque(maxlen=0)
+        self._batches: deque[Batch] = deque(maxlen=0)
+
+    def keep(self) -> None:
+        """From now on somebody collects."""
+        self._handled = deque(maxlen=_KEPT)
+        self._batches = deque(maxlen=_KEPT)
+
+    def handled(self, one: Handled) -> None:
+        """A request was answered."""
+        self._handled.append(one)
+
+    def batch(self, observations: int, rows: int) -> None:
+        """A forward pass was made."""
+        self._batches.append((observations, rows))
+
+    def collect(self) -> tuple[list[Handled], list[Batch]]:
+        """All since the last time."""
+        handled = [self._handled.popleft() for _ in range(len(self._handled))]
+        return handled, [self._batches.popleft() for _ in range(len(self._batches))]
+
+
+class Visit:
+    """One request's way through a door, begun when its last byte is here. Encodes and records its reply."""
+
+    __slots__ = ("_decoded", "_op", "_stats", "arrived", "rank", "transport")
+
+    def __init__(self, stats: Stats, transport: str, rank: Rank = Rank.ROBOT, op: str = "unknown") -> None:
+        self._stats = stats
+        self._op = op
+        self.transport = transport
+        self.rank = rank
+        self.arrived = self._decoded = time.perf_counter()  # s
+
+    def decoded(self, request: Request) -> None:
+        """The request is out of its bytes."""
+        self._decoded = time.perf_counter()
+        self._op = request.op
+
+    def frame(self, reply: Reply) -> bytes:
+        """The reply as a frame, in which `timing` is complete; also an error's."""
+        if reply.error is not None:
+            self.refused(reply.error.code)
+            return encode_reply(reply)
+        reply.timing["decode_ms"] = (self._decoded - self.arrived) * 1e3
+        data = encode_reply(reply, arrived=self.arrived)
+        self._stats.handled((self._op, self.transport, self.rank, "ok", reply.timing["total_ms"], reply.timing))
+        return data
+
+    def document(self, reply: Reply) -> bytes:
+        """The reply as JSON, in which `timing` is complete; not an error's."""
+        begun = time.perf_counter()
+        document = reply_to_json(reply)
+        document.pop("timing")
+        text = _json(document)
+        ended = time.perf_counter()
+        reply.timing["decode_ms"] = (self._decoded - self.arrived) * 1e3
+        reply.timing["encode_ms"] = (ended - begun) * 1e3
+        reply.timing["total_ms"] = total_ms = (ended - self.arrived) * 1e3
+        self._stats.handled((self._op, self.transport, self.rank, "ok", total_ms, reply.timing))
+        return f'{text[:-1]},"timing":{_json(reply.timing)}}}'.encode()
+
+    def refused(self, code: str) -> None:
+        """Its answer is the error with this code, or nobody waits for one."""
+        total_ms = (time.perf_counter() - self.arrived) * 1e3
+        self._stats.handled((self._op, self.transport, self.rank, code, total_ms, {}))
+
+
+class Load(NamedTuple):
+    """Means since the reading before."""
+
+    utilisation: float  # share of the time in which the policy's thread was not idle, in [0, 1]
+    waiting: float  # requests in the queue
+
+
+class LoadMeter:
+    """Load of a queue between one reading and the next; a meter has one reader."""
+
+    def __init__(self, queue: BatchQueue) -> None:
+        self._queue = queue
+        self._last = (time.perf_counter(), queue.slept_s(), queue.waited_s())
+
+    def read(self) -> Load:
+        """Since the last call, or since the meter was made."""
+        now = (time.perf_counter(), self._queue.slept_s(), self._queue.waited_s())
+        elapsed, slept, waited = (b - a for a, b in zip(self._last, now, strict=True))
+        self._last = now
+        if elapsed <= 0:
+            return Load(0.0, 0.0)
+        return Load(min(1.0, max(0.0, 1.0 - slept / elapsed)), max(0.0, waited / elapsed))
+
+
+def _json(value: dict[str, Any]) -> str:
+    return json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
