@@ -38,7 +38,7 @@ def test_what_waits_while_a_batch_runs_is_the_next_batch() -> None:
 
 @pytest.mark.slow
 def test_replicas_are_added_under_load_and_sessions_go_on() -> None:
-    autoscaling = {"min_replicas": 1, "max_replicas": 2, "target_ongoing_requests": 2, "upscale_delay_s": 0}
+    autoscaling = {"min_replicas": 1, "max_replicas": 2, "look_back_s": 2, "upscale_delay_s": 1, "downscale_delay_s": 2}
     with serving("noop", config={"base_ms": 30}, autoscaling=autoscaling) as server:
         assert replicas() == 1
         with ThreadPoolExecutor(8) as pool:

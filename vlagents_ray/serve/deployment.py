@@ -16,13 +16,15 @@ from starlette.applications import Starlette
 
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.registry import policy_class
+from vlagents_ray.serve.autoscaling import SESSIONS, UTILISATION, WAITING
 from vlagents_ray.serve.batching import Rank
 from vlagents_ray.serve.calls import ask
 from vlagents_ray.serve.config import ServerArgs
 from vlagents_ray.serve.engine import Engine
 from vlagents_ray.serve.ingress import build_ingress
 from vlagents_ray.serve.local import LocalDoor
-from vlagents_ray.serve.stats import Visit
+from vlagents_ray.serve.metrics import Exporter
+from vlagents_ray.serve.stats import LoadMeter, Visit
 from vlagents_ray.wire.frames import decode_request
 from vlagents_ray.wire.messages import PROTOCOL_VERSION, Reply
 
@@ -47,6 +49,9 @@ class PolicyReplica:
             session_limit=self._args.sessions.limit,
             session_idle_s=self._args.sessions.idle_s,
         )
+        self._load = LoadMeter(self._engine.queue)
+        self._metrics = Exporter(self._engine, _tags(self._args.policy))
+        self._metrics.start()
         self._local = LocalDoor(self._engine, self._limits) if hasattr(os, "memfd_create") else None
         if self._local is not None:
             self._local.open()
@@ -99,9 +104,19 @@ class PolicyReplica:
         if self._loading.done():
             self._engine.require_ready()
 
+    def record_autoscaling_stats(self) -> dict[str, float]:
+        """Called by Serve at regular times: the load since the last time, for `MeasuredLoad`."""
+        load = self._load.read()
+        return {
+            UTILISATION: load.utilisation,
+            WAITING: load.waiting / self._args.batch.max_size,
+            SESSIONS: float(len(self._engine.sessions)),
+        }
+
     async def __del__(self) -> None:
         if hasattr(self, "_engine"):
             await asyncio.to_thread(self._engine.close)
+            await asyncio.to_thread(self._metrics.close)
             if self._local is not None:
                 self._local.close()
 
@@ -110,6 +125,17 @@ def _others_run() -> bool:
     """Does the application already have a replica that takes requests?"""
     app = serve.status().applications.get(serve.get_replica_context().app_name)
     return app is not None and any(d.replica_states.get("RUNNING", 0) > 0 for d in app.deployments.values())
+
+
+def _tags(policy: str) -> dict[str, str]:
+    """What Serve's own metrics are tagged with, and the policy."""
+    context = serve.get_replica_context()
+    return {
+        "application": context.app_name,
+        "deployment": context.deployment,
+        "replica": context.replica_tag,
+        "policy": policy,
+    }
 
 
 def _log_failure(loading: asyncio.Future[None]) -> None:
