@@ -117,7 +117,6 @@ def test_only_an_unused_application_may_have_no_replica() -> None:
     assert wanted(MeasuredLoad(), [0.0], requests=1.0) == 1
 
 
-@pytest.mark.filterwarnings("ignore:The `metrics_interval_s` field:DeprecationWarning")
 def test_settings_reach_serve() -> None:
     args = AutoscalingArgs(max_replicas=3, target_sessions=8, look_back_s=5, upscale_delay_s=2, downscale_delay_s=4)
     config = AutoscalingConfig(**args.options())
