@@ -215,8 +215,8 @@ class BatchQueue:
                 return False
 
     def _nap(self) -> list[tuple[selectors.SelectorKey, int]]:
-        self._sleep = (self._sleep[0], time.perf_counter())
-        try:
-            return self._selector.select(self._idle_s)
-        finally:
-            self._sleep = (self.slept_s(), None)
+        slept, begun = self._sleep[0], time.perf_counter()
+        self._sleep = (slept, begun)
+        events = self._selector.select(self._idle_s)
+        self._sleep = (slept + time.perf_counter() - begun, None)
+        return events

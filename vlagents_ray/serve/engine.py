@@ -150,7 +150,7 @@ class Engine:
     def _act(self, acting: list[tuple[Ticket, Agent]], started: float) -> None:
         observations = [ticket.request.obs for ticket, _ in acting]
         agents = [agent for _, agent in acting]
-        padding = self._padding.sessions(len(acting))
+        padding = self._padding.sessions(len(acting)) if self._batch_sizes else []
         observations += observations[-1:] * len(padding)
         begun = time.perf_counter()
         results: Sequence[Act | Exception]
@@ -163,8 +163,9 @@ class Engine:
             results = [error] * len(observations)
         ended = time.perf_counter()
         self.stats.batch(len(acting), len(observations))
-        self._padding.judge(results[len(acting) :])
-        results = results[: len(acting)]
+        if padding:
+            self._padding.judge(results[len(acting) :])
+            results = results[: len(acting)]
         for (ticket, _), result in zip(acting, results, strict=True):
             reply = self._answer(ticket, result)
             reply.timing = {**_timing(ticket.arrived, begun, ended), "batch_size": len(acting)}

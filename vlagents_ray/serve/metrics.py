@@ -18,26 +18,27 @@ second, spread evenly over those there are.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import threading
+import time
 from collections import Counter as Count
-from collections.abc import Sequence
+from collections.abc import Iterator
 from typing import Any, TypeVar
 
 from ray.util.metrics import Counter, Gauge, Histogram
 
 from vlagents_ray.serve.engine import Engine
-from vlagents_ray.serve.stats import LoadMeter
+from vlagents_ray.serve.stats import STAGES, Batch, Handled, LoadMeter, Taken
 
 logger = logging.getLogger(__name__)
 
 PERIOD_S = 1.0
-SAMPLE = 1000
+SAMPLE = 500
+_SLICE_S = 50e-6
+_PAUSE_S = 300e-6
 _MS = [0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0, 10_000.0]
 _SIZES = [1.0, 2.0, 4.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 128.0, 256.0]
 _TRANSPORTS = ("shm", "websocket", "http", "handle")
-_STAGES = ("decode", "queue", "inference", "encode")
 
 T = TypeVar("T")
 
@@ -91,18 +92,8 @@ class Exporter:
     def export(self) -> None:
         """All since the last time."""
         handled, batches = self._engine.stats.collect()
-        requests = Count((op, transport, rank, code) for op, transport, rank, code, _, _ in handled)
-        for (op, transport, rank, code), number in requests.items():
-            self._requests.inc(number, {"op": op, "transport": transport, "class": rank.name.lower(), "code": code})
-        for op, transport, rank, _, total_ms, timing in _some([one for one in handled if one[3] == "ok"]):
-            self._latency.observe(total_ms, {"op": op, "transport": transport, "class": rank.name.lower()})
-            for stage in _STAGES if op == "act" else ():
-                with contextlib.suppress(KeyError):
-                    self._stage.observe(timing[f"{stage}_ms"], {"stage": stage, "transport": transport})
-        for observations, _ in _some(batches):
-            self._batch.observe(observations)
-        if padding := sum(rows - observations for observations, rows in batches):
-            self._padding.inc(padding)
+        self._export_requests(handled)
+        self._export_batches(batches)
         for rank, depth in self._engine.queue.depth_by_rank().items():
             self._depth.set(depth, {"class": rank.name.lower()})
         sessions = self._engine.sessions.by_transport()
@@ -110,7 +101,38 @@ class Exporter:
             self._sessions.set(sessions.get(transport, 0), {"transport": transport})
         self._utilisation.set(self._meter.read().utilisation)
 
+    def _export_requests(self, handled: Taken[Handled]) -> None:
+        requests: Count[tuple[str, str, str, str]] = Count()
+        for sampled, (op, transport, kind, code, total_ms, *stages) in _sampling(handled):
+            requests[op, transport, kind, code] += 1
+            if not sampled or code != "ok":
+                continue
+            self._latency.observe(total_ms, {"op": op, "transport": transport, "class": kind})
+            if op == "act":
+                for stage, stage_ms in zip(STAGES, stages, strict=True):
+                    self._stage.observe(stage_ms, {"stage": stage, "transport": transport})
+        for (op, transport, kind, code), number in requests.items():
+            self._requests.inc(number, {"op": op, "transport": transport, "class": kind, "code": code})
 
-def _some(values: Sequence[T]) -> Sequence[T]:
-    """All, or about `SAMPLE` of them, spread evenly: each value costs Ray some microseconds."""
-    return values[:: -(-len(values) // SAMPLE)] if values else values
+    def _export_batches(self, batches: Taken[Batch]) -> None:
+        padding = 0
+        for sampled, (observations, rows) in _sampling(batches):
+            padding += rows - observations
+            if sampled:
+                self._batch.observe(observations)
+        if padding:
+            self._padding.inc(padding)
+
+
+def _sampling(values: Taken[T]) -> Iterator[tuple[bool, T]]:
+    """Each value, and whether it is one of up to `SAMPLE`, since a value costs Ray some microseconds.
+
+    In small slices: the policy's thread, which wants the interpreter too, never waits for more than one.
+    """
+    step = -(-len(values) // SAMPLE)
+    until = time.perf_counter() + _SLICE_S
+    for number, value in enumerate(values):
+        yield number % step == 0, value
+        if time.perf_counter() > until:
+            time.sleep(_PAUSE_S)
+            until = time.perf_counter() + _SLICE_S

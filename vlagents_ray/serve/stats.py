@@ -9,7 +9,8 @@ from __future__ import annotations
 import json
 import time
 from collections import deque
-from typing import Any, NamedTuple
+from collections.abc import Iterator
+from typing import Any, Generic, NamedTuple, TypeVar
 
 from vlagents_ray.serve.batching import BatchQueue
 from vlagents_ray.serve.waiting import Rank
@@ -17,13 +18,38 @@ from vlagents_ray.wire.frames import encode_reply
 from vlagents_ray.wire.messages import Reply, Request
 from vlagents_ray.wire.plain import reply_to_json
 
+T = TypeVar("T")
+
+_CLASSES = [rank.name.lower() for rank in Rank]
 _KEPT = 20_000  # requests, and batches, between two collections; the oldest are dropped
 
-Handled = tuple[str, str, Rank, str, float, dict[str, float]]
-"""A request: op, transport, class, "ok" or the error's code, total ms, ms by stage."""
+STAGES = ("decode", "queue", "inference", "encode")
+_STAGE_KEYS = [f"{stage}_ms" for stage in STAGES]
+
+Handled = tuple[str, str, str, str, float, float, float, float, float]
+"""A request: op, transport, class, "ok" or the error's code, total ms, ms of each of `STAGES`.
+
+Flat and of plain values, which the garbage collector need not look at.
+"""
 
 Batch = tuple[int, int]
 """Observations in a forward pass, and rows of it, padding included."""
+
+
+class Taken(Generic[T]):
+    """What a queue holds at this moment, to be taken out of it once."""
+
+    def __init__(self, queue: deque[T]) -> None:
+        self._queue = queue
+        self._left = len(queue)
+
+    def __len__(self) -> int:
+        return self._left
+
+    def __iter__(self) -> Iterator[T]:
+        while self._left:
+            self._left -= 1
+            yield self._queue.popleft()  # never empty: who adds to a full one drops no more than it adds
 
 
 class Stats:
@@ -46,10 +72,9 @@ class Stats:
         """A forward pass was made."""
         self._batches.append((observations, rows))
 
-    def collect(self) -> tuple[list[Handled], list[Batch]]:
-        """All since the last time."""
-        handled = [self._handled.popleft() for _ in range(len(self._handled))]
-        return handled, [self._batches.popleft() for _ in range(len(self._batches))]
+    def collect(self) -> tuple[Taken[Handled], Taken[Batch]]:
+        """All since the last time; they leave one by one, as they are looked at."""
+        return Taken(self._handled), Taken(self._batches)
 
 
 class Visit:
@@ -76,7 +101,7 @@ class Visit:
             return encode_reply(reply)
         reply.timing["decode_ms"] = (self._decoded - self.arrived) * 1e3
         data = encode_reply(reply, arrived=self.arrived)
-        self._stats.handled((self._op, self.transport, self.rank, "ok", reply.timing["total_ms"], reply.timing))
+        self._answered(reply.timing)
         return data
 
     def document(self, reply: Reply) -> bytes:
@@ -88,14 +113,21 @@ class Visit:
         ended = time.perf_counter()
         reply.timing["decode_ms"] = (self._decoded - self.arrived) * 1e3
         reply.timing["encode_ms"] = (ended - begun) * 1e3
-        reply.timing["total_ms"] = total_ms = (ended - self.arrived) * 1e3
-        self._stats.handled((self._op, self.transport, self.rank, "ok", total_ms, reply.timing))
+        reply.timing["total_ms"] = (ended - self.arrived) * 1e3
+        self._answered(reply.timing)
         return f'{text[:-1]},"timing":{_json(reply.timing)}}}'.encode()
 
     def refused(self, code: str) -> None:
         """Its answer is the error with this code, or nobody waits for one."""
         total_ms = (time.perf_counter() - self.arrived) * 1e3
-        self._stats.handled((self._op, self.transport, self.rank, code, total_ms, {}))
+        self._stats.handled((self._op, self.transport, _CLASSES[self.rank], code, total_ms, 0.0, 0.0, 0.0, 0.0))
+
+    def _answered(self, timing: dict[str, float]) -> None:
+        decode, queue, inference, encode = [timing.get(key, 0.0) for key in _STAGE_KEYS]
+        total = timing["total_ms"]
+        self._stats.handled(
+            (self._op, self.transport, _CLASSES[self.rank], "ok", total, decode, queue, inference, encode)
+        )
 
 
 class Load(NamedTuple):

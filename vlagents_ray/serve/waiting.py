@@ -132,7 +132,7 @@ class Waiting:
         robots, simulations = self._rings
         yields = bool(robots.turns) and not self._yielded and simulations.impatient(now)
         self._yielded = yields
-        while yields and simulations.turns and not batch:
+        if yields:
             self._pick(simulations.next(), now, batch, expired, again)
         for ring in self._rings:
             while ring.turns and len(batch) < size:

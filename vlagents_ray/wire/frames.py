@@ -35,6 +35,7 @@ from vlagents_ray.wire.tree import Buffer, Reader, Writer
 CONTENT_TYPE = "application/x-vlagents-frame"
 _PREFIX = struct.Struct("<3sBI")
 _ALIGN = 8
+_dump = json.JSONEncoder(separators=(",", ":")).encode  # made once: `json.dumps` makes one each time
 _REQUEST_KEYS = {"op", "obs", "instruction", "kwargs", "contract", "request_id", "deadline_ms", "blobs"}
 _OBS_KEYS = {"cameras", "gripper", "state", "info"}
 
@@ -147,7 +148,7 @@ def encode_reply(reply: Reply, *, arrived: float | None = None) -> bytes:
         ended = time.perf_counter()
         reply.timing |= {"encode_ms": (ended - begun) * 1e3, "total_ms": (ended - arrived) * 1e3}
     if reply.timing:  # last and apart, so that it can tell what the rest has cost
-        head = f'{head[:-1]},"timing":{json.dumps(reply.timing, separators=(",", ":"))}}}'
+        head = f'{head[:-1]},"timing":{_timing(reply.timing)}}}'
     return b"".join(_assemble(head.encode(), writer.blobs))
 
 
@@ -251,7 +252,12 @@ def _parts(header: dict[str, Any], blobs: list[Buffer]) -> list[Buffer]:
 
 def _head(header: dict[str, Any], blobs: list[Buffer]) -> str:
     header["blobs"] = [len(blob) for blob in blobs]
-    return json.dumps(header, separators=(",", ":"))
+    return _dump(header)
+
+
+def _timing(timing: dict[str, float]) -> str:
+    """As JSON, times to 0.1 us; a third of what an encoder takes for their last digits."""
+    return "{" + ",".join([f'"{k}":{v:.4f}' if type(v) is float else f'"{k}":{v}' for k, v in timing.items()]) + "}"
 
 
 def _assemble(head: bytes, blobs: list[Buffer]) -> list[Buffer]:
