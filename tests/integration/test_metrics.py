@@ -60,7 +60,8 @@ def test_prometheus_reads_requests_batches_and_load(server: Server) -> None:
                 now.get(ok.format("robot", "act", "shm")) == ACTS
                 and now.get(ok.format("simulation", "act", "handle")) == ACTS
                 and now.get("vlagents_latency_ms_count class=simulation op=act transport=handle") == ACTS
-                and now.get("vlagents_sessions transport=shm") == 1
+                and now.get("vlagents_padding_rows_total") == 2 * ACTS
+                and now.get("vlagents_sessions transport=shm") == now.get("vlagents_sessions transport=handle") == 1
             )
 
         wait_for(complete, 60)
@@ -72,7 +73,5 @@ def test_prometheus_reads_requests_batches_and_load(server: Server) -> None:
         assert now[f"vlagents_stage_ms_count stage={stage} transport=shm"] == ACTS
     assert now["vlagents_batch_size_count"] == 2 * ACTS
     assert now["vlagents_batch_size_bucket le=1.0"] == 2 * ACTS
-    assert now["vlagents_padding_rows_total"] == 2 * ACTS
-    assert now["vlagents_sessions transport=handle"] == 1
     assert now["vlagents_queue_depth class=robot"] == now["vlagents_queue_depth class=simulation"] == 0
     assert 0 <= now["vlagents_utilisation"] < 0.5

@@ -37,7 +37,7 @@ class Engine:
         session_limit: int = 1000,
         session_idle_s: float = 600.0,
     ) -> None:
-        """With `batch_sizes` the policy is only given batches of these; the largest is `max_batch_size`."""
+        """With `batch_sizes` batches are padded up to the next of these; the largest is `max_batch_size`."""
         self._agent = agent
         self._copies: AgentCopies | None = None
         self._batch_sizes = batch_sizes
