@@ -59,7 +59,7 @@ class Act:
 
     action: np.ndarray  # (D,) or (H, D) float32, in the units of the contract's action
     done: bool = False  # the policy considers its task finished
-    info: dict[str, Any] = field(default_factory=dict)  # as in `Obs.info`; `timing` is the server's
+    info: dict[str, Any] = field(default_factory=dict)  # as in `Obs.info`; `timing`: see `RemoteAgent.act`
 
     def rows(self) -> np.ndarray:
         """The action as a chunk, (H, D); a single action has H = 1."""

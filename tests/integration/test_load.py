@@ -1,13 +1,14 @@
-"""Many clients at once: batches fill up, everybody gets an own answer, replicas are added under load."""
+"""Many clients at once: batches fill up, everybody gets an own answer, replicas follow the load."""
 
 from __future__ import annotations
 
+import threading
 import time
-from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
+from eval_fakes import wait_for
 from ray import serve
 
 from tests.integration.conftest import serving
@@ -37,29 +38,35 @@ def test_what_waits_while_a_batch_runs_is_the_next_batch() -> None:
 
 
 @pytest.mark.slow
-def test_replicas_are_added_under_load_and_sessions_go_on() -> None:
-    autoscaling = {"min_replicas": 1, "max_replicas": 2, "target_ongoing_requests": 2, "upscale_delay_s": 0}
+def test_replicas_come_with_the_load_and_go_with_it() -> None:
+    """Neither shared memory nor a WebSocket is a request to Serve that says how much is going on."""
+    autoscaling = {"max_replicas": 2, "look_back_s": 2, "upscale_delay_s": 1, "downscale_delay_s": 1}
     with serving("noop", config={"base_ms": 30}, autoscaling=autoscaling) as server:
-        assert replicas() == 1
-        with ThreadPoolExecutor(8) as pool:
-            stop = time.monotonic() + 90
-            jobs = [
-                pool.submit(act_until, server.url, lambda: replicas() == 2 or time.monotonic() > stop) for _ in range(8)
-            ]
-            counts = [job.result() for job in jobs]
-        assert replicas() == 2
-        assert min(counts) > 0
+        with RemoteAgent(server.url, transport="websocket") as idle:
+            idle.reset(Obs())
+            time.sleep(4)
+            assert replicas() == 1
+        stop = threading.Event()
+        ways: list[TransportName] = ["shm", "websocket"]
+        with ThreadPoolExecutor(4) as pool:
+            jobs = [pool.submit(act_until, server.url, way, stop) for way in 2 * ways]
+            try:
+                wait_for(lambda: replicas() == 2 or any(job.done() for job in jobs), 60)
+                assert replicas() == 2
+            finally:
+                stop.set()
+            assert min(job.result() for job in jobs) > 0
+        wait_for(lambda: replicas() == 1, 60)
 
 
-def act_until(url: str, done: Callable[[], bool]) -> int:
-    """Act over one WebSocket until `done`; returns how often. An error fails the test."""
+def act_until(url: str, transport: TransportName, stop: threading.Event) -> int:
+    """Act until `stop`; returns how often. An error fails the test."""
     acts = 0
-    with RemoteAgent(url, transport="websocket") as agent:
+    with RemoteAgent(url, transport=transport) as agent:
         agent.reset(Obs(), "load")
-        while not done():
-            for _ in range(20):
-                agent.act(Obs())
-                acts += 1
+        while not stop.is_set():
+            agent.act(Obs())
+            acts += 1
     return acts
 
 

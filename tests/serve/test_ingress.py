@@ -73,7 +73,7 @@ def good_act(client: TestClient) -> None:
     np.testing.assert_allclose(document["action"][:3], IMAGE.mean((0, 1)), atol=2)
     np.testing.assert_allclose(document["action"][3:], [0.1, 0.2], atol=1e-6)
     assert document["info"] == {"instruction": "push", "array": [0, 1]}
-    assert document["timing"].keys() >= {"queue_ms", "inference_ms", "decode_ms", "total_ms"}
+    assert document["timing"].keys() >= {"queue_ms", "inference_ms", "decode_ms", "encode_ms", "total_ms"}
 
 
 def test_curl_style_reset_and_act(client: TestClient) -> None:
@@ -113,6 +113,7 @@ def test_health_metadata_and_docs(client: TestClient) -> None:
     page = client.get("/docs")
     assert "/v1/reset" in page.text
     assert "missing_camera" in page.text
+    assert "encode_ms" in page.text
 
 
 def test_health_is_503_until_the_policy_is_loaded() -> None:

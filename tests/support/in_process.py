@@ -58,7 +58,7 @@ class InProcess:
         """To the first replica that is there."""
         for number, engine in enumerate(self._replicas.engines):
             if number not in self._replicas.dead and not engine.draining:
-                self._number, self._sender = number, Sender(engine)
+                self._number, self._sender = number, Sender(engine, "in process")
                 contract = engine.contract
                 return {"protocol": PROTOCOL_VERSION, "contract": contract.to_json() if contract else None}
         raise PolicyUnavailable("no replica lives")

@@ -180,8 +180,10 @@ class RemoteAgent(Agent):
     def act(self, obs: Obs) -> Act:
         """The next action, (D,) float32, or chunk of actions, (H, D).
 
-        `act.info["timing"]` holds milliseconds by stage: `queue_ms`, `inference_ms`, `decode_ms`
-        and `total_ms` on the server, `round_trip_ms` here.
+        `act.info["timing"]` holds milliseconds by stage: on the server, from the last byte of the
+        request, `decode_ms`, `queue_ms`, `inference_ms` (until the device is done), `encode_ms` and
+        `total_ms`, which is the sum and what lies between; here `round_trip_ms` and, as the rest of
+        it, `wire_ms`: this side's coding, the network, proxies. `batch_size` is no time.
         """
         [act] = self.act_batch([obs], [self])
         if isinstance(act, Exception):
@@ -250,7 +252,9 @@ class RemoteAgent(Agent):
                 self._episode = None
             return reply.error or PolicyFailed("act: the server's reply holds no action")
         episode.acted(obs, reply.step)
-        reply.act.info["timing"] = {**reply.timing, "round_trip_ms": round_trip_ms}
+        timing = reply.act.info["timing"] = {**reply.timing, "round_trip_ms": round_trip_ms}
+        if "total_ms" in timing:
+            timing["wire_ms"] = round_trip_ms - timing["total_ms"]
         return reply.act
 
     def _persist(self, agents: Sequence[RemoteAgent], requests: Sequence[Request]) -> list[Reply]:

@@ -4,6 +4,7 @@ Without `from __future__ import annotations`: Ray reads the builder's annotation
 """
 
 import os
+import warnings
 from typing import Any
 
 from ray import serve
@@ -33,7 +34,7 @@ def build(args: ServerArgs) -> Application:
         },
     }
     if args.autoscaling is not None:
-        options["autoscaling_config"] = args.autoscaling.model_dump(exclude_none=True)
+        options["autoscaling_config"] = args.autoscaling.options()
     else:
         options["num_replicas"] = args.replicas or 1
     if os.environ.get("RAY_SERVE_ENABLE_HA_PROXY") != "1":
@@ -44,4 +45,6 @@ def build(args: ServerArgs) -> Application:
             request_router_class="ray.serve.experimental.consistent_hash_router.ConsistentHashRouter"
         )
     replica = serve.ingress()(PolicyReplica)
-    return serve.deployment(**options)(replica).bind(args.model_dump(mode="json", exclude=_OUTSIDE))
+    with warnings.catch_warnings():  # `metrics_interval_s`, whose successor is one variable for a whole cluster
+        warnings.simplefilter("ignore", DeprecationWarning)
+        return serve.deployment(**options)(replica).bind(args.model_dump(mode="json", exclude=_OUTSIDE))

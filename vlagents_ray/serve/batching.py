@@ -1,9 +1,9 @@
 """The batch queue: everything that wants the policy waits here, and nothing else calls it.
 
 Work-conserving: as soon as the policy is free it takes whatever waits, up to the batch limit, so a
-lone request never pays for batching. Robots go before simulations. A session has at most one
-request in a batch, in the order they came. Expired and cancelled requests are dropped before
-inference.
+lone request never pays for batching. Who goes first is up to `vlagents_ray.serve.waiting`. Expired and
+cancelled requests are dropped before inference: when the policy is next free, so that a caller who
+must know sooner keeps a timer of its own.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ import os
 import selectors
 import threading
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from enum import IntEnum
 from typing import Protocol
 
 from vlagents_ray.errors import DeadlineExceeded, PolicyFailed, PolicyUnavailable
-from vlagents_ray.wire.messages import Reply, Request
+from vlagents_ray.serve.waiting import Rank, Ticket, Waiting
+from vlagents_ray.wire.messages import Reply
+
+__all__ = ["BatchQueue", "HasFileno", "Rank", "Ticket"]
 
 logger = logging.getLogger(__name__)
 
@@ -32,41 +32,6 @@ class HasFileno(Protocol):
     def fileno(self) -> int:
         """Its descriptor."""
         ...
-
-
-class Rank(IntEnum):
-    """Classes of requests, the more urgent first."""
-
-    ROBOT = 0
-    SIMULATION = 1
-
-
-@dataclass(slots=True)
-class Ticket:
-    """A request on its way through the queue. `done` is called once, on the queue's thread."""
-
-    session_id: str
-    request: Request
-    done: Callable[[Reply], None]
-    rank: Rank = Rank.ROBOT
-    owner: str = ""  # the connection that it came by
-    arrived: float = field(default_factory=time.perf_counter)  # s
-    cancelled: bool = False  # answered, or nobody waits for the answer any more
-
-    def answer(self, reply: Reply) -> None:
-        """Deliver the reply, once; a caller that is gone gets none."""
-        if self.cancelled:
-            return
-        self.cancelled = True
-        try:
-            self.done(reply)
-        except Exception:
-            logger.exception("request %s: its caller could not take the reply", self.request.request_id)
-
-    def expired(self, now: float) -> bool:
-        """Is the deadline over?"""
-        deadline_ms = self.request.deadline_ms
-        return deadline_ms is not None and (now - self.arrived) * 1e3 > deadline_ms
 
 
 class BatchQueue:
@@ -94,7 +59,11 @@ class BatchQueue:
         self._idle = idle
         self._idle_s = idle_s
         self._max = max_batch_size
-        self._waiting: dict[Rank, deque[Ticket]] = {rank: deque() for rank in Rank}
+        self._waiting = Waiting()
+        self._waited = 0.0  # s, of all requests together
+        self._counted = time.perf_counter()  # until when they are in `_waited`
+        # What the thread has slept, s, and since when it sleeps now; loading the policy is no work for a session.
+        self._sleep: tuple[float, float | None] = (0.0, time.perf_counter())
         self._lock = threading.Lock()
         self._closed = False
         self._asleep = False
@@ -120,7 +89,9 @@ class BatchQueue:
             if self._closed:
                 raise PolicyUnavailable("the replica is stopping; connect again")
             for ticket in tickets:
-                self._waiting[ticket.rank].append(ticket)
+                self._waited += len(self._waiting) * (ticket.arrived - self._counted)
+                self._counted = ticket.arrived
+                self._waiting.add(ticket)
             self._wake()
 
     def watch(self, file: HasFileno, ready: Callable[[], None]) -> None:
@@ -133,7 +104,21 @@ class BatchQueue:
 
     def depth(self) -> int:
         """Requests that wait for the next batch."""
-        return sum(map(len, self._waiting.values()))
+        return len(self._waiting)
+
+    def depth_by_rank(self) -> dict[Rank, int]:
+        """The same, by class."""
+        return dict(zip(Rank, self._waiting.depth, strict=True))
+
+    def waited_s(self) -> float:
+        """How long all requests together have waited so far; its growth is the mean number that wait."""
+        with self._lock:
+            return self._waited + len(self._waiting) * max(0.0, time.perf_counter() - self._counted)
+
+    def slept_s(self) -> float:
+        """How long the policy's thread has had nothing to do so far; the rest of the time it was busy."""
+        slept, since = self._sleep
+        return slept if since is None else slept + max(0.0, time.perf_counter() - since)
 
     def alive(self) -> bool:
         """Is there a thread to take what is put?"""
@@ -162,6 +147,7 @@ class BatchQueue:
             self._release()
             return
         finally:
+            self._sleep = (self.slept_s(), None)
             self._prepared.set()
         while (batch := self._take()) is not None:
             if not batch:
@@ -188,14 +174,15 @@ class BatchQueue:
         batch: list[Ticket] | None
         with self._lock:
             if self._closed:
-                left = [ticket for waiting in self._waiting.values() for ticket in waiting]
-                for waiting in self._waiting.values():
-                    waiting.clear()
+                left = self._waiting.clear()
                 expired: list[Ticket] = []
                 batch = None
             else:
                 left = []
-                expired, batch = self._collect()
+                now = time.perf_counter()
+                self._waited += len(self._waiting) * (now - self._counted)
+                self._counted = now
+                batch, expired = self._waiting.take(self._max, now)
         for ticket in left:
             stopped = PolicyUnavailable("the replica is stopping; connect again")
             ticket.answer(Reply(ticket.request.request_id, error=stopped))
@@ -208,9 +195,9 @@ class BatchQueue:
         """Until something waits, or the queue is closed; also hear all watched files that are ready now."""
         while True:
             with self._lock:
-                here = self._closed or self.depth() > 0
+                here = self._closed or len(self._waiting) > 0
                 self._asleep = not here
-            events = self._selector.select(0 if here else self._idle_s)
+            events = self._selector.select(0) if here else self._nap()
             self._asleep = False
             for key, _ in events:
                 if key.data is None:
@@ -223,28 +210,14 @@ class BatchQueue:
                     logger.exception("a local client's door failed")
                     with contextlib.suppress(KeyError, ValueError):  # it may have been unwatched, or closed, already
                         self._selector.unregister(key.fileobj)
-            if here or self.depth() > 0 or self._closed:
+            if here or len(self._waiting) > 0 or self._closed:
                 return True
             if not events:
                 return False
 
-    def _collect(self) -> tuple[list[Ticket], list[Ticket]]:
-        now = time.perf_counter()
-        batch: list[Ticket] = []
-        expired: list[Ticket] = []
-        sessions: set[str] = set()
-        for waiting in self._waiting.values():
-            later: list[Ticket] = []
-            while waiting and len(batch) < self._max:
-                ticket = waiting.popleft()
-                if ticket.cancelled:
-                    continue
-                if ticket.expired(now):
-                    expired.append(ticket)
-                elif ticket.session_id in sessions:
-                    later.append(ticket)
-                else:
-                    sessions.add(ticket.session_id)
-                    batch.append(ticket)
-            waiting.extendleft(reversed(later))
-        return expired, batch
+    def _nap(self) -> list[tuple[selectors.SelectorKey, int]]:
+        slept, begun = self._sleep[0], time.perf_counter()
+        self._sleep = (slept, begun)
+        events = self._selector.select(self._idle_s)
+        self._sleep = (slept + time.perf_counter() - begun, None)
+        return events

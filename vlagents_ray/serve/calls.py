@@ -24,8 +24,9 @@ class Sender:
     A request names its session, or means `session_id`, the sender's own.
     """
 
-    def __init__(self, engine: Engine, session_id: str = "", *, connected: bool = True) -> None:
+    def __init__(self, engine: Engine, transport: str, session_id: str = "", *, connected: bool = True) -> None:
         self._engine = engine
+        self._transport = transport
         self._session_id = session_id or uuid.uuid4().hex
         self._owner = uuid.uuid4().hex if connected else ""
         self._sessions: set[str] = set()
@@ -82,7 +83,14 @@ class Sender:
         session_id = self._session(request)
         if request.op == "act" and self._owner and not request.session and session_id not in self._sessions:
             raise NotReset("act before reset: this connection has no session yet; reset first")
-        ticket = self._engine.ticket(session_id, request, lambda reply: round_.put(index, reply), self._owner)
+        ticket = self._engine.ticket(
+            session_id,
+            request,
+            lambda reply: round_.put(index, reply),
+            owner=self._owner,
+            turn=self._session_id,
+            transport=self._transport,
+        )
         if self._owner:
             if request.op == "close":
                 self._sessions.discard(session_id)

@@ -17,6 +17,22 @@ class BatchArgs(_Closed):
     """The batch queue of one replica."""
 
     max_size: int = Field(default=16, ge=1, description="observations in one forward pass, at most")
+    sizes: list[int] | None = Field(
+        default=None,
+        description="for compiled models: the only batch sizes to run, ascending; smaller batches are padded up to "
+        "the next one. The largest is max_size, which may then be left out",
+    )
+
+    @model_validator(mode="after")
+    def _consistent(self) -> BatchArgs:
+        if self.sizes is None:
+            return self
+        if not self.sizes or self.sizes[0] < 1 or self.sizes != sorted(set(self.sizes)):
+            raise ValueError(f"sizes: got {self.sizes}, want ascending positive numbers, such as [1, 2, 4, 8, 16]")
+        if "max_size" in self.model_fields_set and self.max_size != self.sizes[-1]:
+            raise ValueError(f"max_size {self.max_size} is not the largest of sizes {self.sizes}; leave it out")
+        self.max_size = self.sizes[-1]
+        return self
 
 
 class SessionArgs(_Closed):
@@ -45,20 +61,41 @@ class LimitArgs(_Closed):
 
 
 class AutoscalingArgs(_Closed):
-    """Ray Serve's autoscaling; a session over WebSocket counts as one request as long as it lasts."""
+    """Replicas by measured load, see `vlagents_ray.serve.autoscaling`; sessions over all transports count."""
 
     min_replicas: int = Field(default=1, ge=0)
     max_replicas: int = Field(default=1, ge=1)
     initial_replicas: int | None = Field(default=None, ge=0)
-    target_ongoing_requests: float = Field(default=8.0, gt=0, description="per replica")
-    upscale_delay_s: float = Field(default=10.0, ge=0)
-    downscale_delay_s: float = Field(default=300.0, ge=0)
+    target_utilisation: float = Field(
+        default=0.7, gt=0, le=1, description="share of the time in which a replica's policy is busy"
+    )
+    target_waiting: float = Field(
+        default=1.0, gt=0, description="mean number of requests in a replica's queue, in batches of the largest size"
+    )
+    target_sessions: float | None = Field(default=None, gt=0, description="sessions of a replica; unset: any number")
+    look_back_s: float = Field(default=15.0, gt=0, description="load is averaged over this time")
+    upscale_delay_s: float = Field(default=10.0, ge=0, description="more must be wanted for this long")
+    downscale_delay_s: float = Field(default=300.0, ge=0, description="less must be wanted for this long")
 
     @model_validator(mode="after")
     def _ordered(self) -> AutoscalingArgs:
         if self.min_replicas > self.max_replicas:
             raise ValueError(f"min_replicas {self.min_replicas} is over max_replicas {self.max_replicas}")
         return self
+
+    def options(self) -> dict[str, Any]:
+        """As Serve's `autoscaling_config` takes them."""
+        chosen = {"target_utilisation", "target_waiting", "target_sessions"}
+        return {
+            **self.model_dump(exclude_none=True, exclude=chosen | {"look_back_s"}),
+            "look_back_period_s": self.look_back_s,
+            # How often a replica reports: as often as it measures, where Serve's own default is every 10 s.
+            "metrics_interval_s": min(2.0, self.look_back_s / 5),
+            "policy": {
+                "policy_function": "vlagents_ray.serve.autoscaling:MeasuredLoad",
+                "policy_kwargs": self.model_dump(include=chosen),
+            },
+        }
 
 
 class ResourceArgs(_Closed):

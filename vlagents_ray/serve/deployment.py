@@ -17,14 +17,17 @@ from starlette.applications import Starlette
 
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.registry import policy_class
+from vlagents_ray.serve.autoscaling import SESSIONS, UTILISATION, WAITING
 from vlagents_ray.serve.calls import Sender
 from vlagents_ray.serve.config import ServerArgs
 from vlagents_ray.serve.engine import Engine
 from vlagents_ray.serve.ingress import build_ingress
 from vlagents_ray.serve.local import LocalDoor
+from vlagents_ray.serve.metrics import Exporter
 from vlagents_ray.serve.moving import Strays, export
 from vlagents_ray.serve.peers import Peers
-from vlagents_ray.wire.frames import decode_requests, encode_replies
+from vlagents_ray.serve.stats import LoadMeter, Visit
+from vlagents_ray.wire.frames import decode_requests
 from vlagents_ray.wire.messages import PROTOCOL_VERSION, Reply
 
 logger = logging.getLogger(__name__)
@@ -46,10 +49,14 @@ class PolicyReplica:
         self._engine = Engine(
             agent,
             max_batch_size=self._args.batch.max_size,
+            batch_sizes=self._args.batch.sizes or (),
             session_limit=self._args.sessions.limit,
             session_idle_s=self._args.sessions.idle_s,
             version=json.dumps([self._args.policy, self._args.config], sort_keys=True),
         )
+        self._load = LoadMeter(self._engine.queue)
+        self._metrics = Exporter(self._engine, _tags(self._args.policy))
+        self._metrics.start()
         self._strays = self._engine.strays = Strays(self._engine, Peers())
         self._local = LocalDoor(self._engine, self._limits) if hasattr(os, "memfd_create") else None
         if self._local is not None:
@@ -88,12 +95,15 @@ class PolicyReplica:
 
     async def call(self, session_id: str, frame: np.ndarray) -> bytes:
         """A frame of requests from inside the cluster, (N,) uint8, read in place from plasma."""
-        sender = Sender(self._engine, session_id, connected=False)
+        visit = Visit(self._engine.stats, "handle")
+        sender = Sender(self._engine, "handle", session_id, connected=False)
         try:
-            replies = await sender.ask(decode_requests(frame.data, self._limits))
+            requests = decode_requests(frame.data, self._limits)
+            visit.decoded(requests)
+            replies = await sender.ask(requests)
         except VLAgentsError as error:
             replies = [Reply(error=error)]
-        return encode_replies(replies)
+        return visit.frame(replies)
 
     async def export_session(self, session_id: str) -> dict[str, Any] | None:
         """For another replica, which got a request of this session."""
@@ -115,6 +125,15 @@ class PolicyReplica:
         if self._loading.done():
             self._engine.require_ready()
 
+    def record_autoscaling_stats(self) -> dict[str, float]:
+        """Called by Serve at regular times: the load since the last time, for `MeasuredLoad`."""
+        load = self._load.read()
+        return {
+            UTILISATION: load.utilisation,
+            WAITING: load.waiting / self._args.batch.max_size,
+            SESSIONS: float(len(self._engine.sessions)),
+        }
+
     async def _watch_for_the_end(self) -> None:
         """Tell clients to go elsewhere, if there is an elsewhere, as soon as Serve wants this replica to stop."""
         while not _stopping():
@@ -130,6 +149,7 @@ class PolicyReplica:
             await asyncio.to_thread(self._strays.hand_over)
         self._strays.close()
         await asyncio.to_thread(self._engine.close)
+        await asyncio.to_thread(self._metrics.close)
         if self._local is not None:
             self._local.close()
 
@@ -145,6 +165,17 @@ def _others_run() -> bool:
     """Does the application already have a replica that takes requests?"""
     app = serve.status().applications.get(serve.get_replica_context().app_name)
     return app is not None and any(d.replica_states.get("RUNNING", 0) > 0 for d in app.deployments.values())
+
+
+def _tags(policy: str) -> dict[str, str]:
+    """What Serve's own metrics are tagged with, and the policy."""
+    context = serve.get_replica_context()
+    return {
+        "application": context.app_name,
+        "deployment": context.deployment,
+        "replica": context.replica_tag,
+        "policy": policy,
+    }
 
 
 def _log_failure(loading: asyncio.Future[None]) -> None:

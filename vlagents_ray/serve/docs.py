@@ -17,6 +17,18 @@ pre, code { font: 0.9em/1.4 ui-monospace, monospace; }
 pre { padding: 0.8rem; overflow-x: auto; border: 1px solid #8884; border-radius: 6px; }
 td, th { text-align: left; padding: 0.2rem 1rem 0.2rem 0; vertical-align: top; }
 """
+_TIMING = (
+    ("decode_ms", "the request, whose last byte is here, out of its bytes"),
+    ("queue_ms", "waiting for the policy"),
+    ("inference_ms", "the batch that it was in, until the device was done"),
+    ("encode_ms", "the answer into bytes"),
+    ("total_ms", "all of that and what lies between, on the server"),
+    ("batch_size", "observations in that batch; no time"),
+    (
+        "round_trip_ms, wire_ms",
+        "added by our client: the whole, and what of it was not the server's",
+    ),
+)
 
 
 def docs_page(metadata: dict[str, Any]) -> str:
@@ -62,6 +74,12 @@ bits, little-endian. With a one in place of the first zero, a frame follows, whi
 <p>Headers: <code>{RANK_HEADER}</code>, <code>robot</code> (the default, goes first) or <code>simulation</code>;
 <code>{DEADLINE_HEADER}</code>, after which an answer is useless (504, and the request is dropped if it has
 not begun); <code>{REQUEST_ID_HEADER}</code>, which comes back with the answer and stands in the server's log.</p>
+<h2>Timing</h2>
+<p>The answer to <code>act</code> says where the milliseconds went, in <code>timing</code>:</p>
+<table>{"".join(f"<tr><td><code>{name}</code></td><td>{text}</td></tr>" for name, text in _TIMING)}</table>
+<h2>Metrics</h2>
+<p>Prometheus reads them at the metrics port of each Ray node, as <code>ray_vlagents_…</code>: requests by op,
+transport, class and outcome, latency, time by stage, batch sizes, queue depth, sessions by transport, utilisation.</p>
 <h2>Errors</h2>
 <p><code>application/problem+json</code> with a stable <code>code</code>:</p>
 <table><tr><th>Status</th><th>Code</th><th>Meaning</th></tr>{errors}</table>

@@ -16,7 +16,9 @@ from vlagents_ray.contract import Contract, check_action, check_observation, req
 from vlagents_ray.errors import InvalidInput, NotReset, PolicyFailed, PolicyUnavailable, UnknownSession, VLAgentsError
 from vlagents_ray.interface import Act, Agent
 from vlagents_ray.serve.batching import BatchQueue, Rank, Ticket
+from vlagents_ray.serve.padding import Padding
 from vlagents_ray.serve.sessions import AgentCopies, Session, SessionTable
+from vlagents_ray.serve.stats import Stats
 from vlagents_ray.wire.messages import Reply, Request
 from vlagents_ray.wire.tree import Writer
 
@@ -39,12 +41,20 @@ class Engine:
         agent: Agent,
         *,
         max_batch_size: int = 16,
+        batch_sizes: Sequence[int] = (),
         session_limit: int = 1000,
         session_idle_s: float = 600.0,
         version: str = "",
     ) -> None:
+        """With `batch_sizes` batches are padded up to the next of these; the largest is `max_batch_size`.
+
+        `version` is that of the policy and its settings: sessions move between equal ones only.
+        """
         self._agent = agent
-        self._version = version  # of policy and settings: sessions move between equal ones only
+        self._version = version
+        self._batch_sizes = batch_sizes
+        self._padding = Padding((), lambda: agent)  # until the agent can be copied
+        self.stats = Stats()
         self._copies: AgentCopies | None = None
         self._unready: VLAgentsError | None = PolicyUnavailable("the policy is loading; try again")
         self.contract: Contract | None = None
@@ -77,29 +87,40 @@ class Engine:
         self.queue.close(timeout_s=30)
         self._agent.close()
 
-    def ticket(self, session_id: str, request: Request, done: Callable[[Reply], None], owner: str = "") -> Ticket:
+    def ticket(
+        self,
+        session_id: str,
+        request: Request,
+        done: Callable[[Reply], None],
+        *,
+        owner: str = "",
+        turn: str = "",
+        transport: str = "",
+    ) -> Ticket:
         """A request made ready for the queue, its answer to go to `done`. What is wrong with it is raised here.
 
-        `owner` is the connection that the session ends with; empty for a caller without one.
+        `owner` is the connection that the session ends with; empty for a caller without one. `turn` is
+        whose turn it is in the queue, if that is more than this session.
         """
         self.require_ready()
         if request.op == "act":
             session = self.sessions.get(session_id)
             if session.agent is None:
                 raise NotReset(f"session {session_id!r}: act before a successful reset; reset first")
-            session.owner = owner
+            session.owner, session.transport = owner, transport
         elif request.op == "reset" and request.contract is not None:
             require_match(self.contract, Contract.from_json(request.contract))
         for obs in (*request.history, request.obs):
             if obs is not None:
                 check_observation(obs, self.contract)
         if request.op == "reset":
-            self.sessions.open(session_id, owner)
-        return Ticket(session_id, request, done, Rank[request.rank.upper()], owner)
+            self.sessions.open(session_id, owner, transport)
+        rank = Rank.SIMULATION if request.rank == "simulation" else Rank.ROBOT
+        return Ticket(session_id, request, done, rank, owner=turn, connection=owner, transport=transport)
 
-    def submit(self, session_id: str, request: Request, done: Callable[[Reply], None], owner: str = "") -> Ticket:
+    def submit(self, session_id: str, request: Request, done: Callable[[Reply], None]) -> Ticket:
         """Queue a request: `ticket`, and put it."""
-        ticket = self.ticket(session_id, request, done, owner)
+        ticket = self.ticket(session_id, request, done)
         self.queue.put(ticket)
         return ticket
 
@@ -116,6 +137,7 @@ class Engine:
         self._agent.initialize()
         self.contract = self._agent.contract
         self._copies = AgentCopies(self._agent)
+        self._padding = Padding(self._batch_sizes, self._copies.make)
         self._copies.make()  # an agent that cannot be copied must fail now, not at the first reset
 
     def _run(self, batch: Sequence[Ticket]) -> None:
@@ -164,7 +186,7 @@ class Engine:
         ticket.answer(Reply(ticket.request.request_id, info=state))
 
     def _reset(self, ticket: Ticket) -> None:
-        session = self.sessions.open(ticket.session_id, ticket.owner)
+        session = self.sessions.open(ticket.session_id, ticket.connection, ticket.transport)
         session.agent = None
         session.steps = 0
         if self._copies is None or ticket.request.obs is None:  # start() and the decoder have seen to both
@@ -182,20 +204,28 @@ class Engine:
         _require_sendable(info)
         session.agent = agent
         ticket.answer(reply)
+        self._padding.remember(ticket.request)
 
     def _act(self, acting: list[tuple[Ticket, Session]], started: float) -> None:
         observations = [ticket.request.obs for ticket, _ in acting]
+        agents = [session.agent for _, session in acting]
+        padding = self._padding.sessions(len(acting)) if self._batch_sizes else []
+        observations += observations[-1:] * len(padding)
+        rows = len(observations)
         begun = time.perf_counter()
         results: Sequence[Act | Exception]
         try:
-            agents = [session.agent for _, session in acting]
-            results = self._agent.act_batch(observations, agents)  # type: ignore[arg-type]
+            results = self._agent.act_batch(observations, agents + padding)  # type: ignore[arg-type]
             _synchronize()
-            if len(results) != len(acting):
-                raise PolicyFailed(f"act_batch: got {len(acting)} observations, returned {len(results)} actions")
+            if len(results) != rows:
+                raise PolicyFailed(f"act_batch: got {rows} observations, returned {len(results)} actions")
         except Exception as error:  # noqa: BLE001 - becomes the replies
-            results = [error] * len(acting)
+            results = [error] * rows
         ended = time.perf_counter()
+        self.stats.batch(len(acting), rows)
+        if padding:
+            self._padding.judge(results[len(acting) :])
+            results = results[: len(acting)]
         for (ticket, session), result in zip(acting, results, strict=True):
             reply = self._answer(ticket, session, result)
             reply.timing = {**_timing(ticket.arrived, begun, ended), "batch_size": len(acting)}

@@ -25,12 +25,14 @@ from starlette.requests import ClientDisconnect
 from starlette.requests import Request as HttpRequest
 from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import Route, WebSocketRoute
+from starlette.types import Message
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable, UnknownApp, VLAgentsError
 from vlagents_ray.serve.calls import Sender
 from vlagents_ray.serve.docs import docs_page
 from vlagents_ray.serve.engine import Engine
+from vlagents_ray.serve.stats import Visit
 from vlagents_ray.wire.frames import CONTENT_TYPE, check_request, decode_requests, encode_replies
 from vlagents_ray.wire.messages import (
     DEADLINE_HEADER,
@@ -44,7 +46,7 @@ from vlagents_ray.wire.messages import (
     Reply,
     Request,
 )
-from vlagents_ray.wire.plain import CAMERA_PREFIX, PROBLEM_TYPE, problem, reply_to_json, request_from_parts
+from vlagents_ray.wire.plain import CAMERA_PREFIX, PROBLEM_TYPE, problem, request_from_parts
 from vlagents_ray.wire.probe import answer, is_probe, probed_frame
 
 logger = logging.getLogger(__name__)
@@ -113,28 +115,29 @@ class _Door:
         """The handler of `POST /v1/<op>`."""
 
         async def handle(http: HttpRequest) -> Response:
-            arrived = time.perf_counter()
+            visit = Visit(self._engine.stats, "http", op)
             request_id = _request_id(http)
             try:
-                sender = Sender(self._engine, _session_id(http), connected=False)
-                requests = await self._read(op, http)
+                sender = Sender(self._engine, "http", _session_id(http), connected=False)
+                requests = await self._read(op, _timed(http, visit))
+                visit.decoded(requests)
                 if isinstance(requests[0], Request):
                     request_id = requests[0].request_id = requests[0].request_id or request_id
-                decoded = time.perf_counter()
                 replies = await sender.ask(requests)
                 if len(replies) == 1 and (error := replies[0].error) is not None:
                     raise error
+                if CONTENT_TYPE in http.headers.get("accept", "") or len(replies) > 1:
+                    return Response(visit.frame(replies), media_type=CONTENT_TYPE)
+                return Response(visit.document(replies[0]), media_type="application/json")
             except ClientDisconnect:
+                visit.refused("disconnected")
                 return Response(status_code=499)
-            except VLAgentsError as error:
+            except Exception as error:
+                if not isinstance(error, VLAgentsError):
+                    logger.exception("%s failed (request %s)", op, request_id)
+                    error = VLAgentsError("internal error; the server's log has the details")
+                visit.refused(error.code)
                 return _problem(error, request_id)
-            except Exception:
-                logger.exception("%s failed (request %s)", op, request_id)
-                return _problem(VLAgentsError("internal error; the server's log has the details"), request_id)
-            _add_timing(replies, arrived, decoded)
-            if CONTENT_TYPE in http.headers.get("accept", "") or len(replies) > 1:
-                return Response(encode_replies(replies), media_type=CONTENT_TYPE)
-            return JSONResponse(reply_to_json(replies[0]))
 
         return handle
 
@@ -222,7 +225,7 @@ class _Door:
             await socket.send_bytes(encode_replies([Reply(error=full)]))
             await socket.close(_TRY_AGAIN_LATER)
             return
-        sender = Sender(self._engine)
+        sender = Sender(self._engine, "websocket")
         try:
             while True:
                 message = await socket.receive()
@@ -236,34 +239,37 @@ class _Door:
 
     async def _reply_to(self, sender: Sender, message: bytes | None) -> bytes:
         if message is None or not is_probe(message):
-            return encode_replies(await self._answer(sender, message))
+            visit = Visit(self._engine.stats, "websocket")
+            return visit.frame(await self._answer(sender, message, visit))
         try:
             return await self._probed(message)
         except VLAgentsError as error:
             return encode_replies([Reply(error=error)])
 
-    async def _answer(self, sender: Sender, frame: bytes | None) -> list[Reply]:
-        arrived = time.perf_counter()
+    async def _answer(self, sender: Sender, frame: bytes | None, visit: Visit) -> list[Reply]:
         try:
             if frame is None:
                 raise MalformedMessage("stream: got a text message, want a binary frame")
             requests = await self._decode(frame)
-            decoded = time.perf_counter()
-            replies = await sender.ask(requests)
+            visit.decoded(requests)
+            return await sender.ask(requests)
         except VLAgentsError as error:
             return [Reply(error=error)]
         except Exception:
             request_id = uuid.uuid4().hex
             logger.exception("stream failed (request %s)", request_id)
             return [Reply(request_id, error=VLAgentsError("internal error; the server's log has the details"))]
-        _add_timing(replies, arrived, decoded)
-        return replies
 
 
-def _add_timing(replies: list[Reply], arrived: float, decoded: float) -> None:
-    now = time.perf_counter()
-    for reply in replies:
-        reply.timing |= {"decode_ms": (decoded - arrived) * 1e3, "total_ms": (now - arrived) * 1e3}
+def _timed(http: HttpRequest, visit: Visit) -> HttpRequest:
+    """The request, whose visit begins when its body is here: how long that took is the network's."""
+
+    async def receive() -> Message:
+        message = await http.receive()
+        visit.arrived = time.perf_counter()
+        return message
+
+    return HttpRequest(http.scope, receive)
 
 
 def _session_id(http: HttpRequest) -> str:

@@ -16,12 +16,12 @@ import os
 import secrets
 import socket
 import struct
-import time
 from collections.abc import Callable
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable, VLAgentsError
 from vlagents_ray.serve.calls import Sender
 from vlagents_ray.serve.engine import Engine
+from vlagents_ray.serve.stats import Visit
 from vlagents_ray.wire.frames import decode_requests, encode_replies
 from vlagents_ray.wire.messages import Limits, LocalAddress, Reply, boot_id
 
@@ -82,11 +82,11 @@ class _Client:
         self._limits = limits
         self._gone = gone
         self._files: dict[int, mmap.mmap] = {}
-        self._sender = Sender(engine)
+        self._sender = Sender(engine, "shm")
 
     def ready(self) -> None:
         """A message, or the end of the connection, is there."""
-        arrived = time.perf_counter()
+        visit = Visit(self._engine.stats, "shm")
         try:
             message, descriptors, _, _ = socket.recv_fds(self._connection, LocalAddress.REQUEST.size, 1)
         except BlockingIOError:
@@ -106,20 +106,10 @@ class _Client:
             if descriptors:
                 self._add(number, descriptors.pop())
             requests = decode_requests(self._frame(number, length), self._limits)
-            decoded = time.perf_counter()
-
-            def answer(replies: list[Reply]) -> None:
-                timing = {
-                    "decode_ms": (decoded - arrived) * 1e3,
-                    "total_ms": (time.perf_counter() - arrived) * 1e3,
-                }
-                for reply in replies:
-                    reply.timing |= timing
-                self._send(number, replies)
-
-            self._sender.send(requests, answer)
+            visit.decoded(requests)
+            self._sender.send(requests, lambda replies: self._send(number, visit.frame(replies)))
         except VLAgentsError as error:
-            self._send(number, [Reply(error=error)])
+            self._send(number, visit.frame([Reply(error=error)]))
         finally:
             for descriptor in descriptors:
                 os.close(descriptor)
@@ -158,8 +148,7 @@ class _Client:
             raise MalformedMessage(f"local: {length} bytes in memory file {number}, which is not there or shorter")
         return memory[:length]  # a copy: the policy may keep what the client soon overwrites
 
-    def _send(self, number: int, replies: list[Reply]) -> None:
-        frame = encode_replies(replies)
+    def _send(self, number: int, frame: bytes) -> None:
         try:
             if len(frame) <= _INLINE:
                 self._connection.send(LocalAddress.REPLY.pack(number, 0) + frame)

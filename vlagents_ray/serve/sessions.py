@@ -24,6 +24,7 @@ import sys
 import threading
 import time
 import types
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
@@ -168,6 +169,7 @@ class Session:
     agent: Agent | None = None  # None until its first `reset` succeeded
     owner: str = ""  # the connection that it ends with; empty: it ends when closed, or idle for long
     steps: int = 0  # acts since its last reset
+    transport: str = ""  # the door that it came through
     used: float = field(default_factory=time.monotonic)
 
 
@@ -194,7 +196,7 @@ class SessionTable:
         session.used = time.monotonic()
         return session
 
-    def open(self, session_id: str, owner: str = "") -> Session:
+    def open(self, session_id: str, owner: str = "", transport: str = "") -> Session:
         """The session, made if it is new, now `owner`'s; `PolicyUnavailable` when the replica is full."""
         with self._lock:
             session = self._sessions.get(session_id)
@@ -208,7 +210,7 @@ class SessionTable:
                     )
                 session = self._sessions[session_id] = Session(session_id)
         session.used = time.monotonic()
-        session.owner = owner
+        session.owner, session.transport = owner, transport
         return session
 
     def close(self, session_id: str) -> None:
@@ -223,6 +225,11 @@ class SessionTable:
                 session = self._sessions.get(session_id)
                 if session is not None and session.owner == owner:
                     del self._sessions[session_id]
+
+    def by_transport(self) -> dict[str, int]:
+        """How many came through which door."""
+        with self._lock:
+            return Counter(session.transport for session in self._sessions.values())
 
     def ids(self) -> list[str]:
         """All sessions."""

@@ -18,12 +18,18 @@ from vlagents_ray.wire.tree import Buffer
 
 _PREFIX = struct.Struct("<3sBI")
 _ALIGN = 8
+dump = json.JSONEncoder(separators=(",", ":")).encode  # made once: `json.dumps` makes one each time
 
 
 def pack(header: dict[str, Any], blobs: list[Buffer]) -> list[Buffer]:
     """The pieces of a frame, in order; `header` gets its list of blobs, which are not copied."""
     header["blobs"] = [len(blob) for blob in blobs]
-    head = json.dumps(header, separators=(",", ":")).encode()
+    return assemble(dump(header), blobs)
+
+
+def assemble(header: str, blobs: list[Buffer]) -> list[Buffer]:
+    """The pieces of a frame whose header is JSON already, "blobs" included."""
+    head = header.encode()
     parts: list[Buffer] = [_PREFIX.pack(b"VLA", PROTOCOL_VERSION, len(head)), head]
     at = _PREFIX.size + len(head)
     for blob in blobs:

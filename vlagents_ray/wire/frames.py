@@ -7,6 +7,7 @@ or "replies": what a vector of environments says at once.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from typing import Any, cast
 
@@ -19,7 +20,7 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.interface import Act
 from vlagents_ray.wire.codecs import RAW, ImageCodec
-from vlagents_ray.wire.container import pack, unpack
+from vlagents_ray.wire.container import assemble, dump, pack, unpack
 from vlagents_ray.wire.messages import DEFAULT_LIMITS, NAME_CHARACTERS, OPS, RANKS, Limits, Op, Reply, Request
 from vlagents_ray.wire.observations import is_number, read_obs, write_obs
 from vlagents_ray.wire.tree import Buffer, Reader, Writer
@@ -148,11 +149,32 @@ def encode_reply(reply: Reply) -> bytes:
     return encode_replies([reply])
 
 
-def encode_replies(replies: Sequence[Reply]) -> bytes:
-    """The replies to one frame of requests, in the requests' order, as one frame."""
+def encode_replies(replies: Sequence[Reply], *, arrived: float | None = None) -> bytes:
+    """The replies to one frame of requests, in the requests' order, as one frame.
+
+    With `arrived`, the `time.perf_counter()` at which the requests were here, the timing of replies
+    that are no errors also gets `encode_ms` and `total_ms`, true up to the joining of the frame's parts.
+    """
+    begun = time.perf_counter()
     writer = Writer()
-    nodes = [_write_reply(reply, writer) for reply in replies]
-    return b"".join(pack(nodes[0] if len(nodes) == 1 else {"replies": nodes}, writer.blobs))
+    nodes = [dump(_write_reply(reply, writer)) for reply in replies]
+    if arrived is not None:
+        ended = time.perf_counter()
+        both = {"encode_ms": (ended - begun) * 1e3, "total_ms": (ended - arrived) * 1e3}
+        for reply in replies:
+            if reply.error is None:
+                reply.timing |= both
+    for i, reply in enumerate(replies):  # last and apart, so that it can tell what the rest has cost
+        if reply.timing:
+            nodes[i] = f'{nodes[i][:-1]},"timing":{_timing(reply.timing)}}}'
+    blobs = dump([len(blob) for blob in writer.blobs])
+    head = nodes[0][1:-1] if len(nodes) == 1 else f'"replies":[{",".join(nodes)}]'
+    return b"".join(assemble(f'{{{head},"blobs":{blobs}}}', writer.blobs))
+
+
+def _timing(timing: dict[str, float]) -> str:
+    """As JSON, times to 0.1 us; a third of what an encoder takes for their last digits."""
+    return "{" + ",".join([f'"{k}":{v:.4f}' if type(v) is float else f'"{k}":{v}' for k, v in timing.items()]) + "}"
 
 
 def _write_reply(reply: Reply, writer: Writer) -> dict[str, Any]:
@@ -171,8 +193,6 @@ def _write_reply(reply: Reply, writer: Writer) -> dict[str, Any]:
         node["step"] = reply.step
     if reply.draining:
         node["draining"] = True
-    if reply.timing:
-        node["timing"] = reply.timing
     return node
 
 

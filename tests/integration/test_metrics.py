@@ -1,0 +1,77 @@
+"""What Prometheus would read of a server."""
+
+from __future__ import annotations
+
+import re
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+
+import pytest
+import ray
+from eval_fakes import wait_for
+
+from tests.integration.conftest import serving
+from vlagents_ray import Obs, RemoteAgent
+from vlagents_ray.serve.cluster import Server
+
+ACTS = 30
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Server]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_metrics_report_interval_ms", "500")  # instead of 10 s
+        with serving("noop", batch={"sizes": [2, 4]}) as server:
+            yield server
+
+
+def scraped() -> dict[str, float]:
+    """Our series of the node: name and tags, sorted, to value."""
+    (node,) = ray.nodes()
+    url = f"http://{node['NodeManagerAddress']}:{node['MetricsExportPort']}/metrics"
+    with urllib.request.urlopen(url, timeout=10) as answer:
+        text = answer.read().decode()
+    found = {}
+    for name, tags, value in re.findall(r"^ray_(vlagents_\w+)\{(.*)\} (\S+)$", text, re.MULTILINE):
+        assert 'application="noop"' in tags
+        assert 'deployment="Policy"' in tags
+        assert 'policy="noop"' in tags
+        assert re.search(r'replica="\w+"', tags)
+        own = sorted(re.findall(r'(op|transport|class|code|stage|le)="([^"]*)"', tags))
+        found[" ".join([name, *(f"{key}={tag}" for key, tag in own)])] = float(value)
+    return found
+
+
+def test_prometheus_reads_requests_batches_and_load(server: Server) -> None:
+    with RemoteAgent(server.url, transport="shm") as near, RemoteAgent("serve://noop", transport="handle") as inside:
+        for agent in (near, inside):
+            agent.reset(Obs())
+            for _ in range(ACTS):
+                agent.act(Obs())
+        stranger = {"content-type": "application/json", "x-session-id": "nobody"}
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            urllib.request.urlopen(urllib.request.Request(f"{server.url}/v1/act", b"{}", stranger), timeout=10)
+        ok = "vlagents_requests_total class={} code=ok op={} transport={}"
+
+        def complete() -> bool:
+            now = scraped()
+            return (
+                now.get(ok.format("robot", "act", "shm")) == ACTS
+                and now.get(ok.format("simulation", "act", "handle")) == ACTS
+                and now.get("vlagents_latency_ms_count class=simulation op=act transport=handle") == ACTS
+                and now.get("vlagents_padding_rows_total") == 2 * ACTS
+                and now.get("vlagents_sessions transport=shm") == now.get("vlagents_sessions transport=handle") == 1
+            )
+
+        wait_for(complete, 60)
+        now = scraped()
+    assert now[ok.format("robot", "reset", "shm")] == 1
+    assert now["vlagents_latency_ms_count class=robot op=act transport=shm"] == ACTS
+    assert now["vlagents_requests_total class=robot code=unknown_session op=act transport=http"] == 1
+    for stage in ("decode", "queue", "inference", "encode"):
+        assert now[f"vlagents_stage_ms_count stage={stage} transport=shm"] == ACTS
+    assert now["vlagents_batch_size_count"] == 2 * ACTS
+    assert now["vlagents_batch_size_bucket le=1.0"] == 2 * ACTS
+    assert now["vlagents_queue_depth class=robot"] == now["vlagents_queue_depth class=simulation"] == 0
+    assert 0 <= now["vlagents_utilisation"] < 0.5

@@ -1,0 +1,138 @@
+"""Prometheus metrics of a replica, through Ray: at the metrics port of its node, with the prefix `ray_`.
+
+| series | kind | tags |
+|---|---|---|
+| `vlagents_requests` | counter | op, transport, class, code ("ok", an error's code, "disconnected") |
+| `vlagents_latency_ms` | histogram | op, transport, class; on the server, successful requests |
+| `vlagents_stage_ms` | histogram | stage (decode, queue, inference, encode), transport; successful acts |
+| `vlagents_batch_size` | histogram | observations in one forward pass |
+| `vlagents_padding_rows` | counter | rows that filled batches up to a fixed size |
+| `vlagents_queue_depth` | gauge | class; requests that wait, at this moment |
+| `vlagents_sessions` | gauge | transport; sessions that are held |
+| `vlagents_utilisation` | gauge | share of the last second in which the policy's thread was busy |
+
+All carry `application`, `deployment`, `replica` and `policy`. Transport is `shm`, `websocket`, `http` or
+`handle`, class is `robot` or `simulation`. Counters are exact; a histogram takes up to `SAMPLE` values a
+second, spread evenly over those there are.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import Counter as Count
+from collections.abc import Iterator
+from typing import Any, TypeVar
+
+from ray.util.metrics import Counter, Gauge, Histogram
+
+from vlagents_ray.serve.engine import Engine
+from vlagents_ray.serve.stats import STAGES, Batch, Handled, LoadMeter, Taken
+
+logger = logging.getLogger(__name__)
+
+PERIOD_S = 1.0
+SAMPLE = 500
+_SLICE_S = 50e-6
+_PAUSE_S = 300e-6
+_MS = [0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0, 10_000.0]
+_SIZES = [1.0, 2.0, 4.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 128.0, 256.0]
+_TRANSPORTS = ("shm", "websocket", "http", "handle")
+
+T = TypeVar("T")
+
+
+class Exporter:
+    """Hands an engine's stats to Ray once a second, on a thread of its own, until `close`."""
+
+    def __init__(self, engine: Engine, tags: dict[str, str]) -> None:
+        """`tags` are those of every series: application, deployment, replica, policy."""
+        common = tuple(tags)
+
+        def make(kind: Any, name: str, text: str, *own: str, **options: Any) -> Any:
+            metric = kind(f"vlagents_{name}", description=text, tag_keys=(*common, *own), **options)
+            return metric.set_default_tags(tags)
+
+        self._engine = engine
+        self._requests = make(Counter, "requests", "Requests answered.", "op", "transport", "class", "code")
+        self._latency = make(
+            Histogram, "latency_ms", "Server time of a request.", "op", "transport", "class", boundaries=_MS
+        )
+        self._stage = make(Histogram, "stage_ms", "Time of an act by stage.", "stage", "transport", boundaries=_MS)
+        self._batch = make(Histogram, "batch_size", "Observations in one forward pass.", boundaries=_SIZES)
+        self._padding = make(Counter, "padding_rows", "Rows that filled batches up to a fixed size.")
+        self._depth = make(Gauge, "queue_depth", "Requests that wait.", "class")
+        self._sessions = make(Gauge, "sessions", "Sessions that are held.", "transport")
+        self._utilisation = make(Gauge, "utilisation", "Busy share of the policy's thread.")
+        self._meter = LoadMeter(engine.queue)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._loop, name="metrics", daemon=True)
+
+    def start(self) -> None:
+        """From now on the engine keeps its stats, and they are exported."""
+        self._engine.stats.keep()
+        self._thread.start()
+
+    def close(self) -> None:
+        """Export what is left, and end the thread."""
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+
+    def _loop(self) -> None:
+        stopped = False
+        while not stopped:
+            stopped = self._stop.wait(PERIOD_S)
+            try:
+                self.export()
+            except Exception:
+                logger.exception("metrics were not exported")
+
+    def export(self) -> None:
+        """All since the last time."""
+        handled, batches = self._engine.stats.collect()
+        self._export_requests(handled)
+        self._export_batches(batches)
+        for rank, depth in self._engine.queue.depth_by_rank().items():
+            self._depth.set(depth, {"class": rank.name.lower()})
+        sessions = self._engine.sessions.by_transport()
+        for transport in _TRANSPORTS:
+            self._sessions.set(sessions.get(transport, 0), {"transport": transport})
+        self._utilisation.set(self._meter.read().utilisation)
+
+    def _export_requests(self, handled: Taken[Handled]) -> None:
+        requests: Count[tuple[str, str, str, str]] = Count()
+        for sampled, (op, transport, kind, code, total_ms, *stages) in _sampling(handled):
+            requests[op, transport, kind, code] += 1
+            if not sampled or code != "ok":
+                continue
+            self._latency.observe(total_ms, {"op": op, "transport": transport, "class": kind})
+            if op == "act":
+                for stage, stage_ms in zip(STAGES, stages, strict=True):
+                    self._stage.observe(stage_ms, {"stage": stage, "transport": transport})
+        for (op, transport, kind, code), number in requests.items():
+            self._requests.inc(number, {"op": op, "transport": transport, "class": kind, "code": code})
+
+    def _export_batches(self, batches: Taken[Batch]) -> None:
+        padding = 0
+        for sampled, (observations, rows) in _sampling(batches):
+            padding += rows - observations
+            if sampled:
+                self._batch.observe(observations)
+        if padding:
+            self._padding.inc(padding)
+
+
+def _sampling(values: Taken[T]) -> Iterator[tuple[bool, T]]:
+    """Each value, and whether it is one of up to `SAMPLE`, since a value costs Ray some microseconds.
+
+    In small slices: the policy's thread, which wants the interpreter too, never waits for more than one.
+    """
+    step = -(-len(values) // SAMPLE)
+    until = time.perf_counter() + _SLICE_S
+    for number, value in enumerate(values):
+        yield number % step == 0, value
+        if time.perf_counter() > until:
+            time.sleep(_PAUSE_S)
+            until = time.perf_counter() + _SLICE_S
