@@ -18,7 +18,7 @@ from vlagents_ray.wire.messages import PROTOCOL_VERSION, Op, Reply, Request
 if TYPE_CHECKING:
     from vlagents_ray.client.transport import Transport
 
-TransportName = Literal["auto", "shm", "websocket", "http", "handle"]
+TransportName = Literal["auto", "shm", "plasma", "websocket", "http", "handle"]
 
 
 class RemoteAgent(Agent):
@@ -26,8 +26,8 @@ class RemoteAgent(Agent):
 
     `url` is `http(s)://HOST:PORT[/APP]`, `ws(s)://…` or, inside a Ray cluster, `serve://APP`.
     `transport` "auto" takes the fastest that there is: shared memory to a server of the same user on
-    this machine, else a WebSocket, or inside the cluster a Serve handle; `agent.transport` says which,
-    once connected.
+    this machine, else a WebSocket; inside the cluster a plasma channel to a replica on this node, else
+    a Serve handle. `agent.transport` says which, once connected.
     `codec` "auto" sends raw pixels to this machine and JPEG to others; "raw", "jpeg" or an
     `ImageCodec` with quality and subsampling force one.
 
@@ -54,7 +54,7 @@ class RemoteAgent(Agent):
 
     @property
     def transport(self) -> str:
-        """What carries the requests: "shm", "websocket", "http" or "handle"; "auto" until connected."""
+        """What carries the requests: "shm", "plasma", "websocket", "http" or "handle"; "auto" until connected."""
         return self._transport.name
 
     @property
@@ -137,13 +137,19 @@ def _choose(url: str, transport: str, codec: ImageCodec | str) -> Transport:
     if transport not in get_args(TransportName):
         raise ConfigError(f"transport: got {transport!r}, want one of {list(get_args(TransportName))}")
     inside = scheme == "serve"
-    if transport in (("http", "websocket") if inside else ("handle",)):
-        raise ConfigError(f"transport {transport!r} does not reach {url!r}; 'handle' and serve://APP go together")
+    if transport in (("http", "websocket") if inside else ("handle", "plasma")):
+        raise ConfigError(
+            f"transport {transport!r} does not reach {url!r}; 'handle' and 'plasma' go together with serve://APP"
+        )
     chosen = _codec(url, codec)
     if transport == "handle":
         from vlagents_ray.client.handle import HandleTransport
 
         return HandleTransport(urlsplit(url).netloc)
+    if transport == "plasma":
+        from vlagents_ray.client.plasma import PlasmaTransport
+
+        return PlasmaTransport(urlsplit(url).netloc)
     if transport == "http":
         from vlagents_ray.client.http import HttpTransport
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import ConfigError, ConnectionLost, DeadlineExceeded, PolicyUnavailable
+from vlagents_ray.errors import ConfigError, ConnectionLost, DeadlineExceeded, PolicyUnavailable, VLAgentsError
 from vlagents_ray.wire.frames import RAW, decode_reply, encode_request
 from vlagents_ray.wire.messages import Reply, Request
 
@@ -54,7 +54,7 @@ class HandleTransport:
         import ray
 
         frame = ray.put(np.frombuffer(encode_request(request, RAW), np.uint8))
-        pending = self._replica.handle_request.remote(self._header(request), self._session, frame)
+        pending = self._replica.handle_request.remote(self._header(request.request_id), self._session, frame)
         try:
             return decode_reply(ray.get(pending, timeout=timeout_s))
         except ray.exceptions.GetTimeoutError as error:
@@ -65,17 +65,33 @@ class HandleTransport:
                 f"serve://{self._app}: the session's replica is gone; reset with a new agent"
             ) from error
 
+    def ask(self, method: str, *args: Any, timeout_s: float) -> Any:
+        """What a method of the chosen replica returns; what it raises of ours is raised here."""
+        import ray
+
+        pending = self._replica.handle_request.remote(self._header(method=method), *args)
+        try:
+            return ray.get(pending, timeout=timeout_s)
+        except ray.exceptions.GetTimeoutError as error:
+            raise DeadlineExceeded(f"serve://{self._app}: no answer within {timeout_s:g} s") from error
+        except ray.exceptions.RayActorError as error:
+            raise ConnectionLost(f"serve://{self._app}: the replica is gone; reset with a new agent") from error
+        except ray.exceptions.RayTaskError as error:
+            if isinstance(error.cause, VLAgentsError):
+                raise error.cause from None
+            raise PolicyUnavailable(f"serve://{self._app}: {error.cause}") from error
+
     def close(self) -> None:
         """End the session."""
         if self._replica is None:
             return
         frame = np.frombuffer(encode_request(Request("close")), np.uint8)
-        self._replica.handle_request.remote(self._header(Request("close")), self._session, frame)
+        self._replica.handle_request.remote(self._header(), self._session, frame)
         self._replica = None
 
-    def _header(self, request: Request) -> bytes:
+    def _header(self, request_id: str = "", method: str = "call") -> bytes:
         """What Serve's own router sends ahead of a method call to the replica it chose."""
         from ray.serve._private.common import RequestMetadata
 
-        request_id = request.request_id or uuid.uuid4().hex
-        return pickle.dumps(RequestMetadata(request_id=request_id, internal_request_id=request_id, call_method="call"))
+        request_id = request_id or uuid.uuid4().hex
+        return pickle.dumps(RequestMetadata(request_id=request_id, internal_request_id=request_id, call_method=method))

@@ -13,6 +13,7 @@ from typing import Any
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable
 from vlagents_ray.wire.frames import RAW, decode_reply, request_parts
 from vlagents_ray.wire.messages import LocalAddress, Reply, Request, boot_id
+from vlagents_ray.wire.tree import Buffer
 
 _MESSAGE_BYTES = 128 * 1024  # the longest reply that comes in a message, and some
 _PAGE = mmap.PAGESIZE
@@ -53,31 +54,18 @@ class ShmTransport:
         deadline = time.monotonic() + timeout_s
         connection = self._open(timeout_s)
         parts = request_parts(request, RAW)
-        length = sum(map(len, parts))
-        memory, descriptor = self._memory(length)
-        at = 0
-        for part in parts:
-            memory.map[at : at + len(part)] = part
-            at += len(part)
-        memory.busy = request.request_id
-        message = LocalAddress.REQUEST.pack(memory.number, length)
         try:
-            connection.settimeout(timeout_s)
-            if descriptor is None:
-                connection.send(message)
-            else:
-                with os.fdopen(descriptor, "rb"):
-                    socket.send_fds(connection, [message], [descriptor])
+            self.hand_over(connection, parts, request.request_id, deadline)
             while True:
                 connection.settimeout(max(1e-4, deadline - time.monotonic()))
-                reply = self._receive(connection)
+                reply = self.receive(connection)
                 if reply.request_id == request.request_id:
                     return reply
         except TimeoutError as error:
-            raise DeadlineExceeded(f"shm: no answer within {timeout_s:g} s") from error
+            raise DeadlineExceeded(f"{self.name}: no answer within {timeout_s:g} s") from error
         except OSError as error:
             self.close()
-            raise ConnectionLost(f"shm: {error}; reset before the next act") from error
+            raise ConnectionLost(f"{self.name}: {error}; reset before the next act") from error
 
     def close(self) -> None:
         """End the session and give its memory back."""
@@ -88,15 +76,36 @@ class ShmTransport:
             memory.map.close()
         self._memories.clear()
 
+    def server(self) -> str:
+        """The name of the server's socket."""
+        return f"\0{self._address.socket}"
+
+    def hand_over(self, connection: socket.socket, parts: list[Buffer], request_id: str, deadline: float) -> None:
+        """Put a frame where the server reads it, and say so. `TimeoutError`, `OSError` if that fails."""
+        length = sum(map(len, parts))
+        memory, descriptor = self._memory(length)
+        at = 0
+        for part in parts:
+            memory.map[at : at + len(part)] = part
+            at += len(part)
+        memory.busy = request_id
+        message = LocalAddress.REQUEST.pack(memory.number, length)
+        connection.settimeout(max(1e-4, deadline - time.monotonic()))
+        if descriptor is None:
+            connection.send(message)
+        else:
+            with os.fdopen(descriptor, "rb"):
+                socket.send_fds(connection, [message], [descriptor])
+
     def _open(self, timeout_s: float) -> socket.socket:
         if self._socket is None:
             connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             connection.settimeout(timeout_s)
             try:
-                connection.connect(f"\0{self._address.socket}")
+                connection.connect(self.server())
             except OSError as error:
                 connection.close()
-                raise PolicyUnavailable(f"shm: the server's socket does not answer ({error})") from error
+                raise PolicyUnavailable(f"{self.name}: the server's socket does not answer ({error})") from error
             self._socket = connection
         return self._socket
 
@@ -119,7 +128,8 @@ class ShmTransport:
             self._memories.append(memory)
         return memory, descriptor
 
-    def _receive(self, connection: socket.socket) -> Reply:
+    def receive(self, connection: socket.socket) -> Reply:
+        """The next reply, to whichever request; its frame's memory is free again."""
         ancillary = socket.CMSG_SPACE(4)
         size, control, _, _ = connection.recvmsg_into([self._buffer], ancillary)
         if size == 0:

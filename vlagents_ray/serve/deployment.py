@@ -14,7 +14,7 @@ import ray
 from ray import serve
 from starlette.applications import Starlette
 
-from vlagents_ray.errors import VLAgentsError
+from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
 from vlagents_ray.registry import policy_class
 from vlagents_ray.serve.batching import Rank
 from vlagents_ray.serve.calls import ask
@@ -22,6 +22,7 @@ from vlagents_ray.serve.config import ServerArgs
 from vlagents_ray.serve.engine import Engine
 from vlagents_ray.serve.ingress import build_ingress
 from vlagents_ray.serve.local import LocalDoor
+from vlagents_ray.serve.plasma import PlasmaDoor
 from vlagents_ray.wire.frames import decode_request, encode_reply
 from vlagents_ray.wire.messages import PROTOCOL_VERSION, Reply
 
@@ -46,8 +47,10 @@ class PolicyReplica:
             session_idle_s=self._args.sessions.idle_s,
         )
         self._local = LocalDoor(self._engine, self._limits) if hasattr(os, "memfd_create") else None
-        if self._local is not None:
-            self._local.open()
+        self._plasma = PlasmaDoor(self._engine, self._limits) if self._local is not None else None
+        for door in (self._local, self._plasma):
+            if door is not None:
+                door.open()
         self._loading = asyncio.ensure_future(asyncio.to_thread(self._engine.start))
         if await asyncio.to_thread(_others_run):
             await self._loading
@@ -77,7 +80,14 @@ class PolicyReplica:
         the actor's own entry point for every request after this one.
         """
         await asyncio.shield(self._loading)
-        return self.metadata(), ray.get_runtime_context().current_actor
+        plasma = None if self._plasma is None else asdict(self._plasma.plasma)
+        return self.metadata() | {"plasma": plasma}, ray.get_runtime_context().current_actor
+
+    async def lease(self, length: int) -> tuple[bytes, int]:
+        """A plasma channel for frames of `length` bytes, for a client that `attach` told of the plasma door."""
+        if self._plasma is None:
+            raise PolicyUnavailable("plasma: this replica has no such door; use transport 'handle'")
+        return await asyncio.to_thread(self._plasma.pool.lease, length)
 
     async def call(self, session_id: str, frame: np.ndarray) -> bytes:
         """One request from inside the cluster: a frame as (N,) uint8, read in place from plasma."""
@@ -98,8 +108,9 @@ class PolicyReplica:
     async def __del__(self) -> None:
         if hasattr(self, "_engine"):
             await asyncio.to_thread(self._engine.close)
-            if self._local is not None:
-                self._local.close()
+            for door in (self._local, self._plasma):
+                if door is not None:
+                    door.close()
 
 
 def _others_run() -> bool:
