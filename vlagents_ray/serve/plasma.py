@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import ray
-from ray._raylet import RawSerializedObject  # type: ignore[attr-defined]
+from ray._raylet import RawSerializedObject, unpack_pickle5_buffers  # type: ignore[attr-defined]
 from ray.exceptions import RayChannelError, RayChannelTimeoutError
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable
@@ -55,23 +55,30 @@ class Channel:
 
     def read(self) -> bytes:
         """A copy of the frame that was written; `MalformedMessage` if there is none. Never waits."""
-        try:
-            (found,) = _core().get_objects([self.ref], 0)
-        except RayChannelTimeoutError as error:
-            raise MalformedMessage("plasma: a message came without a frame in its channel") from error
-        return bytes(found.data)
+        found = self._take()
+        if found.metadata != PlasmaAddress.TAG:  # Ray's parser below trusts its input, as it does everywhere
+            raise MalformedMessage("plasma: what the channel holds is no frame; is this a client of vlagents_ray?")
+        _, pieces = unpack_pickle5_buffers(found.data)  # finds them; there is nothing to unpickle
+        return b"".join(pieces)
 
     def intact(self) -> bool:
         """Discard what nobody read. False if its writer was killed while it wrote: then it is locked for good."""
         with contextlib.suppress(MalformedMessage):
-            self.read()
+            self._take()
         try:
             _core().experimental_channel_register_writer(self.ref, {})
-            _core().experimental_channel_put_serialized(RawSerializedObject(b""), self.ref, 1, 0)
-            self.read()
+            _core().experimental_channel_put_serialized(RawSerializedObject(b"x"), self.ref, 1, 0)
+            self._take()
         except (RayChannelError, MalformedMessage):
             return False
         return True
+
+    def _take(self) -> Any:
+        """What was written last, in place, as long as the caller holds it."""
+        try:
+            return _core().get_objects([self.ref], 0)[0]
+        except RayChannelTimeoutError as error:
+            raise MalformedMessage("plasma: a message came without a frame in its channel") from error
 
 
 class Pool:
@@ -89,7 +96,7 @@ class Pool:
 
         `MessageTooLarge` over `limits.body_bytes`; `PolicyUnavailable` where the object store is too small.
         """
-        if length > self._limits.body_bytes:
+        if length > 2 * self._limits.body_bytes:  # with Ray's framing; the exact check is the decoder's
             raise MessageTooLarge(f"frame: got {length} bytes, the limit is {self._limits.body_bytes}")
         with self._lock:
             oldest = time.monotonic() - _CLAIM_S

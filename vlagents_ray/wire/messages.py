@@ -82,6 +82,7 @@ class PlasmaAddress:
     node: str  # Ray's id of the node
 
     REQUEST: ClassVar[struct.Struct] = struct.Struct("28s")  # Ray's id of the channel that holds the frame
+    TAG: ClassVar[bytes] = b"VLA1"  # Ray's metadata of a frame: out-of-band buffers, to be joined
 
 
 def boot_id() -> str:
