@@ -19,7 +19,6 @@ from eval_fakes import wait_for
 from ray._private import ray_constants
 from ray._private.internal_api import memory_summary
 from ray._private.worker import global_worker
-from ray._raylet import SerializedObject
 
 from tests.integration.conftest import serving
 from vlagents_ray import ConnectionLost, Obs, PolicyUnavailable, RemoteAgent
@@ -151,23 +150,17 @@ def test_killed_env_actors_leave_nothing(agent: RemoteAgent) -> None:
     assert objects() <= before[0] + 2 + 3
 
 
-def test_a_client_that_dies_while_it_writes_costs_its_channel_and_nothing_else(agent: RemoteAgent) -> None:
-    class Halfway(SerializedObject):  # what a killed writer leaves: the channel taken, never released
-        total_bytes = 10
-
-    transport = PlasmaTransport(APP)
-    transport.connect(30)
-    transport.call(Request("reset", frame(), request_id="r"), 10)
-    with pytest.raises(NotImplementedError):
-        global_worker.core_worker.experimental_channel_put_serialized(Halfway(b"x"), transport._channel, 1, 1000)
-    lost = transport._channel.binary()
-    with pytest.raises(ConnectionLost, match="cannot be written"):
-        transport.call(Request("act", frame(), request_id="a"), 10)
-    for _ in range(3):
+def test_an_env_actor_that_dies_while_it_writes_costs_its_channel_and_nothing_else(agent: RemoteAgent) -> None:
+    env = EnvActor.remote(APP)
+    ray.get(env.open.remote())
+    lost = ray.get(env.channel.remote())
+    with pytest.raises(ray.exceptions.RayActorError):
+        ray.get(env.die_writing.remote())
+    for pixel in range(3):
         with RemoteAgent(f"serve://{APP}", transport="plasma") as other:
-            other.reset(frame())
+            other.reset(frame(200))
             assert other._transport._channel.binary() != lost  # type: ignore[attr-defined]
-            assert other.act(frame(pixel=4)).action.tolist() == [4]
+            assert other.act(frame(pixel=pixel)).action.tolist() == [pixel]
 
 
 def test_faults_are_answered_and_harm_nobody(agent: RemoteAgent) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import mmap
 import os
+import tempfile
 
 import numpy as np
 import ray
@@ -36,3 +38,16 @@ class EnvActor:
     def storm(self) -> None:
         """Act until killed."""
         self.act(-1)
+
+    def channel(self) -> bytes:
+        """Ray's id of the plasma channel."""
+        key: bytes = self.agent._transport._channel.binary()  # type: ignore[attr-defined]
+        return key
+
+    def die_writing(self) -> None:
+        """Die in the middle of a frame: its pixels lie in a file that has been cut off."""
+        with tempfile.TemporaryFile() as file:
+            file.truncate(mmap.PAGESIZE * 3)
+            pixels = np.frombuffer(mmap.mmap(file.fileno(), 0), np.uint8).reshape(64, -1, 3)
+            file.truncate(0)
+            self.agent.act(Obs({"front": pixels}))
