@@ -151,14 +151,14 @@ def test_killed_env_actors_leave_nothing(agent: RemoteAgent) -> None:
 
 
 def test_an_env_actor_that_dies_while_it_writes_costs_its_channel_and_nothing_else(agent: RemoteAgent) -> None:
-    env = EnvActor.remote(APP)
+    env = EnvActor.remote(APP, size=600)  # for a size of channel that no other test uses
     ray.get(env.open.remote())
     lost = ray.get(env.channel.remote())
     with pytest.raises(ray.exceptions.RayActorError):
         ray.get(env.die_writing.remote())
     for pixel in range(3):
         with RemoteAgent(f"serve://{APP}", transport="plasma") as other:
-            other.reset(frame(200))
+            other.reset(frame(850))
             assert other._transport._channel.binary() != lost  # type: ignore[attr-defined]
             assert other.act(frame(pixel=pixel)).action.tolist() == [pixel]
 
