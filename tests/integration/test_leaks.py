@@ -16,7 +16,7 @@ from vlagents_ray.client.ways import TransportName
 from vlagents_ray.serve.cluster import Server
 
 # 10,000 in all; VLAGENTS_SESSIONS=N opens N by each transport
-SESSIONS: dict[TransportName, int] = {"shm": 7000, "websocket": 1200, "http": 1200, "handle": 600}
+SESSIONS: dict[TransportName, int] = {"shm": 6400, "websocket": 1200, "http": 1200, "handle": 600, "plasma": 600}
 MIB = 2**20
 
 
@@ -29,7 +29,7 @@ def server() -> Iterator[Server]:
 @pytest.mark.parametrize("transport", SESSIONS)
 def test_sessions_opened_and_closed_leave_nothing(server: Server, transport: TransportName) -> None:
     frame = Obs({"front": np.zeros((64, 64, 3), np.uint8)})
-    where = f"serve://{next(iter(server.apps))}" if transport == "handle" else server.url
+    where = f"serve://{next(iter(server.apps))}" if transport in ("handle", "plasma") else server.url
 
     def session() -> dict[str, int]:
         with RemoteAgent(where, transport=transport) as agent:

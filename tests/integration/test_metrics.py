@@ -44,7 +44,10 @@ def scraped() -> dict[str, float]:
 
 
 def test_prometheus_reads_requests_batches_and_load(server: Server) -> None:
-    with RemoteAgent(server.url, transport="shm") as near, RemoteAgent("serve://noop", transport="handle") as inside:
+    with (
+        RemoteAgent(server.url, transport="shm") as near,
+        RemoteAgent("serve://noop", transport="handle", rank="simulation") as inside,
+    ):
         for agent in (near, inside):
             agent.reset(Obs())
             for _ in range(ACTS):

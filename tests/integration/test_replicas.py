@@ -42,7 +42,7 @@ def test_http_sessions_stay_on_their_replica(server: Server) -> None:
         agent.close()
 
 
-@pytest.mark.parametrize("transport", ["handle", "shm"])
+@pytest.mark.parametrize("transport", ["handle", "shm", "plasma"])
 def test_a_dead_replica_ends_its_own_sessions_and_no_others(server: Server, transport: TransportName) -> None:
     agents = [RemoteAgent("serve://Reacher", transport=transport, resume=False) for _ in range(8)]
     pids = opened(agents)

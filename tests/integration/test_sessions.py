@@ -18,7 +18,7 @@ from vlagents_ray.errors import MessageTooLarge
 from vlagents_ray.serve.cluster import Server
 from vlagents_ray.wire.codecs import JPEG, RAW
 
-TRANSPORTS: list[TransportName] = ["shm", "websocket", "http", "handle"]
+TRANSPORTS: list[TransportName] = ["shm", "plasma", "websocket", "http", "handle"]
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def server() -> Iterator[Server]:
 
 
 def url(server: Server, transport: TransportName) -> str:
-    return "serve://Reacher" if transport == "handle" else server.url
+    return "serve://Reacher" if transport in ("handle", "plasma") else server.url
 
 
 def obs(pixel: int, value: int = 0) -> Obs:

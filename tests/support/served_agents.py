@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import os
+import threading
 import time
 from collections import deque
 from pathlib import Path
@@ -95,3 +96,22 @@ class Accountant(Agent):
 
     def act(self, obs: Obs) -> Act:
         return Act(np.zeros(7, np.float32))
+
+
+class Echo(Agent):
+    """Answers with what it was sent, and with what its process holds."""
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
+        self.instruction = instruction
+        return {"pid": os.getpid()}
+
+    def act(self, obs: Obs) -> Act:
+        time.sleep(obs.info.get("sleep_s", 0.0))
+        info = {
+            "instruction": self.instruction,
+            "echo": obs.info.get("echo"),
+            "big": bytes(obs.info.get("reply_bytes", 0)),
+            "threads": threading.active_count(),
+            "descriptors": len(os.listdir("/proc/self/fd")),
+        }
+        return Act(np.array([float(image[-1, -1, -1]) for image in obs.cameras.values()]), info=info)

@@ -40,14 +40,14 @@ class RemoteAgent(Agent):
 
     `url` is `http(s)://HOST:PORT[/APP]`, `ws(s)://…` or, inside a Ray cluster, `serve://APP`.
     `transport` "auto" takes the fastest that there is: shared memory to a server of the same user on
-    this machine, else a WebSocket, or inside the cluster a Serve handle; `agent.transport` says which,
-    once connected.
+    this machine, else a WebSocket; inside the cluster a plasma channel to a replica on this node, else
+    a Serve handle. `agent.transport` says which, once connected.
     Over a network, `codec` "auto" measures the link when the first images are sent (0.3 s at most,
     unless ten round trips take longer) and writes them as raw pixels, JPEG or PNG, whichever is the
     fastest to encode, send and decode; "exact" leaves out JPEG, which changes the pixels a little;
     "raw", "lossless" (PNG), "jpeg" or an `ImageCodec` with quality and subsampling force one.
-    `agent.codec` says which is used, `agent.link` what was measured. Shared memory and the handle
-    carry raw pixels.
+    `agent.codec` says which is used, `agent.link` what was measured. Shared memory, plasma and the
+    handle carry raw pixels.
     `rank` is the class of its requests: a "robot" goes before a "simulation".
 
     `connect_timeout_s` is how long `initialize` (called by the first `reset`) waits for a server
@@ -100,13 +100,13 @@ class RemoteAgent(Agent):
 
     @property
     def transport(self) -> str:
-        """What carries the requests: "shm", "websocket", "http" or "handle"; "auto" until connected."""
+        """What carries the requests: "shm", "plasma", "websocket", "http" or "handle"; "auto" until connected."""
         return self._connection.transport.name
 
     @property
     def codec(self) -> ImageCodec | None:
         """How cameras are written; None until the first images call for a choice."""
-        return RAW if self.transport in ("shm", "handle") else self._connection.codec.codec
+        return RAW if self.transport in ("shm", "plasma", "handle") else self._connection.codec.codec
 
     @property
     def link(self) -> Link | None:

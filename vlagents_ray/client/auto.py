@@ -10,6 +10,7 @@ from urllib.parse import urlsplit
 from vlagents_ray.client.handle import HandleTransport
 from vlagents_ray.client.http import HttpTransport
 from vlagents_ray.client.link import CodecChoice
+from vlagents_ray.client.plasma import PlasmaTransport
 from vlagents_ray.client.shm import ShmTransport, reaches
 from vlagents_ray.client.transport import Transport
 from vlagents_ray.client.websocket import WebSocketTransport
@@ -18,7 +19,12 @@ from vlagents_ray.wire.messages import Reply, Request
 
 
 class AutoTransport:
-    """Shared memory if the policy runs on this machine for this user; else a WebSocket, or a Serve handle."""
+    """Shared memory if the policy runs on this machine for this user; else a WebSocket.
+
+    Inside the cluster: shared memory, else a plasma channel on the replica's node, else the Serve handle.
+    Shared memory comes first because it is a fifth faster, without Ray's locks and framing; plasma
+    reaches a replica on this node whose socket is in another network namespace.
+    """
 
     def __init__(self, url: str, codec: CodecChoice, *, only_shm: bool = False) -> None:
         self._url = url
@@ -50,7 +56,7 @@ class AutoTransport:
         if near is not None:
             self._chosen = near
         elif inside is not None:
-            self._chosen = inside
+            self._chosen = self._channel(inside, metadata, left_s) or inside
         else:
             self._chosen = WebSocketTransport(self._url, self._codec)
             self._chosen.connect(left_s)
@@ -67,6 +73,14 @@ class AutoTransport:
         if self._chosen is not None:
             self._chosen.close()
             self._chosen = None
+
+    def _channel(self, inside: HandleTransport, metadata: dict[str, Any], timeout_s: float) -> PlasmaTransport | None:
+        transport = PlasmaTransport(urlsplit(self._url).netloc)
+        try:
+            transport.connect_to(inside, metadata, timeout_s)
+        except (ConfigError, PolicyUnavailable):  # on another node
+            return None
+        return transport
 
     def _near(self, local: dict[str, Any] | None, timeout_s: float) -> ShmTransport | None:
         if not local or not reaches(local):

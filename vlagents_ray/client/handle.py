@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import ConfigError, ConnectionLost, DeadlineExceeded, PolicyUnavailable
+from vlagents_ray.errors import ConfigError, ConnectionLost, DeadlineExceeded, PolicyUnavailable, VLAgentsError
 from vlagents_ray.wire.codecs import RAW
 from vlagents_ray.wire.frames import decode_replies, encode_requests
 from vlagents_ray.wire.messages import Reply, Request
@@ -65,6 +65,21 @@ class HandleTransport:
             raise DeadlineExceeded(f"serve://{self._app}: no answer within {timeout_s:g} s") from error
         except ray.exceptions.RayActorError as error:
             raise ConnectionLost(f"serve://{self._app}: the session's replica is gone; reset again") from error
+
+    def ask(self, method: str, *args: Any, timeout_s: float) -> Any:
+        """What a method of the chosen replica returns; what it raises of ours is raised here."""
+        import ray
+
+        try:
+            return ray.get(call_replica(self._replica, method, *args), timeout=timeout_s)
+        except ray.exceptions.GetTimeoutError as error:
+            raise DeadlineExceeded(f"serve://{self._app}: no answer within {timeout_s:g} s") from error
+        except ray.exceptions.RayActorError as error:
+            raise ConnectionLost(f"serve://{self._app}: the replica is gone; reset again") from error
+        except ray.exceptions.RayTaskError as error:
+            if isinstance(error.cause, VLAgentsError):
+                raise error.cause from None
+            raise PolicyUnavailable(f"serve://{self._app}: {error.cause}") from error
 
     def close(self) -> None:
         """Forget the replica."""

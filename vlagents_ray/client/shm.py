@@ -16,6 +16,7 @@ from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavaila
 from vlagents_ray.wire.codecs import RAW
 from vlagents_ray.wire.frames import decode_replies, request_parts
 from vlagents_ray.wire.messages import LocalAddress, Reply, Request, boot_id
+from vlagents_ray.wire.tree import Buffer
 
 _MESSAGE_BYTES = 128 * 1024  # the longest reply that comes in a message, and some
 _PAGE = mmap.PAGESIZE
@@ -53,35 +54,22 @@ class ShmTransport:
         return {}
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """One frame into free memory, a message to the server, its reply back; late ones are discarded."""
+        """One frame into free memory, a message to the server, its replies back; late ones are discarded."""
         deadline = time.monotonic() + timeout_s
         connection = self._open(timeout_s)
         parts = request_parts(requests, RAW)
-        length = sum(map(len, parts))
-        memory, descriptor = self._memory(length)
-        at = 0
-        for part in parts:
-            memory.map[at : at + len(part)] = part
-            at += len(part)
-        memory.busy = requests[0].request_id
-        message = LocalAddress.REQUEST.pack(memory.number, length)
         try:
-            connection.settimeout(timeout_s)
-            if descriptor is None:
-                connection.send(message)
-            else:
-                with os.fdopen(descriptor, "rb"):
-                    socket.send_fds(connection, [message], [descriptor])
+            self.hand_over(connection, parts, requests[0].request_id, deadline)
             while True:
                 connection.settimeout(max(1e-4, deadline - time.monotonic()))
-                replies = self._receive(connection)
+                replies = self.receive(connection)
                 if is_answer(replies, requests):
                     return replies
         except TimeoutError as error:
-            raise DeadlineExceeded(f"shm: no answer within {timeout_s:g} s") from error
+            raise DeadlineExceeded(f"{self.name}: no answer within {timeout_s:g} s") from error
         except OSError as error:
             self.close()
-            raise ConnectionLost(f"shm: {error}; reset before the next act") from error
+            raise ConnectionLost(f"{self.name}: {error}; reset before the next act") from error
 
     def close(self) -> None:
         """Hang up and give the memory back."""
@@ -92,15 +80,36 @@ class ShmTransport:
             memory.map.close()
         self._memories.clear()
 
+    def server(self) -> str:
+        """The name of the server's socket."""
+        return f"\0{self._address.socket}"
+
+    def hand_over(self, connection: socket.socket, parts: list[Buffer], request_id: str, deadline: float) -> None:
+        """Put a frame where the server reads it, and say so. `TimeoutError`, `OSError` if that fails."""
+        length = sum(map(len, parts))
+        memory, descriptor = self._memory(length)
+        at = 0
+        for part in parts:
+            memory.map[at : at + len(part)] = part
+            at += len(part)
+        memory.busy = request_id
+        message = LocalAddress.REQUEST.pack(memory.number, length)
+        connection.settimeout(max(1e-4, deadline - time.monotonic()))
+        if descriptor is None:
+            connection.send(message)
+        else:
+            with os.fdopen(descriptor, "rb"):
+                socket.send_fds(connection, [message], [descriptor])
+
     def _open(self, timeout_s: float) -> socket.socket:
         if self._socket is None:
             connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
             connection.settimeout(timeout_s)
             try:
-                connection.connect(f"\0{self._address.socket}")
+                connection.connect(self.server())
             except OSError as error:
                 connection.close()
-                raise PolicyUnavailable(f"shm: the server's socket does not answer ({error})") from error
+                raise PolicyUnavailable(f"{self.name}: the server's socket does not answer ({error})") from error
             self._socket = connection
         return self._socket
 
@@ -123,7 +132,8 @@ class ShmTransport:
             self._memories.append(memory)
         return memory, descriptor
 
-    def _receive(self, connection: socket.socket) -> list[Reply]:
+    def receive(self, connection: socket.socket) -> list[Reply]:
+        """The next reply, to whichever request; its frame's memory is free again."""
         ancillary = socket.CMSG_SPACE(4)
         size, control, _, _ = connection.recvmsg_into([self._buffer], ancillary)
         if size == 0:

@@ -25,7 +25,7 @@ class Transport(Protocol):
 
     @property
     def name(self) -> str:
-        """What users call it: "shm", "websocket", "http", "handle"."""
+        """What users call it: "shm", "plasma", "websocket", "http", "handle"."""
         ...
 
     def connect(self, timeout_s: float) -> dict[str, Any]:

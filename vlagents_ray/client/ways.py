@@ -12,7 +12,7 @@ from vlagents_ray.errors import ConfigError
 if TYPE_CHECKING:
     from vlagents_ray.client.transport import Transport
 
-TransportName = Literal["auto", "shm", "websocket", "http", "handle"]
+TransportName = Literal["auto", "shm", "plasma", "websocket", "http", "handle"]
 
 
 def choose(url: str, transport: str, codec: CodecChoice) -> Transport:
@@ -21,12 +21,18 @@ def choose(url: str, transport: str, codec: CodecChoice) -> Transport:
     if transport not in get_args(TransportName):
         raise ConfigError(f"transport: got {transport!r}, want one of {list(get_args(TransportName))}")
     inside = scheme == "serve"
-    if transport in (("http", "websocket") if inside else ("handle",)):
-        raise ConfigError(f"transport {transport!r} does not reach {url!r}; 'handle' and serve://APP go together")
+    if transport in (("http", "websocket") if inside else ("handle", "plasma")):
+        raise ConfigError(
+            f"transport {transport!r} does not reach {url!r}; 'handle' and 'plasma' go together with serve://APP"
+        )
     if transport == "handle":
         from vlagents_ray.client.handle import HandleTransport
 
         return HandleTransport(urlsplit(url).netloc)
+    if transport == "plasma":
+        from vlagents_ray.client.plasma import PlasmaTransport
+
+        return PlasmaTransport(urlsplit(url).netloc)
     if transport == "http":
         from vlagents_ray.client.http import HttpTransport
 

@@ -15,7 +15,7 @@ import ray
 from ray import serve
 from starlette.applications import Starlette
 
-from vlagents_ray.errors import VLAgentsError
+from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
 from vlagents_ray.registry import policy_class
 from vlagents_ray.serve.autoscaling import SESSIONS, UTILISATION, WAITING
 from vlagents_ray.serve.calls import Sender
@@ -26,6 +26,7 @@ from vlagents_ray.serve.local import LocalDoor
 from vlagents_ray.serve.metrics import Exporter
 from vlagents_ray.serve.moving import Strays, export
 from vlagents_ray.serve.peers import Peers
+from vlagents_ray.serve.plasma import PlasmaDoor
 from vlagents_ray.serve.stats import LoadMeter, Visit
 from vlagents_ray.wire.frames import decode_requests
 from vlagents_ray.wire.messages import PROTOCOL_VERSION, Reply
@@ -59,8 +60,10 @@ class PolicyReplica:
         self._metrics.start()
         self._strays = self._engine.strays = Strays(self._engine, Peers())
         self._local = LocalDoor(self._engine, self._limits) if hasattr(os, "memfd_create") else None
-        if self._local is not None:
-            self._local.open()
+        self._plasma = PlasmaDoor(self._engine, self._limits) if self._local is not None else None
+        for door in (self._local, self._plasma):
+            if door is not None:
+                door.open()
         self._loading = asyncio.ensure_future(asyncio.to_thread(self._engine.start))
         if await asyncio.to_thread(_others_run):
             await self._loading
@@ -91,7 +94,14 @@ class PolicyReplica:
         the actor's own entry point for every request after this one.
         """
         await asyncio.shield(self._loading)
-        return self.metadata(), ray.get_runtime_context().current_actor
+        plasma = None if self._plasma is None else asdict(self._plasma.plasma)
+        return self.metadata() | {"plasma": plasma}, ray.get_runtime_context().current_actor
+
+    async def lease(self, length: int) -> tuple[bytes, int]:
+        """A plasma channel for frames of `length` bytes, for a client that `attach` told of the plasma door."""
+        if self._plasma is None:
+            raise PolicyUnavailable("plasma: this replica has no such door; use transport 'handle'")
+        return await asyncio.to_thread(self._plasma.pool.lease, length)
 
     async def call(self, session_id: str, frame: np.ndarray) -> bytes:
         """A frame of requests from inside the cluster, (N,) uint8, read in place from plasma."""
@@ -150,8 +160,9 @@ class PolicyReplica:
         self._strays.close()
         await asyncio.to_thread(self._engine.close)
         await asyncio.to_thread(self._metrics.close)
-        if self._local is not None:
-            self._local.close()
+        for door in (self._local, self._plasma):
+            if door is not None:
+                door.close()
 
 
 def _stopping() -> bool:

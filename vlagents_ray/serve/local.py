@@ -17,6 +17,7 @@ import secrets
 import socket
 import struct
 from collections.abc import Callable
+from typing import ClassVar
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable, VLAgentsError
 from vlagents_ray.serve.calls import Sender
@@ -38,15 +39,19 @@ class LocalDoor:
     def __init__(self, engine: Engine, limits: Limits) -> None:
         self._engine = engine
         self._limits = limits
-        self._clients: set[_Client] = set()
+        self._clients: set[LocalClient] = set()
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         self.address = LocalAddress(f"vlagents-ray-{secrets.token_hex(16)}", boot_id())
 
     def open(self) -> None:
         """Start to listen; before the engine starts."""
+        self.listen()
+        self._engine.queue.watch(self._listener, self._accept)
+
+    def listen(self) -> None:
+        """Give the socket its name."""
         self._listener.bind(f"\0{self.address.socket}")
         self._listener.listen(_BACKLOG)
-        self._engine.queue.watch(self._listener, self._accept)
 
     def close(self) -> None:
         """Hang up; after the engine has ended."""
@@ -66,29 +71,36 @@ class LocalDoor:
             connection.send(LocalAddress.REPLY.pack(0, 0) + encode_replies([Reply(error=full)]))
             connection.close()
             return
-        client = _Client(connection, self._engine, self._limits, self._clients.discard)
+        client = self.client(connection)
         self._clients.add(client)
         self._engine.queue.watch(connection, client.ready)
 
+    def client(self, connection: socket.socket) -> LocalClient:
+        """What serves a connection that was let in."""
+        return LocalClient(connection, self._engine, self._limits, self._clients.discard)
 
-class _Client:
-    """One connection, which is a session."""
+
+class LocalClient:
+    """One connection, with which its sessions end. Where its frames lie is up to `locate`, `frame` and `forget`."""
+
+    name: ClassVar[str] = "shm"
+    message: ClassVar[struct.Struct] = LocalAddress.REQUEST
 
     def __init__(
-        self, connection: socket.socket, engine: Engine, limits: Limits, gone: Callable[[_Client], None]
+        self, connection: socket.socket, engine: Engine, limits: Limits, gone: Callable[[LocalClient], None]
     ) -> None:
         self._connection = connection
         self._engine = engine
         self._limits = limits
         self._gone = gone
         self._files: dict[int, mmap.mmap] = {}
-        self._sender = Sender(engine, "shm")
+        self._sender = Sender(engine, self.name)
 
     def ready(self) -> None:
         """A message, or the end of the connection, is there."""
-        visit = Visit(self._engine.stats, "shm")
+        visit = Visit(self._engine.stats, self.name)
         try:
-            message, descriptors, _, _ = socket.recv_fds(self._connection, LocalAddress.REQUEST.size, 1)
+            message, descriptors, _, _ = socket.recv_fds(self._connection, self.message.size, 1)
         except BlockingIOError:
             return
         except OSError as error:
@@ -100,12 +112,12 @@ class _Client:
             return
         number = 0
         try:
-            if len(message) != LocalAddress.REQUEST.size:
-                raise MalformedMessage(f"local: got {len(message)} bytes, want {LocalAddress.REQUEST.size}")
-            number, length = LocalAddress.REQUEST.unpack(message)
+            if len(message) != self.message.size:
+                raise MalformedMessage(f"local: got {len(message)} bytes, want {self.message.size}")
+            number, length = self.locate(message)
             if descriptors:
                 self._add(number, descriptors.pop())
-            requests = decode_requests(self._frame(number, length), self._limits)
+            requests = decode_requests(self.frame(number, length), self._limits)
             visit.decoded(requests)
             self._sender.send(requests, lambda replies: self._send(number, visit.frame(replies)))
         except VLAgentsError as error:
@@ -118,10 +130,26 @@ class _Client:
         """Forget the session and give its memory back."""
         self._sender.release()
         self._connection.close()
+        self.forget()
+        self._gone(self)
+
+    def locate(self, message: bytes) -> tuple[int, int]:
+        """Number of the memory that holds the frame, and the frame's length in bytes."""
+        number, length = self.message.unpack(message)
+        return number, length
+
+    def frame(self, number: int, length: int) -> bytes:
+        """A copy: the policy may keep what the client soon overwrites."""
+        memory = self._files.get(number)
+        if memory is None or length > len(memory):
+            raise MalformedMessage(f"local: {length} bytes in memory file {number}, which is not there or shorter")
+        return memory[:length]
+
+    def forget(self) -> None:
+        """Give the connection's memory back."""
         for memory in self._files.values():
             memory.close()
         self._files.clear()
-        self._gone(self)
 
     def _add(self, number: int, descriptor: int) -> None:
         try:
@@ -141,12 +169,6 @@ class _Client:
         if (old := self._files.pop(number, None)) is not None:
             old.close()
         self._files[number] = mapped
-
-    def _frame(self, number: int, length: int) -> bytes:
-        memory = self._files.get(number)
-        if memory is None or length > len(memory):
-            raise MalformedMessage(f"local: {length} bytes in memory file {number}, which is not there or shorter")
-        return memory[:length]  # a copy: the policy may keep what the client soon overwrites
 
     def _send(self, number: int, frame: bytes) -> None:
         try:

@@ -11,8 +11,8 @@
 | `vlagents_sessions` | gauge | transport; sessions that are held |
 | `vlagents_utilisation` | gauge | share of the last second in which the policy's thread was busy |
 
-All carry `application`, `deployment`, `replica` and `policy`. Transport is `shm`, `websocket`, `http` or
-`handle`, class is `robot` or `simulation`. Counters are exact; a histogram takes up to `SAMPLE` values a
+All carry `application`, `deployment`, `replica` and `policy`. Transport is `shm`, `plasma`, `websocket`, `http`
+or `handle`, class is `robot` or `simulation`. Counters are exact; a histogram takes up to `SAMPLE` values a
 second, spread evenly over those there are.
 """
 
@@ -38,7 +38,7 @@ _SLICE_S = 50e-6
 _PAUSE_S = 300e-6
 _MS = [0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0, 10_000.0]
 _SIZES = [1.0, 2.0, 4.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 128.0, 256.0]
-_TRANSPORTS = ("shm", "websocket", "http", "handle")
+_TRANSPORTS = ("shm", "plasma", "websocket", "http", "handle")
 
 T = TypeVar("T")
 

@@ -86,6 +86,17 @@ class LocalAddress:
     IN_FILE: ClassVar[int] = 1  # flag: the frame of the reply lies in the memory file that comes with it
 
 
+@dataclass(frozen=True, slots=True)
+class PlasmaAddress:
+    """Where processes of the Ray cluster on the replica's node find it: `plasma` in what the replica tells them."""
+
+    socket: str  # path of a Unix socket in Ray's folder
+    node: str  # Ray's id of the node
+
+    REQUEST: ClassVar[struct.Struct] = struct.Struct("28s")  # Ray's id of the channel that holds the frame
+    TAG: ClassVar[bytes] = b"VLA1"  # Ray's metadata of a frame: out-of-band buffers, to be joined
+
+
 def boot_id() -> str:
     """What tells this machine from others until it is restarted; empty where there is no Linux."""
     try:
