@@ -22,10 +22,17 @@ import pytest
 from eval_fakes import wait_for
 
 from vlagents_ray.client.shm import ShmTransport, reaches
-from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable
+from vlagents_ray.errors import (
+    ConnectionLost,
+    DeadlineExceeded,
+    InvalidObservation,
+    PolicyUnavailable,
+    UnknownSession,
+)
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.serve.engine import Engine
 from vlagents_ray.serve.local import LocalDoor, peer_uid
+from vlagents_ray.wire import compact
 from vlagents_ray.wire.frames import encode_request
 from vlagents_ray.wire.messages import Limits, LocalAddress, Reply, Request
 
@@ -46,6 +53,8 @@ class Keeper(Agent):
             Keeper.gate.wait(10)
         self.seen.append(obs.cameras["front"])
         action = [float(image[0, 0, 0]) for image in self.seen[-4:]]
+        if not obs.info:
+            return Act(np.array(action))
         return Act(np.array(action), info={"instruction": self.instruction, "big": bytes(obs.info.get("reply", 0))})
 
 
@@ -86,13 +95,58 @@ def test_what_the_policy_keeps_is_not_overwritten(served: tuple[Engine, LocalDoo
     transport.close()
 
 
+def test_memory_that_the_policy_keeps_is_given_back_when_it_lets_go(served: tuple[Engine, LocalDoor]) -> None:
+    """A window of four frames: four files stay with the policy, and no frame is ever copied for it."""
+    transport = client(served[1])
+    call(transport, request("reset"), 5)
+    for pixel in range(1, 200):
+        act = call(transport, request("act", pixel % 250), 5).act
+        assert act is not None
+        assert act.action.tolist() == [p % 250 for p in range(max(1, pixel - 3), pixel + 1)]
+    assert len(transport._memories) <= 16
+    call(transport, request("reset"), 5)  # all that it kept goes
+    for pixel in (1, 2, 3):
+        call(transport, request("act", pixel), 5)
+    assert sum(memory.busy for memory in transport._memories) <= 4
+    transport.close()
+
+
+def test_vectors_of_sessions_and_odd_observations_come_as_they_are(served: tuple[Engine, LocalDoor]) -> None:
+    transport = client(served[1])
+    names = [f"env {i}" for i in range(7)]
+
+    def requests(op: Any, step: int) -> list[Request]:
+        made = [request(op, 10 * step + i, size=8 + i) for i in range(len(names))]
+        for one, name in zip(made, names, strict=True):
+            one.session = name
+        return made
+
+    assert all(reply.error is None for reply in transport.call(requests("reset", 0), 5))
+    for step in (1, 2, 3):
+        replies = transport.call(requests("act", step), 5)
+        assert [int(reply.act.action[-1]) for reply in replies if reply.act] == [10 * step + i for i in range(7)]
+        assert [reply.step for reply in replies] == [step] * 7
+    striped = np.zeros((8, 16, 3), np.uint8)
+    striped[:, ::2] = 77
+    odd = Obs({"front": striped[:, ::2]}, 1.0, {"joints": np.arange(3.0), "none": np.zeros(0, np.float32)})
+    [reply] = transport.call([Request("act", odd, session=names[0], request_id="odd", step=3)], 5)
+    assert reply.act is not None
+    assert reply.act.action.tolist()[-1] == 77
+    [reply] = transport.call([Request("act", odd, session=names[0], request_id="odd", step=3)], 5)
+    assert isinstance(reply.error, UnknownSession)  # it has four steps behind it
+    odd.gripper = 3.0
+    [reply] = transport.call([Request("act", odd, session=names[0], request_id="odd")], 5)
+    assert isinstance(reply.error, InvalidObservation)
+    transport.close()
+
+
 def test_sessions_do_not_mix(served: tuple[Engine, LocalDoor]) -> None:
     clients = [client(served[1]) for _ in range(5)]
     for pixel, one in enumerate(clients):
         call(one, request("reset", pixel), 5)
     for _ in range(50):
         for pixel, one in enumerate(clients):
-            act = call(one, request("act", pixel), 5).act
+            act = call(one, request("act", pixel, tell=1), 5).act
             assert act is not None
             assert act.info["instruction"] == f"task {pixel}"
             assert set(act.action.tolist()) == {pixel}
@@ -203,7 +257,12 @@ def test_a_full_replica_says_so(served: tuple[Engine, LocalDoor]) -> None:
 def test_faults_are_answered_and_harm_nobody(served: tuple[Engine, LocalDoor]) -> None:
     good = client(served[1])
     call(good, request("reset"), 5)
-    pack = LocalAddress.REQUEST.pack
+
+    def pack(number: int, length: int, flags: int = 0) -> bytes:
+        return LocalAddress.REQUEST.pack(number, flags, length)
+
+    act = compact.Writer().write([request("act")])
+    assert act is not None
     frame = encode_request(request("act"))
 
     def memory(data: bytes, sealed: bool = True) -> int:
@@ -226,7 +285,11 @@ def test_faults_are_answered_and_harm_nobody(served: tuple[Engine, LocalDoor]) -
         (pack(0, 10), memory(b"garbage..."), "malformed"),
         (pack(0, 10), pipe(), "malformed"),
         (pack(0, 10), memory(bytes(2 * LIMITS.body_bytes + 1)), "too_large"),
+        (pack(99, len(frame)), memory(frame), "too_large"),
         (pack(0, len(frame)), memory(frame), "not_reset"),
+        (pack(0, 64, LocalAddress.COMPACT), memory(bytes(64)), "malformed"),
+        (pack(0, 64, LocalAddress.COMPACT) + act.message, memory(bytes(64)), "malformed"),  # its arrays need more
+        (pack(0, act.size, LocalAddress.COMPACT) + act.message, memory(bytes(act.size)), "not_reset"),
     ]
     for message, descriptor, code in faults:
         with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as bad:
@@ -251,11 +314,11 @@ def test_a_client_that_reads_no_replies_is_cut_off(served: tuple[Engine, LocalDo
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as deaf:
         deaf.settimeout(10)
         deaf.connect(f"\0{served[1].address.socket}")
-        socket.send_fds(deaf, [LocalAddress.REQUEST.pack(0, len(frame))], [descriptor])
+        socket.send_fds(deaf, [LocalAddress.REQUEST.pack(0, 0, len(frame))], [descriptor])
 
         def send_many() -> None:
             for _ in range(100_000):
-                deaf.send(LocalAddress.REQUEST.pack(0, len(frame)))
+                deaf.send(LocalAddress.REQUEST.pack(0, 0, len(frame)))
 
         with pytest.raises((BrokenPipeError, ConnectionResetError)):
             send_many()

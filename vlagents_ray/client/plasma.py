@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import pickle
+import select
 import socket
 import time
+from collections.abc import Sequence
 from typing import Any
 
 from vlagents_ray.client.handle import HandleTransport
 from vlagents_ray.client.shm import ShmTransport
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.wire.messages import PlasmaAddress, Reply
+from vlagents_ray.wire.codecs import RAW
+from vlagents_ray.wire.frames import request_parts
+from vlagents_ray.wire.messages import PlasmaAddress, Reply, Request
 from vlagents_ray.wire.tree import Buffer
 
 _CHUNK = 2**20  # bytes; Ray copies no longer ones in the calling thread
@@ -69,23 +73,24 @@ class PlasmaTransport(ShmTransport):
         """The path of the replica's socket."""
         return "" if self._plasma is None else self._plasma.socket
 
-    def hand_over(self, connection: socket.socket, parts: list[Buffer], request_id: str, deadline: float) -> None:
+    def hand_over(self, connection: socket.socket, requests: Sequence[Request], deadline: float) -> None:
         """Write a frame into the channel, and say so. `TimeoutError`, `OSError` if that fails."""
         from ray._private.worker import global_worker
         from ray.exceptions import RayChannelError
 
-        frame = _gather(parts)
+        frame = _gather(request_parts(requests, RAW))
         while self._unread:  # a request whose deadline passed here: its answer says that the channel is free
-            connection.settimeout(max(1e-4, deadline - time.monotonic()))
-            self.receive(connection)
+            try:
+                self.receive(connection)
+            except BlockingIOError:
+                self.wait(connection, select.POLLIN, deadline)
         if frame.total_bytes > self._capacity:
             self._lease(frame.total_bytes, deadline)
         try:
             global_worker.core_worker.experimental_channel_put_serialized(frame, self._channel, 1, _WRITE_MS)
         except RayChannelError as error:
             raise OSError(f"the channel cannot be written ({error})") from error
-        connection.settimeout(max(1e-4, deadline - time.monotonic()))
-        connection.send(PlasmaAddress.REQUEST.pack(self._channel.binary()))
+        self.send(connection, PlasmaAddress.REQUEST.pack(self._channel.binary()), deadline)
         self._unread = True
 
     def receive(self, connection: socket.socket) -> list[Reply]:

@@ -2,24 +2,33 @@
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
+import math
 import mmap
 import os
+import select
 import socket
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from vlagents_ray.client.transport import is_answer
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable
+from vlagents_ray.wire import compact
 from vlagents_ray.wire.codecs import RAW
 from vlagents_ray.wire.frames import decode_replies, request_parts
 from vlagents_ray.wire.messages import LocalAddress, Reply, Request, boot_id
-from vlagents_ray.wire.tree import Buffer
 
 _MESSAGE_BYTES = 128 * 1024  # the longest reply that comes in a message, and some
 _PAGE = mmap.PAGESIZE
+_CONTROL = socket.CMSG_SPACE(4)
+_LOOK_S = 150e-6
+_QUICK_S = 250e-6
 
 
 @dataclass(slots=True)
@@ -28,7 +37,7 @@ class _Memory:
 
     number: int
     map: mmap.mmap
-    busy: str = ""  # the request whose frame the server may still have to read
+    busy: bool = False  # the server may still read it
 
 
 def reaches(local: dict[str, Any]) -> bool:
@@ -47,6 +56,8 @@ class ShmTransport:
         self._socket: socket.socket | None = None
         self._memories: list[_Memory] = []
         self._buffer = bytearray(_MESSAGE_BYTES)
+        self._acts = compact.Writer()
+        self._quick = True  # did the last answer come at once?
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
         """Connect to the server's socket; the metadata came with its address."""
@@ -57,14 +68,9 @@ class ShmTransport:
         """One frame into free memory, a message to the server, its replies back; late ones are discarded."""
         deadline = time.monotonic() + timeout_s
         connection = self._open(timeout_s)
-        parts = request_parts(requests, RAW)
         try:
-            self.hand_over(connection, parts, requests[0].request_id, deadline)
-            while True:
-                connection.settimeout(max(1e-4, deadline - time.monotonic()))
-                replies = self.receive(connection)
-                if is_answer(replies, requests):
-                    return replies
+            self.hand_over(connection, requests, deadline)
+            return self._await(connection, requests, deadline)
         except TimeoutError as error:
             raise DeadlineExceeded(f"{self.name}: no answer within {timeout_s:g} s") from error
         except OSError as error:
@@ -79,27 +85,67 @@ class ShmTransport:
         for memory in self._memories:
             memory.map.close()
         self._memories.clear()
+        self._acts = compact.Writer()
 
     def server(self) -> str:
         """The name of the server's socket."""
         return f"\0{self._address.socket}"
 
-    def hand_over(self, connection: socket.socket, parts: list[Buffer], request_id: str, deadline: float) -> None:
-        """Put a frame where the server reads it, and say so. `TimeoutError`, `OSError` if that fails."""
-        length = sum(map(len, parts))
-        memory, descriptor = self._memory(length)
-        at = 0
-        for part in parts:
-            memory.map[at : at + len(part)] = part
-            at += len(part)
-        memory.busy = request_id
-        message = LocalAddress.REQUEST.pack(memory.number, length)
-        connection.settimeout(max(1e-4, deadline - time.monotonic()))
-        if descriptor is None:
-            connection.send(message)
+    def hand_over(self, connection: socket.socket, requests: Sequence[Request], deadline: float) -> None:
+        """Put requests where the server reads them, and say so. `TimeoutError`, `OSError` if that fails."""
+        written = self._acts.write(requests)
+        if written is not None:
+            memory, descriptor = self._memory(written.size)
+            for at, array in written.arrays:
+                np.ndarray(array.shape, array.dtype, memory.map, at)[...] = array
+            message = LocalAddress.REQUEST.pack(memory.number, LocalAddress.COMPACT, written.size) + written.message
         else:
-            with os.fdopen(descriptor, "rb"):
-                socket.send_fds(connection, [message], [descriptor])
+            parts = request_parts(requests, RAW)
+            length = sum(map(len, parts))
+            memory, descriptor = self._memory(length)
+            at = 0
+            for part in parts:
+                memory.map[at : at + len(part)] = part
+                at += len(part)
+            message = LocalAddress.REQUEST.pack(memory.number, 0, length)
+        memory.busy = True
+        self.send(connection, message, deadline, descriptor)
+
+    def send(self, connection: socket.socket, message: bytes, deadline: float, descriptor: int | None = None) -> None:
+        """A message to the server, with a descriptor that is then closed here. Waits while it reads none."""
+        with contextlib.ExitStack() as closing:
+            if descriptor is not None:
+                closing.callback(os.close, descriptor)
+            sent = 0
+            while not sent:
+                try:
+                    if descriptor is None:
+                        sent = connection.send(message)
+                    else:
+                        sent = socket.send_fds(connection, [message], [descriptor])
+                except BlockingIOError:
+                    self.wait(connection, select.POLLOUT, deadline)
+
+    def _await(self, connection: socket.socket, requests: Sequence[Request], deadline: float) -> list[Reply]:
+        """The replies to these requests, and to no earlier ones.
+
+        Where they came at once lately, look for them for a moment before going to sleep: waking up
+        takes as long as all the rest. Other processes get the core meanwhile if they want it.
+        """
+        begun = time.perf_counter()
+        look_until = begun + (_LOOK_S if self._quick else 0.0)
+        while True:
+            try:
+                replies = self.receive(connection)
+            except BlockingIOError:
+                if time.perf_counter() < look_until:
+                    os.sched_yield()
+                else:
+                    self.wait(connection, select.POLLIN, deadline)
+                continue
+            if is_answer(replies, requests):
+                self._quick = time.perf_counter() - begun < _QUICK_S
+                return replies
 
     def _open(self, timeout_s: float) -> socket.socket:
         if self._socket is None:
@@ -110,6 +156,7 @@ class ShmTransport:
             except OSError as error:
                 connection.close()
                 raise PolicyUnavailable(f"{self.name}: the server's socket does not answer ({error})") from error
+            connection.setblocking(False)
             self._socket = connection
         return self._socket
 
@@ -133,19 +180,32 @@ class ShmTransport:
         return memory, descriptor
 
     def receive(self, connection: socket.socket) -> list[Reply]:
-        """The next reply, to whichever request; its frame's memory is free again."""
-        ancillary = socket.CMSG_SPACE(4)
-        size, control, _, _ = connection.recvmsg_into([self._buffer], ancillary)
+        """The next replies, to whichever requests; `BlockingIOError` if there are none yet."""
+        size, control, _, _ = connection.recvmsg_into([self._buffer], _CONTROL)
         if size == 0:
             raise ConnectionResetError("the server hung up")
-        number, flags = LocalAddress.REPLY.unpack_from(self._buffer)
+        freed, flags = LocalAddress.REPLY.unpack_from(self._buffer)
         if flags & LocalAddress.IN_FILE:
-            descriptor = int.from_bytes(control[0][2][:4], "little")
+            descriptor = int.from_bytes(control[0][2][:4], sys.byteorder)
             with os.fdopen(descriptor, "rb") as file:
                 file.seek(0)
-                frame = file.read()
+                content = memoryview(file.read())
         else:
-            frame = bytes(memoryview(self._buffer)[LocalAddress.REPLY.size : size])
-        if number < len(self._memories):
-            self._memories[number].busy = ""
-        return decode_replies(frame)
+            content = memoryview(self._buffer)[LocalAddress.REPLY.size : size]
+        while freed:
+            number = freed.bit_length() - 1
+            freed -= 1 << number
+            if number < len(self._memories):
+                self._memories[number].busy = False
+        if flags & LocalAddress.COMPACT:
+            return compact.read_answers(content)
+        return decode_replies(bytes(content))
+
+    @staticmethod
+    def wait(connection: socket.socket, event: int, deadline: float) -> None:
+        """Sleep until the socket is ready for `select.POLLIN` or `POLLOUT`; `TimeoutError` at the deadline."""
+        left_s = deadline - time.monotonic()
+        poller = select.poll()
+        poller.register(connection, event)
+        if left_s <= 0 or not poller.poll(math.ceil(left_s * 1e3)):
+            raise TimeoutError

@@ -203,8 +203,9 @@ class Engine:
         )
         _require_sendable(info)
         session.agent = agent
-        ticket.answer(reply)
         self._padding.remember(ticket.request)
+        ticket.request.obs, ticket.request.history = None, []
+        ticket.answer(reply)
 
     def _act(self, acting: list[tuple[Ticket, Session]], started: float) -> None:
         observations = [ticket.request.obs for ticket, _ in acting]
@@ -222,6 +223,9 @@ class Engine:
         except Exception as error:  # noqa: BLE001 - becomes the replies
             results = [error] * rows
         ended = time.perf_counter()
+        del observations  # which may lie in memory that their sender wants back
+        for ticket, _ in acting:
+            ticket.request.obs = None
         self.stats.batch(len(acting), rows)
         if padding:
             self._padding.judge(results[len(acting) :])

@@ -16,19 +16,28 @@ import os
 import secrets
 import socket
 import struct
-from collections.abc import Callable
+import sys
+import threading
+import weakref
+from collections.abc import Callable, Sequence
 from typing import ClassVar
+
+import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable, VLAgentsError
 from vlagents_ray.serve.calls import Sender
 from vlagents_ray.serve.engine import Engine
 from vlagents_ray.serve.stats import Visit
+from vlagents_ray.wire import compact
 from vlagents_ray.wire.frames import decode_requests, encode_replies
-from vlagents_ray.wire.messages import Limits, LocalAddress, Reply, boot_id
+from vlagents_ray.wire.messages import Limits, LocalAddress, Reply, Request, boot_id
 
 logger = logging.getLogger(__name__)
 
-_FILES = 8  # memory files of one client; it needs more than one only after deadlines passed
+_FILES = 16  # memory files of one client, which needs more than one if the policy keeps what it saw
+_KEPT = 8  # of them that a policy may keep
+_MESSAGE_BYTES = 256 * 1024
+_CONTROL = socket.CMSG_SPACE(struct.calcsize("i"))  # for one descriptor
 _INLINE = 64 * 1024  # a longer reply travels in a memory file
 _BACKLOG = 128
 
@@ -81,10 +90,9 @@ class LocalDoor:
 
 
 class LocalClient:
-    """One connection, with which its sessions end. Where its frames lie is up to `locate`, `frame` and `forget`."""
+    """One connection, with which its sessions end. Where its requests lie is up to `read` and `forget`."""
 
     name: ClassVar[str] = "shm"
-    message: ClassVar[struct.Struct] = LocalAddress.REQUEST
 
     def __init__(
         self, connection: socket.socket, engine: Engine, limits: Limits, gone: Callable[[LocalClient], None]
@@ -94,68 +102,86 @@ class LocalClient:
         self._limits = limits
         self._gone = gone
         self._files: dict[int, mmap.mmap] = {}
+        self._kept: dict[int, weakref.ref[np.ndarray]] = {}  # what views each file, and if only to be collected
+        self._freed: set[int] = set()  # of which the client has yet to be told
+        self._acts = compact.Reader(limits)
         self._sender = Sender(engine, self.name)
 
     def ready(self) -> None:
         """A message, or the end of the connection, is there."""
         visit = Visit(self._engine.stats, self.name)
+        buffer = _buffers.bytes
         try:
-            message, descriptors, _, _ = socket.recv_fds(self._connection, self.message.size, 1)
+            size, control, _, _ = self._connection.recvmsg_into([buffer], _CONTROL)
         except BlockingIOError:
             return
         except OSError as error:
             logger.info("local client: %s", error)
-            message, descriptors = b"", []
-        if not message:
+            size, control = 0, []
+        if not size:
             self._engine.queue.unwatch(self._connection)
             self.release()
             return
-        number = 0
+        descriptors = [int.from_bytes(data[:4], sys.byteorder) for _, _, data in control]
         try:
-            if len(message) != self.message.size:
-                raise MalformedMessage(f"local: got {len(message)} bytes, want {self.message.size}")
-            number, length = self.locate(message)
-            if descriptors:
-                self._add(number, descriptors.pop())
-            requests = decode_requests(self.frame(number, length), self._limits)
+            requests = self.read(memoryview(buffer)[:size], descriptors)
             visit.decoded(requests)
-            self._sender.send(requests, lambda replies: self._send(number, visit.frame(replies)))
+            self._sender.send(requests, lambda replies: self._answer(visit, replies))
         except VLAgentsError as error:
-            self._send(number, visit.frame([Reply(error=error)]))
+            self._answer(visit, [Reply(error=error)])
         finally:
             for descriptor in descriptors:
                 os.close(descriptor)
 
     def release(self) -> None:
-        """Forget the session and give its memory back."""
+        """Forget the sessions and give their memory back."""
         self._sender.release()
         self._connection.close()
         self.forget()
         self._gone(self)
 
-    def locate(self, message: bytes) -> tuple[int, int]:
-        """Number of the memory that holds the frame, and the frame's length in bytes."""
-        number, length = self.message.unpack(message)
-        return number, length
-
-    def frame(self, number: int, length: int) -> bytes:
-        """A copy: the policy may keep what the client soon overwrites."""
-        memory = self._files.get(number)
-        if memory is None or length > len(memory):
-            raise MalformedMessage(f"local: {length} bytes in memory file {number}, which is not there or shorter")
-        return memory[:length]
+    def read(self, message: memoryview, descriptors: list[int]) -> Sequence[Request | Reply]:
+        """The requests of a message, whose arrays view the client's memory. Takes the descriptors it needs."""
+        if len(message) < LocalAddress.REQUEST.size:
+            raise MalformedMessage(f"local: got {len(message)} bytes, want at least {LocalAddress.REQUEST.size}")
+        number, flags, length = LocalAddress.REQUEST.unpack_from(message)
+        if descriptors:
+            self._add(number, descriptors.pop())
+        memory = self._memory(number, length)
+        if flags & LocalAddress.COMPACT:
+            return self._acts.read(message[LocalAddress.REQUEST.size :], memory)
+        return decode_requests(memory.data, self._limits)
 
     def forget(self) -> None:
-        """Give the connection's memory back."""
-        for memory in self._files.values():
-            memory.close()
+        """Give the connection's memory back; what a policy keeps of it goes when the policy lets go."""
         self._files.clear()
+
+    def _memory(self, number: int, length: int) -> np.ndarray:
+        """The client's memory in place, which it leaves alone until nobody views it any more and it is told so.
+
+        Of a policy that keeps much of what it sees, a copy.
+        """
+        file = self._files.get(number)
+        if file is None or length > len(file):
+            raise MalformedMessage(f"local: {length} bytes in memory file {number}, which is not there or shorter")
+        memory = np.frombuffer(file, np.uint8, length)
+        if len(self._kept) >= _KEPT:
+            self._freed.add(number)
+            memory = memory.copy()
+            memory.flags.writeable = False
+            return memory
+        self._kept[number] = weakref.ref(memory, lambda _: self._let_go(number))
+        return memory
+
+    def _let_go(self, number: int) -> None:
+        self._kept.pop(number, None)
+        self._freed.add(number)
 
     def _add(self, number: int, descriptor: int) -> None:
         try:
             size = os.fstat(descriptor).st_size
-            if size > 2 * self._limits.body_bytes or (len(self._files) >= _FILES and number not in self._files):
-                raise MessageTooLarge(f"local: a memory file of {size} bytes, {len(self._files)} others are mapped")
+            if size > 2 * self._limits.body_bytes or number >= _FILES:
+                raise MessageTooLarge(f"local: memory file {number} of {size} bytes; {_FILES} files are the limit")
             # A file that could shrink would kill this process when it is read.
             if not fcntl.fcntl(descriptor, fcntl.F_GET_SEALS) & fcntl.F_SEAL_SHRINK:
                 raise MalformedMessage("local: the memory file is not sealed against shrinking")
@@ -166,19 +192,24 @@ class LocalClient:
             raise MalformedMessage(f"local: not a memory file ({error})") from error
         finally:
             os.close(descriptor)
-        if (old := self._files.pop(number, None)) is not None:
-            old.close()
         self._files[number] = mapped
 
-    def _send(self, number: int, frame: bytes) -> None:
+    def _answer(self, visit: Visit, replies: list[Reply]) -> None:
+        frame = visit.answers(replies)
+        flags = LocalAddress.COMPACT
+        if frame is None:
+            frame, flags = visit.frame(replies), 0
+        freed = 0
+        while self._freed:
+            freed |= 1 << self._freed.pop()
         try:
             if len(frame) <= _INLINE:
-                self._connection.send(LocalAddress.REPLY.pack(number, 0) + frame)
+                self._connection.send(LocalAddress.REPLY.pack(freed, flags) + frame)
                 return
             descriptor = os.memfd_create("vlagents-ray-reply")
             try:
                 os.write(descriptor, frame)
-                header = LocalAddress.REPLY.pack(number, LocalAddress.IN_FILE)
+                header = LocalAddress.REPLY.pack(freed, flags | LocalAddress.IN_FILE)
                 socket.send_fds(self._connection, [header], [descriptor])
             finally:
                 os.close(descriptor)
@@ -186,6 +217,16 @@ class LocalClient:
             logger.info("local client: %s", error)
             with contextlib.suppress(OSError):  # gone altogether
                 self._connection.shutdown(socket.SHUT_RDWR)
+
+
+class _Buffers(threading.local):
+    """For the message that is being read, one a thread: it is read to its end before the next one."""
+
+    def __init__(self) -> None:
+        self.bytes = bytearray(_MESSAGE_BYTES)
+
+
+_buffers = _Buffers()
 
 
 def peer_uid(connection: socket.socket) -> int:

@@ -19,9 +19,9 @@ import contextlib
 import logging
 import secrets
 import socket
-import struct
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -33,7 +33,8 @@ from ray.exceptions import RayChannelError, RayChannelTimeoutError
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge
 from vlagents_ray.serve.engine import Engine
 from vlagents_ray.serve.local import LocalClient, LocalDoor
-from vlagents_ray.wire.messages import Limits, PlasmaAddress
+from vlagents_ray.wire.frames import decode_requests
+from vlagents_ray.wire.messages import Limits, PlasmaAddress, Reply, Request
 
 logger = logging.getLogger(__name__)
 
@@ -196,26 +197,21 @@ class _PlasmaClient(LocalClient):
     """A connection whose messages name the channel that holds a frame."""
 
     name: ClassVar[str] = "plasma"
-    message: ClassVar[struct.Struct] = PlasmaAddress.REQUEST
 
     def __init__(self, pool: Pool, *args: Any) -> None:
         super().__init__(*args)
         self._pool = pool
         self._channel: Channel | None = None
 
-    def locate(self, message: bytes) -> tuple[int, int]:
-        """The client changes its channel when its frames outgrow it."""
-        (key,) = self.message.unpack(message)
+    def read(self, message: memoryview, descriptors: list[int]) -> Sequence[Request | Reply]:
+        """The requests in the channel that the message names; the client changes it when its frames outgrow it."""
+        if len(message) != PlasmaAddress.REQUEST.size:
+            raise MalformedMessage(f"plasma: got {len(message)} bytes, want {PlasmaAddress.REQUEST.size}")
+        (key,) = PlasmaAddress.REQUEST.unpack(message)
         if self._channel is None or self._channel.ref.binary() != key:
             self.forget()
             self._channel = self._pool.claim(key)
-        return 0, self._channel.capacity
-
-    def frame(self, number: int, length: int) -> bytes:
-        """A copy: the policy may keep what the client soon overwrites."""
-        if self._channel is None:
-            raise MalformedMessage("plasma: this connection has no channel")
-        return self._channel.read()
+        return decode_requests(self._channel.read(), self._limits)
 
     def forget(self) -> None:
         """The channel is another client's to use."""

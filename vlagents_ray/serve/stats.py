@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from vlagents_ray.serve.batching import BatchQueue
+from vlagents_ray.wire.compact import write_answers
 from vlagents_ray.wire.frames import encode_replies
 from vlagents_ray.wire.messages import Reply, Request
 from vlagents_ray.wire.plain import reply_to_json
@@ -99,6 +100,17 @@ class Visit:
                 reply.timing["decode_ms"] = decode_ms
         data = encode_replies(replies, arrived=self.arrived)
         self._record(replies)
+        return data
+
+    def answers(self, replies: Sequence[Reply]) -> bytes | None:
+        """The answers to acts in compact form, in which `timing` is complete; None if they must be a frame."""
+        decode_ms = (self._decoded - self.arrived) * 1e3
+        for reply in replies:
+            if reply.error is None:
+                reply.timing["decode_ms"] = decode_ms
+        data = write_answers(replies, arrived=self.arrived)
+        if data is not None:
+            self._record(replies)
         return data
 
     def document(self, reply: Reply) -> bytes:

@@ -79,11 +79,13 @@ class LocalAddress:
     socket: str  # name of a Unix socket in the abstract namespace, which no file system keeps
     boot_id: str  # of the machine, as Linux drew it when it started
 
-    # A request's frame lies in a memory file of the client's, handed over with the message that first
-    # names it; a reply's frame follows its header, or lies in a memory file that comes with it.
-    REQUEST: ClassVar[struct.Struct] = struct.Struct("<IxxxxQ")  # number of the memory file, bytes of the frame
-    REPLY: ClassVar[struct.Struct] = struct.Struct("<II")  # number of the memory file that is free again, flags
+    # What a request brings lies in a memory file of the client's, handed over with the message that first
+    # names it: a frame, or with COMPACT the arrays of the acts that follow the message's header (see
+    # `vlagents_ray.wire.compact`). A reply follows its header, or lies in a memory file that comes with it.
+    REQUEST: ClassVar[struct.Struct] = struct.Struct("<IIQ")  # number of the memory file, flags, bytes there
+    REPLY: ClassVar[struct.Struct] = struct.Struct("<QI")  # bit n: memory file n is free again; flags
     IN_FILE: ClassVar[int] = 1  # flag: the frame of the reply lies in the memory file that comes with it
+    COMPACT: ClassVar[int] = 2  # flag: no frame
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,0 +1,155 @@
+"""Acts without headers: what goes in comes out, and nothing else gets in."""
+
+from __future__ import annotations
+
+import json
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from vlagents_ray.errors import InvalidInput, PolicyFailed
+from vlagents_ray.interface import Act, Obs
+from vlagents_ray.wire.compact import ANSWER, COUNT, ITEM, Reader, Writer, Written, read_answers, write_answers
+from vlagents_ray.wire.messages import Limits, Reply, Request
+
+images = hnp.arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9), st.just(3)))
+states = hnp.arrays(np.float32, st.integers(0, 9), elements=st.floats(-1e6, 1e6, width=32))
+observations = st.builds(
+    Obs,
+    cameras=st.dictionaries(st.text(max_size=8), images, max_size=3),
+    gripper=st.none() | st.floats(0, 1),
+    state=st.dictionaries(st.text(max_size=8), states, max_size=3),
+)
+
+
+def placed(written: Written) -> np.ndarray:
+    memory = np.zeros(written.size, np.uint8)
+    for at, array in written.arrays:
+        np.ndarray(array.shape, array.dtype, memory.data, at)[...] = array
+    memory.flags.writeable = False
+    return memory
+
+
+@given(st.lists(observations, min_size=1, max_size=4), st.none() | st.integers(0, 2**40))
+def test_acts_come_back_as_they_were_also_when_their_layout_is_known(seen: list[Obs], step: int | None) -> None:
+    sent = [
+        Request("act", obs, session=f"s{i}", rank="simulation", step=step, request_id=f"r{i}", deadline_ms=5.0 + i)
+        for i, obs in enumerate(seen)
+    ]
+    writer, reader = Writer(), Reader(Limits())
+    sizes = []
+    for _ in range(2):
+        written = writer.write(sent)
+        assert written is not None
+        sizes.append(len(written.message))
+        for i, (one, obs) in enumerate(
+            zip(reader.read(memoryview(written.message), placed(written)), seen, strict=True)
+        ):
+            assert (one.op, one.session, one.rank, one.step) == ("act", f"s{i}", "simulation", step)
+            assert (one.request_id, one.deadline_ms) == (f"r{i}", 5.0 + i)
+            assert one.obs is not None
+            assert one.obs.gripper == obs.gripper
+            for mine, theirs in ((obs.cameras, one.obs.cameras), (obs.state, one.obs.state)):
+                assert list(mine) == list(theirs)
+                for name, array in mine.items():
+                    np.testing.assert_array_equal(array, theirs[name])
+                    assert theirs[name].dtype == array.dtype
+                    assert not theirs[name].flags.writeable
+    assert sizes[1] == COUNT.size + len(seen) * ITEM.size < sizes[0]
+
+
+@pytest.mark.parametrize(
+    "request_",
+    [
+        Request("reset", Obs()),
+        Request("act", Obs(info={"value": 1})),
+        Request("act", Obs(gripper=float("nan"))),
+        Request("act", Obs({"front": np.zeros((4, 4, 3), np.float32)})),
+        Request("act", Obs({"front": np.zeros((4, 4), np.uint8)})),
+        Request("act", Obs({"front": [[1]]})),  # type: ignore[dict-item]
+        Request("act", Obs(state={"joints": np.zeros(3, complex)})),
+        Request("act", Obs(), request_id="x" * 41),
+    ],
+)
+def test_what_does_not_fit_travels_as_a_frame(request_: Request) -> None:
+    assert Writer().write([Request("act", Obs()), request_]) is None
+
+
+@given(st.binary(max_size=300))
+@example(COUNT.pack(0))
+@example(COUNT.pack(2**31) + bytes(ITEM.size))
+@example(COUNT.pack(1) + ITEM.pack(0, 2**31, 0, 0.0, 0.0, b"r"))
+def test_garbage_is_refused_by_name(data: bytes) -> None:
+    with pytest.raises(InvalidInput):
+        Reader(Limits()).read(memoryview(data), np.zeros(64, np.uint8))
+
+
+@pytest.mark.parametrize(
+    "layout",
+    [
+        ["s", "king", [], []],
+        ["s" * 200, "robot", [], []],
+        [1, "robot", [], []],
+        ["s", "robot", {}, []],
+        ["s", "robot", [["a", [4, 4]]], []],
+        ["s", "robot", [["a", [4, 4, 4]]], []],
+        ["s", "robot", [["a", [4, -4, 3]]], []],
+        ["s", "robot", [["a", [2**20, 2**20, 3]]], []],
+        ["s", "robot", [["a", [400, 400, 3]]], []],  # more than the memory holds
+        ["s", "robot", [["a", [4, 4, 3]]] * 17, []],
+        ["s", "robot", [], [["a", [10_000]]]],
+        ["s", "robot", [], [[["a"], [3]]]],
+        ["s", "robot", [[1, 2, 3]], []],
+        "robot",
+        7,
+    ],
+)
+def test_layouts_are_checked(layout: object) -> None:
+    text = json.dumps(layout).encode()
+    message = COUNT.pack(1) + ITEM.pack(0, len(text), -1, 1.0, 0.5, b"r") + text
+    with pytest.raises(InvalidInput):
+        Reader(Limits()).read(memoryview(message), np.zeros(4096, np.uint8))
+
+
+@given(
+    st.lists(
+        st.tuples(hnp.arrays(np.float32, hnp.array_shapes(min_dims=1, max_dims=2)), st.booleans(), st.booleans()),
+        min_size=1,
+        max_size=3,
+    )
+)
+def test_answers_come_back_as_they_were(given_: list[tuple[np.ndarray, bool, bool]]) -> None:
+    timing = {"queue_ms": 0.1, "inference_ms": 2.0, "decode_ms": 0.3, "batch_size": 3}
+    replies = [
+        Reply(f"r{i}", Act(action, done), step=i, timing=dict(timing)) for i, (action, done, _) in enumerate(given_)
+    ]
+    for reply, (_, _, draining) in zip(replies, given_, strict=True):
+        reply.draining = draining
+    data = write_answers(replies, arrived=0.0)
+    assert data is not None
+    for i, (got, (action, done, draining)) in enumerate(zip(read_answers(memoryview(data)), given_, strict=True)):
+        assert got.act is not None
+        assert got.act.action.tobytes() == action.tobytes()
+        assert got.act.action.shape == action.shape
+        assert (got.request_id, got.act.done, got.draining, got.step) == (f"r{i}", done, draining, i)
+        assert got.timing == replies[i].timing
+        assert got.timing.keys() >= {"encode_ms", "total_ms"}
+
+
+def test_answers_with_more_in_them_travel_as_a_frame() -> None:
+    timing = {"queue_ms": 0.1, "inference_ms": 2.0, "decode_ms": 0.3, "batch_size": 3}
+    good = Reply("r", Act(np.zeros(3, np.float32)), step=1, timing=timing)
+    for bad in (
+        Reply("r", error=PolicyFailed("no")),
+        Reply("r", info={}),
+        Reply("r", Act(np.zeros(3, np.float32), info={"a": 1}), timing=timing),
+        Reply("r" * 41, Act(np.zeros(3, np.float32)), timing=timing),
+    ):
+        assert write_answers([good, bad], arrived=0.0) is None
+    assert write_answers([good], arrived=0.0) is not None
+    with pytest.raises((struct.error, ValueError)):
+        read_answers(memoryview(COUNT.pack(1) + bytes(ANSWER.size - 1)))

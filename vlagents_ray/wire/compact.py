@@ -1,0 +1,245 @@
+"""Acts between two processes of one machine, with nothing in them to write and read anew each time.
+
+An observation's layout (session, class, names and sizes of cameras and state) is stated once, in JSON,
+and named by its number from then on. What is left of a request is an `ITEM`, and its arrays, which lie
+one after the other in shared memory, each at a multiple of 64. The answer is an `ANSWER` and its action.
+Whatever does not fit (a reset, `info`, an error) travels as a frame, see `vlagents_ray.wire.frames`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge
+from vlagents_ray.interface import Act, Obs
+from vlagents_ray.wire.frames import check_request
+from vlagents_ray.wire.messages import Limits, RankName, Reply, Request
+
+_ALIGN = 64
+_ID_BYTES = 40  # of a request's id
+_MOST = 1024  # layouts of one connection
+_NONE = float("nan")
+
+COUNT = struct.Struct("<I")
+ITEM = struct.Struct(f"<IIqdd{_ID_BYTES}s")  # layout, bytes of its JSON, step or -1, deadline ms, gripper, request id
+ANSWER = struct.Struct(f"<{_ID_BYTES}sqBB2xIIIddddd")  # id, step, flags, dimensions, H, D, batch size, times in ms
+_DONE, _DRAINING = 1, 2
+_TIMES = ("queue_ms", "inference_ms", "decode_ms", "encode_ms", "total_ms")
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """What is equal in the requests of a session from step to step, and where its arrays lie."""
+
+    session: str
+    rank: RankName
+    cameras: tuple[tuple[str, tuple[int, ...], int], ...]  # name, (H, W, 3) uint8, offset in bytes
+    state: tuple[tuple[str, tuple[int, ...], int], ...]  # name, (D,) float32, offset in bytes
+    size: int  # bytes of all of it
+
+    @classmethod
+    def of(cls, session: str, rank: RankName, cameras: Sequence[Any], state: Sequence[Any]) -> Layout:
+        """With the offsets that follow from the shapes; `cameras` and `state` are pairs of name and shape."""
+        at = 0
+        placed: tuple[list[Any], list[Any]] = ([], [])
+        for group, arrays, width in zip(placed, (cameras, state), (1, 4), strict=True):
+            for name, shape in arrays:
+                group.append((name, tuple(shape), at))
+                at += -(-math.prod(shape) * width // _ALIGN) * _ALIGN
+        return cls(session, rank, tuple(placed[0]), tuple(placed[1]), at)
+
+
+class Writer:
+    """Writes the acts of one connection; remembers which layouts the other side knows."""
+
+    def __init__(self) -> None:
+        self._known: dict[Any, tuple[int, Layout]] = {}
+
+    def write(self, requests: Sequence[Request]) -> Written | None:
+        """The message and where the arrays go; None if the requests must travel as a frame."""
+        keys = []
+        for request in requests:
+            if (key := _key(request)) is None:
+                return None
+            keys.append(key)
+        if len(self._known) + len(keys) > _MOST:
+            return None
+        items, texts = [COUNT.pack(len(requests))], []
+        arrays: list[tuple[int, np.ndarray]] = []
+        at = 0
+        for request, key in zip(requests, keys, strict=True):
+            obs: Obs = request.obs  # type: ignore[assignment]  # it has a key
+            text = b""
+            if (known := self._known.get(key)) is None:
+                known = self._known[key] = (len(self._known), Layout.of(*key))
+                text = json.dumps(key).encode()
+                texts.append(text)
+            number, layout = known
+            arrays += [
+                (at + place[2], image) for place, image in zip(layout.cameras, obs.cameras.values(), strict=True)
+            ]
+            arrays += [
+                (at + place[2], part if part.dtype == np.float32 else part.astype(np.float32))
+                for place, part in zip(layout.state, obs.state.values(), strict=True)
+            ]
+            at += layout.size
+            step = -1 if request.step is None else request.step
+            deadline_ms = _NONE if request.deadline_ms is None else request.deadline_ms
+            gripper = _NONE if obs.gripper is None else obs.gripper
+            items.append(ITEM.pack(number, len(text), step, deadline_ms, gripper, request.request_id.encode()))
+        return Written(b"".join(items + texts), max(at, _ALIGN), arrays)
+
+
+@dataclass(slots=True)
+class Written:
+    """Acts, ready to be sent."""
+
+    message: bytes
+    size: int  # bytes of memory that the arrays take
+    arrays: list[tuple[int, np.ndarray]]  # offset, array
+
+
+class Reader:
+    """Reads the acts of one connection."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self._known: dict[int, Layout] = {}
+
+    def read(self, message: memoryview, memory: np.ndarray) -> list[Request]:
+        """The requests whose arrays are views of `memory`, (N,) uint8; `InvalidInput` if there are none."""
+        try:
+            (count,) = COUNT.unpack_from(message)
+            text_at = COUNT.size + count * ITEM.size
+            requests = []
+            at = 0
+            for item in ITEM.iter_unpack(message[COUNT.size : text_at]):
+                number, text_bytes, step, deadline_ms, gripper, request_id = item
+                if text_bytes:
+                    if len(self._known) >= _MOST:
+                        raise MessageTooLarge(f"local: more than {_MOST} layouts on one connection; connect again")
+                    self._known[number] = self._layout(bytes(message[text_at : text_at + text_bytes]))
+                    text_at += text_bytes
+                layout = self._known[number]
+                if at + layout.size > memory.size:
+                    raise MalformedMessage(f"local: {memory.size} bytes of memory, the arrays need more")
+                obs = Obs(
+                    {name: np.ndarray(shape, np.uint8, memory, at + place) for name, shape, place in layout.cameras},
+                    None if math.isnan(gripper) else gripper,
+                    {name: np.ndarray(shape, np.float32, memory, at + place) for name, shape, place in layout.state},
+                )
+                at += layout.size
+                request = Request("act", obs, session=layout.session, rank=layout.rank)
+                request.request_id = request_id.rstrip(b"\0").decode()
+                request.step = None if step < 0 else step
+                request.deadline_ms = None if math.isnan(deadline_ms) else deadline_ms
+                requests.append(request)
+        except (struct.error, ValueError, KeyError, TypeError) as error:
+            if isinstance(error, MalformedMessage | MessageTooLarge):
+                raise
+            raise MalformedMessage(f"local: not an act ({type(error).__name__}: {error})") from error
+        if len(requests) != count or not count:
+            raise MalformedMessage(f"local: {len(requests)} acts in a message that says {count}")
+        return requests
+
+    def _layout(self, text: bytes) -> Layout:
+        limits = self._limits
+        session, rank, cameras, state = json.loads(text)
+        check_request(Request("close", session=session, rank=rank), limits)
+        if not isinstance(cameras, list) or not isinstance(state, list):
+            raise MalformedMessage("local: cameras and state: want lists of names and shapes")
+        if max(len(cameras), len(state)) > limits.cameras:
+            raise MessageTooLarge(
+                f"obs: got {len(cameras)} cameras and {len(state)} states, the limit is {limits.cameras}"
+            )
+        for (name, shape), dimensions, most in (
+            *((each, 3, limits.pixels) for each in cameras),
+            *((each, 1, limits.state_values) for each in state),
+        ):
+            if not isinstance(name, str) or not isinstance(shape, list) or len(shape) != dimensions:
+                raise MalformedMessage(f"local: got {name!r} of {shape!r}, want a name and {dimensions} dimensions")
+            if not all(type(n) is int and n >= 0 for n in shape) or (dimensions == 3 and shape[2] != 3):
+                raise MalformedMessage(f"local: {name!r}: got shape {shape!r}, want (H, W, 3) or (D,)")
+            if (size := math.prod(shape[:2])) > most:
+                raise MessageTooLarge(f"local: {name!r}: got {size} pixels or values, the limit is {most}")
+        return Layout.of(session, rank, cameras, state)
+
+
+def _key(request: Request) -> tuple[Any, ...] | None:
+    """What the layout follows from; None if the request must travel as a frame."""
+    obs = request.obs
+    if request.op != "act" or obs is None or obs.info or len(request.request_id) > _ID_BYTES:
+        return None
+    if obs.gripper is not None and not 0.0 <= obs.gripper <= 1.0:  # an error, which frames are made for
+        return None
+    for image in obs.cameras.values():
+        if type(image) is not np.ndarray or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
+            return None
+    for part in obs.state.values():
+        if type(part) is not np.ndarray or part.ndim != 1 or part.dtype.kind != "f":
+            return None
+    return (
+        request.session,
+        request.rank,
+        tuple([(name, image.shape) for name, image in obs.cameras.items()]),
+        tuple([(name, part.shape) for name, part in obs.state.items()]),
+    )
+
+
+def write_answers(replies: Sequence[Reply], *, arrived: float) -> bytes | None:
+    """The answers to acts, with `timing` completed as by `encode_replies`; None if they must travel as a frame."""
+    begun = time.perf_counter()
+    for reply in replies:
+        act = reply.act
+        if reply.error is not None or act is None or act.info or act.action.dtype != np.float32:
+            return None
+        if act.action.ndim not in (1, 2) or act.action.shape[0] > 0xFFFF or len(reply.request_id) > _ID_BYTES:
+            return None
+    actions = [np.ascontiguousarray(reply.act.action).tobytes() for reply in replies]  # type: ignore[union-attr]
+    ended = time.perf_counter()
+    parts = [COUNT.pack(len(replies))]
+    for reply in replies:
+        act = reply.act
+        timing = reply.timing
+        timing["encode_ms"], timing["total_ms"] = (ended - begun) * 1e3, (ended - arrived) * 1e3
+        shape = act.action.shape  # type: ignore[union-attr]
+        flags = (_DONE if act.done else 0) | (_DRAINING if reply.draining else 0)  # type: ignore[union-attr]
+        parts.append(
+            ANSWER.pack(
+                reply.request_id.encode(),
+                reply.step or 0,
+                flags,
+                len(shape),
+                shape[0],
+                shape[-1],
+                int(timing["batch_size"]),
+                *[timing[name] for name in _TIMES],
+            )
+        )
+    return b"".join(parts + actions)
+
+
+def read_answers(message: memoryview) -> list[Reply]:
+    """The inverse of `write_answers`."""
+    (count,) = COUNT.unpack_from(message)
+    at = COUNT.size + count * ANSWER.size
+    replies = []
+    for answer in ANSWER.iter_unpack(message[COUNT.size : at]):
+        request_id, step, flags, dimensions, rows, columns, batch_size, *times = answer
+        shape = (rows, columns) if dimensions == 2 else (columns,)
+        action = np.frombuffer(message, np.float32, math.prod(shape), at).reshape(shape).copy()
+        at += action.nbytes
+        timing = dict(zip(_TIMES, times, strict=True))
+        timing["batch_size"] = batch_size
+        reply = Reply(request_id.rstrip(b"\0").decode(), Act(action, bool(flags & _DONE)), step=step, timing=timing)
+        reply.draining = bool(flags & _DRAINING)
+        replies.append(reply)
+    return replies
