@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import random
 import re
+import select
 import signal
 import time
 from collections.abc import Iterator
@@ -171,6 +172,7 @@ def test_faults_are_answered_and_harm_nobody(agent: RemoteAgent) -> None:
     free = PlasmaAddress.REQUEST.pack(os.urandom(28))
     for message, said in ((b"short", "bytes"), (PlasmaAddress.REQUEST.pack(key), "without a frame"), (free, "lease")):
         connection.send(message)
+        transport.wait(connection, select.POLLIN, time.monotonic() + 10)
         [reply] = transport.receive(connection)
         error = reply.error
         assert isinstance(error, MalformedMessage)
