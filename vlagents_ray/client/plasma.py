@@ -14,7 +14,7 @@ from vlagents_ray.client.shm import ShmTransport
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.wire.codecs import RAW
 from vlagents_ray.wire.frames import request_parts
-from vlagents_ray.wire.messages import PlasmaAddress, Reply, Request
+from vlagents_ray.wire.messages import LocalAddress, PlasmaAddress, Reply, Request
 from vlagents_ray.wire.tree import Buffer
 
 _CHUNK = 2**20  # bytes; Ray copies no longer ones in the calling thread
@@ -78,7 +78,8 @@ class PlasmaTransport(ShmTransport):
         from ray._private.worker import global_worker
         from ray.exceptions import RayChannelError
 
-        frame = _gather(request_parts(requests, RAW))
+        written = self._acts.write(requests)
+        frame = _gather(request_parts(requests, RAW) if written is None else written.parts())
         while self._unread:  # a request whose deadline passed here: its answer says that the channel is free
             try:
                 self.receive(connection)
@@ -90,7 +91,8 @@ class PlasmaTransport(ShmTransport):
             global_worker.core_worker.experimental_channel_put_serialized(frame, self._channel, 1, _WRITE_MS)
         except RayChannelError as error:
             raise OSError(f"the channel cannot be written ({error})") from error
-        self.send(connection, PlasmaAddress.REQUEST.pack(self._channel.binary()), deadline)
+        message = PlasmaAddress.REQUEST.pack(self._channel.binary(), 0 if written is None else LocalAddress.COMPACT)
+        self.send(connection, message if written is None else message + written.message, deadline)
         self._unread = True
 
     def receive(self, connection: socket.socket) -> list[Reply]:

@@ -69,7 +69,11 @@ class ShmTransport:
         deadline = time.monotonic() + timeout_s
         connection = self._open(timeout_s)
         try:
-            self.hand_over(connection, requests, deadline)
+            try:
+                self.hand_over(connection, requests, deadline)
+            except BaseException:
+                self._acts = compact.Writer()  # the server may not have heard of a layout
+                raise
             return self._await(connection, requests, deadline)
         except TimeoutError as error:
             raise DeadlineExceeded(f"{self.name}: no answer within {timeout_s:g} s") from error

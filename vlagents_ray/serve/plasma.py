@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 import ray
 from ray._raylet import RawSerializedObject, unpack_pickle5_buffers  # type: ignore[attr-defined]
 from ray.exceptions import RayChannelError, RayChannelTimeoutError
@@ -34,7 +35,7 @@ from vlagents_ray.errors import MalformedMessage, MessageTooLarge
 from vlagents_ray.serve.engine import Engine
 from vlagents_ray.serve.local import LocalClient, LocalDoor
 from vlagents_ray.wire.frames import decode_requests
-from vlagents_ray.wire.messages import Limits, PlasmaAddress, Reply, Request
+from vlagents_ray.wire.messages import Limits, LocalAddress, PlasmaAddress, Reply, Request
 
 logger = logging.getLogger(__name__)
 
@@ -205,13 +206,16 @@ class _PlasmaClient(LocalClient):
 
     def read(self, message: memoryview, descriptors: list[int]) -> Sequence[Request | Reply]:
         """The requests in the channel that the message names; the client changes it when its frames outgrow it."""
-        if len(message) != PlasmaAddress.REQUEST.size:
-            raise MalformedMessage(f"plasma: got {len(message)} bytes, want {PlasmaAddress.REQUEST.size}")
-        (key,) = PlasmaAddress.REQUEST.unpack(message)
+        if len(message) < PlasmaAddress.REQUEST.size:
+            raise MalformedMessage(f"plasma: got {len(message)} bytes, want at least {PlasmaAddress.REQUEST.size}")
+        key, flags = PlasmaAddress.REQUEST.unpack_from(message)
         if self._channel is None or self._channel.ref.binary() != key:
             self.forget()
             self._channel = self._pool.claim(key)
-        return decode_requests(self._channel.read(), self._limits)
+        content = self._channel.read()
+        if flags & LocalAddress.COMPACT:
+            return self._acts.read(message[PlasmaAddress.REQUEST.size :], np.frombuffer(content, np.uint8))
+        return decode_requests(content, self._limits)
 
     def forget(self) -> None:
         """The channel is another client's to use."""

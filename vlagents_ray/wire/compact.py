@@ -22,6 +22,7 @@ from vlagents_ray.errors import MalformedMessage, MessageTooLarge
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.wire.frames import check_request
 from vlagents_ray.wire.messages import Limits, RankName, Reply, Request
+from vlagents_ray.wire.tree import Buffer
 
 _ALIGN = 64
 _ID_BYTES = 40  # of a request's id
@@ -105,6 +106,17 @@ class Written:
     message: bytes
     size: int  # bytes of memory that the arrays take
     arrays: list[tuple[int, np.ndarray]]  # offset, array
+
+    def parts(self) -> list[Buffer]:
+        """The memory in pieces, one after the other: the arrays, without a copy where possible, and what is between."""
+        pieces: list[Buffer] = []
+        end = 0
+        for at, array in self.arrays:
+            if array.size:
+                pieces += (bytes(at - end), np.ascontiguousarray(array).data.cast("B"))
+                end = at + array.nbytes
+        pieces.append(bytes(self.size - end))
+        return pieces
 
 
 class Reader:

@@ -95,8 +95,9 @@ class PlasmaAddress:
     socket: str  # path of a Unix socket in Ray's folder
     node: str  # Ray's id of the node
 
-    REQUEST: ClassVar[struct.Struct] = struct.Struct("28s")  # Ray's id of the channel that holds the frame
-    TAG: ClassVar[bytes] = b"VLA1"  # Ray's metadata of a frame: out-of-band buffers, to be joined
+    # Ray's id of the channel that holds the frame, or the arrays; flags as of `LocalAddress`.
+    REQUEST: ClassVar[struct.Struct] = struct.Struct("<28sI")
+    TAG: ClassVar[bytes] = b"VLA1"  # Ray's metadata of what is in the channel: out-of-band buffers, to be joined
 
 
 def boot_id() -> str:
