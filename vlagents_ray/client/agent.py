@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 import time
-import uuid
 from collections import deque
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from vlagents_ray.client.connection import Connection
-from vlagents_ray.client.episode import Episode, copied
 from vlagents_ray.client.link import CodecChoice, Link, Wish
+from vlagents_ray.client.session import Episode, Session, copied, persist
 from vlagents_ray.client.ways import TransportName, choose
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import (
     ConfigError,
     ConnectionLost,
     DeadlineExceeded,
-    NotReset,
     PolicyFailed,
-    PolicyUnavailable,
     UnknownSession,
 )
 from vlagents_ray.interface import Act, Agent, Obs
@@ -28,11 +25,6 @@ from vlagents_ray.wire.messages import RANKS, RankName, Reply, Request
 
 if TYPE_CHECKING:
     from typing_extensions import Self
-
-
-_GONE = (ConnectionLost, PolicyUnavailable, UnknownSession)  # the session may go on elsewhere
-_FIRST_PAUSE_S = 0.02
-_LONGEST_PAUSE_S = 0.5
 
 
 class RemoteAgent(Agent):
@@ -81,8 +73,7 @@ class RemoteAgent(Agent):
         self._connection = connection
         self._rank: RankName = rank
         self._resume = resume
-        self._session = uuid.uuid4().hex
-        self._episode: Episode | None = None
+        self._session = Session(connection, rank)
 
     def sessions(self, n: int) -> list[Self]:
         """`n` more sessions on this one's connection, for `reset_batch` and `act_batch`; each to be closed."""
@@ -157,7 +148,7 @@ class RemoteAgent(Agent):
         **kwargs: Any,
     ) -> list[dict[str, Any] | Exception]:
         """`reset` of several sessions of this connection in one message; an exception stands for its own alone."""
-        self._require_siblings(sessions)
+        siblings = self._siblings(sessions)
         self._connection.open()
         stated = contract.to_json() if isinstance(contract, Contract) else contract
         history = (self._connection.contract.history if self._connection.contract else None) or 1
@@ -165,15 +156,14 @@ class RemoteAgent(Agent):
             Episode(copied(first) if self._resume else first, text, kwargs, stated, deque(maxlen=history - 1))
             for first, text in zip(obs, instructions, strict=True)
         ]
-        for agent in sessions:
-            agent._episode = None
-        requests = [agent._reset_request(episode) for agent, episode in zip(sessions, episodes, strict=True)]
-        replies = self._persist(sessions, requests)
+        for session in siblings:
+            session.episode = None
+        replies = self._call(siblings, [s.reset(episode) for s, episode in zip(siblings, episodes, strict=True)])
         infos: list[dict[str, Any] | Exception] = []
-        for agent, episode, reply in zip(sessions, episodes, replies, strict=True):
+        for session, episode, reply in zip(siblings, episodes, replies, strict=True):
             if reply.error is None:
-                agent._episode = episode
-                self._connection.users.add(agent)
+                session.episode = episode
+                self._connection.users.add(session)
             infos.append(reply.error or reply.info or {})
         return infos
 
@@ -201,108 +191,41 @@ class RemoteAgent(Agent):
         action is that of its session alone.
         """
         begun = time.perf_counter()
-        agents = self._require_siblings(sessions)
-        if len(obs) != len(agents):
-            raise ConfigError(f"act_batch: got {len(obs)} observations for {len(agents)} sessions")
-        for agent in agents:
-            if agent._episode is None:
-                raise NotReset("act before reset: this agent has no session, or lost it; reset first")
-        replies = self._persist(agents, [agent._act_request(one) for agent, one in zip(agents, obs, strict=True)])
+        siblings = self._siblings(sessions)
+        if len(obs) != len(siblings):
+            raise ConfigError(f"act_batch: got {len(obs)} observations for {len(siblings)} sessions")
+        replies = self._call(siblings, [session.act(one) for session, one in zip(siblings, obs, strict=True)])
         round_trip_ms = (time.perf_counter() - begun) * 1e3
-        return [agent._take(one, reply, round_trip_ms) for agent, one, reply in zip(agents, obs, replies, strict=True)]
+        return [self._take(*each, round_trip_ms) for each in zip(siblings, obs, replies, strict=True)]
 
     def close(self) -> None:
         """End the session. A later `reset` begins another."""
-        self._connection.leave(self, self._session)
-        self._episode = None
-        self._session = uuid.uuid4().hex
+        self._connection.leave(self._session, self._session.id)
+        self._session = Session(self._connection, self._rank)
 
-    def _require_siblings(self, sessions: Sequence[Agent]) -> list[RemoteAgent]:
-        found: list[RemoteAgent] = []
+    def _siblings(self, sessions: Sequence[Agent]) -> list[Session]:
+        found: list[Session] = []
         for agent in sessions:
             if not isinstance(agent, RemoteAgent) or agent._connection is not self._connection:
                 raise ConfigError("sessions: want agents made by sessions() of this one, which share its connection")
-            found.append(agent)
+            found.append(agent._session)
         return found
 
-    def _reset_request(self, episode: Episode) -> Request:
-        return Request(
-            "reset",
-            episode.obs,
-            episode.instruction,
-            episode.kwargs,
-            episode.contract,
-            history=list(episode.recent),
-            session=self._session,
-            rank=self._rank,
-            request_id=self._connection.request_id(),
-        )
+    def _call(self, sessions: Sequence[Session], requests: Sequence[Request]) -> list[Reply]:
+        if self._resume:
+            return persist(self._connection, sessions, requests)
+        return self._connection.call(requests, self._connection.timeout_s)
 
-    def _act_request(self, obs: Obs) -> Request:
-        step = self._episode.step if self._episode is not None else None
-        request_id = self._connection.request_id()
-        return Request("act", obs, session=self._session, rank=self._rank, step=step, request_id=request_id)
-
-    def _take(self, obs: Obs, reply: Reply, round_trip_ms: float) -> Act | Exception:
-        episode = self._episode
+    def _take(self, session: Session, obs: Obs, reply: Reply, round_trip_ms: float) -> Act | Exception:
+        episode = session.episode
         if reply.error is not None or reply.act is None or episode is None:
             if isinstance(reply.error, DeadlineExceeded) and episode is not None:
                 episode.step = None  # it may have been acted on
             elif isinstance(reply.error, (ConnectionLost, UnknownSession)) and not self._resume:
-                self._episode = None
+                session.episode = None
             return reply.error or PolicyFailed("act: the server's reply holds no action")
         episode.acted(obs, reply.step)
         timing = reply.act.info["timing"] = {**reply.timing, "round_trip_ms": round_trip_ms}
         if "total_ms" in timing:
             timing["wire_ms"] = round_trip_ms - timing["total_ms"]
         return reply.act
-
-    def _persist(self, agents: Sequence[RemoteAgent], requests: Sequence[Request]) -> list[Reply]:
-        """The replies to requests of these sessions, from another replica if theirs is gone."""
-        connection = self._connection
-        deadline = time.monotonic() + connection.timeout_s
-        replies = connection.call(requests, connection.timeout_s)
-        lost: set[int] = set()  # whose state no replica has
-        resumed: set[int] = set()
-        pause_s = 0.0
-        while self._resume and (gone := [i for i, reply in enumerate(replies) if _may_go_on(requests[i], reply)]):
-            if time.monotonic() + pause_s >= deadline:
-                break
-            time.sleep(pause_s)
-            pause_s = min(_LONGEST_PAUSE_S, 2 * pause_s + _FIRST_PAUSE_S)
-            lost |= {i for i in gone if requests[i].op == "act" and agents[i]._is_lost(replies[i])}
-            if again := [i for i in gone if i in lost]:
-                resets = [agents[i]._begin_again(requests[i]) for i in again]
-                for i, reply in zip(again, connection.call(resets, deadline - time.monotonic()), strict=True):
-                    if reply.error is None:
-                        lost.discard(i)
-                        resumed.add(i)
-                    else:
-                        replies[i] = reply
-            if retry := [i for i in gone if i not in lost]:
-                for i in retry:
-                    requests[i].request_id = connection.request_id()
-                answers = connection.call([requests[i] for i in retry], deadline - time.monotonic())
-                for i, reply in zip(retry, answers, strict=True):
-                    replies[i] = reply
-        for i in resumed:
-            if (act := replies[i].act) is not None:
-                act.info["resumed"] = True
-        return replies
-
-    def _is_lost(self, reply: Reply) -> bool:
-        """Must the session begin again? If not, the replica that has it checks that no answer was lost."""
-        return isinstance(reply.error, UnknownSession) or self._episode is None or self._episode.step is None
-
-    def _begin_again(self, request: Request) -> Request:
-        """Under another name, lest what is left of the old session is met; `request` is what comes after."""
-        if self._episode is None:  # act_batch has looked
-            raise NotReset("act before reset; reset first")
-        self._session = request.session = uuid.uuid4().hex
-        self._episode.step = request.step = 0
-        return self._reset_request(self._episode)
-
-
-def _may_go_on(request: Request, reply: Reply) -> bool:
-    """Is this an answer that a living replica would not give? A reset that is refused, as by a full one, stays so."""
-    return isinstance(reply.error, ConnectionLost if request.op == "reset" else _GONE)
