@@ -1,23 +1,24 @@
 """The batch queue: everything that wants the policy waits here, and nothing else calls it.
 
-Work-conserving: as soon as the policy is free it takes whatever waits, up to the batch limit, so a
-lone request never pays for batching. Who goes first is up to `vlagents_ray.serve.waiting`. Expired and
-cancelled requests are dropped before inference: when the policy is next free, so that a caller who
-must know sooner keeps a timer of its own.
+Work-conserving, but for one short wait: as soon as the policy is free it takes whatever waits, up to the
+batch limit, so a lone request never pays for batching. Who goes first is up to `vlagents_ray.serve.waiting`.
+Expired and cancelled requests are dropped before inference: when the policy is next free, so that a caller
+who must know sooner keeps a timer of its own.
+
+The wait is for the rest of a group of simulations that was answered together and is coming back; when, and
+for how long at most, is up to `vlagents_ray.serve.returning`. `patience` 0 does without.
 """
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
-import selectors
 import threading
 import time
 from collections.abc import Callable, Sequence
-from typing import Protocol
 
 from vlagents_ray.errors import DeadlineExceeded, PolicyFailed, PolicyUnavailable
+from vlagents_ray.serve.ears import Ears, HasFileno
+from vlagents_ray.serve.returning import SLOW_S, Returning
 from vlagents_ray.serve.waiting import Rank, Ticket, Waiting
 from vlagents_ray.wire.messages import Reply
 
@@ -25,13 +26,7 @@ __all__ = ["BatchQueue", "HasFileno", "Rank", "Ticket"]
 
 logger = logging.getLogger(__name__)
 
-
-class HasFileno(Protocol):
-    """A socket, a pipe: whatever a selector can wait for."""
-
-    def fileno(self) -> int:
-        """Its descriptor."""
-        ...
+_NEWEST = 0.25  # weight of the last batch in the mean of their durations
 
 
 class BatchQueue:
@@ -41,8 +36,12 @@ class BatchQueue:
     renderer) is made there. `run` must `answer` every ticket. `idle` is called when nothing
     came for `idle_s`.
 
+    Before the batch after one of D s starts, the thread may wait `patience` * D s at most for sessions that
+    were in that batch and are about to come back. `is_open` tells whether a session still is there.
+
     The thread waits on file descriptors, so that a local client's socket can be one of them
-    (`watch`): its request then reaches the policy without a change of threads.
+    (`watch`): its request then reaches the policy without a change of threads. While batches take
+    milliseconds, a second thread hears these files, so that the next batch is decoded when one is over.
     """
 
     def __init__(
@@ -53,6 +52,8 @@ class BatchQueue:
         prepare: Callable[[], None] = lambda: None,
         idle: Callable[[], None] = lambda: None,
         idle_s: float = 30.0,
+        patience: float = 0.0,
+        is_open: Callable[[str], bool] = lambda _: True,
     ) -> None:
         self._run = run
         self._prepare = prepare
@@ -67,11 +68,11 @@ class BatchQueue:
         self._lock = threading.Lock()
         self._closed = False
         self._asleep = False
-        self._selector = selectors.DefaultSelector()
-        self._wake_read, self._wake_write = os.pipe()
-        os.set_blocking(self._wake_read, False)
-        os.set_blocking(self._wake_write, False)
-        self._selector.register(self._wake_read, selectors.EVENT_READ)
+        self._ears = Ears()
+        self._usual_s = 0.0  # how long a batch took lately
+        self._returning = Returning(patience, max_batch_size, is_open)
+        self._gathering = False
+        self._whole = threading.Event()
         self._prepared = threading.Event()
         self._failure: BaseException | None = None
         self._thread = threading.Thread(target=self._loop, name="policy", daemon=True)
@@ -91,16 +92,22 @@ class BatchQueue:
             for ticket in tickets:
                 self._waited += len(self._waiting) * (ticket.arrived - self._counted)
                 self._counted = ticket.arrived
+                self._returning.came(ticket)
                 self._waiting.add(ticket)
+                if self._gathering and self._returning.whole(ticket, self._waiting):
+                    self._whole.set()
             self._wake()
 
     def watch(self, file: HasFileno, ready: Callable[[], None]) -> None:
-        """Call `ready` on the queue's thread whenever `file` can be read; before `start`, or on that thread."""
-        self._selector.register(file, selectors.EVENT_READ, ready)
+        """Call `ready` whenever `file` can be read; before `start`, or in such a call. Never two calls at once.
+
+        Calls come on the queue's thread, or beside a batch that runs, on another one.
+        """
+        self._ears.watch(file, ready)
 
     def unwatch(self, file: HasFileno) -> None:
-        """The end of `watch`, on the queue's thread."""
-        self._selector.unregister(file)
+        """The end of `watch`, in such a call."""
+        self._ears.unwatch(file)
 
     def depth(self) -> int:
         """Requests that wait for the next batch."""
@@ -128,23 +135,24 @@ class BatchQueue:
         """Answer what waits with `PolicyUnavailable`, end the thread after the batch under way."""
         with self._lock:
             again, self._closed = self._closed, True
+            self._whole.set()
             self._wake()
         if self._thread.ident is None and not again:
-            self._release()
+            self._ears.close()
         if self._thread.ident is not None and self._thread is not threading.current_thread():
             self._thread.join(timeout_s)
 
     def _wake(self) -> None:
         if self._asleep:
             self._asleep = False
-            os.write(self._wake_write, b"x")
+            self._ears.wake()
 
     def _loop(self) -> None:
         try:
             self._prepare()
         except BaseException as error:  # noqa: BLE001 - raised again by start(), on the caller's thread
             self._failure = error
-            self._release()
+            self._ears.close()
             return
         finally:
             self._sleep = (self.slept_s(), None)
@@ -153,24 +161,31 @@ class BatchQueue:
             if not batch:
                 self._idle()
                 continue
-            try:
-                self._run(batch)
-            except BaseException as error:  # a policy that calls sys.exit() must not end the replica's only thread
-                logger.exception("the batch failed")
-                for ticket in batch:
-                    failed = PolicyFailed(f"the policy raised {type(error).__name__}")
-                    ticket.answer(Reply(ticket.request.request_id, error=failed))
-        self._release()
+            self._run_timed(batch)
+        self._ears.close()
 
-    def _release(self) -> None:
-        self._selector.close()
-        os.close(self._wake_read)
-        os.close(self._wake_write)
+    def _run_timed(self, batch: Sequence[Ticket]) -> None:
+        begun = time.perf_counter()
+        if self._usual_s > SLOW_S:
+            self._ears.lend()
+        try:
+            self._run(batch)
+        except BaseException as error:  # a policy that calls sys.exit() must not end the replica's only thread
+            logger.exception("the batch failed")
+            for ticket in batch:
+                failed = PolicyFailed(f"the policy raised {type(error).__name__}")
+                ticket.answer(Reply(ticket.request.request_id, error=failed))
+        self._ears.take_back()
+        ended = time.perf_counter()
+        self._usual_s += _NEWEST * (ended - begun - self._usual_s)
+        with self._lock:
+            self._returning.ended(ended, ended - begun)
 
     def _take(self) -> list[Ticket] | None:
         """The next batch; [] if nothing came for a while, None when the queue is closed."""
         if not self._listen():
             return []
+        self._gather()
         batch: list[Ticket] | None
         with self._lock:
             if self._closed:
@@ -183,6 +198,8 @@ class BatchQueue:
                 self._waited += len(self._waiting) * (now - self._counted)
                 self._counted = now
                 batch, expired = self._waiting.take(self._max, now)
+                if batch:
+                    self._returning.taken(batch)
         for ticket in left:
             stopped = PolicyUnavailable("the replica is stopping; connect again")
             ticket.answer(Reply(ticket.request.request_id, error=stopped))
@@ -197,27 +214,32 @@ class BatchQueue:
             with self._lock:
                 here = self._closed or len(self._waiting) > 0
                 self._asleep = not here
-            events = self._selector.select(0) if here else self._nap()
+            heard = self._ears.hear(0) if here else self._nap()
             self._asleep = False
-            for key, _ in events:
-                if key.data is None:
-                    with contextlib.suppress(BlockingIOError):
-                        os.read(self._wake_read, 4096)
-                    continue
-                try:
-                    key.data()
-                except Exception:
-                    logger.exception("a local client's door failed")
-                    with contextlib.suppress(KeyError, ValueError):  # it may have been unwatched, or closed, already
-                        self._selector.unregister(key.fileobj)
             if here or len(self._waiting) > 0 or self._closed:
                 return True
-            if not events:
+            if not heard:
                 return False
 
-    def _nap(self) -> list[tuple[selectors.SelectorKey, int]]:
+    def _gather(self) -> None:
+        """Wait for the rest of a group, where that is worth it."""
+        with self._lock:
+            wait_s = 0.0 if self._closed else self._returning.wait_s(time.perf_counter(), self._waiting)
+            if wait_s <= 0:
+                return
+            self._whole.clear()
+            self._gathering = True
+        self._ears.lend()  # a selector waits for whole milliseconds, this for what is asked
+        came = self._whole.wait(wait_s)
+        self._ears.take_back()
+        if not came:
+            self._ears.hear(0)
+        with self._lock:
+            self._gathering = False
+
+    def _nap(self) -> bool:
         slept, begun = self._sleep[0], time.perf_counter()
         self._sleep = (slept, begun)
-        events = self._selector.select(self._idle_s)
+        heard = self._ears.hear(self._idle_s)
         self._sleep = (slept + time.perf_counter() - begun, None)
-        return events
+        return heard

@@ -41,6 +41,7 @@ class Engine:
         agent: Agent,
         *,
         max_batch_size: int = 16,
+        patience: float = 0.0,
         batch_sizes: Sequence[int] = (),
         session_limit: int = 1000,
         session_idle_s: float = 600.0,
@@ -62,7 +63,13 @@ class Engine:
         self.draining = False  # the replica will stop, and others will go on: clients are told
         self.sessions = SessionTable(session_limit, session_idle_s)
         self.queue = BatchQueue(
-            self._run, max_batch_size, prepare=self._prepare, idle=self.sessions.drop_idle, idle_s=session_idle_s / 10
+            self._run,
+            max_batch_size,
+            prepare=self._prepare,
+            idle=self.sessions.drop_idle,
+            idle_s=session_idle_s / 10,
+            patience=patience,
+            is_open=self.sessions.__contains__,
         )
 
     def start(self) -> None:

@@ -3,7 +3,8 @@
 A client connects to an abstract Unix socket whose unguessable name stands in the metadata, and hands
 over memory files that it writes its frames into. Neither side leaves a name behind, so that memory
 and socket are gone with their processes, however those end. Only processes of the same user are let
-in. The policy's own thread reads the sockets: a request reaches it without a change of threads.
+in. The policy's own thread reads the sockets: a request reaches it without a change of threads; while
+a batch runs that takes milliseconds, another thread reads them for it (`vlagents_ray.serve.ears`).
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ import os
 import secrets
 import socket
 import struct
+import threading
 from collections.abc import Callable
 from typing import ClassVar
 
@@ -34,7 +36,7 @@ _BACKLOG = 128
 
 
 class LocalDoor:
-    """Listens from `open` on; everything else happens on the policy's thread."""
+    """Listens from `open` on; everything else happens where the batch queue hears."""
 
     def __init__(self, engine: Engine, limits: Limits) -> None:
         self._engine = engine
@@ -95,6 +97,8 @@ class LocalClient:
         self._gone = gone
         self._files: dict[int, mmap.mmap] = {}
         self._sender = Sender(engine, self.name)
+        self._sending = threading.Lock()  # the end may be heard beside a batch, whose replies still come
+        self._ended = False
 
     def ready(self) -> None:
         """A message, or the end of the connection, is there."""
@@ -129,7 +133,9 @@ class LocalClient:
     def release(self) -> None:
         """Forget the session and give its memory back."""
         self._sender.release()
-        self._connection.close()
+        with self._sending:
+            self._ended = True  # its descriptor's number may soon be another file's
+            self._connection.close()
         self.forget()
         self._gone(self)
 
@@ -171,21 +177,24 @@ class LocalClient:
         self._files[number] = mapped
 
     def _send(self, number: int, frame: bytes) -> None:
-        try:
-            if len(frame) <= _INLINE:
-                self._connection.send(LocalAddress.REPLY.pack(number, 0) + frame)
+        with self._sending:
+            if self._ended:
                 return
-            descriptor = os.memfd_create("vlagents-ray-reply")
             try:
-                os.write(descriptor, frame)
-                header = LocalAddress.REPLY.pack(number, LocalAddress.IN_FILE)
-                socket.send_fds(self._connection, [header], [descriptor])
-            finally:
-                os.close(descriptor)
-        except OSError as error:  # gone, or does not read its replies: hearing of the end is up to `ready`
-            logger.info("local client: %s", error)
-            with contextlib.suppress(OSError):  # gone altogether
-                self._connection.shutdown(socket.SHUT_RDWR)
+                if len(frame) <= _INLINE:
+                    self._connection.send(LocalAddress.REPLY.pack(number, 0) + frame)
+                    return
+                descriptor = os.memfd_create("vlagents-ray-reply")
+                try:
+                    os.write(descriptor, frame)
+                    header = LocalAddress.REPLY.pack(number, LocalAddress.IN_FILE)
+                    socket.send_fds(self._connection, [header], [descriptor])
+                finally:
+                    os.close(descriptor)
+            except OSError as error:  # gone, or does not read its replies: hearing of the end is up to `ready`
+                logger.info("local client: %s", error)
+                with contextlib.suppress(OSError):  # gone altogether
+                    self._connection.shutdown(socket.SHUT_RDWR)
 
 
 def peer_uid(connection: socket.socket) -> int:

@@ -1,0 +1,97 @@
+"""Whether a batch is worth a short wait for sessions that are about to come back. No threads, no clocks.
+
+A group of simulations that was answered together comes back within a millisecond or so. Whoever is first
+would start a batch alone, the others would wait for it, and from then on the group goes in two halves,
+each of which waits for the other. So the first one waits for the others, but only
+
+- for sessions of the batch before that lately took about as long to come back as it is now: one that
+  was late is not waited for again before it has come back in time once more;
+- for at most `patience` times as long as the batch before took;
+- while no robot waits, no slot of the batch is left empty by it, and no deadline is in danger.
+
+So a lone session waits for nobody, and a robot never waits. Robots are not waited for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from vlagents_ray.serve.waiting import Rank, Ticket, Waiting
+
+SLOW_S = 0.002  # a batch that takes less is over before anybody could be waited for, or another thread be awake
+
+
+class _Answered:
+    """The simulations of a batch, and how long each took to come back lately, s; None where that is not known."""
+
+    def __init__(self, batch: Sequence[Ticket]) -> None:
+        self.returns = {
+            ticket.session_id: ticket.return_s
+            for ticket in batch
+            if ticket.rank is Rank.SIMULATION and ticket.request.op in ("act", "reset")
+        }
+        self.ended = float("inf")  # s
+
+
+class Returning:
+    """What the queue knows of the last two batches. The caller sees to it that one thread at a time is in here."""
+
+    def __init__(self, patience: float, size: int, is_open: Callable[[str], bool]) -> None:
+        self._patience = patience
+        self._size = size
+        self._is_open = is_open
+        self._last = _Answered(())
+        self._before = self._last
+        self._duration = 0.0  # s, of the last batch
+        self._missing: set[str] = set()
+        self._until = 0.0
+
+    def taken(self, batch: Sequence[Ticket]) -> None:
+        """A batch begins."""
+        self._before, self._last = self._last, _Answered(batch)
+
+    def ended(self, now: float, duration: float) -> None:
+        """It is over, after `duration` s."""
+        self._last.ended, self._duration = now, duration
+
+    def came(self, ticket: Ticket) -> None:
+        """A request comes in: how long did its session take? A long time is believed at once, a short one by halves."""
+        for answered in (self._last, self._before):
+            if ticket.session_id in answered.returns:
+                usual = answered.returns.pop(ticket.session_id)
+                took = max(0.0, ticket.arrived - answered.ended)
+                ticket.return_s = took if usual is None or took > usual else (took + usual) / 2
+                return
+
+    def wait_s(self, now: float, waiting: Waiting) -> float:
+        """How long the policy, which is free, may wait for more than what waits; then every `put` asks `whole`."""
+        bound = self._patience * self._duration
+        if bound <= 0 or self._duration < SLOW_S or waiting.depth[Rank.ROBOT] or waiting.sessions >= self._size:
+            return 0.0
+        self._missing = {
+            session_id
+            for session_id, return_s in self._last.returns.items()
+            if return_s is not None
+            and abs(self._last.ended + return_s - now) <= bound
+            and session_id not in waiting
+            and self._is_open(session_id)
+        }
+        self._until = now + bound
+        if not self._missing or any(self._endangered(ticket) for ticket in waiting.heads()):
+            return 0.0
+        return bound
+
+    def whole(self, ticket: Ticket, waiting: Waiting) -> bool:
+        """Is the wait over, now that this one came?"""
+        self._missing.discard(ticket.session_id)
+        return (
+            not self._missing
+            or ticket.rank is Rank.ROBOT
+            or waiting.sessions >= self._size
+            or self._endangered(ticket)
+        )
+
+    def _endangered(self, ticket: Ticket) -> bool:
+        """May the deadline pass if the policy waits, and then takes as long as it took last?"""
+        deadline_ms = ticket.request.deadline_ms
+        return deadline_ms is not None and ticket.arrived + deadline_ms / 1e3 < self._until + self._duration
