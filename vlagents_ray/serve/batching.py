@@ -15,6 +15,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 from vlagents_ray.errors import DeadlineExceeded, PolicyFailed, PolicyUnavailable
 from vlagents_ray.serve.ears import Ears, HasFileno
@@ -41,7 +42,8 @@ class BatchQueue:
 
     The thread waits on file descriptors, so that a local client's socket can be one of them
     (`watch`): its request then reaches the policy without a change of threads. While batches take
-    milliseconds, a second thread hears these files, so that the next batch is decoded when one is over.
+    milliseconds, a second thread hears these files, so that the next batch is decoded when one is over,
+    and where that one is full already, a third one sends the answers that are not robots' (`answer_later`).
     """
 
     def __init__(
@@ -73,6 +75,9 @@ class BatchQueue:
         self._returning = Returning(patience, max_batch_size, is_open)
         self._gathering = False
         self._whole = threading.Event()
+        self._alone = ""  # the session that was alone in the last batch
+        self._unsent: list[tuple[Ticket, Reply]] = []
+        self._answers = ThreadPoolExecutor(1, "policy-answers")
         self._prepared = threading.Event()
         self._failure: BaseException | None = None
         self._thread = threading.Thread(target=self._loop, name="policy", daemon=True)
@@ -108,6 +113,14 @@ class BatchQueue:
     def unwatch(self, file: HasFileno) -> None:
         """The end of `watch`, in such a call."""
         self._ears.unwatch(file)
+
+    def hurries(self) -> bool:
+        """Does a full batch wait for the policy, so that answers to simulations can be sent while it runs?"""
+        return self._usual_s > SLOW_S and self._waiting.sessions >= self._max
+
+    def answer_later(self, answers: Sequence[tuple[Ticket, Reply]]) -> None:
+        """Send them as soon as the next batch runs, from another thread; on the queue's thread, in `run`."""
+        self._unsent.extend(answers)
 
     def depth(self) -> int:
         """Requests that wait for the next batch."""
@@ -158,16 +171,24 @@ class BatchQueue:
             self._sleep = (self.slept_s(), None)
             self._prepared.set()
         while (batch := self._take()) is not None:
+            if self._unsent:
+                unsent, self._unsent = self._unsent, []
+                self._answers.submit(_send, unsent)
             if not batch:
                 self._idle()
                 continue
             self._run_timed(batch)
+        _send(self._unsent)
+        self._answers.shutdown()
         self._ears.close()
 
     def _run_timed(self, batch: Sequence[Ticket]) -> None:
         begun = time.perf_counter()
-        if self._usual_s > SLOW_S:
+        alone = batch[0].session_id if len(batch) == 1 else ""
+        slow = self._usual_s > SLOW_S
+        if slow and not (alone and alone == self._alone):  # while a lone session is served, nobody else has to be heard
             self._ears.lend()
+        self._alone = alone
         try:
             self._run(batch)
         except BaseException as error:  # a policy that calls sys.exit() must not end the replica's only thread
@@ -185,7 +206,8 @@ class BatchQueue:
         """The next batch; [] if nothing came for a while, None when the queue is closed."""
         if not self._listen():
             return []
-        self._gather()
+        if self._usual_s > SLOW_S:
+            self._gather()
         batch: list[Ticket] | None
         with self._lock:
             if self._closed:
@@ -243,3 +265,8 @@ class BatchQueue:
         heard = self._ears.hear(self._idle_s)
         self._sleep = (slept + time.perf_counter() - begun, None)
         return heard
+
+
+def _send(answers: Sequence[tuple[Ticket, Reply]]) -> None:
+    for ticket, reply in answers:
+        ticket.answer(reply)

@@ -35,7 +35,7 @@ class Rank(IntEnum):
 
 @dataclass(slots=True)
 class Ticket:
-    """A request on its way through the queue. `done` is called once, on the queue's thread."""
+    """A request on its way through the queue. `done` is called once, on a thread of the queue's."""
 
     session_id: str
     request: Request
