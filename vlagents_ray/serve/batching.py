@@ -20,6 +20,7 @@ from concurrent.futures import ThreadPoolExecutor
 from vlagents_ray.errors import DeadlineExceeded, PolicyFailed, PolicyUnavailable
 from vlagents_ray.serve.ears import Ears, HasFileno
 from vlagents_ray.serve.returning import SLOW_S, Returning
+from vlagents_ray.serve.tally import Tally
 from vlagents_ray.serve.waiting import Rank, Ticket, Waiting
 from vlagents_ray.wire.messages import Reply
 
@@ -63,10 +64,7 @@ class BatchQueue:
         self._idle_s = idle_s
         self._max = max_batch_size
         self._waiting = Waiting()
-        self._waited = 0.0  # s, of all requests together
-        self._counted = time.perf_counter()  # until when they are in `_waited`
-        # What the thread has slept, s, and since when it sleeps now; loading the policy is no work for a session.
-        self._sleep: tuple[float, float | None] = (0.0, time.perf_counter())
+        self._tally = Tally()  # loading the policy is no work for a session: as if the thread slept
         self._lock = threading.Lock()
         self._closed = False
         self._asleep = False
@@ -95,8 +93,7 @@ class BatchQueue:
             if self._closed:
                 raise PolicyUnavailable("the replica is stopping; connect again")
             for ticket in tickets:
-                self._waited += len(self._waiting) * (ticket.arrived - self._counted)
-                self._counted = ticket.arrived
+                self._tally.count(len(self._waiting), ticket.arrived)
                 self._returning.came(ticket)
                 self._waiting.add(ticket)
                 if self._gathering and self._returning.whole(ticket, self._waiting):
@@ -133,12 +130,11 @@ class BatchQueue:
     def waited_s(self) -> float:
         """How long all requests together have waited so far; its growth is the mean number that wait."""
         with self._lock:
-            return self._waited + len(self._waiting) * max(0.0, time.perf_counter() - self._counted)
+            return self._tally.waited_s(len(self._waiting))
 
     def slept_s(self) -> float:
         """How long the policy's thread has had nothing to do so far; the rest of the time it was busy."""
-        slept, since = self._sleep
-        return slept if since is None else slept + max(0.0, time.perf_counter() - since)
+        return self._tally.slept_s()
 
     def alive(self) -> bool:
         """Is there a thread to take what is put?"""
@@ -168,7 +164,7 @@ class BatchQueue:
             self._ears.close()
             return
         finally:
-            self._sleep = (self.slept_s(), None)
+            self._tally.wakes()
             self._prepared.set()
         while (batch := self._take()) is not None:
             if self._unsent:
@@ -217,8 +213,7 @@ class BatchQueue:
             else:
                 left = []
                 now = time.perf_counter()
-                self._waited += len(self._waiting) * (now - self._counted)
-                self._counted = now
+                self._tally.count(len(self._waiting), now)
                 batch, expired = self._waiting.take(self._max, now)
                 if batch:
                     self._returning.taken(batch)
@@ -236,7 +231,11 @@ class BatchQueue:
             with self._lock:
                 here = self._closed or len(self._waiting) > 0
                 self._asleep = not here
-            heard = self._ears.hear(0) if here else self._nap()
+            if not here:
+                self._tally.sleeps()
+            heard = self._ears.hear(0.0 if here else self._idle_s)
+            if not here:
+                self._tally.wakes()
             self._asleep = False
             if here or len(self._waiting) > 0 or self._closed:
                 return True
@@ -258,13 +257,6 @@ class BatchQueue:
             self._ears.hear(0)
         with self._lock:
             self._gathering = False
-
-    def _nap(self) -> bool:
-        slept, begun = self._sleep[0], time.perf_counter()
-        self._sleep = (slept, begun)
-        heard = self._ears.hear(self._idle_s)
-        self._sleep = (slept + time.perf_counter() - begun, None)
-        return heard
 
 
 def _send(answers: Sequence[tuple[Ticket, Reply]]) -> None:

@@ -6,7 +6,8 @@ each of which waits for the other. So the first one waits for the others, but on
 
 - for sessions of the batch before that lately took about as long to come back as it is now: one that
   was late is not waited for again before it has come back in time once more;
-- for at most `patience` times as long as the batch before took;
+- for at most `patience` times as long as the batch before took, and not for longer than one batch in the
+  place of two saves: the time that a batch takes whatever its size, by the durations of the last ones;
 - while no robot waits, no slot of the batch is left empty by it, and no deadline is in danger.
 
 So a lone session waits for nobody, and a robot never waits. Robots are not waited for.
@@ -14,10 +15,13 @@ So a lone session waits for nobody, and a robot never waits. Robots are not wait
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 from vlagents_ray.serve.waiting import Rank, Ticket, Waiting
 
+_KEPT = 0.95  # of its weight a batch keeps with each that follows
+_SPREAD = 0.01  # a smaller variance of the sizes tells nothing
 SLOW_S = 0.002  # a batch that takes less is over before anybody could be waited for, or another thread be awake
 
 
@@ -30,7 +34,28 @@ class _Answered:
             for ticket in batch
             if ticket.rank is Rank.SIMULATION and ticket.request.op in ("act", "reset")
         }
-        self.ended = float("inf")  # s
+        self.acts = len(batch) if all(ticket.request.op == "act" for ticket in batch) else 0
+        self.ended = math.inf  # s
+
+
+class Cost:
+    """A line through the durations of the last batches over their sizes; what is older counts ever less."""
+
+    def __init__(self) -> None:
+        self._sums = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def add(self, size: int, duration: float) -> None:
+        """A batch of `size` took so long, s."""
+        new = (1.0, size, duration, size * size, size * duration)
+        self._sums = tuple(_KEPT * old + one for old, one in zip(self._sums, new, strict=True))  # type: ignore[assignment]
+
+    def fixed_s(self) -> float:
+        """What a batch takes whatever its size; all the time in the world while all had the same."""
+        count, size, duration, squares, products = self._sums
+        spread = count * squares - size * size
+        if spread <= _SPREAD * count * count:
+            return math.inf
+        return (duration * squares - size * products) / spread
 
 
 class Returning:
@@ -43,6 +68,7 @@ class Returning:
         self._last = _Answered(())
         self._before = self._last
         self._duration = 0.0  # s, of the last batch
+        self._cost = Cost()
         self._missing: set[str] = set()
         self._until = 0.0
 
@@ -53,6 +79,8 @@ class Returning:
     def ended(self, now: float, duration: float) -> None:
         """It is over, after `duration` s."""
         self._last.ended, self._duration = now, duration
+        if self._last.acts:
+            self._cost.add(self._last.acts, duration)
 
     def came(self, ticket: Ticket) -> None:
         """A request comes in: how long did its session take? A long time is believed at once, a short one by halves."""
@@ -65,7 +93,7 @@ class Returning:
 
     def wait_s(self, now: float, waiting: Waiting) -> float:
         """How long the policy, which is free, may wait for more than what waits; then every `put` asks `whole`."""
-        bound = self._patience * self._duration
+        bound = min(self._patience * self._duration, self._cost.fixed_s())
         if bound <= 0 or self._duration < SLOW_S or waiting.depth[Rank.ROBOT] or waiting.sessions >= self._size:
             return 0.0
         self._missing = {
@@ -85,10 +113,7 @@ class Returning:
         """Is the wait over, now that this one came?"""
         self._missing.discard(ticket.session_id)
         return (
-            not self._missing
-            or ticket.rank is Rank.ROBOT
-            or waiting.sessions >= self._size
-            or self._endangered(ticket)
+            not self._missing or ticket.rank is Rank.ROBOT or waiting.sessions >= self._size or self._endangered(ticket)
         )
 
     def _endangered(self, ticket: Ticket) -> bool:
