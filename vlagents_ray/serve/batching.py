@@ -19,7 +19,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 from vlagents_ray.errors import DeadlineExceeded, PolicyFailed, PolicyUnavailable
 from vlagents_ray.serve.ears import Ears, HasFileno
-from vlagents_ray.serve.returning import SLOW_S, Returning
+from vlagents_ray.serve.returning import Returning
 from vlagents_ray.serve.tally import Tally
 from vlagents_ray.serve.waiting import Rank, Ticket, Waiting
 from vlagents_ray.wire.messages import Reply
@@ -27,8 +27,6 @@ from vlagents_ray.wire.messages import Reply
 __all__ = ["BatchQueue", "HasFileno", "Rank", "Ticket"]
 
 logger = logging.getLogger(__name__)
-
-_NEWEST = 0.25  # weight of the last batch in the mean of their durations
 
 
 class BatchQueue:
@@ -43,8 +41,8 @@ class BatchQueue:
 
     The thread waits on file descriptors, so that a local client's socket can be one of them
     (`watch`): its request then reaches the policy without a change of threads. While batches take
-    milliseconds, a second thread hears these files, so that the next batch is decoded when one is over,
-    and where that one is full already, a third one sends the answers that are not robots' (`answer_later`).
+    milliseconds and are not all for one session, a second thread hears these files, so that the next batch is
+    decoded when one is over; and where that one is full, a third sends the answers to simulations while it runs.
     """
 
     def __init__(
@@ -69,11 +67,9 @@ class BatchQueue:
         self._closed = False
         self._asleep = False
         self._ears = Ears()
-        self._usual_s = 0.0  # how long a batch took lately
         self._returning = Returning(patience, max_batch_size, is_open)
         self._gathering = False
         self._whole = threading.Event()
-        self._alone = ""  # the session that was alone in the last batch
         self._unsent: list[tuple[Ticket, Reply]] = []
         self._answers = ThreadPoolExecutor(1, "policy-answers")
         self._prepared = threading.Event()
@@ -113,7 +109,7 @@ class BatchQueue:
 
     def hurries(self) -> bool:
         """Does a full batch wait for the policy, so that answers to simulations can be sent while it runs?"""
-        return self._usual_s > SLOW_S and self._waiting.sessions >= self._max
+        return self._returning.slow and self._waiting.sessions >= self._max
 
     def answer_later(self, answers: Sequence[tuple[Ticket, Reply]]) -> None:
         """Send them as soon as the next batch runs, from another thread; on the queue's thread, in `run`."""
@@ -180,11 +176,8 @@ class BatchQueue:
 
     def _run_timed(self, batch: Sequence[Ticket]) -> None:
         begun = time.perf_counter()
-        alone = batch[0].session_id if len(batch) == 1 else ""
-        slow = self._usual_s > SLOW_S
-        if slow and not (alone and alone == self._alone):  # while a lone session is served, nobody else has to be heard
+        if self._returning.slow and not self._returning.alone:
             self._ears.lend()
-        self._alone = alone
         try:
             self._run(batch)
         except BaseException as error:  # a policy that calls sys.exit() must not end the replica's only thread
@@ -194,7 +187,6 @@ class BatchQueue:
                 ticket.answer(Reply(ticket.request.request_id, error=failed))
         self._ears.take_back()
         ended = time.perf_counter()
-        self._usual_s += _NEWEST * (ended - begun - self._usual_s)
         with self._lock:
             self._returning.ended(ended, ended - begun)
 
@@ -202,28 +194,22 @@ class BatchQueue:
         """The next batch; [] if nothing came for a while, None when the queue is closed."""
         if not self._listen():
             return []
-        if self._usual_s > SLOW_S:
+        if self._returning.slow:
             self._gather()
-        batch: list[Ticket] | None
         with self._lock:
-            if self._closed:
-                left = self._waiting.clear()
-                expired: list[Ticket] = []
-                batch = None
-            else:
-                left = []
-                now = time.perf_counter()
-                self._tally.count(len(self._waiting), now)
-                batch, expired = self._waiting.take(self._max, now)
-                if batch:
-                    self._returning.taken(batch)
+            closed, now = self._closed, time.perf_counter()
+            self._tally.count(len(self._waiting), now)
+            left = self._waiting.clear() if closed else []
+            batch, expired = self._waiting.take(self._max, now)
+            if batch:
+                self._returning.taken(batch)
         for ticket in left:
             stopped = PolicyUnavailable("the replica is stopping; connect again")
             ticket.answer(Reply(ticket.request.request_id, error=stopped))
         for ticket in expired:
             late = DeadlineExceeded(f"no action within {ticket.request.deadline_ms:g} ms: dropped before inference")
             ticket.answer(Reply(ticket.request.request_id, error=late))
-        return batch
+        return None if closed else batch
 
     def _listen(self) -> bool:
         """Until something waits, or the queue is closed; also hear all watched files that are ready now."""

@@ -22,6 +22,7 @@ from vlagents_ray.serve.waiting import Rank, Ticket, Waiting
 
 _KEPT = 0.95  # of its weight a batch keeps with each that follows
 _SPREAD = 0.01  # a smaller variance of the sizes tells nothing
+_NEWEST = 0.25  # weight of the last batch in the mean of their durations
 SLOW_S = 0.002  # a batch that takes less is over before anybody could be waited for, or another thread be awake
 
 
@@ -34,6 +35,7 @@ class _Answered:
             for ticket in batch
             if ticket.rank is Rank.SIMULATION and ticket.request.op in ("act", "reset")
         }
+        self.lone = batch[0].session_id if len(batch) == 1 else ""
         self.acts = len(batch) if all(ticket.request.op == "act" for ticket in batch) else 0
         self.ended = math.inf  # s
 
@@ -68,6 +70,7 @@ class Returning:
         self._last = _Answered(())
         self._before = self._last
         self._duration = 0.0  # s, of the last batch
+        self._usual = 0.0  # s, lately
         self._cost = Cost()
         self._missing: set[str] = set()
         self._until = 0.0
@@ -79,8 +82,19 @@ class Returning:
     def ended(self, now: float, duration: float) -> None:
         """It is over, after `duration` s."""
         self._last.ended, self._duration = now, duration
+        self._usual += _NEWEST * (duration - self._usual)
         if self._last.acts:
             self._cost.add(self._last.acts, duration)
+
+    @property
+    def slow(self) -> bool:
+        """Do batches take long enough for anything to be done meanwhile?"""
+        return self._usual > SLOW_S
+
+    @property
+    def alone(self) -> bool:
+        """Is the batch that was taken last for a single session, and was the one before for the same?"""
+        return self._last.lone == self._before.lone != ""
 
     def came(self, ticket: Ticket) -> None:
         """A request comes in: how long did its session take? A long time is believed at once, a short one by halves."""
@@ -94,7 +108,7 @@ class Returning:
     def wait_s(self, now: float, waiting: Waiting) -> float:
         """How long the policy, which is free, may wait for more than what waits; then every `put` asks `whole`."""
         bound = min(self._patience * self._duration, self._cost.fixed_s())
-        if bound <= 0 or self._duration < SLOW_S or waiting.depth[Rank.ROBOT] or waiting.sessions >= self._size:
+        if bound <= 0 or not self.slow or waiting.depth[Rank.ROBOT] or waiting.sessions >= self._size:
             return 0.0
         self._missing = {
             session_id
