@@ -23,7 +23,7 @@ class BatchArgs(_Closed):
         "the next one. The largest is max_size, which may then be left out",
     )
     patience: float = Field(
-        default=0.05,
+        default=0.1,
         ge=0,
         le=1,
         description="how long a batch may wait for simulations that were in the batch before and are coming back, as "
