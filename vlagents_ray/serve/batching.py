@@ -90,7 +90,8 @@ class BatchQueue:
                 raise PolicyUnavailable("the replica is stopping; connect again")
             for ticket in tickets:
                 self._tally.count(len(self._waiting), ticket.arrived)
-                self._returning.came(ticket)
+                if self._returning.slow:
+                    self._returning.came(ticket)
                 self._waiting.add(ticket)
                 if self._gathering and self._returning.whole(ticket, self._waiting):
                     self._whole.set()

@@ -58,7 +58,7 @@ class Ears:
     def hear(self, timeout_s: float) -> bool:
         """Wait for a watched file or a wake-up call, run the callbacks of all that is there. False: nothing came."""
         events = self._selector.select(timeout_s)
-        self._call(events, lambda: True)
+        self._call(events)
         return bool(events)
 
     def lend(self) -> None:
@@ -98,11 +98,11 @@ class Ears:
             outside.poll()
             with self._turn:
                 if self._lent.is_set() and not self._closed:
-                    self._call(self._selector.select(0), self._lent.is_set)
+                    self._call(self._selector.select(0), lent=True)
 
-    def _call(self, events: list[tuple[selectors.SelectorKey, int]], mine: Callable[[], bool]) -> None:
+    def _call(self, events: list[tuple[selectors.SelectorKey, int]], lent: bool = False) -> None:
         for key, _ in events:
-            if not mine():
+            if lent and not self._lent.is_set():
                 return  # the owner is told of the rest again
             if key.data is None:
                 with contextlib.suppress(BlockingIOError):

@@ -67,34 +67,31 @@ class Returning:
         self._patience = patience
         self._size = size
         self._is_open = is_open
-        self._last = _Answered(())
-        self._before = self._last
+        self._nobody = _Answered(())
+        self._last = self._before = self._nobody
         self._duration = 0.0  # s, of the last batch
         self._usual = 0.0  # s, lately
+        self.slow = False  # do batches take long enough for anything to be done meanwhile? If not, this costs nothing
         self._cost = Cost()
         self._missing: set[str] = set()
         self._until = 0.0
 
     def taken(self, batch: Sequence[Ticket]) -> None:
         """A batch begins."""
-        self._before, self._last = self._last, _Answered(batch)
+        self._before, self._last = self._last, _Answered(batch) if self.slow else self._nobody
 
     def ended(self, now: float, duration: float) -> None:
         """It is over, after `duration` s."""
-        self._last.ended, self._duration = now, duration
         self._usual += _NEWEST * (duration - self._usual)
+        self.slow = self._usual > SLOW_S
+        self._last.ended, self._duration = now, duration
         if self._last.acts:
             self._cost.add(self._last.acts, duration)
 
     @property
-    def slow(self) -> bool:
-        """Do batches take long enough for anything to be done meanwhile?"""
-        return self._usual > SLOW_S
-
-    @property
     def alone(self) -> bool:
         """Is the batch that was taken last for a single session, and was the one before for the same?"""
-        return self._last.lone == self._before.lone != ""
+        return self._last.lone != "" and (self._before is self._nobody or self._before.lone == self._last.lone)
 
     def came(self, ticket: Ticket) -> None:
         """A request comes in: how long did its session take? A long time is believed at once, a short one by halves."""
