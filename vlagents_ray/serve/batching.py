@@ -1,37 +1,32 @@
 """The batch queue: everything that wants the policy waits here, and nothing else calls it.
 
-Work-conserving: as soon as the policy is free it takes whatever waits, up to the batch limit, so a
-lone request never pays for batching. Who goes first is up to `vlagents_ray.serve.waiting`. Expired and
-cancelled requests are dropped before inference: when the policy is next free, so that a caller who
-must know sooner keeps a timer of its own.
+Work-conserving, but for one short wait: as soon as the policy is free it takes whatever waits, up to the
+batch limit, so a lone request never pays for batching. Who goes first is up to `vlagents_ray.serve.waiting`.
+Expired and cancelled requests are dropped before inference: when the policy is next free, so that a caller
+who must know sooner keeps a timer of its own.
+
+The wait is for the rest of a group of simulations that was answered together and is coming back; when, and
+for how long at most, is up to `vlagents_ray.serve.returning`. `patience` 0 does without.
 """
 
 from __future__ import annotations
 
-import contextlib
 import logging
-import os
-import selectors
 import threading
 import time
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from concurrent.futures import ThreadPoolExecutor
 
 from vlagents_ray.errors import DeadlineExceeded, PolicyFailed, PolicyUnavailable
+from vlagents_ray.serve.ears import Ears, HasFileno
+from vlagents_ray.serve.returning import Returning
+from vlagents_ray.serve.tally import Tally
 from vlagents_ray.serve.waiting import Rank, Ticket, Waiting
 from vlagents_ray.wire.messages import Reply
 
 __all__ = ["BatchQueue", "HasFileno", "Rank", "Ticket"]
 
 logger = logging.getLogger(__name__)
-
-
-class HasFileno(Protocol):
-    """A socket, a pipe: whatever a selector can wait for."""
-
-    def fileno(self) -> int:
-        """Its descriptor."""
-        ...
 
 
 class BatchQueue:
@@ -41,8 +36,13 @@ class BatchQueue:
     renderer) is made there. `run` must `answer` every ticket. `idle` is called when nothing
     came for `idle_s`.
 
+    Before the batch after one of D s starts, the thread may wait `patience` * D s at most for sessions that
+    were in that batch and are about to come back. `is_open` tells whether a session still is there.
+
     The thread waits on file descriptors, so that a local client's socket can be one of them
-    (`watch`): its request then reaches the policy without a change of threads.
+    (`watch`): its request then reaches the policy without a change of threads. While batches take
+    milliseconds and are not all for one session, a second thread hears these files, so that the next batch is
+    decoded when one is over; and where that one is full, a third sends the answers to simulations while it runs.
     """
 
     def __init__(
@@ -53,6 +53,8 @@ class BatchQueue:
         prepare: Callable[[], None] = lambda: None,
         idle: Callable[[], None] = lambda: None,
         idle_s: float = 30.0,
+        patience: float = 0.0,
+        is_open: Callable[[str], bool] = lambda _: True,
     ) -> None:
         self._run = run
         self._prepare = prepare
@@ -60,18 +62,16 @@ class BatchQueue:
         self._idle_s = idle_s
         self._max = max_batch_size
         self._waiting = Waiting()
-        self._waited = 0.0  # s, of all requests together
-        self._counted = time.perf_counter()  # until when they are in `_waited`
-        # What the thread has slept, s, and since when it sleeps now; loading the policy is no work for a session.
-        self._sleep: tuple[float, float | None] = (0.0, time.perf_counter())
+        self._tally = Tally()  # loading the policy is no work for a session: as if the thread slept
         self._lock = threading.Lock()
         self._closed = False
         self._asleep = False
-        self._selector = selectors.DefaultSelector()
-        self._wake_read, self._wake_write = os.pipe()
-        os.set_blocking(self._wake_read, False)
-        os.set_blocking(self._wake_write, False)
-        self._selector.register(self._wake_read, selectors.EVENT_READ)
+        self._ears = Ears()
+        self._returning = Returning(patience, max_batch_size, is_open)
+        self._gathering = False
+        self._whole = threading.Event()
+        self._unsent: list[tuple[Ticket, Reply]] = []
+        self._answers = ThreadPoolExecutor(1, "policy-answers")
         self._prepared = threading.Event()
         self._failure: BaseException | None = None
         self._thread = threading.Thread(target=self._loop, name="policy", daemon=True)
@@ -89,18 +89,32 @@ class BatchQueue:
             if self._closed:
                 raise PolicyUnavailable("the replica is stopping; connect again")
             for ticket in tickets:
-                self._waited += len(self._waiting) * (ticket.arrived - self._counted)
-                self._counted = ticket.arrived
+                self._tally.count(len(self._waiting), ticket.arrived)
+                if self._returning.slow:
+                    self._returning.came(ticket)
                 self._waiting.add(ticket)
+                if self._gathering and self._returning.whole(ticket, self._waiting):
+                    self._whole.set()
             self._wake()
 
     def watch(self, file: HasFileno, ready: Callable[[], None]) -> None:
-        """Call `ready` on the queue's thread whenever `file` can be read; before `start`, or on that thread."""
-        self._selector.register(file, selectors.EVENT_READ, ready)
+        """Call `ready` whenever `file` can be read; before `start`, or in such a call. Never two calls at once.
+
+        Calls come on the queue's thread, or beside a batch that runs, on another one.
+        """
+        self._ears.watch(file, ready)
 
     def unwatch(self, file: HasFileno) -> None:
-        """The end of `watch`, on the queue's thread."""
-        self._selector.unregister(file)
+        """The end of `watch`, in such a call."""
+        self._ears.unwatch(file)
+
+    def hurries(self) -> bool:
+        """Does a full batch wait for the policy, so that answers to simulations can be sent while it runs?"""
+        return self._returning.slow and self._waiting.sessions >= self._max
+
+    def answer_later(self, answers: Sequence[tuple[Ticket, Reply]]) -> None:
+        """Send them as soon as the next batch runs, from another thread; on the queue's thread, in `run`."""
+        self._unsent.extend(answers)
 
     def depth(self) -> int:
         """Requests that wait for the next batch."""
@@ -113,12 +127,11 @@ class BatchQueue:
     def waited_s(self) -> float:
         """How long all requests together have waited so far; its growth is the mean number that wait."""
         with self._lock:
-            return self._waited + len(self._waiting) * max(0.0, time.perf_counter() - self._counted)
+            return self._tally.waited_s(len(self._waiting))
 
     def slept_s(self) -> float:
         """How long the policy's thread has had nothing to do so far; the rest of the time it was busy."""
-        slept, since = self._sleep
-        return slept if since is None else slept + max(0.0, time.perf_counter() - since)
+        return self._tally.slept_s()
 
     def alive(self) -> bool:
         """Is there a thread to take what is put?"""
@@ -128,68 +141,76 @@ class BatchQueue:
         """Answer what waits with `PolicyUnavailable`, end the thread after the batch under way."""
         with self._lock:
             again, self._closed = self._closed, True
+            self._whole.set()
             self._wake()
         if self._thread.ident is None and not again:
-            self._release()
+            self._ears.close()
         if self._thread.ident is not None and self._thread is not threading.current_thread():
             self._thread.join(timeout_s)
 
     def _wake(self) -> None:
         if self._asleep:
             self._asleep = False
-            os.write(self._wake_write, b"x")
+            self._ears.wake()
 
     def _loop(self) -> None:
         try:
             self._prepare()
         except BaseException as error:  # noqa: BLE001 - raised again by start(), on the caller's thread
             self._failure = error
-            self._release()
+            self._ears.close()
             return
         finally:
-            self._sleep = (self.slept_s(), None)
+            self._tally.wakes()
             self._prepared.set()
         while (batch := self._take()) is not None:
+            if self._unsent:
+                unsent, self._unsent = self._unsent, []
+                self._answers.submit(_send, unsent)
             if not batch:
                 self._idle()
                 continue
-            try:
-                self._run(batch)
-            except BaseException as error:  # a policy that calls sys.exit() must not end the replica's only thread
-                logger.exception("the batch failed")
-                for ticket in batch:
-                    failed = PolicyFailed(f"the policy raised {type(error).__name__}")
-                    ticket.answer(Reply(ticket.request.request_id, error=failed))
-        self._release()
+            self._run_timed(batch)
+        _send(self._unsent)
+        self._answers.shutdown()
+        self._ears.close()
 
-    def _release(self) -> None:
-        self._selector.close()
-        os.close(self._wake_read)
-        os.close(self._wake_write)
+    def _run_timed(self, batch: Sequence[Ticket]) -> None:
+        begun = time.perf_counter()
+        if self._returning.slow and not self._returning.alone:
+            self._ears.lend()
+        try:
+            self._run(batch)
+        except BaseException as error:  # a policy that calls sys.exit() must not end the replica's only thread
+            logger.exception("the batch failed")
+            for ticket in batch:
+                failed = PolicyFailed(f"the policy raised {type(error).__name__}")
+                ticket.answer(Reply(ticket.request.request_id, error=failed))
+        self._ears.take_back()
+        ended = time.perf_counter()
+        with self._lock:
+            self._returning.ended(ended, ended - begun)
 
     def _take(self) -> list[Ticket] | None:
         """The next batch; [] if nothing came for a while, None when the queue is closed."""
         if not self._listen():
             return []
-        batch: list[Ticket] | None
+        if self._returning.slow:
+            self._gather()
         with self._lock:
-            if self._closed:
-                left = self._waiting.clear()
-                expired: list[Ticket] = []
-                batch = None
-            else:
-                left = []
-                now = time.perf_counter()
-                self._waited += len(self._waiting) * (now - self._counted)
-                self._counted = now
-                batch, expired = self._waiting.take(self._max, now)
+            closed, now = self._closed, time.perf_counter()
+            self._tally.count(len(self._waiting), now)
+            left = self._waiting.clear() if closed else []
+            batch, expired = self._waiting.take(self._max, now)
+            if batch:
+                self._returning.taken(batch)
         for ticket in left:
             stopped = PolicyUnavailable("the replica is stopping; connect again")
             ticket.answer(Reply(ticket.request.request_id, error=stopped))
         for ticket in expired:
             late = DeadlineExceeded(f"no action within {ticket.request.deadline_ms:g} ms: dropped before inference")
             ticket.answer(Reply(ticket.request.request_id, error=late))
-        return batch
+        return None if closed else batch
 
     def _listen(self) -> bool:
         """Until something waits, or the queue is closed; also hear all watched files that are ready now."""
@@ -197,27 +218,34 @@ class BatchQueue:
             with self._lock:
                 here = self._closed or len(self._waiting) > 0
                 self._asleep = not here
-            events = self._selector.select(0) if here else self._nap()
+            if not here:
+                self._tally.sleeps()
+            heard = self._ears.hear(0.0 if here else self._idle_s)
+            if not here:
+                self._tally.wakes()
             self._asleep = False
-            for key, _ in events:
-                if key.data is None:
-                    with contextlib.suppress(BlockingIOError):
-                        os.read(self._wake_read, 4096)
-                    continue
-                try:
-                    key.data()
-                except Exception:
-                    logger.exception("a local client's door failed")
-                    with contextlib.suppress(KeyError, ValueError):  # it may have been unwatched, or closed, already
-                        self._selector.unregister(key.fileobj)
             if here or len(self._waiting) > 0 or self._closed:
                 return True
-            if not events:
+            if not heard:
                 return False
 
-    def _nap(self) -> list[tuple[selectors.SelectorKey, int]]:
-        slept, begun = self._sleep[0], time.perf_counter()
-        self._sleep = (slept, begun)
-        events = self._selector.select(self._idle_s)
-        self._sleep = (slept + time.perf_counter() - begun, None)
-        return events
+    def _gather(self) -> None:
+        """Wait for the rest of a group, where that is worth it."""
+        with self._lock:
+            wait_s = 0.0 if self._closed else self._returning.wait_s(time.perf_counter(), self._waiting)
+            if wait_s <= 0:
+                return
+            self._whole.clear()
+            self._gathering = True
+        self._ears.lend()  # a selector waits for whole milliseconds, this for what is asked
+        came = self._whole.wait(wait_s)
+        self._ears.take_back()
+        if not came:
+            self._ears.hear(0)
+        with self._lock:
+            self._gathering = False
+
+
+def _send(answers: Sequence[tuple[Ticket, Reply]]) -> None:
+    for ticket, reply in answers:
+        ticket.answer(reply)

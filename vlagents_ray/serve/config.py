@@ -22,6 +22,13 @@ class BatchArgs(_Closed):
         description="for compiled models: the only batch sizes to run, ascending; smaller batches are padded up to "
         "the next one. The largest is max_size, which may then be left out",
     )
+    patience: float = Field(
+        default=0.1,
+        ge=0,
+        le=1,
+        description="how long a batch may wait for simulations that were in the batch before and are coming back, as "
+        "a share of that batch's duration; 0 never waits. No robot waits, nor does a lone session",
+    )
 
     @model_validator(mode="after")
     def _consistent(self) -> BatchArgs:

@@ -50,6 +50,7 @@ class PolicyReplica:
         self._engine = Engine(
             agent,
             max_batch_size=self._args.batch.max_size,
+            patience=self._args.batch.patience,
             batch_sizes=self._args.batch.sizes or (),
             session_limit=self._args.sessions.limit,
             session_idle_s=self._args.sessions.idle_s,

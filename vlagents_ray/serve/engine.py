@@ -1,7 +1,7 @@
 """One policy, its sessions and its batch queue: the core of a replica, without Ray.
 
 Every door (HTTP, WebSocket, a Serve handle, …) turns what it receives into a `Request` and calls
-`submit`; the reply comes back through a callback on the policy's thread.
+`submit`; the reply comes back through a callback on a thread of the batch queue.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ class Engine:
         agent: Agent,
         *,
         max_batch_size: int = 16,
+        patience: float = 0.0,
         batch_sizes: Sequence[int] = (),
         session_limit: int = 1000,
         session_idle_s: float = 600.0,
@@ -62,7 +63,13 @@ class Engine:
         self.draining = False  # the replica will stop, and others will go on: clients are told
         self.sessions = SessionTable(session_limit, session_idle_s)
         self.queue = BatchQueue(
-            self._run, max_batch_size, prepare=self._prepare, idle=self.sessions.drop_idle, idle_s=session_idle_s / 10
+            self._run,
+            max_batch_size,
+            prepare=self._prepare,
+            idle=self.sessions.drop_idle,
+            idle_s=session_idle_s / 10,
+            patience=patience,
+            is_open=self.sessions.__contains__,
         )
 
     def start(self) -> None:
@@ -230,10 +237,17 @@ class Engine:
         if padding:
             self._padding.judge(results[len(acting) :])
             results = results[: len(acting)]
+        hurries = self.queue.hurries()
+        unsent = []
         for (ticket, session), result in zip(acting, results, strict=True):
             reply = self._answer(ticket, session, result)
             reply.timing = {**_timing(ticket.arrived, begun, ended), "batch_size": len(acting)}
-            ticket.answer(reply)
+            if hurries and ticket.rank is not Rank.ROBOT:
+                unsent.append((ticket, reply))
+            else:
+                ticket.answer(reply)
+        if unsent:
+            self.queue.answer_later(unsent)
 
     def _answer(self, ticket: Ticket, session: Session, result: Act | Exception) -> Reply:
         request_id = ticket.request.request_id

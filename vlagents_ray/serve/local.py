@@ -3,7 +3,8 @@
 A client connects to an abstract Unix socket whose unguessable name stands in the metadata, and hands
 over memory files that it writes its frames into. Neither side leaves a name behind, so that memory
 and socket are gone with their processes, however those end. Only processes of the same user are let
-in. The policy's own thread reads the sockets: a request reaches it without a change of threads.
+in. The policy's own thread reads the sockets: a request reaches it without a change of threads; while
+a batch runs that takes milliseconds, another thread reads them for it (`vlagents_ray.serve.ears`).
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ _BACKLOG = 128
 
 
 class LocalDoor:
-    """Listens from `open` on; everything else happens on the policy's thread."""
+    """Listens from `open` on; everything else happens where the batch queue hears."""
 
     def __init__(self, engine: Engine, limits: Limits) -> None:
         self._engine = engine
@@ -106,6 +107,8 @@ class LocalClient:
         self._freed: set[int] = set()  # of which the client has yet to be told
         self._acts = compact.Reader(limits)
         self._sender = Sender(engine, self.name)
+        self._sending = threading.Lock()  # the end may be heard beside a batch, whose replies still come
+        self._ended = False
 
     def ready(self) -> None:
         """A message, or the end of the connection, is there."""
@@ -136,7 +139,9 @@ class LocalClient:
     def release(self) -> None:
         """Forget the sessions and give their memory back."""
         self._sender.release()
-        self._connection.close()
+        with self._sending:
+            self._ended = True  # its descriptor's number may soon be another file's
+            self._connection.close()
         self.forget()
         self._gone(self)
 
@@ -199,24 +204,27 @@ class LocalClient:
         flags = LocalAddress.COMPACT
         if frame is None:
             frame, flags = visit.frame(replies), 0
-        freed = 0
-        while self._freed:
-            freed |= 1 << self._freed.pop()
-        try:
-            if len(frame) <= _INLINE:
-                self._connection.send(LocalAddress.REPLY.pack(freed, flags) + frame)
+        with self._sending:
+            if self._ended:
                 return
-            descriptor = os.memfd_create("vlagents-ray-reply")
+            freed = 0
+            while self._freed:
+                freed |= 1 << self._freed.pop()
             try:
-                os.write(descriptor, frame)
-                header = LocalAddress.REPLY.pack(freed, flags | LocalAddress.IN_FILE)
-                socket.send_fds(self._connection, [header], [descriptor])
-            finally:
-                os.close(descriptor)
-        except OSError as error:  # gone, or does not read its replies: hearing of the end is up to `ready`
-            logger.info("local client: %s", error)
-            with contextlib.suppress(OSError):  # gone altogether
-                self._connection.shutdown(socket.SHUT_RDWR)
+                if len(frame) <= _INLINE:
+                    self._connection.send(LocalAddress.REPLY.pack(freed, flags) + frame)
+                    return
+                descriptor = os.memfd_create("vlagents-ray-reply")
+                try:
+                    os.write(descriptor, frame)
+                    header = LocalAddress.REPLY.pack(freed, flags | LocalAddress.IN_FILE)
+                    socket.send_fds(self._connection, [header], [descriptor])
+                finally:
+                    os.close(descriptor)
+            except OSError as error:  # gone, or does not read its replies: hearing of the end is up to `ready`
+                logger.info("local client: %s", error)
+                with contextlib.suppress(OSError):  # gone altogether
+                    self._connection.shutdown(socket.SHUT_RDWR)
 
 
 class _Buffers(threading.local):

@@ -185,6 +185,9 @@ class SessionTable:
     def __len__(self) -> int:
         return len(self._sessions)
 
+    def __contains__(self, session_id: str) -> bool:
+        return session_id in self._sessions
+
     def get(self, session_id: str) -> Session:
         """The session, or `UnknownSession`."""
         session = self._sessions.get(session_id)

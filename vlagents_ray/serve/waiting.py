@@ -35,7 +35,7 @@ class Rank(IntEnum):
 
 @dataclass(slots=True)
 class Ticket:
-    """A request on its way through the queue. `done` is called once, on the queue's thread."""
+    """A request on its way through the queue. `done` is called once, on a thread of the queue's."""
 
     session_id: str
     request: Request
@@ -46,6 +46,7 @@ class Ticket:
     owner: str = ""  # the connection that it came by; the session, unless one connection carries several
     connection: str = ""  # that its session ends with
     transport: str = ""  # for the metrics
+    return_s: float | None = None  # how long its session lately took from an answer to the next request, if known
 
     def __post_init__(self) -> None:
         if not self.owner:
@@ -114,6 +115,18 @@ class Waiting:
 
     def __len__(self) -> int:
         return sum(self.depth)
+
+    def __contains__(self, session_id: str) -> bool:
+        return session_id in self._sessions
+
+    @property
+    def sessions(self) -> int:
+        """Those with tickets that wait."""
+        return len(self._sessions)
+
+    def heads(self) -> list[Ticket]:
+        """The next ticket of each session."""
+        return [lane[0] for lane in self._sessions.values()]
 
     def add(self, ticket: Ticket) -> None:
         """Behind what its session has asked already."""

@@ -1,0 +1,80 @@
+"""The end of a local connection that is heard while the policy runs its batch."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+import threading
+import time
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+from eval_fakes import wait_for
+
+from vlagents_ray.client.shm import ShmTransport
+from vlagents_ray.errors import ConnectionLost
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.serve.engine import Engine
+from vlagents_ray.serve.local import LocalDoor
+from vlagents_ray.wire.messages import DEFAULT_LIMITS, Op, Reply, Request
+
+
+class Gated(Agent):
+    """Acts when the gate opens."""
+
+    gate = threading.Event()
+    busy = threading.Event()
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self.instruction = instruction
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        Gated.busy.set()
+        Gated.gate.wait(10)
+        return Act(np.zeros(1), info={"instruction": self.instruction})
+
+
+def call(transport: ShmTransport, op: Op, instruction: str | None = None) -> Reply:
+    one = Request(op, Obs({}), instruction, request_id=os.urandom(8).hex())
+    [reply] = transport.call([one], 5)
+    return reply
+
+
+def test_a_client_that_ends_while_its_batch_runs_harms_nobody() -> None:
+    engine = Engine(Gated())
+    door = LocalDoor(engine, DEFAULT_LIMITS)
+    door.open()
+    engine.start()
+    one, other = (ShmTransport(asdict(door.address)) for _ in range(2))
+    for each, name in ((one, "first"), (other, "second")):
+        call(each, "reset", name)
+    for ending in (False, True):  # the queue listens beside a batch once it has seen a slow one
+        asking = one if ending else other
+        Gated.gate, Gated.busy = threading.Event(), threading.Event()
+        thread = threading.Thread(target=_act_to_the_end, args=(asking,))
+        thread.start()
+        try:
+            assert Gated.busy.wait(5)
+            if ending:
+                asking._socket.shutdown(socket.SHUT_RDWR)  # type: ignore[union-attr]
+                wait_for(lambda: len(engine.sessions) == 1)  # while the batch is under way
+            else:
+                time.sleep(0.02)
+        finally:
+            Gated.gate.set()
+            thread.join(5)
+    act = call(other, "act").act
+    assert act is not None
+    assert act.info == {"instruction": "second"}
+    one.close()
+    other.close()
+    engine.close()
+    door.close()
+
+
+def _act_to_the_end(transport: ShmTransport) -> None:
+    with contextlib.suppress(ConnectionLost):
+        call(transport, "act")
