@@ -92,7 +92,11 @@ class Balance:
     def _place(self, place: Place) -> str | None:
         now = time.monotonic()
         if now - self._asked > _FRESH_S:
-            self._others = self._neighbours.loads()
+            try:
+                self._others = self._neighbours.loads()
+            except Exception:  # a client connects whatever is wrong with the others
+                logger.exception("the other replicas could not be asked")
+                self._others = []
             self._asked = time.monotonic()
         loads = [self.load(), *self._others]
         random.shuffle(loads)  # of equally loaded ones each client of each replica takes any

@@ -101,15 +101,15 @@ class PolicyReplica:
         """
         await asyncio.shield(self._loading)
         place = Place(node, boot_id, must_be_near)
-        return await self._elsewhere(place) or self.welcome()
+        return await self._elsewhere(place) or await self.welcome()
 
-    def welcome(self) -> tuple[dict[str, Any], Any]:
+    async def welcome(self) -> tuple[dict[str, Any], Any]:
         """What `attach` answers of this replica: a client is going to be sent here."""
         self._balance.expect()
         plasma = None if self._plasma is None else asdict(self._plasma.plasma)
         return self.metadata() | {"plasma": plasma}, ray.get_runtime_context().current_actor
 
-    def load(self) -> Load:
+    async def load(self) -> Load:
         """For other replicas, which compare it with theirs."""
         return self._balance.load()
 
