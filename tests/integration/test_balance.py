@@ -17,7 +17,7 @@ from vlagents_ray.client.ways import TransportName
 from vlagents_ray.serve.cluster import Server, running_server
 from vlagents_ray.serve.files import deployment
 
-WAYS: list[TransportName] = ["shm", "handle", "websocket"]
+HELD: dict[TransportName, int] = {"handle": 2, "shm": 2, "websocket": 6}  # of equal connections the oldest go first
 
 
 def deployed(replicas: int) -> ServeDeploySchema:
@@ -44,15 +44,18 @@ def test_a_server_on_a_single_address_is_reached_there(server: Server) -> None:
 
 
 def test_sessions_move_to_a_replica_that_joins(server: Server) -> None:
-    """Pinned ones, on every such transport, exactly where they were; so do several of one connection."""
-    agents = {(way, i): RemoteAgent(url(server, way), transport=way) for way in WAYS for i in range(3)}
+    """Pinned ones, on every such transport, exactly where they were; so do several of one connection.
+
+    Then the first to go end, and the rest is uneven again.
+    """
+    agents = {(way, i): RemoteAgent(url(server, way), transport=way) for way, n in HELD.items() for i in range(n)}
     vector = RemoteAgent(url(server, "shm"), transport="shm")
-    envs = vector.sessions(3)
+    envs = vector.sessions(2)
     pids = {key: agent.reset(obs(key[1]), f"{key}")["pid"] for key, agent in agents.items()}
-    vector.reset_batch([obs(i) for i in range(3)], [f"env {i}" for i in range(3)], envs)
+    vector.reset_batch([obs(i) for i in range(2)], [f"env {i}" for i in range(2)], envs)
     counts = dict.fromkeys(agents, 0)
     together = 0
-    moves: Counter[object] = Counter()
+    moves: Counter[tuple[str, int]] = Counter()
 
     def act() -> dict[object, int]:
         """Once in each session; returns where it was."""
@@ -66,14 +69,14 @@ def test_sessions_move_to_a_replica_that_joins(server: Server) -> None:
             moves[key] += act.info["pid"] != pids[key]
             pids[key] = act.info["pid"]
         together += 1
-        acts = vector.act_batch([obs(0, 1)] * 3, envs)
+        acts = vector.act_batch([obs(0, 1)] * len(envs), envs) if envs else []
         where = []
         for i, one in enumerate(acts):
             assert not isinstance(one, Exception), one
             assert one.action.tolist() == [together, together, i]
             assert "resumed" not in one.info
             where.append(one.info["pid"])
-        assert len(set(where)) == 1, "sessions of one connection were parted"
+        assert len(set(where)) <= 1, "sessions of one connection were parted"
         return dict(pids) | {f"env {i}": pid for i, pid in enumerate(where)}
 
     assert len(set(act().values())) == 1
@@ -85,17 +88,28 @@ def test_sessions_move_to_a_replica_that_joins(server: Server) -> None:
 
     def even() -> bool:
         held = Counter(act().values())
-        return len(held) == 2 and min(held.values()) >= 5
+        return len(held) == 2 and max(held.values()) <= min(held.values()) + 2
 
-    begun = time.monotonic()
-    wait_for(even, 90)
-    print(f"even {time.monotonic() - begun:.1f} s after the second replica was asked for")
+    def become_even() -> None:
+        begun = time.monotonic()
+        wait_for(even, 60)
+        print(f"{len(pids) + len(envs)} sessions: even after {time.monotonic() - begun:.1f} s")
+
+    become_even()
+    for env in envs:
+        env.close()
+    envs.clear()
+    for key in [key for key in agents if key[0] != "websocket"]:
+        agents.pop(key).close()
+        del pids[key]
+    become_even()
+    assert {way for way, _ in +moves} == set(HELD)
     settled = Counter(moves)
     until = time.monotonic() + 8
     while time.monotonic() < until:
         act()
     assert sum((moves - settled).values()) <= 2, "sessions go to and fro"
-    for agent in [*agents.values(), *envs]:
+    for agent in agents.values():
         agent.close()
 
 
