@@ -110,11 +110,15 @@ class Beside:
     """Neighbours that hold what they are told to hold; counts how often they were asked."""
 
     def __init__(self, *loads: Load) -> None:
-        self.held, self.asked = list(loads), 0
+        self.held, self.asked, self.slow_s = list(loads), 0, 0.0
 
     def loads(self) -> list[Load]:
         self.asked += 1
+        time.sleep(self.slow_s)
         return [replace(one) for one in self.held]
+
+    def invite(self, replica: str) -> str:
+        return replica
 
 
 def balance(engine: Engine, *beside: Load) -> tuple[Balance, Beside]:
@@ -125,12 +129,11 @@ def balance(engine: Engine, *beside: Load) -> tuple[Balance, Beside]:
 def test_clients_that_come_at_once_are_spread_evenly() -> None:
     engine = Engine(Counting())
     mine, neighbours = balance(engine, load("b", 3), load("c", 0))
-    places = []
-    for _ in range(15):
-        places.append(mine.place(Place()).result(5))
-        if places[-1] == "me":
-            mine.expect()
-    assert {name: places.count(name) for name in ("me", "b", "c")} == {"me": 6, "b": 3, "c": 6}
+    neighbours.slow_s = 0.2
+    waiting = [mine.place(Place()) for _ in range(15)]
+    places = [one.result(5) for one in waiting]
+    assert {name: places.count(name) for name in (None, "b", "c")} == {None: 6, "b": 3, "c": 6}
+    assert mine.load().sessions == 6
     assert neighbours.asked == 1
     mine.close()
 

@@ -16,7 +16,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Protocol
+from typing import Any, Protocol
 
 from vlagents_ray.serve.engine import Engine
 from vlagents_ray.serve.spread import Load, Place, choose, pick, surplus
@@ -25,7 +25,6 @@ logger = logging.getLogger(__name__)
 
 PERIOD_S = 3.0  # between two comparisons
 MOVABLE = ("shm", "plasma", "websocket", "handle")
-_FRESH_S = 0.2  # what the others said counts for so long, so that many clients at once cost one question
 _EXPECTED_S = 3.0  # a client that was sent here and has not come since does not come
 _SETTLE_S = 6.0  # a connection that was told counts as leaving for so long
 _REST_S = 20.0  # a connection is told at most once in this time
@@ -38,6 +37,10 @@ class Neighbours(Protocol):
 
     def loads(self) -> list[Load]:
         """Of those that answer at once."""
+        ...
+
+    def invite(self, replica: str) -> Any:
+        """Tell one of them that a client is sent there. Does not wait; returns what is to be waited for."""
         ...
 
 
@@ -85,26 +88,29 @@ class Balance:
         with self._lock:
             self._expected.append(time.monotonic())
 
-    def place(self, place: Place) -> Future[str | None]:
-        """The name of the replica for a client, this one's or another's; None if none suits."""
-        return self._one.submit(self._place, place)
+    def place(self, place: Place) -> Future[Any]:
+        """What `Neighbours.invite` returned of the replica that suits a client best; None if that is this one."""
+        return self._one.submit(self._place, place, time.monotonic())
 
-    def _place(self, place: Place) -> str | None:
-        now = time.monotonic()
-        if now - self._asked > _FRESH_S:
+    def _place(self, place: Place, came: float) -> Any:
+        if came > self._asked:  # clients that came while the others were asked cost no question more
             try:
                 self._others = self._neighbours.loads()
             except Exception:  # a client connects whatever is wrong with the others
                 logger.exception("the other replicas could not be asked")
                 self._others = []
             self._asked = time.monotonic()
-        loads = [self.load(), *self._others]
+        mine = self.load()
+        loads = [mine, *self._others]
         random.shuffle(loads)  # of equally loaded ones each client of each replica takes any
         chosen = choose(loads, place)
         if chosen is None:
             return None
+        if chosen is mine:
+            self.expect()
+            return None
         chosen.sessions += 1  # until it is asked again
-        return chosen.replica
+        return self._neighbours.invite(chosen.replica)
 
     def _loop(self) -> None:
         while not self._stop.wait(random.uniform(0.8, 1.2) * PERIOD_S):

@@ -101,11 +101,14 @@ class PolicyReplica:
         """
         await asyncio.shield(self._loading)
         place = Place(node, boot_id, must_be_near)
-        return await self._elsewhere(place) or await self.welcome()
+        return await self._elsewhere(place) or self._introduction()
 
     async def welcome(self) -> tuple[dict[str, Any], Any]:
-        """What `attach` answers of this replica: a client is going to be sent here."""
+        """For another replica, which sends a client here: what to tell it."""
         self._balance.expect()
+        return self._introduction()
+
+    def _introduction(self) -> tuple[dict[str, Any], Any]:
         plasma = None if self._plasma is None else asdict(self._plasma.plasma)
         return self.metadata() | {"plasma": plasma}, ray.get_runtime_context().current_actor
 
@@ -117,16 +120,14 @@ class PolicyReplica:
         """The metadata of the least loaded replica on the machine with that boot id; there may be none: this one's."""
         place = Place(boot_id=caller, must_be_near=True)
         metadata, _ = await self._elsewhere(place) or (self.metadata(), None)
-        if metadata.get("local") == self.metadata()["local"] and caller == boot_id():
-            self._balance.expect()
         return {key: value for key, value in metadata.items() if key != "plasma"}
 
     async def _elsewhere(self, place: Place) -> tuple[dict[str, Any], Any] | None:
         """What another replica tells a client from `place`, if it suits the client better than this one."""
-        name = await asyncio.wrap_future(self._balance.place(place))
-        if name is None or name == self._peers.me:
+        invitation = await asyncio.wrap_future(self._balance.place(place))
+        if invitation is None:
             return None
-        found: tuple[dict[str, Any], Any] | None = await asyncio.to_thread(self._peers.welcome, name)
+        found: tuple[dict[str, Any], Any] | None = await asyncio.to_thread(self._peers.answer, invitation)
         return found
 
     def _load_of(self, sessions: int) -> Load:

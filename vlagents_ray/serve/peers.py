@@ -57,13 +57,17 @@ class Peers:
             self._silent[asked[reference]] = now + _SILENT_S
         return [load for reference in ready if (load := _result(reference)) is not None]
 
-    def welcome(self, name: str) -> Any:
-        """What another replica tells a client that is sent there; None if it does not answer at once."""
+    def invite(self, replica: str) -> Any:
+        """Tell another replica that a client is sent there; `answer` waits for what it says to the client."""
         try:
-            actor = ray.get_actor(name, namespace=_NAMESPACE)
+            return call_replica(ray.get_actor(replica, namespace=_NAMESPACE), "welcome")
         except ValueError:  # it ended meanwhile
             return None
-        return _result(call_replica(actor, "welcome"), _QUICK_S)
+
+    @staticmethod
+    def answer(invitation: Any) -> Any:
+        """None if the other replica does not answer at once."""
+        return _result(invitation, _QUICK_S)
 
     def _actors(self) -> Iterator[tuple[str, Any]]:
         for entry in ray.util.list_named_actors(all_namespaces=True):
