@@ -18,7 +18,7 @@ logger = logging.getLogger(__name__)
 _NAMESPACE = "serve"
 _ANSWER_S = 3.0  # a replica that still loads answers nobody
 _QUICK_S = 0.3  # a client that connects waits for it
-_SILENT_S = 5.0  # a replica that did not answer is not asked for its load again
+_SILENT_S = 3.0  # a replica that did not answer is not asked for its load again
 
 
 class Peers:
