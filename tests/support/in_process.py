@@ -24,6 +24,7 @@ class Replicas:
     def __init__(self, agents: Sequence[Agent]) -> None:
         self.engines = [Engine(agent) for agent in agents]
         self.dead: set[int] = set()
+        self.prefer = 0  # where new connections go, if that one lives and does not stop
         self.lose_reply = False  # of the next frame, after it was acted on
         self.frames: list[int] = []  # requests in each frame that was sent
         for engine in self.engines:
@@ -55,8 +56,9 @@ class InProcess:
         self._number = -1
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
-        """To the first replica that is there."""
-        for number, engine in enumerate(self._replicas.engines):
+        """To the preferred replica, or the first that is there."""
+        numbered = sorted(enumerate(self._replicas.engines), key=lambda one: one[0] != self._replicas.prefer)
+        for number, engine in numbered:
             if number not in self._replicas.dead and not engine.draining:
                 self._number, self._sender = number, Sender(engine, "in process")
                 contract = engine.contract

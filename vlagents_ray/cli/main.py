@@ -40,7 +40,8 @@ Address = Annotated[
 def serve(
     source: Annotated[str, typer.Argument(help="A registered policy, 'module:Class', or a deployment file (.yaml).")],
     host: Annotated[
-        str | None, typer.Option(help="0.0.0.0 lets other machines in; default: the file's, 127.0.0.1.")
+        str | None,
+        typer.Option(help="0.0.0.0, or one address of this machine, lets others in; default: the file's, 127.0.0.1."),
     ] = None,
     port: Annotated[int | None, typer.Option(min=1, max=65535, help="Default: the file's, or 8000.")] = None,
     settings: Set = [],  # noqa: B006 - typer reads it

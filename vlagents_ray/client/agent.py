@@ -45,11 +45,11 @@ class RemoteAgent(Agent):
     `connect_timeout_s` is how long `initialize` (called by the first `reset`) waits for a server
     that is still loading; `timeout_s` is how long a `reset` or `act` may take.
 
-    When the replica stops or dies, the session goes on at another one within `timeout_s`: moved with
-    all its state if the old replica still lives, else begun again with the same instruction and options
-    and shown the last observations (`Contract.history` of them; see `Agent.observe`). `act.info["resumed"]`
-    says that the latter happened. No observation is ever acted on twice by one session. With `resume=False`
-    the loss is raised as `ConnectionLost` instead, and the episode needs a new `reset`.
+    When the replica stops, dies or has more sessions than others, the session goes on at another one within
+    `timeout_s`: moved with all its state if the old replica still lives, else begun again with the same
+    instruction and options and shown the last observations (`Contract.history` of them; see `Agent.observe`).
+    `act.info["resumed"]` says that the latter happened. No observation is ever acted on twice by one session.
+    With `resume=False` the loss is raised as `ConnectionLost` instead, and the episode needs a new `reset`.
     """
 
     def __init__(

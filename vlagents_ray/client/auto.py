@@ -15,7 +15,7 @@ from vlagents_ray.client.shm import ShmTransport, reaches
 from vlagents_ray.client.transport import Transport
 from vlagents_ray.client.websocket import WebSocketTransport
 from vlagents_ray.errors import ConfigError, NotReset, PolicyUnavailable
-from vlagents_ray.wire.messages import Reply, Request
+from vlagents_ray.wire.messages import Reply, Request, boot_id
 
 
 class AutoTransport:
@@ -46,8 +46,8 @@ class AutoTransport:
         """The server's metadata, once it answers and the chosen transport is connected."""
         deadline = time.monotonic() + timeout_s
         parts = urlsplit(self._url)
-        inside = HandleTransport(parts.netloc) if parts.scheme == "serve" else None
-        door = inside or HttpTransport(self._url, self._codec)
+        inside = HandleTransport(parts.netloc, must_be_near=self._only_shm) if parts.scheme == "serve" else None
+        door = inside or HttpTransport(self._url, self._codec, boot_id())
         metadata = door.connect(timeout_s)
         left_s = max(1.0, deadline - time.monotonic())
         near = self._near(metadata.get("local"), left_s)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 import uuid
 from collections.abc import Sequence
@@ -19,7 +20,7 @@ _CLOSE_S = 2.0
 
 
 class Connection:
-    """Connects when first needed, and again when the connection broke or the replica wants to stop.
+    """Connects when first needed, and again when the connection broke or the replica sends its sessions elsewhere.
 
     Used by one thread at a time.
     """
@@ -36,6 +37,7 @@ class Connection:
         self.users: set[object] = set()  # whoever has a session here
         self._connect_timeout_s = connect_timeout_s
         self._stale = False  # connect anew before the next request
+        self._sent_away = False  # because the replica said so, and for no other reason
         self._prefix = uuid.uuid4().hex[:16]
         self._requests = 0
 
@@ -48,7 +50,7 @@ class Connection:
         """Connect, waiting for the server to become ready; `PolicyUnavailable` if it does not."""
         if self._stale:
             self.transport.close()
-            self.metadata, self._stale = None, False
+            self.metadata, self._stale, self._sent_away = None, False, False
         if self.metadata is not None:
             return
         metadata = self.transport.connect(self._connect_timeout_s if timeout_s is None else timeout_s)
@@ -77,8 +79,9 @@ class Connection:
         if len(replies) != len(requests):  # an answer to the frame as a whole
             whole = replies[0].error or PolicyUnavailable(f"got {len(replies)} replies to {len(requests)} requests")
             replies = [Reply(request.request_id, error=whole) for request in requests]
-        if any(reply.draining or isinstance(reply.error, (ConnectionLost, PolicyUnavailable)) for reply in replies):
-            self._stale = True
+        broken = any(isinstance(reply.error, (ConnectionLost, PolicyUnavailable)) for reply in replies)
+        if broken or any(reply.draining for reply in replies):
+            self._stale, self._sent_away = True, not broken
         return replies
 
     def leave(self, user: object, session: str) -> None:
@@ -86,9 +89,10 @@ class Connection:
         begun = user in self.users
         self.users.discard(user)
         told = self.transport.holds_sessions and not self.users  # by hanging up
-        if begun and not told and not self._stale and self.metadata is not None:
-            close = Request("close", session=session, request_id=self.request_id())
-            self.call([close], _CLOSE_S)  # an error would change nothing: the server forgets idle sessions
+        if begun and self.metadata is not None and (self._sent_away or not (told or self._stale)):
+            close = Request("close", session=session, request_id=self.request_id(), deadline_ms=_CLOSE_S * 1e3)
+            with contextlib.suppress(VLAgentsError):  # it would change nothing: the server forgets idle sessions
+                self.transport.call([close], _CLOSE_S)  # over this connection still: the session is there
         if not self.users:
             self.transport.close()
-            self.metadata, self._stale = None, False
+            self.metadata, self._stale, self._sent_away = None, False, False

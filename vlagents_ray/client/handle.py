@@ -16,7 +16,7 @@ import numpy as np
 from vlagents_ray.errors import ConfigError, ConnectionLost, DeadlineExceeded, PolicyUnavailable, VLAgentsError
 from vlagents_ray.wire.codecs import RAW
 from vlagents_ray.wire.frames import decode_replies, encode_requests
-from vlagents_ray.wire.messages import Reply, Request
+from vlagents_ray.wire.messages import Reply, Request, boot_id
 
 
 class HandleTransport:
@@ -25,7 +25,9 @@ class HandleTransport:
     name = "handle"
     holds_sessions = False
 
-    def __init__(self, app: str) -> None:
+    def __init__(self, app: str, *, must_be_near: bool = False) -> None:
+        """`must_be_near`: only a replica on this machine will do, even if one elsewhere has far less to do."""
+        self._must_be_near = must_be_near
         self._app = app
         self._session = uuid.uuid4().hex
         self._replica: Any = None
@@ -34,6 +36,7 @@ class HandleTransport:
         """Choose a replica; returns the metadata."""
         import ray
         from ray import serve
+        from ray._private.worker import global_worker
         from ray.serve.exceptions import RayServeException
 
         if not ray.is_initialized():
@@ -42,7 +45,9 @@ class HandleTransport:
             )
         try:
             handle = serve.get_app_handle(self._app)
-            metadata, self._replica = handle.attach.remote().result(timeout_s=timeout_s)
+            here = ray.get_runtime_context().get_node_id() if global_worker.connected else ""
+            attaching = handle.attach.remote(here, boot_id(), self._must_be_near)
+            metadata, self._replica = attaching.result(timeout_s=timeout_s)
         except ray.exceptions.RayTaskError as error:
             raise PolicyUnavailable(f"serve://{self._app}: {error.cause}") from error
         except (RayServeException, ray.exceptions.RayActorError) as error:

@@ -24,7 +24,7 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 from vlagents_ray.wire.frames import CONTENT_TYPE, decode_replies, encode_requests, read_error
-from vlagents_ray.wire.messages import REQUEST_ID_HEADER, SESSION_HEADER, Reply, Request
+from vlagents_ray.wire.messages import MACHINE_HEADER, REQUEST_ID_HEADER, SESSION_HEADER, Reply, Request
 
 _UNKNOWN_APP_S = 10.0  # a starting server knows no path until its first replica exists
 
@@ -35,7 +35,9 @@ class HttpTransport:
     name = "http"
     holds_sessions = False
 
-    def __init__(self, url: str, codec: CodecChoice) -> None:
+    def __init__(self, url: str, codec: CodecChoice, machine: str = "") -> None:
+        """With `machine`, its `boot_id`, the metadata is that of the least loaded replica there, if there is one."""
+        self._machine = machine
         self._url = http_url(url)
         self._codec = codec
         self._session = uuid.uuid4().hex
@@ -61,7 +63,9 @@ class HttpTransport:
             pause_s = min(1.0, pause_s * 1.5)
 
     def _metadata(self, timeout_s: float) -> dict[str, Any]:
-        status, kind, body = self._exchange("GET", "/v1/metadata", None, {}, timeout_s)
+        # By this object's own hash: the load balancer's turn is left to WebSockets, which spread by it.
+        headers = {SESSION_HEADER: self._session} | ({MACHINE_HEADER: self._machine} if self._machine else {})
+        status, kind, body = self._exchange("GET", "/v1/metadata", None, headers, timeout_s)
         if status != 200:
             raise _refusal(status, kind, body)
         metadata = _json(body)

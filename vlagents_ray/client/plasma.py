@@ -32,7 +32,7 @@ class PlasmaTransport(ShmTransport):
 
     def __init__(self, app: str) -> None:
         self._app = app
-        self._handle = HandleTransport(app)
+        self._handle = HandleTransport(app, must_be_near=True)
         self._plasma: PlasmaAddress | None = None
         self._channel: Any = None  # its ObjectRef
         self._capacity = 0

@@ -30,13 +30,14 @@ class Sender:
         self._session_id = session_id or uuid.uuid4().hex
         self._owner = uuid.uuid4().hex if connected else ""
         self._sessions: set[str] = set()
+        self._told = False  # to connect anew, and that its sessions follow
 
     def send(self, items: Sequence[Request | Reply], done: Done) -> Round:
         """Queue the requests of a frame. `done` gets all replies at once, in order, on whatever thread is last.
 
         A `Reply` among `items` is the answer to a request that could not be read.
         """
-        round_ = Round(items, done, self._engine)
+        round_ = Round(items, done, self._shall_leave)
         ready: list[Ticket] = []
         for index, item in enumerate(items):
             if isinstance(item, Reply):
@@ -72,9 +73,15 @@ class Sender:
                 timer.cancel()
 
     def release(self) -> None:
-        """The connection is gone, and its sessions with it; those of a replica that stops may be fetched still."""
-        if self._owner and not self._engine.draining:
+        """The connection is gone, and its sessions with it, unless it was told to go elsewhere: those are fetched."""
+        if self._owner and not self._told and not self._engine.draining:
             self._engine.sessions.close_owned(self._owner, self._sessions)
+
+    def _shall_leave(self) -> bool:
+        """Is the client to connect anew, which takes its sessions to another replica?"""
+        if self._engine.leavers.tell(self._session_id):
+            self._told = True
+        return self._engine.draining or self._told
 
     def _session(self, request: Request) -> str:
         return request.session or self._session_id
@@ -121,15 +128,16 @@ class Sender:
 class Round:
     """The replies to the requests of one frame, as they come; `done` gets them once, when none is missing."""
 
-    __slots__ = ("_done", "_engine", "_items", "_left", "_lock", "_replies", "tickets")
+    __slots__ = ("_done", "_items", "_leave", "_left", "_lock", "_replies", "tickets")
 
-    def __init__(self, items: Sequence[Request | Reply], done: Done, engine: Engine) -> None:
+    def __init__(self, items: Sequence[Request | Reply], done: Done, leave: Callable[[], bool]) -> None:
+        """`leave` says whether the replies ask their client to connect anew."""
         self.tickets: list[Ticket] = []
         self._items = items
         self._replies: list[Reply | None] = [None] * len(items)
         self._left = len(items)
         self._done = done
-        self._engine = engine
+        self._leave = leave
         self._lock = threading.Lock()
 
     def put(self, index: int, reply: Reply) -> None:
@@ -141,8 +149,9 @@ class Round:
             self._left -= 1
             if self._left:
                 return
+        leave = self._leave()
         for each in self._replies:
-            each.draining = self._engine.draining  # type: ignore[union-attr]
+            each.draining = leave  # type: ignore[union-attr]
         self._done(self._replies)  # type: ignore[arg-type]
 
     def expire(self) -> None:

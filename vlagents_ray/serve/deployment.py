@@ -18,6 +18,7 @@ from starlette.applications import Starlette
 from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
 from vlagents_ray.registry import policy_class
 from vlagents_ray.serve.autoscaling import SESSIONS, UTILISATION, WAITING
+from vlagents_ray.serve.balance import Balance
 from vlagents_ray.serve.calls import Sender
 from vlagents_ray.serve.config import ServerArgs
 from vlagents_ray.serve.engine import Engine
@@ -27,9 +28,10 @@ from vlagents_ray.serve.metrics import Exporter
 from vlagents_ray.serve.moving import Strays, export
 from vlagents_ray.serve.peers import Peers
 from vlagents_ray.serve.plasma import PlasmaDoor
+from vlagents_ray.serve.spread import Load, Place
 from vlagents_ray.serve.stats import LoadMeter, Visit
 from vlagents_ray.wire.frames import decode_requests
-from vlagents_ray.wire.messages import PROTOCOL_VERSION, Reply
+from vlagents_ray.wire.messages import PROTOCOL_VERSION, Reply, boot_id
 
 logger = logging.getLogger(__name__)
 
@@ -59,7 +61,9 @@ class PolicyReplica:
         self._load = LoadMeter(self._engine.queue)
         self._metrics = Exporter(self._engine, _tags(self._args.policy))
         self._metrics.start()
-        self._strays = self._engine.strays = Strays(self._engine, Peers())
+        self._peers = Peers()
+        self._strays = self._engine.strays = Strays(self._engine, self._peers)
+        self._balance = Balance(self._engine, self._peers, self._load_of)
         self._local = LocalDoor(self._engine, self._limits) if hasattr(os, "memfd_create") else None
         self._plasma = PlasmaDoor(self._engine, self._limits) if self._local is not None else None
         for door in (self._local, self._plasma):
@@ -70,10 +74,11 @@ class PolicyReplica:
             await self._loading
         else:
             self._loading.add_done_callback(_log_failure)
+        self._balance.start()
         self._watching = asyncio.ensure_future(self._watch_for_the_end())
 
     def __serve_build_asgi_app__(self) -> Starlette:
-        return build_ingress(self._engine, self.metadata, self._limits)
+        return build_ingress(self._engine, self.metadata, self._limits, self._near)
 
     def metadata(self) -> dict[str, Any]:
         """What `GET /v1/metadata` and `RemoteAgent.metadata` say."""
@@ -88,15 +93,48 @@ class PolicyReplica:
             "local": None if self._local is None else asdict(self._local.address),
         }
 
-    async def attach(self) -> tuple[dict[str, Any], Any]:
-        """For a client inside the cluster: the metadata, and this replica's actor, once it can act.
+    async def attach(self, node: str = "", boot_id: str = "", must_be_near: bool = False) -> tuple[dict[str, Any], Any]:
+        """For a client inside the cluster, on that node and machine: a replica's metadata, and its actor.
 
-        A session must stay on one replica, which a Serve handle does not promise; the client calls
-        the actor's own entry point for every request after this one.
+        The replica is the least loaded one, if it can be near to the client. A session must stay there,
+        which a Serve handle does not promise; the client calls the actor's own entry point for every
+        request after this one.
         """
         await asyncio.shield(self._loading)
+        place = Place(node, boot_id, must_be_near)
+        return await self._elsewhere(place) or self._introduction()
+
+    async def welcome(self) -> tuple[dict[str, Any], Any]:
+        """For another replica, which sends a client here: what to tell it."""
+        self._balance.expect()
+        return self._introduction()
+
+    def _introduction(self) -> tuple[dict[str, Any], Any]:
         plasma = None if self._plasma is None else asdict(self._plasma.plasma)
         return self.metadata() | {"plasma": plasma}, ray.get_runtime_context().current_actor
+
+    async def load(self) -> Load:
+        """For other replicas, which compare it with theirs."""
+        return self._balance.load()
+
+    async def _near(self, caller: str) -> dict[str, Any]:
+        """The metadata of the least loaded replica on the machine with that boot id; there may be none: this one's."""
+        place = Place(boot_id=caller, must_be_near=True)
+        metadata, _ = await self._elsewhere(place) or (self.metadata(), None)
+        return {key: value for key, value in metadata.items() if key != "plasma"}
+
+    async def _elsewhere(self, place: Place) -> tuple[dict[str, Any], Any] | None:
+        """What another replica tells a client from `place`, if it suits the client better than this one."""
+        invitation = await asyncio.wrap_future(self._balance.place(place))
+        if invitation is None:
+            return None
+        found: tuple[dict[str, Any], Any] | None = await asyncio.to_thread(self._peers.answer, invitation)
+        return found
+
+    def _load_of(self, sessions: int) -> Load:
+        accepts = self._loading.done() and self._engine.ready and not (self._engine.draining or _stopping())
+        node = ray.get_runtime_context().get_node_id()
+        return Load(self._peers.me, sessions, accepts, node, boot_id(), self._engine.version)
 
     async def lease(self, length: int) -> tuple[bytes, int]:
         """A plasma channel for frames of `length` bytes, for a client that `attach` told of the plasma door."""
@@ -158,6 +196,7 @@ class PolicyReplica:
             self._watching.cancel()
         if self._engine.draining:
             await asyncio.to_thread(self._strays.hand_over)
+        self._balance.close()
         self._strays.close()
         await asyncio.to_thread(self._engine.close)
         await asyncio.to_thread(self._metrics.close)

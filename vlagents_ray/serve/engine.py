@@ -16,6 +16,7 @@ from vlagents_ray.contract import Contract, check_action, check_observation, req
 from vlagents_ray.errors import InvalidInput, NotReset, PolicyFailed, PolicyUnavailable, UnknownSession, VLAgentsError
 from vlagents_ray.interface import Act, Agent
 from vlagents_ray.serve.batching import BatchQueue, Rank, Ticket
+from vlagents_ray.serve.leavers import Leavers
 from vlagents_ray.serve.padding import Padding
 from vlagents_ray.serve.sessions import AgentCopies, Session, SessionTable
 from vlagents_ray.serve.stats import Stats
@@ -61,6 +62,7 @@ class Engine:
         self.contract: Contract | None = None
         self.strays: FindsStrays | None = None  # where to look for a session that is not here
         self.draining = False  # the replica will stop, and others will go on: clients are told
+        self.leavers = Leavers()  # told the same although it goes on, since others hold fewer sessions
         self.sessions = SessionTable(session_limit, session_idle_s)
         self.queue = BatchQueue(
             self._run,
@@ -82,6 +84,11 @@ class Engine:
             raise self._unready from error
         self._unready = None
 
+    @property
+    def ready(self) -> bool:
+        """Can it act?"""
+        return self._unready is None and self.queue.alive()
+
     def require_ready(self) -> None:
         """Raise `PolicyUnavailable` while the policy loads, `PolicyFailed` if it could not or has died."""
         if self._unready is not None:
@@ -93,6 +100,11 @@ class Engine:
         """Answer what waits with 503, finish the batch under way, close the agent."""
         self.queue.close(timeout_s=30)
         self._agent.close()
+
+    @property
+    def version(self) -> tuple[str, str]:
+        """Equal in replicas that can take each other's sessions over."""
+        return self._version, "" if self._copies is None else self._copies.fingerprint
 
     def ticket(
         self,
@@ -114,14 +126,14 @@ class Engine:
             session = self.sessions.get(session_id)
             if session.agent is None:
                 raise NotReset(f"session {session_id!r}: act before a successful reset; reset first")
-            session.owner, session.transport = owner, transport
+            session.owner, session.transport, session.connection = owner, transport, turn
         elif request.op == "reset" and request.contract is not None:
             require_match(self.contract, Contract.from_json(request.contract))
         for obs in (*request.history, request.obs):
             if obs is not None:
                 check_observation(obs, self.contract)
         if request.op == "reset":
-            self.sessions.open(session_id, owner, transport)
+            self.sessions.open(session_id, owner, transport, turn)
         rank = Rank.SIMULATION if request.rank == "simulation" else Rank.ROBOT
         return Ticket(session_id, request, done, rank, owner=turn, connection=owner, transport=transport)
 
@@ -134,7 +146,7 @@ class Engine:
     def adopt(self, session_id: str, state: dict[str, Any]) -> None:
         """Go on with a session that another replica gave up: the `info` of its answer to "export"."""
         self.require_ready()
-        if self._copies is None or state["version"] != (self._version, self._copies.fingerprint):
+        if self._copies is None or state["version"] != self.version:
             raise UnknownSession(f"session {session_id!r}: of another version of the policy; reset it")
         agent = self._copies.load(state["agent"])
         session = self.sessions.open(session_id)
@@ -187,13 +199,13 @@ class Engine:
         state = {
             "agent": self._copies.dump(session.agent),
             "steps": session.steps,
-            "version": (self._version, self._copies.fingerprint),
+            "version": self.version,
         }
         self.sessions.close(ticket.session_id)
         ticket.answer(Reply(ticket.request.request_id, info=state))
 
     def _reset(self, ticket: Ticket) -> None:
-        session = self.sessions.open(ticket.session_id, ticket.connection, ticket.transport)
+        session = self.sessions.open(ticket.session_id, ticket.connection, ticket.transport, ticket.owner)
         session.agent = None
         session.steps = 0
         if self._copies is None or ticket.request.obs is None:  # start() and the decoder have seen to both

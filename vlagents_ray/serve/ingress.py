@@ -36,6 +36,7 @@ from vlagents_ray.serve.stats import Visit
 from vlagents_ray.wire.frames import CONTENT_TYPE, check_request, decode_requests, encode_replies
 from vlagents_ray.wire.messages import (
     DEADLINE_HEADER,
+    MACHINE_HEADER,
     OPS,
     RANK_HEADER,
     REQUEST_ID_HEADER,
@@ -56,9 +57,14 @@ _TRY_AGAIN_LATER = 1013  # a WebSocket close code
 _INLINE_BYTES = 512 * 1024  # a larger body is decoded beside the event loop, which others wait for
 
 
-def build_ingress(engine: Engine, metadata: Callable[[], dict[str, Any]], limits: Limits) -> Starlette:
-    """The ASGI application of a replica."""
-    door = _Door(engine, metadata, limits)
+def build_ingress(
+    engine: Engine,
+    metadata: Callable[[], dict[str, Any]],
+    limits: Limits,
+    near: Callable[[str], Awaitable[dict[str, Any]]] | None = None,
+) -> Starlette:
+    """The ASGI application of a replica; `near` gives the metadata for a caller on the machine with that boot id."""
+    door = _Door(engine, metadata, limits, near)
     return Starlette(
         routes=[
             *(Route(f"/v1/{op}", door.endpoint(op), methods=["POST"]) for op in OPS),
@@ -73,15 +79,25 @@ def build_ingress(engine: Engine, metadata: Callable[[], dict[str, Any]], limits
 
 
 class _Door:
-    def __init__(self, engine: Engine, metadata: Callable[[], dict[str, Any]], limits: Limits) -> None:
+    def __init__(
+        self,
+        engine: Engine,
+        metadata: Callable[[], dict[str, Any]],
+        limits: Limits,
+        near: Callable[[str], Awaitable[dict[str, Any]]] | None,
+    ) -> None:
         self._engine = engine
         self._metadata = metadata
         self._limits = limits
+        self._near = near
 
     async def health(self, http: HttpRequest) -> Response:
         return self._when_ready(http, lambda: PlainTextResponse("OK\n"))
 
     async def show_metadata(self, http: HttpRequest) -> Response:
+        machine = http.headers.get(MACHINE_HEADER)
+        if machine and self._near is not None and self._engine.ready:
+            return JSONResponse(await self._near(machine))
         return self._when_ready(http, lambda: JSONResponse(self._metadata()))
 
     async def docs(self, http: HttpRequest) -> Response:

@@ -25,7 +25,7 @@ import threading
 import time
 import types
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -170,6 +170,7 @@ class Session:
     owner: str = ""  # the connection that it ends with; empty: it ends when closed, or idle for long
     steps: int = 0  # acts since its last reset
     transport: str = ""  # the door that it came through
+    connection: str = ""  # that its last request came by, if one carries several sessions; else its own
     used: float = field(default_factory=time.monotonic)
 
 
@@ -179,6 +180,7 @@ class SessionTable:
     def __init__(self, limit: int, idle_s: float) -> None:
         self._sessions: dict[str, Session] = {}
         self.limit = limit
+        self.opened = 0  # so far
         self._idle_s = idle_s
         self._lock = threading.Lock()
 
@@ -199,7 +201,7 @@ class SessionTable:
         session.used = time.monotonic()
         return session
 
-    def open(self, session_id: str, owner: str = "", transport: str = "") -> Session:
+    def open(self, session_id: str, owner: str = "", transport: str = "", connection: str = "") -> Session:
         """The session, made if it is new, now `owner`'s; `PolicyUnavailable` when the replica is full."""
         with self._lock:
             session = self._sessions.get(session_id)
@@ -212,8 +214,9 @@ class SessionTable:
                         f"close one, or raise sessions.limit or the number of replicas"
                     )
                 session = self._sessions[session_id] = Session(session_id)
+                self.opened += 1
         session.used = time.monotonic()
-        session.owner, session.transport = owner, transport
+        session.owner, session.transport, session.connection = owner, transport, connection
         return session
 
     def close(self, session_id: str) -> None:
@@ -233,6 +236,13 @@ class SessionTable:
         """How many came through which door."""
         with self._lock:
             return Counter(session.transport for session in self._sessions.values())
+
+    def by_connection(self, transports: Container[str], within_s: float) -> Counter[str]:
+        """How many of those that were used lately came by which connection, over these transports."""
+        since = time.monotonic() - within_s
+        with self._lock:
+            sessions = list(self._sessions.values())
+        return Counter(s.connection for s in sessions if s.transport in transports and s.used >= since)
 
     def ids(self) -> list[str]:
         """All sessions."""

@@ -13,6 +13,7 @@ from vlagents_ray.interface import Act, Obs
 PROTOCOL_VERSION = 1
 SESSION_HEADER = "x-session-id"
 REQUEST_ID_HEADER = "x-request-id"
+MACHINE_HEADER = "x-boot-id"  # with GET /v1/metadata: the caller's machine, see `boot_id`
 DEADLINE_HEADER = "x-deadline-ms"
 RANK_HEADER = "x-rank"
 NAME_CHARACTERS = 128  # of a session's or a request's id, at most
@@ -50,7 +51,7 @@ class Reply:
     info: dict[str, Any] | None = None  # what `Agent.reset` returned
     error: VLAgentsError | None = None
     step: int | None = None  # acts that the session has behind it, this one included
-    draining: bool = False  # the replica will stop: connect again, and the session follows
+    draining: bool = False  # the replica stops, or has too much to do: connect again, and the session follows
     timing: dict[str, float] = field(default_factory=dict)  # ms, by stage
 
 

@@ -1,0 +1,133 @@
+"""Sessions spread over the replicas, as they come and when a replica joins them."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+
+import pytest
+from eval_fakes import wait_for
+from ray.serve.schema import ServeDeploySchema
+
+from tests.integration.test_sessions import obs, url
+from vlagents_ray import RemoteAgent
+from vlagents_ray.client.ways import TransportName
+from vlagents_ray.serve.cluster import Server, running_server
+from vlagents_ray.serve.files import deployment
+
+HELD: dict[TransportName, int] = {"handle": 2, "shm": 2, "websocket": 6}  # of equal connections the oldest go first
+
+
+def deployed(replicas: int) -> ServeDeploySchema:
+    """As `serve deploy` with another `num_replicas` would have it."""
+    reacher = deployment("served_agents:Reacher").model_dump(exclude_unset=True)
+    reacher["applications"][0]["deployments"] = [{"name": "Policy", "num_replicas": replicas}]
+    return ServeDeploySchema(applications=reacher["applications"])
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Server]:
+    """On an address that is not the loopback's usual one."""
+    with running_server(deployed(1), host="127.0.0.2", num_cpus=4, timeout_s=120) as server:
+        yield server
+
+
+def test_a_server_on_a_single_address_is_reached_there(server: Server) -> None:
+    """HAProxy looks for replicas at 127.0.0.1, Serve would have bound them to this one."""
+    assert server.url.startswith("http://127.0.0.2:")
+    for transport in ("http", "websocket", "shm"):
+        with RemoteAgent(server.url, transport=transport) as agent:
+            agent.reset(obs(1), "x")
+            assert agent.act(obs(0, 3)).action.tolist() == [1, 3, 1]
+
+
+def test_sessions_move_to_a_replica_that_joins(server: Server) -> None:
+    """Pinned ones, on every such transport, exactly where they were; so do several of one connection.
+
+    Then the first to go end, and the rest is uneven again.
+    """
+    agents = {(way, i): RemoteAgent(url(server, way), transport=way) for way, n in HELD.items() for i in range(n)}
+    vector = RemoteAgent(url(server, "shm"), transport="shm")
+    envs = vector.sessions(2)
+    pids = {key: agent.reset(obs(key[1]), f"{key}")["pid"] for key, agent in agents.items()}
+    vector.reset_batch([obs(i) for i in range(2)], [f"env {i}" for i in range(2)], envs)
+    counts = dict.fromkeys(agents, 0)
+    together = 0
+    moves: Counter[tuple[str, int]] = Counter()
+
+    def act() -> dict[object, int]:
+        """Once in each session; returns where it was."""
+        nonlocal together
+        for key, agent in agents.items():
+            counts[key] += 1
+            act = agent.act(obs(0, 10 * counts[key]))
+            assert act.info["instruction"] == f"{key}"
+            assert act.action.tolist() == [counts[key], 5 * counts[key] * (counts[key] + 1), key[1]]
+            assert "resumed" not in act.info
+            moves[key] += act.info["pid"] != pids[key]
+            pids[key] = act.info["pid"]
+        together += 1
+        acts = vector.act_batch([obs(0, 1)] * len(envs), envs) if envs else []
+        where = []
+        for i, one in enumerate(acts):
+            assert not isinstance(one, Exception), one
+            assert one.action.tolist() == [together, together, i]
+            assert "resumed" not in one.info
+            where.append(one.info["pid"])
+        assert len(set(where)) <= 1, "sessions of one connection were parted"
+        return dict(pids) | {f"env {i}": pid for i, pid in enumerate(where)}
+
+    assert len(set(act().values())) == 1
+    from ray.serve.context import _get_global_client
+
+    client = _get_global_client()
+    assert client is not None
+    client.deploy_apps(deployed(2))
+
+    def even() -> bool:
+        held = Counter(act().values())
+        return len(held) == 2 and max(held.values()) <= min(held.values()) + 2
+
+    def become_even() -> None:
+        begun = time.monotonic()
+        wait_for(even, 60)
+        print(f"{len(pids) + len(envs)} sessions: even after {time.monotonic() - begun:.1f} s")
+
+    become_even()
+    for env in envs:
+        env.close()
+    envs.clear()
+    for key in [key for key in agents if key[0] != "websocket"]:
+        agents.pop(key).close()
+        del pids[key]
+    become_even()
+    assert {way for way, _ in +moves} == set(HELD)
+    settled = Counter(moves)
+    until = time.monotonic() + 8
+    while time.monotonic() < until:
+        act()
+    assert sum((moves - settled).values()) <= 2, "sessions go to and fro"
+    for agent in agents.values():
+        agent.close()
+
+
+@pytest.mark.parametrize("way", ["shm", "handle", "plasma"])
+def test_new_sessions_spread_evenly(server: Server, way: TransportName) -> None:
+    """Sixteen that come at once; two replicas run since the test before."""
+    agents = [RemoteAgent(url(server, way), transport=way) for _ in range(16)]
+    pids: list[int] = []
+    threads = [
+        threading.Thread(target=lambda i=i: pids.append(agents[i].reset(obs(i), f"task {i}")["pid"])) for i in range(16)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    held = Counter(pids)
+    print(f"{way}: {sorted(held.values())}")
+    assert len(held) == 2
+    assert min(held.values()) >= 6
+    for agent in agents:
+        agent.close()
