@@ -10,7 +10,7 @@ import pytest
 
 from vlagents_ray.bench.client import connect
 from vlagents_ray.bench.observing import observation
-from vlagents_ray.bench.rtt import in_turns
+from vlagents_ray.bench.rtt import ROUND, in_turns
 from vlagents_ray.bench.ways import WAYS, Driver, installed, peer_ways, ways
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.images import encode_jpeg
@@ -38,8 +38,8 @@ def test_the_observation_compresses_as_a_photograph_does() -> None:
 def test_all_take_turns_in_short_rounds_and_nobody_is_always_the_first() -> None:
     log: list[str] = []
     drivers: Mapping[str, Driver] = {name: Turns(name, log) for name in "abc"}
-    found = in_turns(drivers, 60, lambda _: None)
-    assert {name: trips.rounds.shape for name, trips in found.items()} == dict.fromkeys("abc", (3, 25))
+    found = in_turns(drivers, 3 * ROUND - 15, lambda _: None)
+    assert {name: trips.rounds.shape for name, trips in found.items()} == dict.fromkeys("abc", (3, ROUND))
     assert [sorted(log[i : i + 3]) for i in (0, 3, 6)] == [["a", "b", "c"]] * 3
     assert len(set(log[::3])) > 1
     assert in_turns(drivers, 10, lambda _: None)["a"].rounds.shape == (1, 10)

@@ -38,7 +38,7 @@ _TOOLS = ("ip", "tc", "unshare", "nsenter")
 
 
 def measure_link(
-    calls: int = 300,
+    calls: int = 600,
     *,
     rate: str = RATE,
     delay: str | None = None,

@@ -23,8 +23,8 @@ COMMAND = "vlagents-ray bench report"
 def collect(
     peers_python: Path,
     *,
-    calls: int = 500,
-    link_calls: int = 300,
+    calls: int = 1000,
+    link_calls: int = 600,
     plan: Plan | None = None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:

@@ -30,7 +30,7 @@ __all__ = ["RoundTripsOfAll", "measure_rtt", "observation"]
 
 POLICY = "vlagents_ray.bench.policy:Measured"
 LOOPBACK = "127.0.0.1"
-ROUND = 25  # calls of one way before it is the next one's turn
+ROUND = 100  # calls of one way before it is the next one's turn
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class RoundTripsOfAll:
 
 
 def measure_rtt(
-    calls: int = 500,
+    calls: int = 1000,
     *,
     transports: Sequence[str] = (),
     peers: Sequence[str] = (),
@@ -113,7 +113,7 @@ def measure(
 
 
 def in_turns(drivers: Mapping[str, Driver], calls: int, tell: Callable[[str], None]) -> dict[str, RoundTrips]:
-    """Rounds of at most 25 calls of each until everyone has made `calls`; the order is drawn anew each time."""
+    """Rounds of at most 100 calls of each until everyone has made `calls`; the order is drawn anew each time."""
     each = min(ROUND, calls)
     rounds = -(-calls // each)
     taken: dict[str, list[list[float]]] = {name: [] for name in drivers}

@@ -30,7 +30,7 @@ DEFAULT_PEERS_PYTHON = PEERS_DIR / "bin" / "python"
 
 @bench.command("rtt")
 def bench_rtt(
-    calls: Annotated[int, typer.Option(min=1, help="Round trips by each way.")] = 500,
+    calls: Annotated[int, typer.Option(min=1, help="Round trips by each way.")] = 1000,
     transports: Annotated[str, typer.Option(help="Of ours: shm,websocket,http,handle,plasma; default: all.")] = "",
     peers: Peers = "",
     peers_python: PeersPython = DEFAULT_PEERS_PYTHON,
@@ -54,7 +54,7 @@ def bench_rtt(
 
 @bench.command("link")
 def bench_link(
-    calls: Annotated[int, typer.Option(min=1, help="Round trips by each way.")] = 300,
+    calls: Annotated[int, typer.Option(min=1, help="Round trips by each way.")] = 600,
     rate: Annotated[str, typer.Option(help="Of the link, as tc writes it.")] = "1gbit",
     delay: Annotated[str | None, typer.Option(help="Each way, as tc writes it: 2ms. Needs the kernel's netem.")] = None,
     peers: Peers = "vlagents,openpi",
@@ -162,7 +162,7 @@ def bench_peers_setup(
 def bench_report(
     readme: Annotated[Path, typer.Option(help="Its text between the bench markers is replaced.")] = Path("README.md"),
     json_file: Annotated[Path, typer.Option("--json", help="Keep the figures here.")] = Path("benchmarks/latest.json"),
-    calls: Annotated[int, typer.Option(min=1, help="Round trips by each way.")] = 500,
+    calls: Annotated[int, typer.Option(min=1, help="Round trips by each way.")] = 1000,
     seconds: Annotated[float, typer.Option(min=0.1, help="Of each measurement of the throughput.")] = 2.0,
     peers_python: PeersPython = DEFAULT_PEERS_PYTHON,
     from_json: Annotated[bool, typer.Option("--from-json", help="Measure nothing: use the figures in --json.")] = False,
