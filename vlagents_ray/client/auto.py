@@ -22,7 +22,7 @@ class AutoTransport:
     """Shared memory if the policy runs on this machine for this user; else a WebSocket.
 
     Inside the cluster: shared memory, else a plasma channel on the replica's node, else the Serve handle.
-    Shared memory comes first because it is a fifth faster, without Ray's locks and framing; plasma
+    Shared memory comes first because it is faster, without Ray's locks and framing; plasma
     reaches a replica on this node whose socket is in another network namespace.
     """
 

@@ -29,8 +29,8 @@ __all__ = ["BatchQueue", "HasFileno", "Rank", "Ticket"]
 
 logger = logging.getLogger(__name__)
 
-_LOOK_S = 100e-6
-_DENSE_S = 200e-6
+_LOOK_S = 100e-6  # for a next request before going to sleep
+_DENSE_S = 200e-6  # since the last one: the next is likely to come as soon
 
 
 class BatchQueue:
@@ -235,9 +235,10 @@ class BatchQueue:
                 return False
 
     def _nap(self) -> bool:
-        """Wait for something to hear. Where the last one came at once, look for the next before going to sleep:
+        """Wait for something to hear.
 
-        waking up takes as long as a fast policy does. Other processes get the core meanwhile if they want it.
+        Where the last request came at once, look for the next one before going to sleep: waking up takes
+        as long as a fast policy does. Other processes get the core meanwhile if they want it.
         """
         begun = time.perf_counter()
         while self._dense and time.perf_counter() - begun < _LOOK_S:

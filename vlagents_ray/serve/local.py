@@ -200,10 +200,8 @@ class LocalClient:
         self._files[number] = mapped
 
     def _answer(self, visit: Visit, replies: list[Reply]) -> None:
-        frame = visit.answers(replies)
-        flags = LocalAddress.COMPACT
-        if frame is None:
-            frame, flags = visit.frame(replies), 0
+        frame, compact_form = visit.packed(replies)
+        flags = LocalAddress.COMPACT if compact_form else 0
         with self._sending:
             if self._ended:
                 return

@@ -94,24 +94,18 @@ class Visit:
 
     def frame(self, replies: Sequence[Reply]) -> bytes:
         """The replies as a frame, in which `timing` is complete."""
-        decode_ms = (self._decoded - self.arrived) * 1e3
-        for reply in replies:
-            if reply.error is None:
-                reply.timing["decode_ms"] = decode_ms
+        self._tell_decoding(replies)
         data = encode_replies(replies, arrived=self.arrived)
         self._record(replies)
         return data
 
-    def answers(self, replies: Sequence[Reply]) -> bytes | None:
-        """The answers to acts in compact form, in which `timing` is complete; None if they must be a frame."""
-        decode_ms = (self._decoded - self.arrived) * 1e3
-        for reply in replies:
-            if reply.error is None:
-                reply.timing["decode_ms"] = decode_ms
-        data = write_answers(replies, arrived=self.arrived)
-        if data is not None:
-            self._record(replies)
-        return data
+    def packed(self, replies: Sequence[Reply]) -> tuple[bytes, bool]:
+        """The replies in compact form if they fit, else as a frame, and whether they did; `timing` is complete."""
+        self._tell_decoding(replies)
+        compact = write_answers(replies, arrived=self.arrived)
+        data = encode_replies(replies, arrived=self.arrived) if compact is None else compact
+        self._record(replies)
+        return data, compact is not None
 
     def document(self, reply: Reply) -> bytes:
         """The reply as JSON, in which `timing` is complete; not an error's."""
@@ -131,6 +125,12 @@ class Visit:
         total_ms = (time.perf_counter() - self.arrived) * 1e3
         for op, rank in self._asked:
             self._stats.handled((op, self.transport, rank, code, total_ms, 0.0, 0.0, 0.0, 0.0))
+
+    def _tell_decoding(self, replies: Sequence[Reply]) -> None:
+        decode_ms = (self._decoded - self.arrived) * 1e3
+        for reply in replies:
+            if reply.error is None:
+                reply.timing["decode_ms"] = decode_ms
 
     def _record(self, replies: Sequence[Reply]) -> None:
         if len(replies) != len(self._asked):  # the frame was unreadable as a whole
