@@ -348,3 +348,24 @@ def test_another_user_is_not_let_in(served: tuple[Engine, LocalDoor]) -> None:
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=30, check=True)
     assert result.stdout.strip() == "b''"
     assert len(served[0].sessions) == 0
+
+
+def test_what_could_not_be_sent_keeps_no_memory() -> None:
+    """A server that reads nothing: once its socket is full, calls fail and take nothing more."""
+    name = f"vlagents-ray-test-{os.urandom(8).hex()}"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as deaf:
+        deaf.bind(f"\0{name}")
+        deaf.listen(1)
+        transport = ShmTransport({"socket": name, "boot_id": ""})
+        busy = [-1, 0]
+        while busy[-1] > busy[-2]:  # sent, and given up
+            with pytest.raises(DeadlineExceeded):
+                call(transport, request("act", size=8), 0.001)
+            busy.append(sum(memory.busy for memory in transport._memories))
+        assert busy[-1] > 1
+        for _ in range(3):
+            with pytest.raises(DeadlineExceeded):
+                call(transport, request("act", size=8), 0.001)
+        assert sum(memory.busy for memory in transport._memories) == busy[-1]
+        assert len(transport._memories) <= busy[-1] + 1
+        transport.close()

@@ -113,7 +113,13 @@ class ShmTransport:
                 at += len(part)
             message = LocalAddress.REQUEST.pack(memory.number, 0, length)
         memory.busy = True
-        self.send(connection, message, deadline, descriptor)
+        try:
+            self.send(connection, message, deadline, descriptor)
+        except BaseException:  # the server has heard of nothing, nor got the file: another one takes its number
+            memory.busy = False
+            if descriptor is not None:
+                self._memories[memory.number] = _Memory(memory.number, mmap.mmap(-1, 1))
+            raise
 
     def send(self, connection: socket.socket, message: bytes, deadline: float, descriptor: int | None = None) -> None:
         """A message to the server, with a descriptor that is then closed here. Waits while it reads none."""
