@@ -17,30 +17,16 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import ConfigError, InvalidObservation
-from vlagents_ray.interface import Obs
-from vlagents_ray.mp4 import Mp4
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import require
-from vlagents_ray.robot.statistics import ImageStatistics, Stats, joined, of_values
+from vlagents_ray.robot.episode import NUMBERS, Episode
+from vlagents_ray.robot.statistics import Stats, joined, of_values
 
 VERSION = "v3.0"
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 DATA, VIDEO, EPISODES = f"data/{FILE}.parquet", f"videos/{{video_key}}/{FILE}.mp4", f"meta/episodes/{FILE}.parquet"
 FILES_IN_CHUNK = 1000
 _UNFINISHED = "unfinished"  # folder of the running episode
-_KEY_FRAMES = 2  # LeRobot's own, for quick access to any frame
-
-IMAGES, STATE, ACTION = "observation.images.", "observation.state", "action"
-_NUMBERS = {  # what each frame has beside the observation and the action
-    "captured_at": "float64",  # s since 1970
-    "tick": "int64",  # of the control loop; gaps are frames that were missed or dropped
-    "safe": "bool",  # the action was the safe one, not the policy's
-    "timestamp": "float32",  # s, frame_index / fps
-    "frame_index": "int64",
-    "episode_index": "int64",
-    "index": "int64",
-    "task_index": "int64",
-}
 
 
 class Dataset:
@@ -153,7 +139,7 @@ class Dataset:
         columns = {}
         for key, values in rows.items():
             if values.ndim == 1:
-                columns[key] = pa.array(values, getattr(pa, _ARROW[_NUMBERS[key]])())
+                columns[key] = pa.array(values, getattr(pa, _ARROW[NUMBERS[key]])())
             else:
                 flat = pa.array(np.ascontiguousarray(values, np.float32).ravel())
                 columns[key] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
@@ -193,93 +179,7 @@ class Dataset:
         return folder / name.replace("/", "_")
 
 
-class Episode:
-    """An episode under way: videos on disk, numbers in memory."""
-
-    def __init__(self, folder: Path, instruction: str, fps: float, features: dict[str, Any] | None) -> None:
-        """`features` are the dataset's, which the frames must have; None in a dataset's first episode."""
-        self.instruction = instruction
-        self.features: dict[str, Any] = features or {}
-        self.rows: dict[str, list[Any]] = {}
-        self.videos: dict[str, tuple[Path, Mp4]] = {}
-        self.images: dict[str, ImageStatistics] = {}
-        self._folder = folder
-        self._fps = fps
-
-    def add(self, obs: Obs, action: np.ndarray, captured_at: float, tick: int, safe: bool) -> None:
-        """Append a frame; `InvalidObservation` if it is not like those before it."""
-        values, names = _state(obs)
-        if not self.rows:
-            self._first(obs, names, len(action))
-        if len(values) != len(names) or sorted(obs.cameras) != sorted(k.removeprefix(IMAGES) for k in self.videos):
-            raise InvalidObservation(f"recording: got cameras {sorted(obs.cameras)}, want {sorted(self.videos)}")
-        for name, shape in ((STATE, values.shape), (ACTION, action.shape)):
-            wanted = tuple(self.features[name]["shape"]) if name in self.features else (0,)
-            if shape != wanted:
-                raise InvalidObservation(f"recording: got {name} of {shape}, want {wanted} as in the first frame")
-        for name, image in obs.cameras.items():
-            key = camera_key(name)
-            self.videos[key][1].add(image)
-            self.images[key].add(image)
-        frame = {ACTION: np.asarray(action, np.float32), "captured_at": captured_at, "tick": tick, "safe": safe}
-        if len(values):
-            frame[STATE] = values
-        for key, value in frame.items():
-            self.rows.setdefault(key, []).append(value)
-
-    def abandon(self) -> None:
-        """Give up what was recorded of it."""
-        for _, video in self.videos.values():
-            video.abandon()
-        shutil.rmtree(self._folder, ignore_errors=True)
-
-    def _first(self, obs: Obs, names: list[str], action_dim: int) -> None:
-        features: dict[str, Any] = {}
-        for name, image in sorted(obs.cameras.items()):
-            key = camera_key(name)
-            path = self._folder / f"{key}.mp4"
-            video = Mp4(path, image.shape, self._fps, key_frames=_KEY_FRAMES)
-            self.videos[key], self.images[key] = (path, video), ImageStatistics()
-            height, width = video.size
-            features[key] = {
-                "dtype": "video",
-                "shape": [height, width, 3],
-                "names": ["height", "width", "channels"],
-                "info": _video_info(height, width, self._fps),
-            }
-        if names:
-            features[STATE] = {"dtype": "float32", "shape": [len(names)], "names": names}
-        features[ACTION] = {
-            "dtype": "float32", "shape": [action_dim], "names": [f"action_{i}" for i in range(action_dim)]
-        }  # fmt: skip
-        features |= {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in _NUMBERS.items()}
-        if self.features and self.features != features:
-            odd = sorted(k for k in self.features.keys() | features.keys() if self.features.get(k) != features.get(k))
-            raise InvalidObservation(f"recording: {odd} differ from the dataset's; record into a new folder")
-        self.features = features
-
-
 _ARROW = {"float64": "float64", "float32": "float32", "int64": "int64", "bool": "bool_"}
-
-
-def camera_key(name: str) -> str:
-    """A camera's feature; LeRobot allows no slash in it."""
-    return IMAGES + name.replace("/", "_")
-
-
-def _state(obs: Obs) -> tuple[np.ndarray, list[str]]:
-    """All proprioception as one vector, as LeRobot's policies take it, and what its numbers are."""
-    parts = dict(sorted(obs.state.items()))
-    names = [f"{part}_{i}" for part, values in parts.items() for i in range(len(values))]
-    gripper = [] if obs.gripper is None else [np.array([obs.gripper])]
-    values = np.concatenate([*parts.values(), *gripper]) if parts or gripper else np.zeros(0)
-    return values.astype(np.float32), names + ["gripper"] * len(gripper)
-
-
-def _video_info(height: int, width: int, fps: float) -> dict[str, Any]:
-    size = {"video.height": height, "video.width": width, "video.fps": fps, "video.channels": 3}
-    kind = {"video.codec": "h264", "video.pix_fmt": "yuv420p", "video.is_depth_map": False, "has_audio": False}
-    return size | kind
 
 
 def _move(part: Path, path: Path) -> None:

@@ -16,7 +16,8 @@ import numpy as np
 
 from vlagents_ray.client.session import copied
 from vlagents_ray.interface import CAPTURED, Obs
-from vlagents_ray.robot.dataset import Dataset, Episode
+from vlagents_ray.robot.dataset import Dataset
+from vlagents_ray.robot.episode import Episode
 
 if TYPE_CHECKING:
     from typing_extensions import Self
