@@ -22,6 +22,8 @@ Mode = Literal["open_loop", "ensemble", "async"]
 Check = Callable[[np.ndarray, "np.ndarray | None"], np.ndarray]
 """The action and the one before it, (D,) each -> the action to be taken, or `InvalidAction`."""
 
+_WAITING = "waiting for an answer: the last one's rows are executed"
+_LATE = "the answer came so late that the ticks of all its rows were over"
 _DELAYS = 10  # requests of which the longest delay is taken
 
 
@@ -97,7 +99,7 @@ class ChunkPlayer(Agent):
         self._chunks = 0
         self._asked = -1  # tick of the last request
         self._waiting_since: float | None = None
-        self._trouble = "no answer yet"
+        self._trouble = _WAITING
         self._delays: deque[int] = deque(maxlen=_DELAYS)
         self._last: np.ndarray | None = None
         self._safe: SafeAction | None = None
@@ -206,7 +208,7 @@ class ChunkPlayer(Agent):
         if self._mode == "open_loop" and act.done and self._execute is not None:
             rows = rows[: self._execute]
         late = self._plan.add(Chunk(self._chunks, asked, rows, act.done, act.info), now)
-        self._trouble = f"the last answer came {late} ticks after its observation, with {len(rows)} rows"
+        self._trouble = _LATE if late == len(rows) else _WAITING
         self._chunks += 1
         self._delays.append(now - asked)
 
