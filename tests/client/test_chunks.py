@@ -284,6 +284,24 @@ def test_a_player_keeps_the_promises_of_an_agent(mode: Any) -> None:
     check_agent(ChunkPlayer(Chunks(), mode=mode), steps=5)
 
 
+def test_a_reply_that_was_lost_replays_nothing() -> None:
+    served = Replicas([Counting(rows=4)])
+    player = ChunkPlayer(served.agent(), mode="async", execute=2)
+    player.reset(obs(0))
+    done, resumed = [], False
+    for t in range(30):
+        served.lose_reply |= t == 10
+        act = player.act(obs(t))
+        assert player._asker is not None
+        wait_for(lambda: player._asker._job is None)
+        resumed |= "resumed" in act.info
+        done.append((t, round(float(act.action[0]), 4), act.info["age_ticks"]))
+    player.close()
+    served.close()
+    assert resumed
+    assert all(value == pytest.approx(t - age + 0.1 * age) for t, value, age in done)  # each of its own tick
+
+
 class Continuing(Agent):
     """Real-time chunking in small: new chunks begin with the frozen rows and go on by 0.1 a row."""
 

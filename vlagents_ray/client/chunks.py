@@ -91,6 +91,7 @@ class ChunkPlayer(Agent):
         self._real_time = real_time_chunking
         self._plan = Plan(ENSEMBLE if mode == "ensemble" else merge, ensemble_m)
         self._asker: Asker | None = None
+        self._contract: Contract | None = None
         self._begin()
 
     def _begin(self) -> None:
@@ -107,8 +108,9 @@ class ChunkPlayer(Agent):
     @property
     def contract(self) -> Contract | None:
         """The policy's, with single actions."""
-        contract = self._agent.contract
-        return None if contract is None else replace(contract, chunk=1)
+        if self._tick is None:  # in an episode the policy is busy, and asking a remote one might wait
+            self._contract = self._agent.contract
+        return None if self._contract is None else replace(self._contract, chunk=1)
 
     def initialize(self) -> None:
         """Initialize the policy."""
@@ -121,11 +123,10 @@ class ChunkPlayer(Agent):
         self._begin()
         obs = _stamped(obs, {})
         info = self._agent.reset(obs, instruction, **kwargs)
+        self._contract = self._agent.contract
         if self._deadline_s is not None:
-            contract = self._agent.contract
-            self._safe = SafeAction(
-                self._safe_choice, contract.action if contract is not None else ActionSpec(), self._grippers
-            )
+            spec = ActionSpec() if self._contract is None else self._contract.action
+            self._safe = SafeAction(self._safe_choice, spec, self._grippers)
             self._take(0, self._agent.act(obs), 0)
             self._asked = 0
             if self._asker is None:
@@ -203,8 +204,7 @@ class ChunkPlayer(Agent):
         self._trouble = f"{answer.result.code}: {answer.result}"
 
     def _take(self, asked: int, act: Act, now: int) -> None:
-        rows = check_action(act.action, self._agent.contract)
-        rows = (rows if rows.ndim == 2 else rows[np.newaxis])[: self._horizon]
+        rows = Act(check_action(act.action, self._contract)).rows()[: self._horizon]
         if self._mode == "open_loop" and act.done and self._execute is not None:
             rows = rows[: self._execute]
         late = self._plan.add(Chunk(self._chunks, asked, rows, act.done, act.info), now)
