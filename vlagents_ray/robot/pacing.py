@@ -96,6 +96,9 @@ def undisturbed(*, real_time: bool = False) -> Iterator[list[str]]:
     what is not in cycles is freed as ever), other threads give the interpreter back within 0.5 ms, and where
     the user may (root, or `ulimit -e`), the thread goes before others of this machine. `real_time` asks for
     SCHED_FIFO instead, before everything that is not real-time (`ulimit -r`).
+
+    Measured on 2 cores at 50 Hz, p99 of lateness: beside two busy processes 2.8 ms as it is, 0.6 ms with the
+    priority, 0.02 ms with SCHED_FIFO; beside a busy Python thread of the same process 5.3 ms as it is, 1.3 ms so.
     """
     collects, switch_s = gc.isenabled(), sys.getswitchinterval()
     gc.collect()
