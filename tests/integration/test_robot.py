@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import signal
 import threading
@@ -19,6 +20,7 @@ from vlagents_ray import Act, Agent, Obs, RemoteAgent
 from vlagents_ray.client.chunks import ChunkPlayer
 from vlagents_ray.client.ways import TransportName
 from vlagents_ray.robot import Watchdog, run_loop
+from vlagents_ray.robot.__main__ import main
 from vlagents_ray.robot.pacing import empty_loop
 
 HZ = 50.0
@@ -110,6 +112,19 @@ def test_no_tick_is_without_an_action_though_an_answer_takes_ten_ticks(
     assert report.safe_ticks == 0
     assert report.jitter["on_time"] > 0.9 * machine["on_time"]
     assert len({act.info["chunk"] for act in seen.acts}) > 5
+
+
+def test_the_command_drives_records_and_reports(
+    server: contextlib.ExitStack, address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--seconds", "2", "--baseline", "0.5", "--record", str(tmp_path), "--instruction", "stack the cups"]
+    assert main([f"http://{address}", *options]) == 0
+    said = capsys.readouterr().out
+    assert "empty loop" in said
+    assert "ticks without an action of the policy: 0" in said
+    assert f"recorded: 1 episodes in {tmp_path}" in said
+    info = json.loads((tmp_path / "meta/info.json").read_text())
+    assert (info["total_episodes"], info["fps"]) == (1, 50)
 
 
 def test_a_killed_replica_and_a_restarted_server_cost_safe_ticks_and_nothing_else(

@@ -13,7 +13,7 @@ import numpy as np
 import psutil
 
 from vlagents_ray import Act, Agent, Obs
-from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 
 
 class Reacher(Agent):
@@ -120,7 +120,7 @@ class Echo(Agent):
 class Ticking(Agent):
     """Rows that name the observation that they answer and their own number, after 0.2 s."""
 
-    contract = Contract(action=ActionSpec(dim=2, delta=False), chunk=50)
+    contract = Contract(state={"tick": StateSpec(1)}, action=ActionSpec(dim=2, delta=False), chunk=50)
 
     def act(self, obs: Obs) -> Act:
         time.sleep(0.2)

@@ -36,7 +36,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> LoopReport:
     say: Callable[[str], None] = lambda line: print(line, flush=True)  # noqa: E731, T201
     with contextlib.ExitStack() as stack:
-        agent = stack.enter_context(RemoteAgent(options.url, transport=options.transport, timeout_s=options.timeout_s))
+        agent = RemoteAgent(
+            options.url, transport=options.transport, timeout_s=options.timeout_s
+        )  # the player closes it
         agent.initialize()
         contract = agent.contract
         player = stack.enter_context(

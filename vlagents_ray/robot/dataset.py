@@ -106,12 +106,13 @@ class Dataset:
         self._parquet(self._table(rows), DATA.format(**place))
         self._parquet(self._tasks_table(), "meta/tasks.parquet")
         self._parquet(self._pa.Table.from_pylist([about]), EPISODES.format(**place))
-        self._stats = joined(self._stats, stats)
+        stats = joined(self._stats, stats)
         total = {"total_episodes": number + 1, "total_frames": first + frames, "total_tasks": len(self.tasks)}
-        self.info |= total | {"features": episode.features, "splits": {"train": f"0:{number + 1}"}}
-        plain = {key: {name: v.tolist() for name, v in one.items()} for key, one in self._stats.items()}
+        info = self.info | total | {"features": episode.features, "splits": {"train": f"0:{number + 1}"}}
+        plain = {key: {name: v.tolist() for name, v in one.items()} for key, one in stats.items()}
         self._json(plain, "meta/stats.json")
-        self._json(self.info, "meta/info.json")
+        self._json(info, "meta/info.json")
+        self.info, self._stats = info, stats
 
     def _open(self, fps: float) -> None:
         info = json.loads((self.root / "meta/info.json").read_text())

@@ -79,6 +79,7 @@ def run_loop(
     if seconds is not None and not seconds > 0:
         raise ConfigError(f"seconds: got {seconds}, want above 0, or None")
     report = LoopReport(hz)
+    barks = len(watchdog.barks) if watchdog is not None else 0
     agent.initialize()
     guard = guard or Guard(agent.contract)
     with contextlib.ExitStack() as stack:
@@ -93,7 +94,7 @@ def run_loop(
         finally:
             robot.stop()  # before anything else ends
     if watchdog is not None:
-        report.barks = list(watchdog.barks)
+        report.barks = watchdog.barks[barks:]
     return report
 
 
@@ -141,5 +142,6 @@ def _drive(
 
 
 def _observed(robot: Robot) -> Obs:
+    at = time.time()
     obs = robot.observe()
-    return obs if CAPTURED in obs.info else replace(obs, info={CAPTURED: time.time(), **obs.info})
+    return obs if CAPTURED in obs.info else replace(obs, info={CAPTURED: at, **obs.info})
