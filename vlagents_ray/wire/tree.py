@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -107,7 +107,7 @@ class Reader:
             raise MalformedMessage(f"reference: got {str(node)[:80]}, want {{'$': [kind, blob, ...]}}")
         kind, *rest = reference
         if kind == "nd" and len(rest) == 3:
-            return self._array(self._get(rest[0]), rest[1], rest[2])
+            return read_array(self._get(rest[0]), rest[1], rest[2])
         if kind == "img" and len(rest) == 1:
             return self._image(rest[0])
         if kind == "bin" and len(rest) == 1:
@@ -128,19 +128,20 @@ class Reader:
             raise MalformedMessage(f"reference: got blob {str(index)[:20]}, want one of {len(self._blobs)}")
         return self._blobs[index]
 
-    @staticmethod
-    def _array(data: Buffer, dtype: Any, shape: Any) -> np.ndarray:
-        if not isinstance(dtype, str) or not _DTYPE.fullmatch(dtype):
-            raise MalformedMessage(f"array: got dtype {str(dtype)[:20]!r}, want one like '<f4' or '|u1'")
-        if not isinstance(shape, list) or len(shape) > 8 or not all(type(n) is int and n >= 0 for n in shape):
-            raise MalformedMessage(f"array: got shape {str(shape)[:80]}, want up to 8 non-negative integers")
-        try:
-            kind = np.dtype(dtype)
-        except TypeError as error:
-            raise MalformedMessage(f"array: got dtype {dtype!r}, which is none of numpy's") from error
-        if math.prod(shape) * kind.itemsize != len(data):
-            raise MalformedMessage(f"array: got {len(data)} bytes, want {shape} of {dtype}")
-        return np.frombuffer(data, kind).reshape(shape)
+
+def read_array(data: Buffer | bytearray, dtype: object, shape: object, order: Literal["C", "F"] = "C") -> np.ndarray:
+    """A read-only view of `data` as what a message says that it is; `MalformedMessage` if it cannot be that."""
+    if not isinstance(dtype, str) or not _DTYPE.fullmatch(dtype):
+        raise MalformedMessage(f"array: got dtype {str(dtype)[:20]!r}, want one like '<f4' or '|u1'")
+    if not isinstance(shape, list) or len(shape) > 8 or not all(type(n) is int and n >= 0 for n in shape):
+        raise MalformedMessage(f"array: got shape {str(shape)[:80]}, want up to 8 non-negative integers")
+    try:
+        kind = np.dtype(dtype)
+    except TypeError as error:
+        raise MalformedMessage(f"array: got dtype {dtype!r}, which is none of numpy's") from error
+    if math.prod(shape) * kind.itemsize != len(data):
+        raise MalformedMessage(f"array: got {len(data)} bytes, want {shape} of {dtype}")
+    return np.frombuffer(data, kind).reshape(shape, order=order)
 
 
 def _reference(node: Any) -> list[Any]:

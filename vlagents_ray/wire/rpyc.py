@@ -1,0 +1,271 @@
+"""The part of RPyC's protocol that a service of text in, text out needs; facts from rpyc 6.0.
+
+RPyC lets the other side name attributes of objects here, call what it got, and hand over objects that are called
+back. None of that exists in this reader: it knows one object, the root, and takes values that hold no reference.
+So a peer can reach the methods that a door offers, and nothing else.
+
+A frame is a header (length, compressed?), a message and a newline. A message is its kind and one value, written
+in "brine": `(sequence number, content)`.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge
+
+HEADER = struct.Struct("!LB")  # bytes of the message, is it compressed
+END = b"\n"
+ROOT = ("vlagents_ray.Policy", 1, 1)  # the name of the only object that there is: its class, ids of class and object
+_COMPRESS_OVER = 3000  # bytes, as RPyC does
+_DEPTH = 16
+_ITEMS = 1024  # values in a message
+_DIGITS = 20  # of an integer
+_REQUEST, _REPLY, _EXCEPTION = 1, 2, 3
+_VALUE, _TUPLE, _LOCAL, _REMOTE = 1, 2, 3, 4  # how a value is boxed
+_F8, _U4 = struct.Struct("!d"), struct.Struct("!L")
+
+
+class Handler(IntEnum):
+    """What a peer may ask for; RPyC has more, which would reach into objects."""
+
+    PING = 1
+    CLOSE = 2
+    GETROOT = 3
+    GETATTR = 4
+    CALL = 7
+    CALLATTR = 8
+    DEL = 15
+    INSPECT = 16
+
+
+class Root:
+    """Stands for the root, where a peer names it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Call:
+    """A request of the peer."""
+
+    sequence: int
+    handler: Handler
+    args: tuple[Any, ...]
+
+
+def read_header(header: bytes | bytearray, limit: int) -> tuple[int, bool]:
+    """How many bytes follow, the newline included, and whether the message is compressed."""
+    length, compressed = HEADER.unpack(header)
+    if length > limit:
+        raise MessageTooLarge(f"rpyc: a message of {length} bytes, the limit is {limit}")
+    if compressed > 1 or length == 0:
+        raise MalformedMessage("rpyc: not a frame")
+    return length + len(END), bool(compressed)
+
+
+def read_call(body: bytes | bytearray, compressed: bool, limit: int) -> Call | None:
+    """The request in a frame's body (what follows the header); None for what needs no answer."""
+    message = memoryview(body)[: -len(END)]
+    if compressed:
+        message = memoryview(_inflate(message, limit))
+    if len(message) == 0:
+        raise MalformedMessage("rpyc: an empty message")
+    kind = message[0]
+    if kind in (_REPLY, _EXCEPTION):  # to something that was never asked
+        return None
+    if kind != _REQUEST:
+        raise MalformedMessage(f"rpyc: got a message of kind {kind}, want a request")
+    content = _Reader(message[1:]).all()
+    if not (isinstance(content, tuple) and len(content) == 2 and _is_int(content[0])):
+        raise MalformedMessage("rpyc: want (sequence number, request)")
+    sequence, request = content
+    if not (isinstance(request, tuple) and len(request) == 2 and _is_int(request[0])):
+        raise MalformedMessage("rpyc: want (handler, arguments)")
+    try:
+        handler = Handler(request[0])
+    except ValueError:
+        raise Refused(sequence, f"rpyc: handler {request[0]} is not offered here") from None
+    try:
+        args = _unbox(request[1])
+    except MalformedMessage as error:
+        raise Refused(sequence, str(error)) from error
+    if not isinstance(args, tuple):
+        raise Refused(sequence, "rpyc: want a tuple of arguments")
+    return Call(sequence, handler, args)
+
+
+class Refused(MalformedMessage):
+    """A request that can be read and is not served; its sender gets an answer."""
+
+    def __init__(self, sequence: int, text: str) -> None:
+        super().__init__(text)
+        self.sequence = sequence
+
+
+def reply(sequence: int, value: Any) -> bytes:
+    """The frame that answers with a value: None, bool, int, float, text, bytes or tuples of these."""
+    return _frame(_REPLY, (sequence, (_VALUE, value)))
+
+
+def root_reply(sequence: int) -> bytes:
+    """The frame that hands out the root."""
+    return _frame(_REPLY, (sequence, (_REMOTE, ROOT)))
+
+
+def exception(sequence: int, kind: str, text: str) -> bytes:
+    """The frame that raises the built-in exception `kind` at the peer, without a traceback."""
+    return _frame(_EXCEPTION, (sequence, (("builtins", kind), (text,), (), "")))
+
+
+def _frame(kind: int, content: tuple[Any, ...]) -> bytes:
+    parts: list[bytes] = [bytes([kind])]
+    _write(content, parts)
+    message = b"".join(parts)
+    compressed = len(message) > _COMPRESS_OVER
+    if compressed:
+        message = zlib.compress(message, 1)
+    return HEADER.pack(len(message), compressed) + message + END
+
+
+def _inflate(data: memoryview, limit: int) -> bytes:
+    machine = zlib.decompressobj()
+    try:
+        message = machine.decompress(data, limit + 1)
+    except zlib.error as error:
+        raise MalformedMessage(f"rpyc: not compressed as its header says ({error})") from error
+    if len(message) > limit:
+        raise MessageTooLarge(f"rpyc: a message of more than {limit} bytes")
+    if not machine.eof:
+        raise MalformedMessage("rpyc: a compressed message without an end")
+    return message
+
+
+def _unbox(boxed: Any) -> Any:
+    if not (isinstance(boxed, tuple) and len(boxed) == 2):
+        raise MalformedMessage("rpyc: want (label, value)")
+    label, value = boxed
+    if label == _VALUE:
+        return value
+    if label == _TUPLE and isinstance(value, tuple):
+        return tuple(_unbox(item) for item in value)
+    if label == _LOCAL and value == ROOT:
+        return Root()
+    raise MalformedMessage("rpyc: objects are not taken here; send values")
+
+
+def _is_int(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)
+
+
+class _Reader:
+    """Brine into values: what is immutable, and no slices, sets or complex numbers."""
+
+    def __init__(self, data: memoryview) -> None:
+        self._data = data
+        self._at = 0
+        self._items = 0
+
+    def all(self) -> Any:
+        """The value that fills the message."""
+        value = self._value(0)
+        if self._at != len(self._data):
+            raise MalformedMessage("rpyc: more than one value in a message")
+        return value
+
+    def _take(self, count: int) -> memoryview:
+        end = self._at + count
+        if end > len(self._data):
+            raise MalformedMessage("rpyc: a message that ends too early")
+        found = self._data[self._at : end]
+        self._at = end
+        return found
+
+    def _value(self, depth: int) -> Any:
+        self._items += 1
+        if self._items > _ITEMS or depth > _DEPTH:
+            raise MessageTooLarge(f"rpyc: more than {_ITEMS} values or {_DEPTH} levels in a message")
+        tag = self._take(1)[0]
+        if 0x20 <= tag < 0xF0:
+            return tag - 0x50
+        if tag in _SINGLE:
+            return _SINGLE[tag]
+        if tag == 0x18:
+            return _F8.unpack(self._take(8))[0]
+        if tag == 0x08:
+            return self._text(depth)
+        if tag in _BYTES:
+            return bytes(self._take(_BYTES[tag](self)))
+        if tag in _TUPLES:
+            return self._tuple(_TUPLES[tag](self), depth)
+        if tag in _INTS:
+            return self._integer(_INTS[tag](self))
+        raise MalformedMessage(f"rpyc: got a value of kind {tag:#04x}, want text, numbers or tuples")
+
+    def _text(self, depth: int) -> str:
+        data = self._value(depth + 1)
+        if not isinstance(data, bytes):
+            raise MalformedMessage("rpyc: text that is none")
+        try:
+            return data.decode()
+        except UnicodeDecodeError as error:
+            raise MalformedMessage(f"rpyc: not UTF-8 ({error.reason})") from error
+
+    def _tuple(self, length: int, depth: int) -> tuple[Any, ...]:
+        if length > _ITEMS:
+            raise MessageTooLarge(f"rpyc: a tuple of {length} values, the limit is {_ITEMS}")
+        return tuple(self._value(depth + 1) for _ in range(length))
+
+    def _integer(self, length: int) -> int:
+        digits = bytes(self._take(length))
+        sign = digits[:1] == b"-"
+        if not digits[sign:].isdigit() or length > _DIGITS:
+            raise MalformedMessage("rpyc: not a number")
+        return int(digits)
+
+    def length1(self) -> int:
+        """A length in one byte."""
+        return self._take(1)[0]
+
+    def length4(self) -> int:
+        """A length in four bytes."""
+        return int(_U4.unpack(self._take(4))[0])
+
+
+def _fixed(length: int) -> Callable[[_Reader], int]:
+    return lambda _: length
+
+
+_SINGLE: dict[int, Any] = {0x00: None, 0x01: b"", 0x02: (), 0x03: True, 0x04: False}
+_BYTES = {0x09 + n: _fixed(n) for n in (1, 2, 3, 4)} | {0x0E: _Reader.length1, 0x0F: _Reader.length4}
+_TUPLES = {0x0F + n: _fixed(n) for n in (1, 2, 3, 4)} | {0x14: _Reader.length1, 0x15: _Reader.length4}
+_INTS = {0x16: _Reader.length1, 0x17: _Reader.length4}
+
+
+def _write(value: Any, parts: list[bytes]) -> None:
+    if value is None:
+        parts.append(b"\x00")
+    elif isinstance(value, bool):
+        parts.append(b"\x03" if value else b"\x04")
+    elif isinstance(value, int):
+        if -0x30 <= value < 0xA0:
+            parts.append(bytes([value + 0x50]))
+        else:
+            digits = str(value).encode()
+            parts.append(b"\x16" + bytes([len(digits)]) + digits)
+    elif isinstance(value, float):
+        parts.append(b"\x18" + _F8.pack(value))
+    elif isinstance(value, str):
+        parts.append(b"\x08")
+        _write(value.encode(), parts)
+    elif isinstance(value, bytes):
+        parts.append(b"\x01" if not value else b"\x0f" + _U4.pack(len(value)) + value)
+    elif isinstance(value, tuple):
+        parts.append(b"\x02" if not value else b"\x15" + _U4.pack(len(value)))
+        for item in value:
+            _write(item, parts)
+    else:
+        raise TypeError(f"rpyc: cannot send {type(value).__name__}")
