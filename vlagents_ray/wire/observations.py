@@ -33,15 +33,18 @@ def read_obs(node: Any, reader: Reader, limits: Limits) -> Obs:
         raise InvalidObservation(f"gripper: got {str(gripper)[:40]!r}, want a number in [0, 1] where 1 = open")
     reader.decode_images(cameras.values())
     return Obs(
-        cameras={name: _read_camera(name, image, reader, limits) for name, image in cameras.items()},
+        cameras={name: as_camera(name, reader.blob(image), limits) for name, image in cameras.items()},
         gripper=None if gripper is None else float(gripper),
-        state={name: _read_state(name, part, reader, limits) for name, part in state.items()},
+        state={
+            name: as_state(name, reader.blob(part) if isinstance(part, dict) else part, limits)
+            for name, part in state.items()
+        },
         info=reader.value(info),
     )
 
 
-def _read_camera(name: str, node: Any, reader: Reader, limits: Limits) -> np.ndarray:
-    image = reader.blob(node)
+def as_camera(name: str, image: Any, limits: Limits) -> np.ndarray:
+    """`image` as it is, if it is (H, W, 3) uint8 RGB within the limits; `name` is for the error."""
     if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
         got = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
         raise InvalidObservation(f"camera {name!r}: got {got}, want (H, W, 3) uint8 RGB")
@@ -50,8 +53,8 @@ def _read_camera(name: str, node: Any, reader: Reader, limits: Limits) -> np.nda
     return image
 
 
-def _read_state(name: str, node: Any, reader: Reader, limits: Limits) -> np.ndarray:
-    part = reader.blob(node) if isinstance(node, dict) else node
+def as_state(name: str, part: Any, limits: Limits) -> np.ndarray:
+    """`part`, a list of numbers or an array, as (D,) float32 within the limits; `name` is for the error."""
     if isinstance(part, list):
         if len(part) > limits.state_values:
             raise MessageTooLarge(f"state {name!r}: got {len(part)} values, the limit is {limits.state_values}")
