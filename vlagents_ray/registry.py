@@ -39,6 +39,8 @@ _EXTRAS = {
     "yaml": "serve",
     "typer": "serve",
     "rich": "serve",
+    "msgpack": "gr00t",
+    "zmq": "gr00t",
     "matplotlib": "bench",
     "gymnasium": "sim",
     "av": "sim",

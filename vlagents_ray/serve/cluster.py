@@ -21,6 +21,7 @@ from typing import Any
 from ray.serve.schema import ServeDeploySchema
 
 from vlagents_ray.errors import ConfigError, PolicyUnavailable
+from vlagents_ray.serve.files import with_gateways_at
 from vlagents_ray.serve.haproxy import (
     behind_haproxy,
     haproxy_available,
@@ -62,6 +63,7 @@ def running_server(
     Raises `ConfigError` when the deployment fails, `PolicyUnavailable` when it takes too long.
     """
     port = port or free_port(EVERYWHERE if is_foreign(host) else host)
+    config = with_gateways_at(config, host)
     with contextlib.ExitStack() as stack:
         stack.enter_context(_ray(address, host, port, num_cpus, show_logs))
         from ray import serve

@@ -6,7 +6,10 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from vlagents_ray.serve.gateways.config import GatewayDialects
 from vlagents_ray.wire.messages import DEFAULT_LIMITS, Limits
+
+POLICY, GATEWAY = "Policy", "Gateway"  # the deployments of an application
 
 
 class _Closed(BaseModel):
@@ -125,6 +128,7 @@ class ServerArgs(_Closed):
     sessions: SessionArgs = SessionArgs()
     limits: LimitArgs = LimitArgs()
     resources: ResourceArgs = ResourceArgs()
+    dialects: GatewayDialects = Field(default=GatewayDialects(), description="other systems' clients that may connect")
 
     @model_validator(mode="after")
     def _one_scaling(self) -> ServerArgs:

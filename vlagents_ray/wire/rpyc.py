@@ -1,8 +1,8 @@
 """The part of RPyC's protocol that a service of text in, text out needs; facts from rpyc 6.0.
 
 RPyC lets the other side name attributes of objects here, call what it got, and hand over objects that are called
-back. None of that exists in this reader: it knows one object, the root, and takes values that hold no reference.
-So a peer can reach the methods that a door offers, and nothing else.
+back. None of that exists in this reader: it knows the root and its methods by number, and takes values that hold no
+reference. So a peer can reach the methods that a door offers, and nothing else.
 
 A frame is a header (length, compressed?), a message and a newline. A message is its kind and one value, written
 in "brine": `(sequence number, content)`.
@@ -21,7 +21,10 @@ from vlagents_ray.errors import MalformedMessage, MessageTooLarge
 
 HEADER = struct.Struct("!LB")  # bytes of the message, is it compressed
 END = b"\n"
-ROOT = ("vlagents_ray.Policy", 1, 1)  # the name of the only object that there is: its class, ids of class and object
+ROOT = 0  # the number of the root; its methods have those that follow
+_ROOT_NAME = ("vlagents_ray.Policy", 1, 1)  # as a peer names it: its class, numbers of class and object
+_METHOD_CLASS = "builtins.method"  # which a peer knows, and does not ask about
+_METHODS_AT_MOST = 64
 _COMPRESS_OVER = 3000  # bytes, as RPyC does
 _DEPTH = 16
 _ITEMS = 1024  # values in a message
@@ -44,8 +47,11 @@ class Handler(IntEnum):
     INSPECT = 16
 
 
-class Root:
-    """Stands for the root, where a peer names it."""
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """Stands for the root, or one of its methods, where a peer names it."""
+
+    number: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,9 +117,10 @@ def reply(sequence: int, value: Any) -> bytes:
     return _frame(_REPLY, (sequence, (_VALUE, value)))
 
 
-def root_reply(sequence: int) -> bytes:
-    """The frame that hands out the root."""
-    return _frame(_REPLY, (sequence, (_REMOTE, ROOT)))
+def reference_reply(sequence: int, number: int) -> bytes:
+    """The frame that hands out the root, or a method of it."""
+    name = _ROOT_NAME if number == ROOT else (_METHOD_CLASS, 2, number)
+    return _frame(_REPLY, (sequence, (_REMOTE, name)))
 
 
 def exception(sequence: int, kind: str, text: str) -> bytes:
@@ -152,8 +159,11 @@ def _unbox(boxed: Any) -> Any:
         return value
     if label == _TUPLE and isinstance(value, tuple):
         return tuple(_unbox(item) for item in value)
-    if label == _LOCAL and value == ROOT:
-        return Root()
+    if label == _LOCAL and isinstance(value, tuple) and len(value) == 3:
+        if value == _ROOT_NAME:
+            return Reference(ROOT)
+        if value[:2] == (_METHOD_CLASS, 2) and _is_int(value[2]) and 0 < value[2] < _METHODS_AT_MOST:
+            return Reference(value[2])
     raise MalformedMessage("rpyc: objects are not taken here; send values")
 
 

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from vlagents_ray.wire.messages import RankName
+from vlagents_ray.wire.presets import read_mapping
 
 Mapping = str | dict[str, Any]
+
+
+def _readable(value: Mapping) -> Mapping:
+    read_mapping(value)
+    return value
 
 
 class GatewayArgs(BaseModel):
@@ -29,7 +35,11 @@ class GR00TArgs(GatewayArgs):
     """GR00T's ZMQ protocol, as its `PolicyServer` answers it."""
 
     port: int = Field(default=5555, ge=1, le=65535)
-    mapping: Mapping = Field(default="gr00t", description="a preset, or the mapping itself")
+    mapping: Mapping = Field(
+        default="gr00t", description="a preset's name, or an object: see vlagents_ray.wire.mapping"
+    )
+
+    _mapping = field_validator("mapping")(_readable)
 
 
 class GripperArgs(BaseModel):
@@ -68,7 +78,7 @@ class VlagentsArgs(GatewayArgs):
         default=None, description="the model's name, which clients must give; default: the application's"
     )
     mapping: Mapping | None = Field(
-        default=None, description="theirs are cameras/NAME, state/NAME, gripper, instruction; unset: names stay"
+        default=None, description="theirs are cameras/NAME, state/NAME, gripper, info; unset: names stay as they are"
     )
     gripper: GripperArgs | None = Field(
         default=None, description="of the only robot: the column that goes into SingleAct.gripper; unset: none"
@@ -79,6 +89,11 @@ class VlagentsArgs(GatewayArgs):
         default=False, description="with API keys on: let everybody in here nevertheless, as the protocol has no key"
     )
 
+    @field_validator("mapping")
+    @classmethod
+    def _mapping(cls, value: Mapping | None) -> Mapping | None:
+        return None if value is None else _readable(value)
+
     @model_validator(mode="after")
     def _one_way(self) -> VlagentsArgs:
         if self.gripper is not None and self.robots:
@@ -86,5 +101,22 @@ class VlagentsArgs(GatewayArgs):
         return self
 
 
-DoorName = Literal["gr00t", "vlagents"]
-DOORS: tuple[DoorName, ...] = ("gr00t", "vlagents")
+class GatewayDialects(BaseModel):
+    """Those of `args.dialects` that have a port of their own."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    gr00t: GR00TArgs | None = None
+    vlagents: VlagentsArgs | None = None
+
+    def gateways(self) -> dict[str, GatewayArgs]:
+        """Those that are on, by name."""
+        found: dict[str, GatewayArgs | None] = {"gr00t": self.gr00t, "vlagents": self.vlagents}
+        return {name: args for name, args in found.items() if args is not None}
+
+    @model_validator(mode="after")
+    def _ports_of_their_own(self) -> GatewayDialects:
+        ports = {args.port for args in self.gateways().values()}
+        if len(ports) < len(self.gateways()):
+            raise ValueError(f"gr00t and vlagents share port {ports.pop()}; each needs one of its own")
+        return self

@@ -12,11 +12,13 @@ from typing import Any
 
 from vlagents_ray.contract import ActionSpec
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge, VLAgentsError
+from vlagents_ray.interface import Obs
 from vlagents_ray.serve.gateways.config import GripperArgs, VlagentsArgs
 from vlagents_ray.serve.gateways.door import House, listen
 from vlagents_ray.serve.gateways.segments import SharedMemory
 from vlagents_ray.serve.gateways.talk import Talk
 from vlagents_ray.wire import json_numpy, rpyc, vlagents
+from vlagents_ray.wire.presets import read_mapping
 from vlagents_ray.wire.rpyc import Call, Handler
 
 logger = logging.getLogger(__name__)
@@ -36,6 +38,7 @@ class VlagentsDoor:
         self.name = args.name or house.app
         self.version = version
         self.shared_memory = args.shared_memory
+        self.mapping = None if args.mapping is None else read_mapping(args.mapping)
         self.parts = self._parts(args)
         self._clients: dict[threading.Thread, socket.socket] = {}
         self._lock = threading.Lock()
@@ -159,7 +162,9 @@ class _Client:
     def _answer(self, call: Call) -> bytes:
         try:
             if call.handler is Handler.GETROOT:
-                return rpyc.root_reply(call.sequence)
+                return rpyc.reference_reply(call.sequence, rpyc.ROOT)
+            if call.handler is Handler.GETATTR:
+                return rpyc.reference_reply(call.sequence, _number(call.args))
             return rpyc.reply(call.sequence, self._value(call))
         except VLAgentsError as error:
             return rpyc.exception(call.sequence, _builtin(error), f"{error.code}: {error}")
@@ -177,11 +182,8 @@ class _Client:
             return None
         if call.handler is Handler.INSPECT:
             return tuple((name, None) for name in _METHODS)
-        if call.handler is Handler.CALLATTR and len(call.args) in (3, 4) and isinstance(call.args[0], rpyc.Root):
-            _, method, args, *options = call.args
-            if method in _METHODS and isinstance(args, tuple) and not any(options):
-                return self._method(method, args)
-        raise MalformedMessage(f"rpyc: want a call of one of {list(_METHODS)} of the root")
+        method, args = _called(call)
+        return self._method(method, args)
 
     def _method(self, method: str, args: tuple[Any, ...]) -> Any:
         if method in ("act", "reset"):
@@ -198,7 +200,8 @@ class _Client:
 
     def _act(self, text: str | bytes) -> str:
         seen = vlagents.read_act(text, self._house.limits, self._segments)
-        act = self._talk.act(seen.obs, seen.instruction) if seen.robots else self._talk.act_on(seen.obs)
+        obs = self._ours(seen.obs)
+        act = self._talk.act(obs, seen.instruction) if seen.robots else self._talk.act_on(obs)
         parts = self._door.parts
         if isinstance(parts, vlagents.Part):
             if len(seen.robots) > 1:
@@ -210,7 +213,17 @@ class _Client:
 
     def _reset(self, text: str | bytes) -> str:
         episode = vlagents.read_reset(text, self._house.limits, self._segments)
-        return json_numpy.dumps(self._talk.reset(episode.seen.obs, episode.seen.instruction, **episode.kwargs))
+        obs = self._ours(episode.seen.obs)
+        return json_numpy.dumps(self._talk.reset(obs, episode.seen.instruction, **episode.kwargs))
+
+    def _ours(self, obs: Obs) -> Obs:
+        """With our names, if the deployment says what theirs mean."""
+        if self._door.mapping is None:
+            return obs
+        theirs: dict[str, Any] = {"cameras": obs.cameras, "state": obs.state, "info": obs.info}
+        if obs.gripper is not None:
+            theirs["gripper"] = obs.gripper
+        return self._door.mapping.obs(theirs, self._house.limits)[0]
 
     def _receive(self) -> tuple[bytearray, bool] | None:
         """The next message and whether it is compressed; None when the client hung up between two."""
@@ -246,6 +259,28 @@ class _Client:
 
 def _first(*values: float | None) -> float:
     return next(value for value in values if value is not None)
+
+
+def _number(args: tuple[Any, ...]) -> int:
+    """The number of the method that a client looks up."""
+    match args:
+        case (rpyc.Reference(rpyc.ROOT), str(name)) if name in _METHODS:
+            return _METHODS.index(name) + 1
+    raise MalformedMessage(f"the server has {list(_METHODS)} and nothing else")
+
+
+def _called(call: Call) -> tuple[str, tuple[Any, ...]]:
+    """The method that a client calls, by its number or by its name, and the arguments."""
+    match call.handler, call.args:
+        case Handler.CALL, (rpyc.Reference(number), tuple(args), *options) if 0 < number <= len(_METHODS):
+            name = _METHODS[number - 1]
+        case Handler.CALLATTR, (rpyc.Reference(rpyc.ROOT), str(name), tuple(args), *options) if name in _METHODS:
+            pass
+        case _:
+            raise MalformedMessage(f"rpyc: want a call of one of {list(_METHODS)} of the root")
+    if any(options):
+        raise MalformedMessage(f"{name}: takes no arguments by name")
+    return name, args
 
 
 def _builtin(error: VLAgentsError) -> str:
