@@ -159,6 +159,7 @@ class _Reader:
                 raw=False,
                 strict_map_key=True,
                 object_hook=self._map,
+                list_hook=self._list,
                 max_str_len=limits.text,
                 max_array_len=limits.items,
                 max_map_len=limits.items,
@@ -170,10 +171,17 @@ class _Reader:
             raise MalformedMessage(f"gr00t: not msgpack as its client writes it ({str(error)[:120]})") from error
         return value
 
-    def _map(self, node: dict[Any, Any]) -> Any:
-        self._items += 1 + len(node)
+    def _count(self, values: int) -> None:
+        self._items += 1 + values
         if self._items > self._limits.items:
             raise MessageTooLarge(f"gr00t: more than {self._limits.items} values in a message")
+
+    def _list(self, node: list[Any]) -> list[Any]:
+        self._count(len(node))
+        return node
+
+    def _map(self, node: dict[Any, Any]) -> Any:
+        self._count(len(node))
         if "__ndarray_class__" in node:
             return _read_npy(node.get("as_npy"), self._limits)
         if b"nd" in node or "nd" in node:

@@ -63,6 +63,9 @@ class VlagentsDoor:
         for connection in clients.values():
             _hang_up(connection)
         deadline = time.monotonic() + _END_S
+        if self._accepting.ident is not None:
+            self._accepting.join(_END_S)
+        self._listener.close()
         for thread in clients:
             thread.join(max(0.0, deadline - time.monotonic()))
 
