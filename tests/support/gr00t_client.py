@@ -1,4 +1,4 @@
-"""A client as GR00T's own `PolicyClient` is: a REQ socket, msgpack, arrays as .npy files (gr00t/policy/server_client.py).
+"""A client as GR00T's own `PolicyClient` is (gr00t/policy/server_client.py): a REQ socket, msgpack, .npy files.
 
 GR00T is not on PyPI; this follows its code, and its answers are decoded by numpy's own reader.
 """

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import zlib
 
 import pytest
@@ -14,7 +15,6 @@ from vlagents_ray.wire import rpyc
 from vlagents_ray.wire.rpyc import Handler
 
 LIMIT = 2**16
-
 
 
 def read(frame: bytes) -> rpyc.Call | None:
@@ -46,10 +46,8 @@ def test_a_call_of_the_root_is_read_and_long_ones_are_compressed() -> None:
 @given(st.binary(max_size=200))
 def test_garbage_is_refused_by_name(data: bytes) -> None:
     for compressed in (False, True):
-        try:
+        with contextlib.suppress(VLAgentsError):
             rpyc.read_call(data, compressed, LIMIT)
-        except VLAgentsError:
-            pass
 
 
 @given(st.data())
@@ -57,10 +55,8 @@ def test_a_mutated_request_is_read_or_refused(data: st.DataObject) -> None:
     body = bytearray(call("act", "some text", "more")[rpyc.HEADER.size :])
     for _ in range(data.draw(st.integers(1, 4))):
         body[data.draw(st.integers(0, len(body) - 1))] = data.draw(st.integers(0, 255))
-    try:
+    with contextlib.suppress(VLAgentsError):
         rpyc.read_call(bytes(body), False, LIMIT)
-    except VLAgentsError:
-        pass
 
 
 @pytest.mark.parametrize(

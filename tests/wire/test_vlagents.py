@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import contextlib
 import json
 
 import numpy as np
@@ -140,10 +141,8 @@ def test_a_mutated_document_is_read_or_refused(data: st.DataObject) -> None:
     text = list(document())
     for _ in range(data.draw(st.integers(1, 5))):
         text[data.draw(st.integers(0, len(text) - 1))] = data.draw(st.sampled_from('{}[]":,0eN-_=\\ \n9ax'))
-    try:
+    with contextlib.suppress(VLAgentsError):
         act("".join(text))
-    except VLAgentsError:
-        pass
 
 
 arrays = st.sampled_from([np.float32, np.float64, np.uint8, np.int64, np.bool_]).flatmap(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import socket
 import threading
@@ -19,6 +20,7 @@ from vlagents_ray.wire import json_numpy, rpyc
 from vlagents_ray.wire.rpyc import Handler
 
 REPLY, EXCEPTION = 2, 3
+FRAMES = int(os.environ.get("VLAGENTS_RAY_FUZZ", "5000"))
 
 
 def sessions(replicas: Replicas) -> int:
@@ -46,7 +48,7 @@ def test_a_client_of_0_2_resets_and_acts(open_vlagents) -> None:
         assert content[1][0].startswith("not_reset")
         robot.send(call("reset", json_numpy.dumps([old, "go", {"seed": 3}])))
         kind, _, (_, text) = robot.receive()
-        assert json_numpy.loads(text, __import__("vlagents_ray").wire.messages.DEFAULT_LIMITS)["options"] == {"seed": 3}
+        assert '"options": {"seed": 3}' in text
         robot.send(call("act", json_numpy.dumps(old)))
         kind, _, (_, text) = robot.receive()
         assert '"done": false' in text
@@ -159,7 +161,7 @@ def _answers(port: int) -> bool:
 
 
 def test_mutated_frames_end_their_own_client_at_most(open_vlagents, replicas: Replicas) -> None:
-    """Two thousand, over as many connections as they end; a good client acts all the while."""
+    """Over as many connections as they end; a good client acts all the while."""
     port = open_vlagents(sessions=16)
     choose = random.Random(5)
     frames = [call("act", document(9, side=4)), call("name"), request(1, Handler.GETROOT, (VALUE, ()))]
@@ -167,7 +169,7 @@ def test_mutated_frames_end_their_own_client_at_most(open_vlagents, replicas: Re
     threads = threading.active_count()
     with Client(port) as good:
         acts, sent = 0, 0
-        while sent < 2000:
+        while sent < FRAMES:
             with socket.create_connection(("127.0.0.1", port), timeout=20) as bad:
                 for _ in range(20):
                     frame = bytearray(choose.choice(frames))
