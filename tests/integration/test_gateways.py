@@ -56,7 +56,7 @@ class Robot:
         """[action rows] of each call."""
         answer = self.say(pixel=pixel, joints=0.5, gripper=0.25, instruction=instruction, **more)
         if isinstance(answer, dict):
-            raise RuntimeError(answer["error"])
+            raise RuntimeError(answer["error"])  # noqa: TRY004 - what the robot was told
         return [[step[1] for step in act] for act in answer]
 
 

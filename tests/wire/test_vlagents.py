@@ -103,15 +103,19 @@ def robot(**changes: object) -> dict:
     return {"obs": {"arm": {"cameras": {}, "camera_data_type": "raw"} | changes}}
 
 
+def shared(shape: list[int]) -> dict:
+    return robot(cameras={"a": {"shm_name": "psm_9", "shape": shape}}, camera_data_type="shared_memory")
+
+
 @pytest.mark.parametrize(
     ("value", "error"),
     [
         (robot(cameras={"a": "x"}, camera_data_type="jpeg_encoded"), MalformedMessage),
         (robot(cameras={"a": "x"}), InvalidObservation),
         (robot(cameras={"a": np.zeros((4, 4), np.uint8)}), InvalidObservation),
-        (robot(cameras={"a": {"shm_name": "psm_9", "shape": [2, 2, 3]}}, camera_data_type="shared_memory"), InvalidObservation),
-        (robot(cameras={"a": {"shm_name": "psm_9", "shape": [2**40, 2**40, 3]}}, camera_data_type="shared_memory"), MessageTooLarge),
-        (robot(cameras={"a": {"shm_name": "psm_9", "shape": [-1]}}, camera_data_type="shared_memory"), MalformedMessage),
+        (shared([2, 2, 3]), InvalidObservation),
+        (shared([2**40, 2**40, 3]), MessageTooLarge),
+        (shared([-1]), MalformedMessage),
         (robot(camera_data_type="pickle", cameras={"a": "x"}), MalformedMessage),
         (robot(joints="x"), InvalidObservation),
         (robot(gripper="x"), InvalidObservation),

@@ -93,8 +93,8 @@ def test_errors_are_told_without_a_traceback_and_the_client_goes_on(open_gr00t) 
 
 
 def test_a_key_is_checked_before_anything_is_done(open_gr00t, replicas: Replicas) -> None:
-    def check(token: str | None) -> None:
-        if token != "right":
+    def check(key: str | None) -> None:
+        if key != "right":
             raise InvalidInput("no such key")
 
     port = open_gr00t(check=check)
