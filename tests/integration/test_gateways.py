@@ -16,7 +16,8 @@ import numpy as np
 import pytest
 from eval_fakes import wait_for
 from gr00t_client import PolicyClient
-from peers import package, peers_python
+from peer_versions import package
+from peers import peers_python
 
 from tests.integration.conftest import SUPPORT, serving
 from vlagents_ray.bench.child import Child

@@ -1,21 +1,26 @@
-"""The environment of other systems' packages, which conflict with ours; made when a test first wants it."""
+"""Clients of other systems, as PyPI has them, in an environment of their own: some need what ours conflicts with.
+
+The environment is `.venv-peers` of this checkout, the one that the benchmark uses; it is made when it is first wanted.
+"""
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
-import sys
 from pathlib import Path
+from typing import Any
 
 from vlagents_ray.bench.environment import python_in, set_up
 from vlagents_ray.bench.ways import REQUIREMENTS
 
-FOLDER = Path(os.environ.get("VLAGENTS_RAY_PEERS", Path(__file__).parent.parent.parent / ".venv-peers"))
+FOLDER = Path(os.environ.get("VLAGENTS_PEERS", Path(__file__).parents[2] / ".venv-peers"))
+CLIENTS = Path(__file__).with_name("peer_clients.py")
 
 
 def peers_python() -> Path:
-    """Its Python, with every package at the version that the benchmark pins."""
-    stamp = FOLDER / ".requirements"
+    """Their Python, with the pinned packages in it."""
+    stamp = FOLDER / "installed.txt"
     wanted = REQUIREMENTS.read_text()
     if not stamp.is_file() or stamp.read_text() != wanted:
         set_up(FOLDER)
@@ -23,12 +28,9 @@ def peers_python() -> Path:
     return python_in(FOLDER)
 
 
-def package(requirement: str) -> Path:
-    """A folder for PYTHONPATH with another version of a package, alone: what it needs is the environment's."""
-    folder = FOLDER / requirement.replace("==", "-")
-    done = folder / ".installed"
-    if not done.exists():
-        command = [str(peers_python()), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps"]
-        subprocess.run([*command, "--upgrade", "--target", str(folder), requirement], check=True, stdout=sys.stderr)
-        done.touch()
-    return folder
+def drive(python: Path, client: str, *words: object, timeout_s: float = 120) -> Any:
+    """What a client of `peer_clients.py` has to say at its end; its error is this process's."""
+    command = [str(python), str(CLIENTS), client, *map(str, words)]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=timeout_s)
+    assert done.returncode == 0, f"{client} ended with {done.returncode}:\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
+    return json.loads(done.stdout.splitlines()[-1])

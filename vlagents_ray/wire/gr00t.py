@@ -18,8 +18,8 @@ import numpy as np
 
 from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge
 from vlagents_ray.registry import require
+from vlagents_ray.wire.arrays import read_array
 from vlagents_ray.wire.messages import Limits
-from vlagents_ray.wire.tree import read_array
 
 ENDPOINTS = ("get_action", "reset", "ping", "get_modality_config")
 TEXT_KEY = "task"  # in "language", whatever the client calls it there
@@ -199,12 +199,12 @@ def _read_npy(data: Any, limits: Limits) -> Any:
     header = _HEADER.fullmatch(data[start : start + length]) if length < 1000 else None
     if header is None:
         raise MalformedMessage("gr00t: as_npy: want a plain array of numbers or text")
-    dtype, order = header[1].decode(), "F" if header[2] == b"True" else "C"
+    dtype, by_columns = header[1].decode(), header[2] == b"True"
     shape = [int(n) for n in header[3].replace(b" ", b"").split(b",") if n]
     content = memoryview(data)[start + length :]
     if _TEXT_DTYPE.fullmatch(dtype):
         return _read_texts(content, dtype, shape, limits)
-    return read_array(content, dtype, shape, order)  # type: ignore[arg-type]  # one of two letters
+    return read_array(content, dtype, shape[::-1]).T if by_columns else read_array(content, dtype, shape)
 
 
 def _read_texts(content: memoryview, dtype: str, shape: list[int], limits: Limits) -> Any:

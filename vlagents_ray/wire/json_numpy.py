@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
+from vlagents_ray.wire.arrays import read_array
 from vlagents_ray.wire.messages import Limits
-from vlagents_ray.wire.tree import read_array
 
 _KEYS = {"__numpy__", "dtype", "shape"}
 

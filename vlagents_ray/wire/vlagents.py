@@ -16,9 +16,9 @@ from vlagents_ray import images
 from vlagents_ray.errors import InvalidAction, InvalidObservation, MalformedMessage, MessageTooLarge
 from vlagents_ray.interface import GOAL_IMAGE, Act, Obs
 from vlagents_ray.wire import json_numpy
+from vlagents_ray.wire.arrays import read_array
 from vlagents_ray.wire.messages import Limits
 from vlagents_ray.wire.observations import is_number
-from vlagents_ray.wire.tree import read_array
 
 RAW, JPEG, SHARED = "raw", "jpeg_encoded", "shared_memory"
 _TOP_3 = {"obs", "language_instruction", "goal_image", "goal_image_data_type"}
@@ -210,7 +210,7 @@ def _shared(payload: Mapping[str, Any], limits: Limits, segments: Segments) -> n
         size *= n
     if size > limits.body_bytes:
         raise MessageTooLarge(f"shared memory: got {size} bytes, the limit is {limits.body_bytes}")
-    return read_array(segments.read(name, size), "|u1", shape)
+    return read_array(memoryview(segments.read(name, size)), "|u1", shape)
 
 
 def _instruction(value: Any, limits: Limits) -> str | None:
