@@ -137,7 +137,7 @@ class Mirror(Agent):
         if obs.info.get("unnorm_key") == "broken":
             raise RuntimeError("/no/path/of/ours")
         pixel = float(obs.cameras["front"][-1, -1, -1])
-        time.sleep(2.0 if pixel == 255 else self.slow_s)
+        time.sleep(2.0 if obs.cameras["front"].min() == 255 else self.slow_s)
         self.acts += 1
         total = float(next(iter(obs.state.values())).sum()) if obs.state else 0.0
         row = [pixel, total, self.acts, self.number, 0.0, 0.0, 0.0 if obs.gripper is None else obs.gripper]

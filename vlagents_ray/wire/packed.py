@@ -48,6 +48,8 @@ def unpack(data: bytes, limits: Limits, hook: Hook) -> Any:
     except InvalidInput:
         raise
     except (msgpack.exceptions.UnpackException, ValueError, TypeError, OverflowError) as error:
+        if "exceeds max_" in str(error):  # msgpack has no class of its own for it
+            raise MessageTooLarge(f"message: {error}; send arrays instead of lists") from error
         raise MalformedMessage(f"message: no msgpack ({type(error).__name__}: {str(error)[:100]})") from error
     require_plain(value, limits.depth)
     return value
