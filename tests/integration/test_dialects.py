@@ -10,11 +10,12 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+import yaml
 from peers import drive, peers_python
 from websockets.sync.client import connect
 
-from tests.integration.conftest import serving
-from vlagents_ray.serve.cluster import Server
+from vlagents_ray.serve.cluster import Server, running_server
+from vlagents_ray.serve.files import IMPORT_PATH, read_deployment
 from vlagents_ray.wire import openpi
 
 CALLS = 12
@@ -32,8 +33,17 @@ def python() -> Path:
 
 
 @pytest.fixture(scope="module")
-def server() -> Iterator[Server]:
-    with serving("served_agents:Mirror", config={"slow_s": 0.002}, dialects=DIALECTS, batch={"max_size": 8}) as server:
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """Two applications of one deployment file: at the root, and under /pi."""
+    args = {"policy": "served_agents:Mirror", "config": {"slow_s": 0.002}, "batch": {"max_size": 8}}
+    names = {"root": ("/", DIALECTS), "pi": ("/pi", {"openpi": DIALECTS["openpi"]})}
+    apps = [
+        {"name": name, "route_prefix": prefix, "import_path": IMPORT_PATH, "args": {**args, "dialects": dialects}}
+        for name, (prefix, dialects) in names.items()
+    ]
+    file = tmp_path_factory.mktemp("deployment") / "two.yaml"
+    file.write_text(yaml.safe_dump({"applications": apps}))
+    with running_server(read_deployment(str(file)), num_cpus=4) as server:
         yield server
 
 
@@ -63,8 +73,9 @@ def test_the_real_clients_get_their_own_answers(server: Server, python: Path, cl
     require_own_answers(said, client)
 
 
-def test_openpi_takes_a_whole_url_with_a_path(server: Server, python: Path) -> None:
-    require_own_answers(drive(python, "openpi", websocket(server, "/openpi"), 1, 4), "openpi")
+@pytest.mark.parametrize("path", ["/openpi", "/pi", "/pi/", "/pi/openpi"])
+def test_openpi_takes_a_whole_url_with_a_path(server: Server, python: Path, path: str) -> None:
+    require_own_answers(drive(python, "openpi", websocket(server, path), 1, 4), "openpi")
 
 
 def test_openpis_client_reads_the_key_that_is_missing(server: Server, python: Path) -> None:

@@ -11,9 +11,10 @@ import http.client
 import os
 import random
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from urllib.parse import urlsplit
 
@@ -144,25 +145,25 @@ def over_http(target: Target, server: Server, bad: list[bytes]) -> bytes:
 
 
 def over_websocket(target: Target, server: Server, bad: list[bytes]) -> bytes:
-    socket = opened(target, server)
-    for frame in bad:
+    waiting = deque(bad)
+    while waiting:
         try:
-            socket.send(frame)
-            if target.fence:
-                socket.send(target.fence)
-            note(target, wait_for_answer(target, socket))
+            with opened(target, server) as socket:
+                while waiting:
+                    socket.send(waiting.popleft())
+                    if target.fence:
+                        socket.send(target.fence)
+                    note(target, wait_for_answer(target, socket))
         except ConnectionClosedError as closed:
-            if closed.rcvd is None:
+            if closed.rcvd is None:  # the server broke off without a word
                 raise
             target.seen["closed"] += 1
-            socket = opened(target, server)
-    socket.close()
-    socket = opened(target, server)
-    for seed in target.seeds:
-        socket.send(seed)
-        answer = b"" if b"episode_start" in seed else socket.recv(timeout=ANSWER_S)
-    socket.close()
-    assert isinstance(answer, bytes), answer
+    with opened(target, server) as socket:
+        for seed in target.seeds:
+            socket.send(seed)
+            answer = b"" if b"episode_start" in seed else socket.recv(timeout=ANSWER_S)
+    if not isinstance(answer, bytes):
+        raise TypeError(answer)
     return answer
 
 
@@ -177,16 +178,13 @@ def wait_for_answer(target: Target, socket: ClientConnection) -> bytes | str:
             return answer
 
 
-def opened(target: Target, server: Server) -> ClientConnection:
-    socket = connect(
-        server.url.replace("http://", "ws://") + target.path,
-        compression=None,
-        ping_interval=None,
-        open_timeout=ANSWER_S,
-    )
-    if target.greeting:
-        socket.recv(timeout=ANSWER_S)
-    return socket
+@contextmanager
+def opened(target: Target, server: Server) -> Iterator[ClientConnection]:
+    url = server.url.replace("http://", "ws://") + target.path
+    with connect(url, compression=None, ping_interval=None, open_timeout=ANSWER_S) as socket:
+        if target.greeting:
+            socket.recv(timeout=ANSWER_S)
+        yield socket
 
 
 def test_no_message_crashes_hangs_or_bloats_the_server(server: Server) -> None:
