@@ -79,7 +79,7 @@ class Target:
 
 TARGETS = [
     Target("stream", "/v1/stream", [request("reset"), request("act")], lambda a: decode_reply(a).act.action[0]),  # type: ignore[union-attr]
-    Target("frames", "/v1/act", [request("act")], lambda a: decode_reply(a).act.action[0], CONTENT_TYPE),  # type: ignore[union-attr]
+    Target("frames", "/v1/act", [request("act")], lambda a: decode_reply(a).act.action[0, 0], CONTENT_TYPE),  # type: ignore[union-attr]
     Target("openpi", "/openpi", [openpi.encode(LIBERO)], lambda a: openpi.decode(a)["actions"][0, 0], greeting=True),
     Target(
         "roboarena",
@@ -208,7 +208,7 @@ def test_no_message_crashes_hangs_or_bloats_the_server(server: Server) -> None:
         for target in TARGETS:
             print(f"{target.name}: {dict(target.seen)}")
         assert process.is_running()
-        assert agent.act(OBS).action[0] == 9
+        assert agent.act(OBS).action[0, 0] == 9
         assert after[0] - before[0] < 64 * 2**20
         assert after[1] - before[1] < 20
         assert after[2] - before[2] < 20

@@ -289,6 +289,21 @@ def test_of_observations_that_nobody_waits_for_the_newest_is_acted_on() -> None:
         assert [hear(socket).seq for _ in range(3)] == [1, 49, 50]
 
 
+def test_a_client_that_sends_far_more_than_it_waits_for_is_cut_off(house: tuple[TestClient, Engine]) -> None:
+    with serving(Mirror(slow_s=0.1), {"vla_eval": {}}) as (client, _), client.websocket_connect("/") as socket:
+        for seq in range(100):
+            say(socket, "observation", seen(1), seq)
+            say(socket, "hello", {"protocol_version": 1}, seq)
+        heard = [hear(socket)]
+        while heard[-1].kind != "error":
+            heard.append(hear(socket))
+        assert "wait" in heard[-1].payload["error"]
+        assert len(heard) < 100
+        with pytest.raises(WebSocketDisconnect) as closed:
+            hear(socket)
+        assert closed.value.code == 1008
+
+
 def test_a_connection_that_the_replica_has_no_room_for_is_told_to_come_later() -> None:
     with serving(Mirror(), ALL, session_limit=1) as (client, _), client.websocket_connect("/openpi") as socket:
         socket.receive_bytes()

@@ -76,7 +76,11 @@ def test_groots_newest_frame_counts_and_names_are_the_clients() -> None:
     assert instruction == "pour"
     np.testing.assert_array_equal(obs.cameras["ego_view"], IMAGE)
     assert obs.state["left_arm"].tolist() == [7, 8, 9, 10, 11, 12, 13]
-    flat = {"video.ego_view": video, "state.waist": np.ones((1, 1, 3)), "annotation.human.task_description": ["pour"]}
+    flat = {
+        "video.ego_view": video,
+        "state.waist": np.ones((1, 1, 3)),
+        "annotation.human.action.task_description": ["pour"],
+    }
     obs, instruction = PRESETS["gr00t-n1.5"].obs(flat)
     assert (list(obs.cameras), list(obs.state), instruction) == (["ego_view"], ["waist"], "pour")
 

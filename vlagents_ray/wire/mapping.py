@@ -187,7 +187,8 @@ class KeyMapping:
         return min(1.0, max(0.0, opening))
 
     def _instruction(self, flat: Mapping[str, Any], limits: Limits) -> str | None:
-        value = None if self.instruction is None else lookup(flat, self.instruction)
+        found = [] if self.instruction is None else pick(flat, "", self.instruction, True, MissingState)
+        value = found[0][2] if found else None
         while isinstance(value, (list, tuple)) and len(value) == 1:  # a batch of one, as some clients send it
             value = value[0]
         if isinstance(value, np.ndarray) and value.dtype.kind == "U" and value.size == 1:

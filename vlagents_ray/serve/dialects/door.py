@@ -25,7 +25,7 @@ T = TypeVar("T")
 
 logger = logging.getLogger(__name__)
 
-INTERNAL_ERROR, TRY_AGAIN_LATER = 1011, 1013  # WebSocket close codes
+POLICY_VIOLATION, INTERNAL_ERROR, TRY_AGAIN_LATER = 1008, 1011, 1013  # WebSocket close codes
 _INLINE_BYTES = 512 * 1024  # a larger message is decoded beside the event loop, which others wait for
 
 

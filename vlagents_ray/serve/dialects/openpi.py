@@ -99,7 +99,6 @@ class Talk:
 
     async def answer(self, message: dict[str, Any], visit: Visit, request_id: str) -> bytes | str:
         """To one message."""
-        visit.transport = self.door.name
         if (said := self.door.begins(message, self)) is not None:
             return said
         obs, prompt = self.door.read(message)
@@ -138,13 +137,14 @@ class OpenPiRoot:
 
     async def _answer(self, socket: WebSocket, data: bytes | None, talks: dict[str, Talk]) -> bool:
         """Answer one message; False if that was the end."""
-        visit = self._doors[0].visit()
-        request_id = uuid.uuid4().hex
+        visit, request_id = self._doors[0].visit(), uuid.uuid4().hex
         try:
             if data is None:
                 raise MalformedMessage("message: got text, want a binary map")
             message = await decoded(wire.decode, data, self._house.limits)
             door = next((door for door in self._doors if door.speaks(message)), self._doors[0])
+            arrived, visit = visit.arrived, door.visit()
+            visit.arrived = arrived
             talk = talks.get(door.name) or talks.setdefault(door.name, Talk(door))
             answer = await talk.answer(message, visit, request_id)
         except Exception as error:  # noqa: BLE001 - it is told

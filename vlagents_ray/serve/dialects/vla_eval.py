@@ -18,10 +18,10 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, VLAgentsError
 from vlagents_ray.serve.conversation import Conversation
 from vlagents_ray.serve.dialects.config import VlaEval
-from vlagents_ray.serve.dialects.door import Door, House, admit, decoded, tellable
+from vlagents_ray.serve.dialects.door import POLICY_VIOLATION, Door, House, admit, decoded, tellable
 from vlagents_ray.wire import vla_eval as wire
 
-_WAITING = 64  # messages of a client that does not wait for answers
+_WAITING = 16  # messages of a client that does not wait for answers
 
 
 class VlaEvalDoor(Door):
@@ -45,6 +45,8 @@ class VlaEvalDoor(Door):
                 answer = await self._answer(message, episode)
                 if answer is not None:
                     await socket.send_bytes(wire.encode(answer))
+            if inbox.overrun:
+                await socket.close(POLICY_VIOLATION)
         except WebSocketDisconnect:
             return
         finally:
@@ -117,6 +119,7 @@ class _Inbox:
     def __init__(self) -> None:
         self._messages: deque[wire.Message | VLAgentsError | None] = deque()
         self._there = asyncio.Event()
+        self.overrun = False  # it was closed, as far more came than was waited for
 
     async def next(self) -> wire.Message | VLAgentsError | None:
         """The oldest, or the error in place of one that cannot be read; None when the client has gone."""
@@ -127,21 +130,24 @@ class _Inbox:
 
     async def fill(self, socket: WebSocket, house: House) -> None:
         """Take in what comes, until the client goes or sends far more than it waits for."""
-        while True:
-            event: Any = await socket.receive()
-            if event["type"] == "websocket.disconnect":
-                self._put(None)
-                return
-            if len(self._messages) >= _WAITING:
-                self._put(MessageTooLarge(f"{_WAITING} messages wait; wait for their answers"))
-                self._put(None)
-                return
-            try:
-                if (data := event.get("bytes")) is None:
-                    raise MalformedMessage("message: got text, want a binary map")
-                self._put(await decoded(wire.decode, data, house.limits))
-            except Exception as error:  # noqa: BLE001 - it is told
-                self._put(tellable(error, "vla_eval", "of an unreadable message"))
+        try:
+            while (event := await socket.receive())["type"] != "websocket.disconnect":
+                if len(self._messages) >= _WAITING:
+                    self.overrun = True
+                    self._put(MessageTooLarge(f"{_WAITING} messages wait for answers; send no more than that at once"))
+                    return
+                self._put(await self._read(event.get("bytes"), house))
+        finally:
+            self._put(None)
+
+    @staticmethod
+    async def _read(data: bytes | None, house: House) -> wire.Message | VLAgentsError:
+        try:
+            if data is None:
+                raise MalformedMessage("message: got text, want a binary map")
+            return await decoded(wire.decode, data, house.limits)
+        except Exception as error:  # noqa: BLE001 - it is told
+            return tellable(error, "vla_eval", "of an unreadable message")
 
     def _put(self, message: wire.Message | VLAgentsError | None) -> None:
         last = self._messages[-1] if self._messages else None
