@@ -21,7 +21,7 @@ from vlagents_ray.wire import openpi
 CALLS = 12
 DIALECTS = {
     "openpi": {"mapping": "openpi-libero"},
-    "roboarena": {"mapping": "openpi-libero"},
+    "roboarena": {"mapping": {"preset": "roboarena", "action_gripper": {"index": 6}}},  # Mirror's rows have 7 numbers
     "openvla": {},
     "vla_eval": {},
 }
@@ -51,6 +51,12 @@ def websocket(server: Server, path: str = "") -> str:
     return server.url.replace("http://", "ws://") + path
 
 
+def url_for(client: str, server: Server) -> str:
+    if client == "openvla":
+        return server.url
+    return websocket(server, "/vla-eval" if client == "vla_eval" else "")
+
+
 def require_own_answers(said: list[list[Any]], client: str) -> None:
     """Pixel, state, instruction are the sender's; its acts are counted from 1 in each episode."""
     for one in said:
@@ -65,10 +71,9 @@ def require_own_answers(said: list[list[Any]], client: str) -> None:
 
 
 @pytest.mark.parametrize("clients", [1, 8])
-@pytest.mark.parametrize("client", ["openpi", "openvla", "vla_eval"])
+@pytest.mark.parametrize("client", ["openpi", "roboarena", "openvla", "vla_eval"])
 def test_the_real_clients_get_their_own_answers(server: Server, python: Path, client: str, clients: int) -> None:
-    url = {"openpi": websocket(server), "openvla": server.url, "vla_eval": websocket(server, "/vla-eval")}[client]
-    said = drive(python, client, url, clients, CALLS)
+    said = drive(python, client, url_for(client, server), clients, CALLS)
     assert [len(one) for one in said] == [CALLS] * clients
     require_own_answers(said, client)
 
@@ -111,20 +116,13 @@ def test_pings_are_answered_while_the_policy_thinks(server: Server) -> None:
 def test_all_of_them_at_once_beside_our_own(server: Server, python: Path) -> None:
     failed: list[BaseException] = []
 
-    def run(client: str, url: str) -> None:
+    def run(client: str) -> None:
         try:
-            require_own_answers(drive(python, client, url, 3, CALLS), client)
+            require_own_answers(drive(python, client, url_for(client, server), 3, CALLS), client)
         except BaseException as error:  # noqa: BLE001 - raised below
             failed.append(error)
 
-    threads = [
-        threading.Thread(target=run, args=one)
-        for one in (
-            ("openpi", websocket(server)),
-            ("openvla", server.url),
-            ("vla_eval", websocket(server, "/vla-eval")),
-        )
-    ]
+    threads = [threading.Thread(target=run, args=(client,)) for client in DIALECTS]
     for thread in threads:
         thread.start()
     for thread in threads:

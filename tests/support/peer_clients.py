@@ -60,6 +60,34 @@ def openpi(url: str, client: int, calls: int) -> list[Any]:
     return said
 
 
+def roboarena(url: str, client: int, calls: int) -> list[Any]:
+    """RoboArena's client, which is openpi's with an `endpoint` in each request, and is not on PyPI."""
+    from openpi_client.websocket_client_policy import WebsocketClientPolicy
+
+    policy = WebsocketClientPolicy(url)
+    config = policy.get_server_metadata()
+    if config["action_space"] != "joint_position" or config["image_resolution"] != [224, 224]:
+        raise RuntimeError(f"config: {config}")
+    said = []
+    for number, one in enumerate(observations(client, calls)):
+        if number == calls // 2:
+            policy._ws.send(policy._packer.pack({"endpoint": "reset"}))
+            if policy._ws.recv() != "reset successful":
+                raise RuntimeError("reset failed")
+        joints = np.array([one["number"], 0, 0, 0, 0, 0, 0], np.float32)
+        obs = {
+            "observation/exterior_image_0_left": image(one["pixel"]),
+            "observation/wrist_image_left": image(0),
+            "observation/joint_position": joints,
+            "observation/cartesian_position": np.zeros(6, np.float32),
+            "observation/gripper_position": np.zeros(1, np.float32),
+            "prompt": one["task"],
+            "endpoint": "infer",
+        }
+        said.append([one, policy.infer(obs)["actions"].tolist()])
+    return said
+
+
 def openpi_error(url: str, client: int, calls: int) -> list[Any]:
     """What openpi-client raises for an observation that lacks a key."""
     from openpi_client.websocket_client_policy import WebsocketClientPolicy
