@@ -28,7 +28,7 @@ from vlagents_ray.serve.haproxy import (
     is_foreign,
     wait_for_haproxy,
 )
-from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK, free_port, is_free
+from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK, free_port, is_free
 from vlagents_ray.serve.reaper import MARK, reaped
 
 __all__ = ["Server", "free_port", "running_server"]
@@ -105,7 +105,7 @@ def _ray(address: str | None, host: str, port: int, num_cpus: int | None, show_l
         raise ConfigError(f"cannot listen on {host}:{port}: it is taken; choose another --port or --host")
     with tempfile.TemporaryDirectory(prefix="vlagents-ray-") as folder, contextlib.ExitStack() as stack:
         # Ray starts its workers with a low priority, which would make a policy wait for whatever else runs here.
-        environment = {"RAY_worker_niceness": "0", MARK: folder}
+        environment = {"RAY_worker_niceness": "0", MARK: folder, HOST: host}
         if haproxy_available():
             environment |= ingress_environment(Path(folder), host, port)
         stack.enter_context(reaped(Path(folder)))

@@ -31,10 +31,12 @@ from vlagents_ray.serve.metrics import Exporter
 from vlagents_ray.serve.moving import Strays, export
 from vlagents_ray.serve.peers import Peers
 from vlagents_ray.serve.plasma import PlasmaDoor
+from vlagents_ray.serve.ports import HOST
 from vlagents_ray.serve.spread import Load, Place
 from vlagents_ray.serve.stats import LoadMeter, Visit
+from vlagents_ray.serve.stream import StreamDoor
 from vlagents_ray.wire.frames import decode_requests
-from vlagents_ray.wire.messages import PROTOCOL_VERSION, Reply, boot_id
+from vlagents_ray.wire.messages import PROTOCOL_VERSION, SERVERS_MACHINE, Reply, boot_id
 
 logger = logging.getLogger(__name__)
 
@@ -70,7 +72,8 @@ class PolicyReplica:
         self._balance = Balance(self._engine, self._peers, self._load_of)
         self._local = LocalDoor(self._engine, self._limits) if hasattr(os, "memfd_create") else None
         self._plasma = PlasmaDoor(self._engine, self._limits) if self._local is not None else None
-        for door in (self._local, self._plasma):
+        self._stream = self._stream_door()
+        for door in (self._local, self._plasma, self._stream):
             if door is not None:
                 door.open()
         self._loading = asyncio.ensure_future(asyncio.to_thread(self._engine.start))
@@ -97,7 +100,14 @@ class PolicyReplica:
             "version": importlib.metadata.version("vlagents-ray"),
             "dialects": describe(self._args.dialects),
             "local": None if self._local is None else asdict(self._local.address),
+            "stream": None if self._stream is None else asdict(self._stream.address),
         }
+
+    def _stream_door(self) -> StreamDoor | None:
+        stream = self._args.stream
+        if not stream.enabled:
+            return None
+        return StreamDoor(self._engine, self._limits, os.environ.get(HOST) or _serves_host(), stream.ports)
 
     async def attach(self, node: str = "", boot_id: str = "", must_be_near: bool = False) -> tuple[dict[str, Any], Any]:
         """For a client inside the cluster, on that node and machine: a replica's metadata, and its actor.
@@ -125,7 +135,7 @@ class PolicyReplica:
 
     async def _near(self, caller: str) -> dict[str, Any]:
         """The metadata of the least loaded replica on the machine with that boot id; there may be none: this one's."""
-        place = Place(boot_id=caller, must_be_near=True)
+        place = Place(boot_id=boot_id() if caller == SERVERS_MACHINE else caller, must_be_near=True)
         metadata, _ = await self._elsewhere(place) or (self.metadata(), None)
         return {key: value for key, value in metadata.items() if key != "plasma"}
 
@@ -206,7 +216,7 @@ class PolicyReplica:
         self._strays.close()
         await asyncio.to_thread(self._engine.close)
         await asyncio.to_thread(self._metrics.close)
-        for door in (self._local, self._plasma):
+        for door in (self._local, self._plasma, self._stream):
             if door is not None:
                 door.close()
 
@@ -216,6 +226,13 @@ def _stopping() -> bool:
     worker = ray._private.worker.global_worker
     actor = worker.actors.get(worker.actor_id)
     return bool(actor._replica_impl._shutting_down)
+
+
+def _serves_host() -> str:
+    """Where Serve listens, and so its replicas."""
+    controller = serve.context._get_global_client()._controller
+    host: str = ray.get(controller.get_http_config.remote()).host
+    return host
 
 
 def _others_run() -> bool:
