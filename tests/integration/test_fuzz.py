@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from urllib.parse import urlsplit
 
+import httpx
 import numpy as np
 import psutil
 import pytest
@@ -32,7 +33,7 @@ from vlagents_ray.wire import openpi, openvla, vla_eval
 from vlagents_ray.wire.frames import CONTENT_TYPE, decode_reply, encode_request
 from vlagents_ray.wire.messages import Request
 
-FRAMES = int(os.environ.get("VLAGENTS_FUZZ_FRAMES", "2400"))
+FRAMES = int(os.environ.get("VLAGENTS_FUZZ_FRAMES", "2800"))
 ANSWER_S = 30.0
 EVERY = 100  # messages; then a right one
 PICTURE = np.full((8, 8, 3), 9, np.uint8)
@@ -68,7 +69,7 @@ class Target:
     """A door, right messages for it, and what the last of them is answered with."""
 
     name: str
-    path: str
+    path: str  # empty: the replica's own port for WebSockets
     seeds: list[bytes]
     pixel: Callable[[bytes], float]  # in the answer to the last seed
     content_type: str = ""  # of an HTTP body; empty: it is a WebSocket
@@ -79,6 +80,7 @@ class Target:
 
 TARGETS = [
     Target("stream", "/v1/stream", [request("reset"), request("act")], lambda a: decode_reply(a).act.action[0]),  # type: ignore[union-attr]
+    Target("port", "", [request("reset"), request("act")], lambda a: decode_reply(a).act.action[0, 0]),  # type: ignore[union-attr]
     Target("frames", "/v1/act", [request("act")], lambda a: decode_reply(a).act.action[0, 0], CONTENT_TYPE),  # type: ignore[union-attr]
     Target("openpi", "/openpi", [openpi.encode(LIBERO)], lambda a: openpi.decode(a)["actions"][0, 0], greeting=True),
     Target(
@@ -181,6 +183,9 @@ def wait_for_answer(target: Target, socket: ClientConnection) -> bytes | str:
 @contextmanager
 def opened(target: Target, server: Server) -> Iterator[ClientConnection]:
     url = server.url.replace("http://", "ws://") + target.path
+    if not target.path:
+        own = httpx.get(f"{server.url}/v1/metadata").json()["stream"]
+        url = f"ws://127.0.0.1:{own['port']}{own['path']}"
     with connect(url, compression=None, ping_interval=None, open_timeout=ANSWER_S) as socket:
         if target.greeting:
             socket.recv(timeout=ANSWER_S)
