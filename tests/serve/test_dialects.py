@@ -238,6 +238,7 @@ def seen(pixel: int, task: str = "task 1") -> dict[str, Any]:
 
 def test_vla_eval_gets_one_row_a_step_and_a_new_chunk_after_the_last(house: tuple[TestClient, Engine]) -> None:
     with house[0].websocket_connect("/vla-eval") as socket:
+        assert house[0].get("/health").json() == {"status": "ok"}
         say(socket, "hello", {"protocol_version": 1}, 1)
         hello = hear(socket)
         assert (hello.kind, hello.seq, hello.payload["protocol_version"]) == ("hello", 1, 1)
@@ -345,6 +346,18 @@ def test_dialects_count_in_the_statistics_by_their_names() -> None:
         ("reset", "vla_eval", "simulation", "ok"),
         ("act", "vla_eval", "simulation", "ok"),
     ]
+
+
+def test_until_the_policy_is_loaded_every_door_says_503() -> None:
+    house = House(Engine(Mirror()), lambda: METADATA, LIMITS)
+    door = build_ingress(house.engine, lambda: METADATA, LIMITS, dialects=dialect_routes(DialectArgs(**ALL), house))
+    with TestClient(door) as client:
+        assert client.get("/health").status_code == 503
+        assert client.post("/act", json=body(1)).status_code == 503
+        for path in ("/", "/openpi", "/roboarena", "/vla-eval"):
+            with pytest.raises(WebSocketDenialResponse) as refused, client.websocket_connect(path):
+                pass
+            assert refused.value.status_code == 503
 
 
 def test_a_dialect_that_is_off_is_not_there() -> None:

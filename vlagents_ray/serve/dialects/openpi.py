@@ -1,7 +1,8 @@
-"""openpi's and RoboArena's clients over WebSocket: a binary map each way, the server speaks first.
+"""openpi's clients over WebSocket: a binary map each way, the server speaks first.
 
-Both connect to the root, and both may be on: RoboArena's requests name an `endpoint`, openpi's do not. What is said
-first is RoboArena's configuration if it is on, which openpi's client takes as metadata.
+RoboArena's (`roboarena.py`) speak much the same and connect to the root as well. Both may be on: RoboArena's requests
+name an `endpoint`, openpi's do not. What is said first is then RoboArena's configuration, which openpi's client takes
+as metadata.
 
 An error is a text with a request id, and the end of the connection (1011); theirs sends a traceback.
 """
@@ -18,31 +19,26 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from vlagents_ray.errors import MalformedMessage
 from vlagents_ray.serve.calls import Sender
 from vlagents_ray.serve.conversation import Conversation
-from vlagents_ray.serve.dialects.config import OpenPi, RoboArena
+from vlagents_ray.serve.dialects.config import OpenPi
 from vlagents_ray.serve.dialects.door import INTERNAL_ERROR, Door, House, admit, decoded, tellable
 from vlagents_ray.serve.stats import Visit
 from vlagents_ray.wire import openpi as wire
 from vlagents_ray.wire.messages import Reply
 
 
-class OpenPiDoor(Door):
-    """Its session begins with the connection, and again with each new prompt."""
-
-    def __init__(self, dialect: OpenPi, house: House) -> None:
-        super().__init__("openpi", dialect, house)
-        self._added = dialect.metadata
+class MapDoor(Door):
+    """A dialect of maps, in openpi's encoding."""
 
     def first(self) -> dict[str, Any]:
         """What a client is told when it connects."""
-        known = self.house.metadata()
-        return {key: known.get(key) for key in ("policy", "checkpoint", "version")} | self._added
+        raise NotImplementedError
 
     def speaks(self, message: dict[str, Any]) -> bool:
         """Is it one of its client's?"""
-        return "endpoint" not in message
+        raise NotImplementedError
 
     def begins(self, message: dict[str, Any], talk: Talk) -> str | None:
-        """The answer to what is no observation."""
+        """Notice what begins an episode; the answer, if the message is no observation."""
         return None
 
     def answer(self, reply: Reply, before_ms: float | None) -> Any:
@@ -56,41 +52,25 @@ class OpenPiDoor(Door):
         }
 
 
-class RoboArenaDoor(OpenPiDoor):
-    """Its episodes end with `reset`, or with another `session_id`."""
+class OpenPiDoor(MapDoor):
+    """Its session begins with the connection, and again with each new prompt."""
 
-    def __init__(self, dialect: RoboArena, house: House) -> None:
-        Door.__init__(self, "roboarena", dialect, house)
-        self._first = dialect.first()
-        self._bare = dialect.bare
+    def __init__(self, dialect: OpenPi, house: House) -> None:
+        super().__init__("openpi", dialect, house)
+        self._added = dialect.metadata
 
     def first(self) -> dict[str, Any]:
-        return self._first
+        known = self.house.metadata()
+        return {key: known.get(key) for key in ("policy", "checkpoint", "version")} | self._added
 
     def speaks(self, message: dict[str, Any]) -> bool:
-        return "endpoint" in message
-
-    def begins(self, message: dict[str, Any], talk: Talk) -> str | None:
-        endpoint = message.get("endpoint", "infer")
-        if endpoint == "reset":
-            talk.conversation.begin_again()
-            return "reset successful"
-        if endpoint != "infer":
-            raise MalformedMessage(f"endpoint: got {str(endpoint)[:40]!r}, want 'infer' or 'reset'")
-        episode = message.get("session_id")
-        if talk.episode is not None and str(episode) != talk.episode:
-            talk.conversation.begin_again()
-        talk.episode = None if episode is None else str(episode)
-        return None
-
-    def answer(self, reply: Reply, before_ms: float | None) -> Any:
-        return self.rows(reply) if self._bare else super().answer(reply, before_ms)
+        return "endpoint" not in message
 
 
 class Talk:
     """One connection's with one door."""
 
-    def __init__(self, door: OpenPiDoor) -> None:
+    def __init__(self, door: MapDoor) -> None:
         self.door = door
         self.sender: Sender = door.sender()
         self.conversation: Conversation = door.conversation(self.sender)
@@ -109,10 +89,10 @@ class Talk:
         return data
 
 
-class OpenPiRoot:
-    """The path at which these doors are."""
+class MapRoot:
+    """A path at which these doors are; the last one speaks first."""
 
-    def __init__(self, doors: Sequence[OpenPiDoor], house: House) -> None:
+    def __init__(self, doors: Sequence[MapDoor], house: House) -> None:
         self._doors = doors
         self._house = house
 

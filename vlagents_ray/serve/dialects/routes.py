@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Awaitable, Callable
 from typing import Any
 
 from starlette.requests import Request as HttpRequest
@@ -10,11 +11,12 @@ from starlette.routing import BaseRoute, Match, Route, WebSocketRoute
 from starlette.types import Scope
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import ConfigError
+from vlagents_ray.errors import ConfigError, PolicyUnavailable, VLAgentsError
 from vlagents_ray.serve.dialects.config import DialectArgs
 from vlagents_ray.serve.dialects.door import House
-from vlagents_ray.serve.dialects.openpi import OpenPiDoor, OpenPiRoot, RoboArenaDoor
+from vlagents_ray.serve.dialects.openpi import MapDoor, MapRoot, OpenPiDoor
 from vlagents_ray.serve.dialects.openvla import OpenVLADoor
+from vlagents_ray.serve.dialects.roboarena import RoboArenaDoor
 from vlagents_ray.serve.dialects.vla_eval import VlaEvalDoor
 from vlagents_ray.serve.problems import problem_response
 
@@ -33,16 +35,16 @@ class Root(WebSocketRoute):
 def dialect_routes(args: DialectArgs, house: House) -> list[BaseRoute]:
     """Of the dialects that are on."""
     routes: list[BaseRoute] = []
-    pi: list[OpenPiDoor] = []
+    pi: list[MapDoor] = []
     if args.openpi is not None:
         pi.append(OpenPiDoor(args.openpi, house))
-        routes.append(WebSocketRoute("/openpi", OpenPiRoot(pi[-1:], house).stream))
+        routes.append(WebSocketRoute("/openpi", MapRoot(pi[-1:], house).stream))
     if args.roboarena is not None:
         pi.append(RoboArenaDoor(args.roboarena, house))
-        routes.append(WebSocketRoute("/roboarena", OpenPiRoot(pi[-1:], house).stream))
+        routes.append(WebSocketRoute("/roboarena", MapRoot(pi[-1:], house).stream))
     if args.openvla is not None:
         routes.append(Route("/act", OpenVLADoor(args.openvla, house).act, methods=["POST"]))
-    root = OpenPiRoot(pi, house).stream if pi else None
+    root = MapRoot(pi, house).stream if pi else None
     if args.vla_eval is not None:
         door = VlaEvalDoor(args.vla_eval, house)
         routes += [WebSocketRoute("/vla-eval", door.stream), Route("/health", _health(house))]
@@ -72,14 +74,13 @@ def require_fit(args: DialectArgs, contract: Contract | None) -> None:
         raise ConfigError("dialects and policy do not fit:\n" + "\n".join(found))
 
 
-def _health(house: House) -> Any:
+def _health(house: House) -> Callable[[HttpRequest], Awaitable[Response]]:
     async def health(_http: HttpRequest) -> Response:
         """As vla-eval's own servers have it."""
-        if not house.engine.ready:
-            try:
-                house.engine.require_ready()
-            except Exception as error:  # noqa: BLE001 - it is told
-                return problem_response(error, "", 503)  # type: ignore[arg-type]  # it raises no others
+        try:
+            house.engine.require_ready()
+        except VLAgentsError as error:
+            return problem_response(error, "", PolicyUnavailable.status)
         return JSONResponse({"status": "ok"})
 
     return health
