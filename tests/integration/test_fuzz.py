@@ -79,7 +79,7 @@ class Target:
 
 
 TARGETS = [
-    Target("stream", "/v1/stream", [request("reset"), request("act")], lambda a: decode_reply(a).act.action[0]),  # type: ignore[union-attr]
+    Target("stream", "/v1/stream", [request("reset"), request("act")], lambda a: decode_reply(a).act.action[0, 0]),  # type: ignore[union-attr]
     Target("port", "", [request("reset"), request("act")], lambda a: decode_reply(a).act.action[0, 0]),  # type: ignore[union-attr]
     Target("frames", "/v1/act", [request("act")], lambda a: decode_reply(a).act.action[0, 0], CONTENT_TYPE),  # type: ignore[union-attr]
     Target("openpi", "/openpi", [openpi.encode(LIBERO)], lambda a: openpi.decode(a)["actions"][0, 0], greeting=True),
