@@ -86,7 +86,7 @@ class LocalAddress:
     # names it: a frame, or with COMPACT the arrays of the acts that follow the message's header (see
     # `vlagents_ray.wire.compact`). A reply follows its header, or lies in a memory file that comes with it.
     REQUEST: ClassVar[struct.Struct] = struct.Struct("<IIQ")  # number of the memory file, flags, bytes there
-    REPLY: ClassVar[struct.Struct] = struct.Struct("<QI")  # bit n: memory file n is free again; flags
+    REPLY: ClassVar[struct.Struct] = struct.Struct("<QHh")  # bit n: memory file n is free again; flags; core or -1
     IN_FILE: ClassVar[int] = 1  # flag: the frame of the reply lies in the memory file that comes with it
     COMPACT: ClassVar[int] = 2  # flag: no frame
 
