@@ -8,6 +8,7 @@ Some thousands in CI; as many as wanted by hand:
 from __future__ import annotations
 
 import http.client
+import json
 import os
 import random
 import time
@@ -16,13 +17,14 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
 import numpy as np
 import psutil
 import pytest
-from mutations import mutated
+from mutations import changed, mutated
 from websockets.exceptions import ConnectionClosedError
 from websockets.sync.client import ClientConnection, connect
 
@@ -74,21 +76,49 @@ class Target:
     pixel: Callable[[bytes], float]  # in the answer to the last seed
     content_type: str = ""  # of an HTTP body; empty: it is a WebSocket
     greeting: bool = False  # the server speaks first
+    trees: list[dict[str, Any]] = field(default_factory=list)  # messages before they were encoded
+    encode: Callable[[Any], bytes] = openpi.encode
     fence: bytes = b""  # a message that is always answered, for where others may not be
     seen: Counter[str] = field(default_factory=Counter)
 
 
+def as_json(tree: dict[str, Any]) -> bytes:
+    return json.dumps(tree, default=lambda array: json.loads(openvla.encode(np.asarray(array), twice=False))).encode()
+
+
+def as_vla_eval(tree: dict[str, Any]) -> bytes:
+    fields = {"kind": "observation", "payload": {}, "seq": 3} | tree
+    return vla_eval.encode(vla_eval.Message(fields["kind"], fields["payload"], fields["seq"]))
+
+
+def frame_pixel(answer: bytes) -> float:
+    act = decode_reply(answer).act
+    return -1.0 if act is None else act.action[0, 0]
+
+
+def map_pixel(answer: bytes) -> float:
+    return openpi.decode(answer)["actions"][0, 0]
+
+
 TARGETS = [
-    Target("stream", "/v1/stream", [request("reset"), request("act")], lambda a: decode_reply(a).act.action[0, 0]),  # type: ignore[union-attr]
-    Target("port", "", [request("reset"), request("act")], lambda a: decode_reply(a).act.action[0, 0]),  # type: ignore[union-attr]
-    Target("frames", "/v1/act", [request("act")], lambda a: decode_reply(a).act.action[0, 0], CONTENT_TYPE),  # type: ignore[union-attr]
-    Target("openpi", "/openpi", [openpi.encode(LIBERO)], lambda a: openpi.decode(a)["actions"][0, 0], greeting=True),
+    Target("stream", "/v1/stream", [request("reset"), request("act")], frame_pixel),
+    Target("port", "", [request("reset"), request("act")], frame_pixel),
+    Target("frames", "/v1/act", [request("act")], frame_pixel, CONTENT_TYPE),
+    Target(
+        "openpi",
+        "/openpi",
+        [openpi.encode(LIBERO)],
+        map_pixel,
+        greeting=True,
+        trees=[LIBERO],
+    ),
     Target(
         "roboarena",
         "/roboarena",
         [openpi.encode({"endpoint": "reset"}), openpi.encode(LIBERO | {"endpoint": "infer"})],
-        lambda a: openpi.decode(a)["actions"][0, 0],
+        map_pixel,
         greeting=True,
+        trees=[LIBERO | {"endpoint": "infer", "session_id": "a"}],
     ),
     Target(
         "openvla",
@@ -96,6 +126,8 @@ TARGETS = [
         [b'{"image":%s,"instruction":"task 4","unnorm_key":null}' % openvla.encode(PICTURE, twice=False)],
         lambda a: openvla.decode(b'{"a":%s}' % a)[0]["a"][0],
         "application/json",
+        trees=[{"image": PICTURE, "instruction": "task 4", "unnorm_key": "a"}],
+        encode=as_json,
     ),
     Target(
         "vla_eval",
@@ -107,6 +139,8 @@ TARGETS = [
         ],
         lambda a: vla_eval.decode(a).payload["actions"][0],
         fence=FENCE,
+        trees=[{"payload": SEEN}, {"kind": "episode_start", "payload": {"task": {}}}],
+        encode=as_vla_eval,
     ),
 ]
 
@@ -116,9 +150,16 @@ def attack(target: Target, server: Server, frames: int, seed: int) -> None:
     choose = random.Random(seed)
     talk = over_http if target.content_type else over_websocket
     for begun in range(0, frames, EVERY):
-        bad = [mutated(choose, choose.choice(target.seeds)) for _ in range(min(EVERY, frames - begun))]
+        bad = [nearly_right(target, choose) for _ in range(min(EVERY, frames - begun))]
         answer = talk(target, server, bad)
         assert target.pixel(answer) == 9
+
+
+def nearly_right(target: Target, choose: random.Random) -> bytes:
+    """Wrong in its bytes or, where there is a tree, half of the time in what they say."""
+    if target.trees and choose.random() < 0.5:
+        return target.encode(changed(choose, choose.choice(target.trees)))
+    return mutated(choose, choose.choice(target.seeds))
 
 
 def note(target: Target, answer: bytes | str) -> None:

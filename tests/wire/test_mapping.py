@@ -211,3 +211,15 @@ def test_a_mapping_of_junk_is_refused_by_name(value: Any) -> None:
         read_mapping(value)
     except ConfigError:
         return
+
+
+def test_a_number_too_large_for_float32_is_infinite_without_a_warning() -> None:
+    for value in ([1e308], np.array([1e308])):
+        obs, _ = KeyMapping.from_json({"state": {"joints": "joints"}}).obs({"joints": value})
+        assert np.isinf(obs.state["joints"]).all()
+
+
+@pytest.mark.parametrize("value", [10**400, [10**400], [-(10**400), 1.0]])
+def test_a_number_too_large_for_any_float_is_refused(value: Any) -> None:
+    with pytest.raises(InvalidObservation, match="joints"):
+        KeyMapping.from_json({"state": {"joints": "joints"}}).obs({"joints": value})

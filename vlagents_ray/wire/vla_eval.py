@@ -87,4 +87,6 @@ def _node(value: Any) -> Any:
             "dtype": value.dtype.str,
             "shape": list(value.shape),
         }
+    if isinstance(value, np.generic) and value.dtype.kind in "biuf":
+        return value.item()
     raise TypeError(f"cannot send {type(value).__name__}; want plain values and arrays of numbers")

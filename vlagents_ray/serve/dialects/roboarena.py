@@ -8,7 +8,7 @@ from vlagents_ray.errors import MalformedMessage
 from vlagents_ray.serve.dialects.config import RoboArena
 from vlagents_ray.serve.dialects.door import House
 from vlagents_ray.serve.dialects.openpi import MapDoor, Talk
-from vlagents_ray.wire.messages import Reply
+from vlagents_ray.wire.messages import NAME_CHARACTERS, Reply
 
 
 class RoboArenaDoor(MapDoor):
@@ -27,15 +27,16 @@ class RoboArenaDoor(MapDoor):
 
     def begins(self, message: dict[str, Any], talk: Talk) -> str | None:
         endpoint = message.get("endpoint", "infer")
+        if not isinstance(endpoint, str) or endpoint not in ("infer", "reset"):
+            raise MalformedMessage(f"endpoint: got {str(endpoint)[:40]!r}, want 'infer' or 'reset'")
         if endpoint == "reset":
             talk.conversation.begin_again()
             return "reset successful"
-        if endpoint != "infer":
-            raise MalformedMessage(f"endpoint: got {str(endpoint)[:40]!r}, want 'infer' or 'reset'")
-        episode = message.get("session_id")
-        if talk.episode is not None and str(episode) != talk.episode:
-            talk.conversation.begin_again()
-        talk.episode = None if episode is None else str(episode)
+        if (named := message.get("session_id")) is not None:
+            episode = str(named)[:NAME_CHARACTERS]  # of a text, or of an array of one
+            if talk.episode not in (None, episode):
+                talk.conversation.begin_again()
+            talk.episode = episode
         return None
 
     def answer(self, reply: Reply, before_ms: float | None) -> Any:
