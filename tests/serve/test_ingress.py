@@ -144,7 +144,7 @@ FAULTS: list[tuple[dict[str, Any], int, str]] = [
     *[({"obs": text}, 400, "malformed") for text in ("", "{", "null", "[1]", "nan", "[" * 9999, '{"a": 1}', "\xff")],
     *[({"obs": {**GOOD, key: 1}}, 400, "malformed") for key in ("camera", "images", "prompt", "session", "x" * 999)],
     *[({"obs": {**GOOD, "state": {"joints": x}}}, 422, "invalid_observation")
-      for x in ([NAN, 0], [float("inf"), 0], [1], [1, 2, 3], [[1, 2]], ["1", "2"], [None, 1], [True, 1], [HUGE, 1], "1", 1)],
+      for x in ([NAN, 0], [float("inf"), 0], [1], [1, 2, 3], [[1, 2]], ["1", "2"], [None, 1], [True, 1], [HUGE, 1], 1)],
     *[({"obs": {**GOOD, "gripper": x}}, 422, "invalid_observation") for x in (-0.1, 1.1, "open", [1], NAN, True, HUGE)],
     *[({"obs": {**GOOD, "state": x}}, 400, "malformed") for x in ([1], "joints", 3)],
     ({"obs": {**GOOD, "state": {}}}, 422, "missing_state"),
