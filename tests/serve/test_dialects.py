@@ -58,7 +58,7 @@ def image(pixel: int) -> np.ndarray:
     return np.full((8, 8, 3), pixel, np.uint8)
 
 
-def libero(pixel: int, prompt: str = "task 1", **more: Any) -> bytes:
+def libero(pixel: int, prompt: str | None = "task 1", **more: Any) -> bytes:
     state = np.array([0, 0, 0, 0, 0, 1, 0.04, -0.04])
     both = {"observation/image": image(pixel), "observation/wrist_image": image(0)}
     return openpi.encode({**both, "observation/state": state, "prompt": prompt, **more})
@@ -90,6 +90,16 @@ def test_an_episode_begins_with_the_connection_and_with_each_new_prompt(house: t
         acts = [call(one, libero(1, f"task {number}"))["actions"][0, 2:4].tolist() for number in (3, 3, 4, 4, 3)]
         assert acts == [[1, 3], [2, 3], [1, 4], [2, 4], [1, 3]]
         assert call(two, libero(1, "task 9"))["actions"][0, 2:4].tolist() == [1, 9]
+
+
+def test_without_a_prompt_the_one_before_holds(house: tuple[TestClient, Engine]) -> None:
+    with house[0].websocket_connect("/roboarena") as socket:
+        socket.receive_bytes()
+        call(socket, libero(1, "task 5", endpoint="infer"))
+        assert call(socket, libero(1, None, endpoint="infer"))["actions"][0, 2:4].tolist() == [2, 5]
+        socket.send_bytes(openpi.encode({"endpoint": "reset"}))
+        socket.receive_text()
+        assert call(socket, libero(1, None, endpoint="infer"))["actions"][0, 2:4].tolist() == [1, 5]
 
 
 def test_a_sessions_end_is_its_connections(house: tuple[TestClient, Engine]) -> None:

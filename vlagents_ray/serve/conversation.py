@@ -45,11 +45,12 @@ class Conversation:
             return await self._ask("act", obs, None, request_id)
         except UnknownSession:
             logger.info("%s: a session was forgotten; it begins again (request %s)", self._transport, request_id)
-            await self._reset(obs, instruction or self._instruction, request_id)
+            await self._reset(obs, instruction, request_id)
             return await self._ask("act", obs, None, request_id)
 
     async def _reset(self, obs: Obs, instruction: str | None, request_id: str) -> None:
         contract = self._engine.contract
+        instruction = self._instruction if instruction is None else instruction
         if instruction is None and contract is not None and contract.instruction:
             raise InvalidObservation("instruction: got none, the policy needs one; send it with the observation")
         visit = Visit(self._engine.stats, self._transport, "reset", self._rank)
