@@ -33,13 +33,13 @@ ENVS: dict[str, str] = {
 # import name -> extra of this package that installs it
 _EXTRAS = {
     "ray": "serve",
+    "msgpack": "serve",
     "starlette": "serve",
     "pydantic": "serve",
     "PIL": "serve",
     "yaml": "serve",
     "typer": "serve",
     "rich": "serve",
-    "msgpack": "gr00t",
     "zmq": "gr00t",
     "matplotlib": "bench",
     "gymnasium": "sim",

@@ -76,7 +76,11 @@ def test_groots_newest_frame_counts_and_names_are_the_clients() -> None:
     assert instruction == "pour"
     np.testing.assert_array_equal(obs.cameras["ego_view"], IMAGE)
     assert obs.state["left_arm"].tolist() == [7, 8, 9, 10, 11, 12, 13]
-    flat = {"video.ego_view": video, "state.waist": np.ones((1, 1, 3)), "annotation.human.task_description": ["pour"]}
+    flat = {
+        "video.ego_view": video,
+        "state.waist": np.ones((1, 1, 3)),
+        "annotation.human.action.task_description": ["pour"],
+    }
     obs, instruction = PRESETS["gr00t-n1.5"].obs(flat)
     assert (list(obs.cameras), list(obs.state), instruction) == (["ego_view"], ["waist"], "pour")
 
@@ -207,3 +211,15 @@ def test_a_mapping_of_junk_is_refused_by_name(value: Any) -> None:
         read_mapping(value)
     except ConfigError:
         return
+
+
+def test_a_number_too_large_for_float32_is_infinite_without_a_warning() -> None:
+    for value in ([1e308], np.array([1e308])):
+        obs, _ = KeyMapping.from_json({"state": {"joints": "joints"}}).obs({"joints": value})
+        assert np.isinf(obs.state["joints"]).all()
+
+
+@pytest.mark.parametrize("value", [10**400, [10**400], [-(10**400), 1.0]])
+def test_a_number_too_large_for_any_float_is_refused(value: Any) -> None:
+    with pytest.raises(InvalidObservation, match="joints"):
+        KeyMapping.from_json({"state": {"joints": "joints"}}).obs({"joints": value})

@@ -47,7 +47,7 @@ from vlagents_ray.wire.keys import (
     stated,
 )
 from vlagents_ray.wire.messages import DEFAULT_LIMITS, Limits
-from vlagents_ray.wire.observations import as_camera, as_state
+from vlagents_ray.wire.observations import as_camera, as_state, is_number
 from vlagents_ray.wire.paths import keys, lookup, matches, pick
 
 _OVERSHOOT = 0.25  # of a gripper's range: what a sensor may read beyond its ends
@@ -187,7 +187,8 @@ class KeyMapping:
         return min(1.0, max(0.0, opening))
 
     def _instruction(self, flat: Mapping[str, Any], limits: Limits) -> str | None:
-        value = None if self.instruction is None else lookup(flat, self.instruction)
+        found = [] if self.instruction is None else pick(flat, "", self.instruction, True, MissingState)
+        value = found[0][2] if found else None
         while isinstance(value, (list, tuple)) and len(value) == 1:  # a batch of one, as some clients send it
             value = value[0]
         if isinstance(value, np.ndarray) and value.dtype.kind == "U" and value.size == 1:
@@ -225,8 +226,10 @@ def _vector(key: str, value: Any, limits: Limits) -> np.ndarray:
     """(D,) float32."""
     if isinstance(value, np.ndarray):
         value = np.atleast_1d(_newest(key, value, 1))
-    elif isinstance(value, (int, float, np.number)) and not isinstance(value, bool):
-        value = [float(value)]
+    elif isinstance(value, np.number):
+        value = [value.item()]
+    elif is_number(value):
+        value = [value]
     return as_state(key, value, limits)
 
 

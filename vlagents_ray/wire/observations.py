@@ -60,13 +60,19 @@ def as_state(name: str, part: Any, limits: Limits) -> np.ndarray:
             raise MessageTooLarge(f"state {name!r}: got {len(part)} values, the limit is {limits.state_values}")
         if not all(is_number(x) for x in part):
             raise InvalidObservation(f"state {name!r}: want a list of numbers")
-        return np.asarray(part, dtype=np.float32)
+        return _single(np.array(part, dtype=np.float64))
     if not isinstance(part, np.ndarray) or part.ndim != 1 or part.dtype.kind not in "fiu":
         got = f"{part.shape} {part.dtype}" if isinstance(part, np.ndarray) else type(part).__name__
         raise InvalidObservation(f"state {name!r}: got {got}, want (D,) float32")
     if part.size > limits.state_values:
         raise MessageTooLarge(f"state {name!r}: got {part.size} values, the limit is {limits.state_values}")
-    return part.astype(np.float32, copy=False)
+    return _single(part)
+
+
+def _single(part: np.ndarray) -> np.ndarray:
+    """As float32; what is too large for it becomes infinite, which `check_observation` refuses."""
+    with np.errstate(over="ignore"):
+        return part.astype(np.float32, copy=False)
 
 
 def write_obs(obs: Obs, writer: Writer, codec: ImageCodec) -> dict[str, Any]:
@@ -85,5 +91,7 @@ def write_obs(obs: Obs, writer: Writer, codec: ImageCodec) -> dict[str, Any]:
 
 
 def is_number(value: object) -> bool:
-    """A number, and no bool, which JSON and Python tell apart differently."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+    """A number that a float can hold, and no bool, which JSON and Python tell apart differently."""
+    if isinstance(value, int):
+        return not isinstance(value, bool) and value.bit_length() < 1024
+    return isinstance(value, float)

@@ -93,13 +93,13 @@ _JSON: dict[str, dict[str, Any]] = {
     "gr00t": {
         "cameras": {"*": "video/*"},
         "state": {"*": "state/*"},
-        "instruction": "language/task",
+        "instruction": "language/*",
     },
     # GR00T N1.5: the same with flat keys
     "gr00t-n1.5": {
         "cameras": {"*": "video.*"},
         "state": {"*": "state.*"},
-        "instruction": "annotation.human.task_description",
+        "instruction": "annotation.human.*",
     },
     # vla-eval, types.py: the benchmark chooses the cameras' names
     "vla-eval": {
