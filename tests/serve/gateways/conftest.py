@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -31,10 +32,13 @@ def vlagents_doors(replicas: Replicas) -> Iterator[OpenDoor]:
     """Open a door; returns its port."""
     doors: list[VlagentsDoor] = []
 
-    def make(sessions: int = 8, idle_s: float = 30.0, **args: object) -> int:
+    def make(sessions: int = 8, idle_s: float = 30.0, check: object = None, **args: object) -> int:
         settings = VlagentsArgs(port=free_port(), **args)
-        house = House("noop", replicas.agent, LIMITS, sessions, idle_s, None)
-        doors.append(VlagentsDoor(house, settings, reserve("vlagents", "127.0.0.1", settings.port), "0"))
+        house = House("noop", lambda _: replicas.agent(), LIMITS, sessions, idle_s, None, check)  # type: ignore[arg-type]
+        with contextlib.ExitStack() as stack:
+            listener = stack.enter_context(reserve("vlagents", "127.0.0.1", settings.port))
+            doors.append(VlagentsDoor(house, settings, listener, "0"))
+            stack.pop_all()
         doors[-1].open()
         return settings.port
 
@@ -52,7 +56,7 @@ def gr00t_doors(replicas: Replicas) -> Iterator[OpenDoor]:
 
     def make(sessions: int = 8, idle_s: float = 30.0, check: object = None, **args: object) -> int:
         settings = GR00TArgs(port=free_port(), **args)
-        house = House("noop", replicas.agent, LIMITS, sessions, idle_s, None, check)  # type: ignore[arg-type]
+        house = House("noop", lambda _: replicas.agent(), LIMITS, sessions, idle_s, None, check)  # type: ignore[arg-type]
         doors.append(GR00TDoor(house, settings, reserve("gr00t", "127.0.0.1", settings.port)))
         doors[-1].open()
         return settings.port

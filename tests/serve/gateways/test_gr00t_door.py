@@ -12,6 +12,7 @@ from typing import Any
 import gr00t_client
 import msgpack
 import numpy as np
+import psutil
 import pytest
 import zmq
 from eval_fakes import wait_for
@@ -21,6 +22,7 @@ from in_process import Replicas
 from vlagents_ray.errors import InvalidInput
 
 FRAMES = int(os.environ.get("VLAGENTS_RAY_FUZZ", "5000"))
+GROWTH = 64 * 2**20  # bytes, whatever the number of frames
 
 
 def sessions(replicas: Replicas) -> int:
@@ -166,7 +168,7 @@ def test_mutated_messages_get_an_error_or_an_answer(open_gr00t, replicas: Replic
     try:
         with PolicyClient(port) as good:
             good.ping()
-            threads = threading.active_count()
+            threads, held = threading.active_count(), psutil.Process().memory_info().rss
             for number in range(FRAMES):
                 message = bytearray(choose.choice(messages))
                 for _ in range(choose.randrange(1, 4)):
@@ -176,6 +178,7 @@ def test_mutated_messages_get_an_error_or_an_answer(open_gr00t, replicas: Replic
                 if number % 200 == 0:
                     assert rows(good.get_action(seen(5))[0])[-1] == number // 200 + 1
             assert threading.active_count() <= threads + 2
+            assert psutil.Process().memory_info().rss - held < GROWTH
     finally:
         bad.close()
         context.term()

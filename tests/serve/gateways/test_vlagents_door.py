@@ -9,6 +9,7 @@ import threading
 from multiprocessing.shared_memory import SharedMemory as Segment
 
 import numpy as np
+import psutil
 import pytest
 from eval_fakes import wait_for
 from in_process import Replicas
@@ -21,6 +22,7 @@ from vlagents_ray.wire.rpyc import Handler
 
 REPLY, EXCEPTION = 2, 3
 FRAMES = int(os.environ.get("VLAGENTS_RAY_FUZZ", "5000"))
+GROWTH = 64 * 2**20  # bytes, whatever the number of frames
 
 
 def sessions(replicas: Replicas) -> int:
@@ -124,20 +126,16 @@ def test_the_clients_memory_is_read_in_place(open_vlagents) -> None:
 
 def test_a_slow_a_dead_and_a_silent_client_hold_up_nobody(open_vlagents, replicas: Replicas) -> None:
     port = open_vlagents(idle_s=1.0)
-    half, silent, deaf = Client(port), Client(port), Client(port)
-    half.send(call("act", document())[:20])  # and no more
-    silent.send(b"")
-    deaf.send(call("act", document()) * 3)  # and never reads
-    with Client(port) as good:
-        for i in range(1, 6):
-            assert good.act(document(3, "x"))[-1] == i
-        for slow in (silent, deaf):
-            slow.socket.settimeout(20)
-            while slow.socket.recv(4096):
-                pass  # until the server hangs up
-        assert sessions(replicas) <= 1
-    for client in (half, silent, deaf):
-        client.close()
+    with Client(port) as half, Client(port) as silent, Client(port) as deaf:
+        half.send(call("act", document())[:20])  # and no more
+        deaf.send(call("act", document()) * 3)  # and does not read
+        with Client(port) as good:
+            for i in range(1, 6):
+                assert good.act(document(3, "x"))[-1] == i
+            for slow in (silent, deaf):
+                while slow.socket.recv(4096):
+                    pass  # until the server hangs up
+        wait_for(lambda: sessions(replicas) == 0)
 
 
 def test_one_client_more_than_the_limit_is_turned_away(open_vlagents) -> None:
@@ -166,7 +164,7 @@ def test_mutated_frames_end_their_own_client_at_most(open_vlagents, replicas: Re
     choose = random.Random(5)
     frames = [call("act", document(9, side=4)), call("name"), request(1, Handler.GETROOT, (VALUE, ()))]
     frames += [request(1, Handler.GETATTR, (TUPLE, ((LOCAL, ROOT), (VALUE, "act"))))]
-    threads = threading.active_count()
+    threads, held = threading.active_count(), psutil.Process().memory_info().rss
     with Client(port) as good:
         acts, sent = 0, 0
         while sent < FRAMES:
@@ -184,6 +182,15 @@ def test_mutated_frames_end_their_own_client_at_most(open_vlagents, replicas: Re
             assert good.act(document(3, "x"))[-1] == acts
     wait_for(lambda: sessions(replicas) == 0)
     wait_for(lambda: threading.active_count() <= threads)
+    assert psutil.Process().memory_info().rss - held < GROWTH
+
+
+def test_with_keys_on_the_door_stays_shut_unless_the_deployment_says_otherwise(open_vlagents) -> None:
+    """The protocol has no place for a key."""
+    with pytest.raises(ConfigError, match="without_key: true"):
+        open_vlagents(check=lambda _: None)
+    with Client(open_vlagents(check=lambda _: None, without_key=True)) as client:
+        assert client.act(document())[-1] == 1
 
 
 def test_a_taken_port_is_named_with_the_cure() -> None:

@@ -14,6 +14,7 @@ from vlagents_ray.errors import ConfigError, PolicyUnavailable
 from vlagents_ray.serve.config import ServerArgs
 from vlagents_ray.serve.gateways.config import GatewayArgs, GR00TArgs, VlagentsArgs
 from vlagents_ray.serve.gateways.door import Door, House, reserve
+from vlagents_ray.serve.gateways.talk import Connect
 from vlagents_ray.wire.messages import RankName
 
 logger = logging.getLogger(__name__)
@@ -69,8 +70,11 @@ def _wait_for_policy(app: str) -> Any:
         return agent.contract
 
 
-def _connector(app: str, rank: RankName) -> Any:
-    return lambda: RemoteAgent(f"serve://{app}", rank=rank, timeout_s=_ANSWER_S, connect_timeout_s=_ANSWER_S)
+def _connector(app: str, rank: RankName) -> Connect:
+    def connect(_key: str | None) -> RemoteAgent:
+        return RemoteAgent(f"serve://{app}", rank=rank, timeout_s=_ANSWER_S, connect_timeout_s=_ANSWER_S)
+
+    return connect
 
 
 def _door(args: GatewayArgs, house: House, listener: Any) -> Door:

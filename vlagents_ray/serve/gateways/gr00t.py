@@ -218,6 +218,7 @@ class _Client:
             request = gr00t.read_request(payload, self._house.limits)
             if self._house.check is not None:
                 self._house.check(request.api_token)
+                self._talk.show(request.api_token)
             return gr00t.pack(self._value(request), packed=request.packed)
         except VLAgentsError as error:
             return gr00t.pack({"error": f"{error.code}: {error}"})

@@ -8,7 +8,8 @@ from typing import Any
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.interface import Act, Obs
 
-Connect = Callable[[], RemoteAgent]
+Connect = Callable[[str | None], RemoteAgent]
+"""Reaches the application for one client, whose API key that is; None for a client without one."""
 
 
 class Talk:
@@ -16,6 +17,7 @@ class Talk:
 
     def __init__(self, connect: Connect) -> None:
         self._connect = connect
+        self._key: str | None = None
         self._agents: list[RemoteAgent] = []
         self._instructions: list[str | None] = []  # of those of `_agents` that have begun
 
@@ -53,6 +55,12 @@ class Talk:
         _raise_first(acts)
         return [act for act in acts if isinstance(act, Act)]
 
+    def show(self, key: str | None) -> None:
+        """The client's API key; what was begun with another one ends."""
+        if key != self._key:
+            self.close()
+            self._key = key
+
     def restart(self) -> None:
         """Reset every session before it acts again."""
         self._instructions = []
@@ -65,7 +73,7 @@ class Talk:
 
     def _sessions(self, number: int) -> list[RemoteAgent]:
         if not self._agents:
-            self._agents = [self._connect()]
+            self._agents = [self._connect(self._key)]
         for agent in self._agents[number:]:
             agent.close()
         del self._agents[number:]

@@ -11,7 +11,7 @@ import uuid
 from typing import Any
 
 from vlagents_ray.contract import ActionSpec
-from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge, VLAgentsError
+from vlagents_ray.errors import ConfigError, InvalidInput, MalformedMessage, MessageTooLarge, VLAgentsError
 from vlagents_ray.interface import Obs
 from vlagents_ray.serve.gateways.config import GripperArgs, VlagentsArgs
 from vlagents_ray.serve.gateways.door import House, listen
@@ -33,6 +33,11 @@ class VlagentsDoor:
     """Listens on a socket that is bound already."""
 
     def __init__(self, house: House, args: VlagentsArgs, listener: socket.socket, version: str) -> None:
+        if house.check is not None and not args.without_key:
+            raise ConfigError(
+                "dialects.vlagents: the server wants API keys, and this protocol has none; take the door away, or "
+                "let everybody in here who reaches its port: without_key: true"
+            )
         self._house = house
         self._listener = listener
         self.name = args.name or house.app
