@@ -84,6 +84,14 @@ def test_a_client_of_n1_5_sends_flat_keys(open_gr00t) -> None:
         assert client.get_modality_config()["action"]["modality_keys"] == ["arm", "hand"]
 
 
+def test_a_client_is_told_its_own_names(open_gr00t) -> None:
+    mapping = {"cameras": {"front": "video/ego_view"}, "state": {"joints": ["state/arm", "state/hand"]}}
+    with PolicyClient(open_gr00t(mapping=mapping)) as client:
+        config = client.get_modality_config()
+    assert config["video"] == {"delta_indices": [0], "modality_keys": ["ego_view"]}
+    assert config["state"]["modality_keys"] == ["arm", "hand"]
+
+
 def test_errors_are_told_without_a_traceback_and_the_client_goes_on(open_gr00t) -> None:
     with PolicyClient(open_gr00t(mapping={"cameras": {"front": "video/front"}})) as client:
         with pytest.raises(RuntimeError, match="missing_camera: camera 'video/front' is missing") as error:

@@ -10,8 +10,10 @@ from typing import Any
 from ray import serve
 
 from vlagents_ray.client.agent import RemoteAgent
+from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, PolicyUnavailable
 from vlagents_ray.serve.config import ServerArgs
+from vlagents_ray.serve.dialects.routes import require_fit
 from vlagents_ray.serve.gateways.config import GatewayArgs, GR00TArgs, VlagentsArgs
 from vlagents_ray.serve.gateways.door import Door, House, reserve
 from vlagents_ray.serve.gateways.talk import Connect
@@ -37,6 +39,7 @@ class Gateway:
         try:
             app = serve.get_replica_context().app_name
             contract = _wait_for_policy(app)
+            require_fit(args.dialects, contract)
             for name, one in wanted.items():
                 house = House(
                     app=app,
@@ -64,7 +67,7 @@ class Gateway:
             await asyncio.to_thread(door.close)
 
 
-def _wait_for_policy(app: str) -> Any:
+def _wait_for_policy(app: str) -> Contract | None:
     """The policy's contract, once it can act; raises what keeps it from loading."""
     with RemoteAgent(f"serve://{app}", connect_timeout_s=_LOADING_S) as agent:
         return agent.contract

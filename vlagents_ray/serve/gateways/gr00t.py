@@ -9,8 +9,10 @@ import socket
 import threading
 import time
 import uuid
+from collections.abc import Iterable
 from typing import Any
 
+from vlagents_ray.contract import Contract
 from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
 from vlagents_ray.registry import require
 from vlagents_ray.serve.gateways.config import GR00TArgs
@@ -18,6 +20,7 @@ from vlagents_ray.serve.gateways.door import House, listen
 from vlagents_ray.serve.gateways.talk import Talk
 from vlagents_ray.wire import gr00t
 from vlagents_ray.wire.gr00t import Observations, Request
+from vlagents_ray.wire.paths import matches
 from vlagents_ray.wire.presets import read_mapping
 
 logger = logging.getLogger(__name__)
@@ -163,6 +166,15 @@ class GR00TDoor:
         return True
 
 
+def _theirs(entries: Iterable[tuple[str, str]], needed: Iterable[str]) -> list[str]:
+    """What a client calls the policy's cameras or states: as in the mapping, in which `*` keeps our names."""
+    found: dict[str, None] = {}
+    for ours, key in entries:
+        names = needed if "*" in key else [key.rpartition("/")[2]]
+        found |= dict.fromkeys(name for name in names if "*" not in key or matches(name, ours))
+    return list(found)
+
+
 class _Client:
     """One client's requests, answered one after the other on a thread of its own."""
 
@@ -247,12 +259,13 @@ class _Client:
 
     def _modalities(self) -> dict[str, tuple[list[str], list[int]]]:
         mapping, contract = self._door.mapping, self._house.contract
-        cameras = contract.cameras if contract is not None and contract.cameras else {}
-        state = contract.state if contract is not None and contract.state else {}
-        chunk = contract.chunk if contract is not None and contract.chunk else 1
+        contract = contract or Contract()
+        cameras = [(name, camera.key) for name, camera in mapping.cameras.items()]
+        state = [(name, part.key) for name, parts in mapping.state.items() for part in parts]
+        chunk = contract.chunk or 1
         return {
-            "video": (list(cameras), [0]),
-            "state": (list(state), [0]),
+            "video": (_theirs(cameras, contract.cameras or {}), [0]),
+            "state": (_theirs(state, contract.state or {}), [0]),
             "action": (list(mapping.action) or ["action"], list(range(chunk))),
             "language": ([gr00t.TEXT_KEY], [0]),
         }
