@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.wire import json_numpy, rpyc
+from vlagents_ray.wire import brine, json_numpy, rpyc
 from vlagents_ray.wire.rpyc import Handler
 
 ROOT = ("vlagents_ray.Policy", 1, 1)
@@ -57,7 +57,7 @@ class Client:
         length, compressed = rpyc.HEADER.unpack(header)
         body = self.file.read(length + 1)[:-1]
         message = zlib.decompress(body) if compressed else body
-        sequence, content = rpyc._Reader(memoryview(message)[1:]).all()
+        sequence, content = brine.read(memoryview(message)[1:])
         return message[0], sequence, content
 
     def act(self, text: str) -> list:

@@ -12,12 +12,12 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge
+from vlagents_ray.wire import brine
 
 HEADER = struct.Struct("!LB")  # bytes of the message, is it compressed
 END = b"\n"
@@ -26,12 +26,8 @@ _ROOT_NAME = ("vlagents_ray.Policy", 1, 1)  # as a peer names it: its class, num
 _METHOD_CLASS = "builtins.method"  # which a peer knows, and does not ask about
 _METHODS_AT_MOST = 64
 _COMPRESS_OVER = 3000  # bytes, as RPyC does
-_DEPTH = 16
-_ITEMS = 1024  # values in a message
-_DIGITS = 20  # of an integer
 _REQUEST, _REPLY, _EXCEPTION = 1, 2, 3
 _VALUE, _TUPLE, _LOCAL, _REMOTE = 1, 2, 3, 4  # how a value is boxed
-_F8, _U4 = struct.Struct("!d"), struct.Struct("!L")
 
 
 class Handler(IntEnum):
@@ -85,7 +81,7 @@ def read_call(body: bytes | bytearray, compressed: bool, limit: int) -> Call | N
         return None
     if kind != _REQUEST:
         raise MalformedMessage(f"rpyc: got a message of kind {kind}, want a request")
-    content = _Reader(message[1:]).all()
+    content = brine.read(message[1:])
     if not (isinstance(content, tuple) and len(content) == 2 and _is_int(content[0])):
         raise MalformedMessage("rpyc: want (sequence number, request)")
     sequence, request = content
@@ -129,9 +125,7 @@ def exception(sequence: int, kind: str, text: str) -> bytes:
 
 
 def _frame(kind: int, content: tuple[Any, ...]) -> bytes:
-    parts: list[bytes] = [bytes([kind])]
-    _write(content, parts)
-    message = b"".join(parts)
+    message = bytes([kind]) + brine.write(content)
     compressed = len(message) > _COMPRESS_OVER
     if compressed:
         message = zlib.compress(message, 1)
@@ -169,113 +163,3 @@ def _unbox(boxed: Any) -> Any:
 
 def _is_int(value: object) -> bool:
     return isinstance(value, int) and not isinstance(value, bool)
-
-
-class _Reader:
-    """Brine into values: what is immutable, and no slices, sets or complex numbers."""
-
-    def __init__(self, data: memoryview) -> None:
-        self._data = data
-        self._at = 0
-        self._items = 0
-
-    def all(self) -> Any:
-        """The value that fills the message."""
-        value = self._value(0)
-        if self._at != len(self._data):
-            raise MalformedMessage("rpyc: more than one value in a message")
-        return value
-
-    def _take(self, count: int) -> memoryview:
-        end = self._at + count
-        if end > len(self._data):
-            raise MalformedMessage("rpyc: a message that ends too early")
-        found = self._data[self._at : end]
-        self._at = end
-        return found
-
-    def _value(self, depth: int) -> Any:
-        self._items += 1
-        if self._items > _ITEMS or depth > _DEPTH:
-            raise MessageTooLarge(f"rpyc: more than {_ITEMS} values or {_DEPTH} levels in a message")
-        tag = self._take(1)[0]
-        if 0x20 <= tag < 0xF0:
-            return tag - 0x50
-        if tag in _SINGLE:
-            return _SINGLE[tag]
-        if tag == 0x18:
-            return _F8.unpack(self._take(8))[0]
-        if tag == 0x08:
-            return self._text(depth)
-        if tag in _BYTES:
-            return bytes(self._take(_BYTES[tag](self)))
-        if tag in _TUPLES:
-            return self._tuple(_TUPLES[tag](self), depth)
-        if tag in _INTS:
-            return self._integer(_INTS[tag](self))
-        raise MalformedMessage(f"rpyc: got a value of kind {tag:#04x}, want text, numbers or tuples")
-
-    def _text(self, depth: int) -> str:
-        data = self._value(depth + 1)
-        if not isinstance(data, bytes):
-            raise MalformedMessage("rpyc: text that is none")
-        try:
-            return data.decode()
-        except UnicodeDecodeError as error:
-            raise MalformedMessage(f"rpyc: not UTF-8 ({error.reason})") from error
-
-    def _tuple(self, length: int, depth: int) -> tuple[Any, ...]:
-        if length > _ITEMS:
-            raise MessageTooLarge(f"rpyc: a tuple of {length} values, the limit is {_ITEMS}")
-        return tuple(self._value(depth + 1) for _ in range(length))
-
-    def _integer(self, length: int) -> int:
-        digits = bytes(self._take(length))
-        sign = digits[:1] == b"-"
-        if not digits[sign:].isdigit() or length > _DIGITS:
-            raise MalformedMessage("rpyc: not a number")
-        return int(digits)
-
-    def length1(self) -> int:
-        """A length in one byte."""
-        return self._take(1)[0]
-
-    def length4(self) -> int:
-        """A length in four bytes."""
-        return int(_U4.unpack(self._take(4))[0])
-
-
-def _fixed(length: int) -> Callable[[_Reader], int]:
-    return lambda _: length
-
-
-_SINGLE: dict[int, Any] = {0x00: None, 0x01: b"", 0x02: (), 0x03: True, 0x04: False}
-_BYTES = {0x09 + n: _fixed(n) for n in (1, 2, 3, 4)} | {0x0E: _Reader.length1, 0x0F: _Reader.length4}
-_TUPLES = {0x0F + n: _fixed(n) for n in (1, 2, 3, 4)} | {0x14: _Reader.length1, 0x15: _Reader.length4}
-_INTS = {0x16: _Reader.length1, 0x17: _Reader.length4}
-
-
-def _write(value: Any, parts: list[bytes]) -> None:
-    if value is None:
-        parts.append(b"\x00")
-    elif isinstance(value, bool):
-        parts.append(b"\x03" if value else b"\x04")
-    elif isinstance(value, int):
-        if -0x30 <= value < 0xA0:
-            parts.append(bytes([value + 0x50]))
-        else:
-            digits = str(value).encode()
-            parts.append(b"\x16" + bytes([len(digits)]) + digits)
-    elif isinstance(value, float):
-        parts.append(b"\x18" + _F8.pack(value))
-    elif isinstance(value, str):
-        parts.append(b"\x08")
-        _write(value.encode(), parts)
-    elif isinstance(value, bytes):
-        parts.append(b"\x01" if not value else b"\x0f" + _U4.pack(len(value)) + value)
-    elif isinstance(value, tuple):
-        parts.append(b"\x02" if not value else b"\x15" + _U4.pack(len(value)))
-        for item in value:
-            _write(item, parts)
-    else:
-        raise TypeError(f"rpyc: cannot send {type(value).__name__}")

@@ -8,26 +8,21 @@ import queue
 import socket
 import threading
 import time
-import uuid
-from collections.abc import Iterable
+from functools import partial
 from typing import Any
 
-from vlagents_ray.contract import Contract
-from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.registry import require
 from vlagents_ray.serve.gateways.config import GR00TArgs
 from vlagents_ray.serve.gateways.door import House, listen
-from vlagents_ray.serve.gateways.talk import Talk
+from vlagents_ray.serve.gateways.gr00t_client import WAITING, Client
 from vlagents_ray.wire import gr00t
-from vlagents_ray.wire.gr00t import Observations, Request
-from vlagents_ray.wire.paths import matches
 from vlagents_ray.wire.presets import read_mapping
 
 logger = logging.getLogger(__name__)
 
 Envelope = tuple[bytes, ...]  # who sent a message: the connection, and what lies between it and the payload
 _ENVELOPE = 8  # parts
-_WAITING = 4  # requests of one client; a REQ socket has one
 _HEARTBEAT_MS = 10_000
 _TICK_MS = 1000
 _QUIET_S = 30.0  # a client without a session that says nothing is forgotten
@@ -41,7 +36,7 @@ class GR00TDoor:
         self._house = house
         self.mapping = read_mapping(args.mapping)
         self._listener = listener
-        self._clients: dict[Envelope, _Client] = {}
+        self._clients: dict[Envelope, Client] = {}
         self._answers: queue.SimpleQueue[tuple[Envelope, bytes]] = queue.SimpleQueue()
         self._bell, self._ring = socket.socketpair()
         self._ring.setblocking(False)
@@ -88,8 +83,8 @@ class GR00TDoor:
         try:
             router.setsockopt(zmq.LINGER, 0)
             router.setsockopt(zmq.MAXMSGSIZE, self._house.limits.body_bytes)
-            router.setsockopt(zmq.RCVHWM, _WAITING)
-            router.setsockopt(zmq.SNDHWM, _WAITING)  # what a client does not fetch is dropped, and holds up nobody
+            router.setsockopt(zmq.RCVHWM, WAITING)
+            router.setsockopt(zmq.SNDHWM, WAITING)  # what a client does not fetch is dropped, and holds up nobody
             router.setsockopt(zmq.HEARTBEAT_IVL, _HEARTBEAT_MS)
             router.setsockopt(zmq.HEARTBEAT_TIMEOUT, 3 * _HEARTBEAT_MS)
             router.setsockopt(zmq.HANDSHAKE_IVL, _HEARTBEAT_MS)
@@ -144,7 +139,7 @@ class GR00TDoor:
                 full = PolicyUnavailable(f"{len(self._clients)} clients are connected, the limit; try again later")
                 self.answer(envelope, gr00t.pack({"error": f"{full.code}: {full}"}))
                 return
-            client = self._clients[envelope] = _Client(self, self._house, envelope)
+            client = self._clients[envelope] = Client(self._house, self.mapping, partial(self.answer, envelope))
         if not client.put(payload):
             self.answer(envelope, gr00t.pack({"error": "malformed: wait for the answer before the next request"}))
 
@@ -164,108 +159,3 @@ class GR00TDoor:
             return False
         self._clients.pop(envelope).end()
         return True
-
-
-def _theirs(entries: Iterable[tuple[str, str]], needed: Iterable[str]) -> list[str]:
-    """What a client calls the policy's cameras or states: as in the mapping, in which `*` keeps our names."""
-    found: dict[str, None] = {}
-    for ours, key in entries:
-        names = needed if "*" in key else [key.rpartition("/")[2]]
-        found |= dict.fromkeys(name for name in names if "*" not in key or matches(name, ours))
-    return list(found)
-
-
-class _Client:
-    """One client's requests, answered one after the other on a thread of its own."""
-
-    def __init__(self, door: GR00TDoor, house: House, envelope: Envelope) -> None:
-        self._door = door
-        self._house = house
-        self._envelope = envelope
-        self._talk = Talk(house.connect)
-        self._requests: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
-        self._pending = 0  # requests without an answer
-        self._lock = threading.Lock()
-        self._used = time.monotonic()
-        self._thread = threading.Thread(target=self._run, name="gr00t-client", daemon=True)
-        self._thread.start()
-
-    @property
-    def begun(self) -> bool:
-        """Does it hold a session?"""
-        return self._talk.begun
-
-    def put(self, payload: bytes) -> bool:
-        """Queue a request; False if there are too many."""
-        with self._lock:
-            if self._pending >= _WAITING:
-                return False
-            self._pending += 1
-        self._requests.put(payload)
-        return True
-
-    def quiet_s(self, now: float) -> float:
-        """How long it has said nothing; 0 while it waits for an answer."""
-        return 0.0 if self._pending else now - self._used
-
-    def end(self) -> None:
-        """End its session, after the request under way."""
-        self._requests.put(None)
-
-    def join(self, timeout_s: float) -> None:
-        """Wait for that."""
-        self._thread.join(timeout_s)
-
-    def _run(self) -> None:
-        while (payload := self._requests.get()) is not None:
-            message = self._answer(payload)
-            with self._lock:
-                self._pending -= 1
-                self._used = time.monotonic()
-            self._door.answer(self._envelope, message)
-        self._talk.close()
-
-    def _answer(self, payload: bytes) -> bytes:
-        try:
-            request = gr00t.read_request(payload, self._house.limits)
-            if self._house.check is not None:
-                self._house.check(request.api_token)
-                self._talk.show(request.api_token)
-            return gr00t.pack(self._value(request), packed=request.packed)
-        except VLAgentsError as error:
-            return gr00t.pack({"error": f"{error.code}: {error}"})
-        except Exception:
-            name = uuid.uuid4().hex
-            logger.exception("gr00t: request %s failed", name)
-            return gr00t.pack({"error": f"internal error; the server's log has the details under {name}"})
-
-    def _value(self, request: Request) -> Any:
-        if request.endpoint == "ping":
-            return {"status": "ok", "message": "Server is running"}
-        if request.endpoint == "get_modality_config":
-            return gr00t.modality_config(self._modalities())
-        if request.endpoint == "reset":
-            self._talk.restart()
-            return {}
-        return self._act(gr00t.read_observations(request.data))
-
-    def _act(self, asked: Observations) -> Any:
-        mapping, contract = self._door.mapping, self._house.contract
-        seen = [mapping.obs(gr00t.newest(one), self._house.limits) for one in asked.each]
-        acts = self._talk.act_batch([obs for obs, _ in seen], [text for _, text in seen])
-        spec = None if contract is None else contract.action
-        info = {"done": [act.done for act in acts]} | {"timing": acts[0].info.get("timing", {})}
-        return gr00t.write_actions([mapping.actions(act.action, spec) for act in acts], asked, info)
-
-    def _modalities(self) -> dict[str, tuple[list[str], list[int]]]:
-        mapping, contract = self._door.mapping, self._house.contract
-        contract = contract or Contract()
-        cameras = [(name, camera.key) for name, camera in mapping.cameras.items()]
-        state = [(name, part.key) for name, parts in mapping.state.items() for part in parts]
-        chunk = contract.chunk or 1
-        return {
-            "video": (_theirs(cameras, contract.cameras or {}), [0]),
-            "state": (_theirs(state, contract.state or {}), [0]),
-            "action": (list(mapping.action) or ["action"], list(range(chunk))),
-            "language": ([gr00t.TEXT_KEY], [0]),
-        }
