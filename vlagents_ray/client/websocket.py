@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ssl
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -10,7 +11,8 @@ from typing import Any
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
-from vlagents_ray.client.http import HttpTransport, http_url
+from vlagents_ray.client.credentials import NOBODY, Credentials, tls_failure
+from vlagents_ray.client.http import HttpTransport, http_url, refusal
 from vlagents_ray.client.link import CodecChoice
 from vlagents_ray.client.transport import is_answer
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, MalformedMessage, MessageTooLarge, PolicyUnavailable
@@ -25,7 +27,8 @@ class WebSocketTransport:
     name = "websocket"
     holds_sessions = True
 
-    def __init__(self, url: str, codec: CodecChoice) -> None:
+    def __init__(self, url: str, codec: CodecChoice, credentials: Credentials = NOBODY) -> None:
+        self._credentials = credentials
         base = http_url(url)
         scheme = "wss" if base.scheme == "https" else "ws"
         self._base = base.geturl()
@@ -37,7 +40,7 @@ class WebSocketTransport:
     def connect(self, timeout_s: float) -> dict[str, Any]:
         """The server's metadata, once it answers and has accepted the stream."""
         deadline = time.monotonic() + timeout_s
-        door = HttpTransport(self._base, self._codec)
+        door = HttpTransport(self._base, self._codec, self._credentials)
         try:
             metadata = door.connect(timeout_s)
         finally:
@@ -95,9 +98,22 @@ class WebSocketTransport:
         if self._socket is None:
             try:
                 self._socket = self._open.enter_context(
-                    connect(self._url, open_timeout=timeout_s, close_timeout=1, compression=None, max_size=None)
+                    connect(
+                        self._url,
+                        open_timeout=timeout_s,
+                        close_timeout=1,
+                        compression=None,
+                        max_size=None,
+                        ssl=self._credentials.context(self._url),
+                        additional_headers=self._credentials.headers,
+                    )
                 )
+            except ssl.SSLError as error:
+                raise tls_failure(self._url, error) from error
             except InvalidStatus as error:
+                if error.response.status_code in (401, 403, 429):
+                    kind = error.response.headers.get("content-type", "")
+                    raise refusal(error.response.status_code, kind, error.response.body or b"") from error
                 raise PolicyUnavailable(f"{self._url}: refused with HTTP {error.response.status_code}") from error
             except (OSError, InvalidHandshake, TimeoutError) as error:
                 raise PolicyUnavailable(f"{self._url}: cannot connect ({error}); is it running?") from error

@@ -13,21 +13,24 @@ from typing import Any
 import numpy as np
 import ray
 from ray import serve
-from starlette.applications import Starlette
+from starlette.types import ASGIApp
 
 from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
 from vlagents_ray.registry import policy_class
+from vlagents_ray.serve.auth import Caller, load_keys, require_access
 from vlagents_ray.serve.autoscaling import SESSIONS, UTILISATION, WAITING
 from vlagents_ray.serve.balance import Balance
 from vlagents_ray.serve.calls import Sender
 from vlagents_ray.serve.config import ServerArgs
 from vlagents_ray.serve.engine import Engine
+from vlagents_ray.serve.guard import Guard
 from vlagents_ray.serve.ingress import build_ingress
 from vlagents_ray.serve.local import LocalDoor
 from vlagents_ray.serve.metrics import Exporter
 from vlagents_ray.serve.moving import Strays, export
 from vlagents_ray.serve.peers import Peers
 from vlagents_ray.serve.plasma import PlasmaDoor
+from vlagents_ray.serve.ports import EVERYWHERE
 from vlagents_ray.serve.spread import Load, Place
 from vlagents_ray.serve.stats import LoadMeter, Visit
 from vlagents_ray.wire.frames import decode_requests
@@ -47,6 +50,9 @@ class PolicyReplica:
 
     async def __init__(self, args: dict[str, Any]) -> None:  # type: ignore[misc]  # Serve awaits it
         self._args = ServerArgs(**args)
+        self._app = serve.get_replica_context().app_name
+        self._keys = load_keys(self._args.access.keys_file)
+        require_access(_listens_at(), self._keys, self._args.access.insecure)
         agent = policy_class(self._args.policy).from_config(self._args.config)
         self._limits = self._args.limits.limits()
         self._engine = Engine(
@@ -64,7 +70,9 @@ class PolicyReplica:
         self._peers = Peers()
         self._strays = self._engine.strays = Strays(self._engine, self._peers)
         self._balance = Balance(self._engine, self._peers, self._load_of)
-        self._local = LocalDoor(self._engine, self._limits) if hasattr(os, "memfd_create") else None
+        self._local = None
+        if hasattr(os, "memfd_create"):
+            self._local = LocalDoor(self._engine, self._limits, self._admit if self._keys else None)
         self._plasma = PlasmaDoor(self._engine, self._limits) if self._local is not None else None
         for door in (self._local, self._plasma):
             if door is not None:
@@ -77,8 +85,21 @@ class PolicyReplica:
         self._balance.start()
         self._watching = asyncio.ensure_future(self._watch_for_the_end())
 
-    def __serve_build_asgi_app__(self) -> Starlette:
-        return build_ingress(self._engine, self.metadata, self._limits, self._near)
+    def __serve_build_asgi_app__(self) -> ASGIApp:
+        inside = build_ingress(self._engine, self.metadata, self._limits, self._near)
+        slow_s, idle_s = self._args.limits.slow_s, self._args.sessions.idle_s
+        return Guard(inside, self._keys, self._app, slow_s=slow_s, idle_s=idle_s)
+
+    def _admit(self, token: str) -> Caller | None:
+        return None if self._keys is None else self._keys.check(token, self._app)
+
+    async def refusal(self) -> str | None:
+        """Why the policy cannot act yet; None when it can. For whoever started the server."""
+        try:
+            self._engine.require_ready()
+        except VLAgentsError as error:
+            return str(error)
+        return None
 
     def metadata(self) -> dict[str, Any]:
         """What `GET /v1/metadata` and `RemoteAgent.metadata` say."""
@@ -203,6 +224,14 @@ class PolicyReplica:
         for door in (self._local, self._plasma):
             if door is not None:
                 door.close()
+
+
+def _listens_at() -> str:
+    """The address that Serve lets clients in at."""
+    from ray.serve.context import _get_global_client
+
+    host: str | None = _get_global_client().http_config.host
+    return host or EVERYWHERE
 
 
 def _stopping() -> bool:
