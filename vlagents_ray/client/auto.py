@@ -52,7 +52,11 @@ class AutoTransport:
         parts = urlsplit(self._url)
         inside = HandleTransport(parts.netloc, must_be_near=self._only_shm) if parts.scheme == "serve" else None
         door = inside or HttpTransport(self._url, self._codec, self._credentials, boot_id())
-        metadata = door.connect(timeout_s)
+        try:
+            metadata = door.connect(timeout_s)
+        except BaseException:
+            door.close()
+            raise
         left_s = max(1.0, deadline - time.monotonic())
         near = self._near(metadata.get("local"), left_s)
         if near is not None or inside is None:

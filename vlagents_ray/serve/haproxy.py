@@ -103,12 +103,19 @@ def ingress_environment(folder: Path, binary: str, front: Front | None = None) -
 
 
 def _launcher(folder: Path, binary: str) -> Path:
-    """A program that starts HAProxy with its metrics and statistics on loopback, as no setting of Serve's can."""
+    """A program that starts HAProxy, with what no setting of Serve's can say.
+
+    Its metrics and statistics are on loopback, and it tells nobody which applications there are (`/-/routes`).
+    """
+    changes = (
+        rf"s/^( *bind )[*]?:([0-9]+)$/\1{LOOPBACK}:\2/",
+        r"s/^( *http-request ).* if routes$/\1deny deny_status 404 if routes/",
+    )
     file = folder / "haproxy"
     file.write_text(
         "#!/bin/sh\n"
         "for word; do\n"
-        f'    [ "$before" = -f ] && sed -i -E \'s/^( *bind )[*]?:([0-9]+)$/\\1{LOOPBACK}:\\2/\' "$word"\n'
+        f"""    [ "$before" = -f ] && sed -i -E {" ".join(f"-e '{one}'" for one in changes)} "$word"\n"""
         "    before=$word\n"
         "done\n"
         f'exec {shlex.quote(binary)} "$@"\n'

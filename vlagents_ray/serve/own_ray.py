@@ -14,6 +14,7 @@ from vlagents_ray.serve.ports import LOOPBACK, free_port, is_free
 from vlagents_ray.serve.reaper import MARK, reaped
 from vlagents_ray.serve.tls import Tls
 
+_MODE = "RAY_AUTH_MODE"
 # Ray asks it whether this machine is one of a cluster, and takes the loopback address for a node's own if not: then
 # all that it listens at is there. (An argument that says so, `_node_ip_address`, is turned into another address.)
 _ALONE = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
@@ -29,6 +30,11 @@ def own_ray(
     """
     import ray
 
+    if os.environ.get(_MODE, "token").lower() != "token":
+        raise ConfigError(
+            f"{_MODE}={os.environ[_MODE]}: a port of each replica, which runs whatever it is sent, would be open to "
+            f"other machines without Ray's token; unset it"
+        )
     if not is_free(host, port):
         raise ConfigError(f"cannot listen on {host}:{port}: it is taken; choose another --port or --host")
     with tempfile.TemporaryDirectory(prefix="vlagents-ray-") as name, contextlib.ExitStack() as stack:
