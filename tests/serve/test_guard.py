@@ -73,6 +73,23 @@ class Door:
         return connect(url, additional_headers=headers, ping_interval=None)
 
 
+@contextlib.contextmanager
+def served(app: Guard) -> Iterator[int]:
+    """On a port of this machine."""
+    port = free_port()
+    server = uvicorn.Server(
+        uvicorn.Config(app, port=port, log_level="critical", lifespan="off", ws="websockets-sansio")
+    )
+    thread = threading.Thread(target=lambda: asyncio.run(server.serve()))
+    thread.start()
+    wait_for(lambda: server.started)
+    try:
+        yield port
+    finally:
+        server.should_exit = server.force_exit = True
+        thread.join()
+
+
 @pytest.fixture(scope="module")
 def door(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Door]:
     before, auth._LOOK_S = auth._LOOK_S, 0.0
@@ -84,16 +101,8 @@ def door(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Door]:
         engine, lambda: {"policy": "p", "version": "0", "protocol": PROTOCOL_VERSION}, Limits(body_bytes=2**24)
     )
     guard = Guard(inside, Keys.from_file(file), "noop", slow_s=SLOW_S, idle_s=3600)
-    port = free_port()
-    server = uvicorn.Server(
-        uvicorn.Config(guard, port=port, log_level="critical", lifespan="off", ws="websockets-sansio")
-    )
-    thread = threading.Thread(target=lambda: asyncio.run(server.serve()))
-    thread.start()
-    wait_for(lambda: server.started)
-    yield Door(f"http://127.0.0.1:{port}", port, engine, file, tokens)
-    server.should_exit = server.force_exit = True
-    thread.join()
+    with served(guard) as port:
+        yield Door(f"http://127.0.0.1:{port}", port, engine, file, tokens)
     engine.close()
     auth._LOOK_S = before
 
@@ -276,3 +285,18 @@ def test_a_websocket_that_never_reads_its_replies_ends_with_its_sessions_alone(d
             bystander.act(Obs())
             with contextlib.suppress(OSError):
                 deaf.shutdown(socket.SHUT_RDWR)
+
+
+def test_a_websocket_that_stays_silent_or_sends_half_a_message_is_cut_off() -> None:
+    engine = Engine(Big())
+    engine.start()
+    with served(Guard(build_ingress(engine, dict, Limits()), None, "noop", idle_s=SLOW_S)) as port:
+        with connect(f"ws://127.0.0.1:{port}/v1/stream", ping_interval=None) as silent:
+            half = silent.socket
+            half.sendall(b"\x82\xfe\x00\x7e" + bytes(8))  # a masked frame of 126 bytes, of which 4 follow
+            with pytest.raises(ConnectionClosed):
+                silent.recv(timeout=30)
+        with connect(f"ws://127.0.0.1:{port}/v1/stream", ping_interval=None) as silent:
+            with pytest.raises(ConnectionClosed, match="silent"):
+                silent.recv(timeout=30)
+    engine.close()

@@ -26,11 +26,11 @@ class Listener:
 
 
 def listeners(root: psutil.Process) -> set[Listener]:
-    """Of a process and all that it started."""
+    """Of the process that drives the server, and of all that it started."""
     found = set()
     for process in [root, *root.children(recursive=True)]:
         try:
-            name = _name(process)
+            name = "driver" if process == root else _name(process)
             sockets = process.net_connections("inet")
             unix = _unix(process.pid)
         except psutil.NoSuchProcess:
