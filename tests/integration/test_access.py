@@ -17,6 +17,7 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 import grpc
+import numpy as np
 import psutil
 import pytest
 from certificates import Authority, authority
@@ -24,7 +25,7 @@ from listeners import Listener, listeners
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
-from vlagents_ray import ConfigError, ConnectionLost, Forbidden, Obs, RemoteAgent, Unauthorized
+from vlagents_ray import ConfigError, ConnectionLost, Forbidden, Obs, RemoteAgent, Unauthorized, VLAgentsError
 from vlagents_ray.client.ways import TransportName
 from vlagents_ray.serve.cluster import running_server
 from vlagents_ray.serve.files import deployment
@@ -35,6 +36,18 @@ from vlagents_ray.wire.messages import LocalAddress, Request
 
 EVERYWHERE = "0.0.0.0"  # noqa: S104 - what this is about
 WAYS: tuple[TransportName, ...] = ("http", "websocket", "shm", "auto")
+
+
+LIMITS = {"pixels": 64 * 64, "cameras": 2, "state_values": 8, "depth": 3, "items": 100, "body_bytes": 2**20, "text": 50}
+TOO_MUCH = {
+    "pixels": Obs(cameras={"front": np.zeros((65, 64, 3), np.uint8)}),
+    "cameras": Obs(cameras={name: np.zeros((8, 8, 3), np.uint8) for name in "abc"}),
+    "states": Obs(state={name: np.zeros(1, np.float32) for name in "abc"}),
+    "state_values": Obs(state={"joints": np.zeros(9, np.float32)}),
+    "depth": Obs(info={"a": {"b": {"c": {"d": 1}}}}),
+    "items": Obs(info={"a": list(range(101))}),
+    "body_bytes": Obs(info={"a": np.zeros(2**21, np.uint8)}),
+}
 
 
 @dataclass
@@ -68,7 +81,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     keys = folder / "keys.json"
     tokens = {name: new_key(keys, name) for name in ("arm", "leaver")} | {"other": new_key(keys, "other", apps=("x",))}
     tls = Tls(*ca.sign("server"))
-    config = deployment("noop", sessions={"idle_s": 600})
+    config = deployment("noop", limits=LIMITS)
     with running_server(config, host=EVERYWHERE, num_cpus=2, keys_file=keys, tls=tls, timeout_s=120) as server:
         yield Served(server.url, keys, tokens, ca)
 
@@ -106,6 +119,24 @@ def test_a_websocket_is_refused_before_it_is_accepted(served: Served) -> None:
         ):
             pytest.fail("was let in")
         assert refused.value.response.status_code == status
+
+
+@pytest.mark.parametrize("way", ["http", "websocket", "shm", "handle", "plasma"])
+def test_every_door_refuses_what_is_over_the_limits_and_goes_on(served: Served, way: TransportName) -> None:
+    url = "serve://noop" if way in ("handle", "plasma") else served.url
+    with RemoteAgent(
+        url, transport=way, api_key=served.tokens["arm"], ca=served.ca.file, codec="raw", timeout_s=20
+    ) as agent:
+        agent.reset(Obs(), "x")
+        for limit, obs in TOO_MUCH.items():
+            with pytest.raises(VLAgentsError) as refused:
+                agent.act(obs)
+            assert refused.value.code == "too_large", limit
+        with pytest.raises(VLAgentsError) as refused:
+            agent.reset(Obs(), "x" * 51)
+        assert refused.value.code == "too_large"
+        agent.reset(Obs(), "x")
+        agent.act(Obs())
 
 
 def test_a_revoked_key_is_shut_out_of_every_door_within_seconds(served: Served) -> None:

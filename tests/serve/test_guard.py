@@ -296,7 +296,9 @@ def test_a_websocket_that_stays_silent_or_sends_half_a_message_is_cut_off() -> N
             half.sendall(b"\x82\xfe\x00\x7e" + bytes(8))  # a masked frame of 126 bytes, of which 4 follow
             with pytest.raises(ConnectionClosed):
                 silent.recv(timeout=30)
-        with connect(f"ws://127.0.0.1:{port}/v1/stream", ping_interval=None) as silent:
-            with pytest.raises(ConnectionClosed, match="silent"):
-                silent.recv(timeout=30)
+        with (
+            connect(f"ws://127.0.0.1:{port}/v1/stream", ping_interval=None) as silent,
+            pytest.raises(ConnectionClosed, match="silent"),
+        ):
+            silent.recv(timeout=30)
     engine.close()
