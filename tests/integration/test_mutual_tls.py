@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from certificates import authority
 from eval_fakes import wait_for
 
-from vlagents_ray import ConfigError, Obs, RemoteAgent
+from vlagents_ray import ConfigError, Obs, RemoteAgent, Unauthorized
 from vlagents_ray.client.ways import TransportName
+from vlagents_ray.serve import own_ray
 from vlagents_ray.serve.cluster import running_server
 from vlagents_ray.serve.files import deployment
 from vlagents_ray.serve.keyfile import new_key
@@ -45,10 +47,9 @@ def test_a_replica_that_others_would_reach_does_not_start_without_keys() -> None
     from ray import serve
     from ray.serve._private.api import serve_start
 
-    from vlagents_ray.serve.own_ray import own_ray
     from vlagents_ray.serve.ports import EVERYWHERE, free_port
 
-    with own_ray("127.0.0.1", free_port(), num_cpus=2):
+    with own_ray.own_ray("127.0.0.1", free_port(), num_cpus=2):
         client = serve_start(http_options={"host": EVERYWHERE, "port": free_port(EVERYWHERE)})
         try:
             client.deploy_apps(deployment("noop"))
@@ -58,3 +59,28 @@ def test_a_replica_that_others_would_reach_does_not_start_without_keys() -> None
         finally:
             serve.shutdown()
     assert not ray.is_initialized()
+
+
+def test_without_haproxy_serve_asks_for_keys_and_encrypts_by_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(own_ray, "haproxy_binary", lambda: None)
+    ca = authority(tmp_path, "ca")
+    token = new_key(tmp_path / "keys.json", "arm")
+    tls, config = Tls(*ca.sign("server", "IP:127.0.0.2")), deployment("noop")
+    access = {"host": "127.0.0.2", "keys_file": tmp_path / "keys.json", "num_cpus": 2, "timeout_s": 120}
+    with (
+        pytest.raises(ConfigError, match="needs HAProxy"),
+        running_server(config, tls=replace(tls, client_ca=ca.file), **access),  # type: ignore[arg-type]
+    ):
+        pytest.fail("started")
+    with running_server(config, tls=tls, **access) as server:  # type: ignore[arg-type]
+        for way in WAYS:
+            with RemoteAgent(server.url, transport=way, api_key=token, ca=ca.file) as agent:
+                agent.reset(Obs(), "x")
+                agent.act(Obs())
+            with (
+                pytest.raises(Unauthorized),
+                RemoteAgent(server.url, transport=way, api_key="wrong", ca=ca.file) as agent,
+            ):
+                agent.reset(Obs(), "x")

@@ -20,7 +20,7 @@ from typing import Any
 from ray.serve.schema import ServeDeploySchema
 
 from vlagents_ray.errors import ConfigError, PolicyUnavailable
-from vlagents_ray.serve.auth import load_keys, require_access
+from vlagents_ray.serve.auth import require_access
 from vlagents_ray.serve.config import AccessArgs
 from vlagents_ray.serve.files import IMPORT_PATH
 from vlagents_ray.serve.haproxy import Front, wait_for_haproxy
@@ -65,7 +65,7 @@ def running_server(
     """
     config = _access(config, keys_file, insecure)
     if address is None:  # else each replica says so, where it runs
-        _require_access(config, host)
+        _require_access(config, host, insecure)
     if tls is not None:
         tls.check()
     port = port or free_port(host)
@@ -112,11 +112,12 @@ def _our_apps(config: ServeDeploySchema) -> list[Any]:
     return [app for app in config.applications if app.import_path == IMPORT_PATH]
 
 
-def _require_access(config: ServeDeploySchema, host: str) -> None:
+def _require_access(config: ServeDeploySchema, host: str, insecure: bool) -> None:
     """`ConfigError` if an application lets others in without keys, or its keys cannot be read."""
-    for app in _our_apps(config):
-        access = AccessArgs(**app.args.get("access", {}))
-        require_access(host, load_keys(access.keys_file), access.insecure)
+    ours = _our_apps(config)
+    for app in config.applications:  # another one asks for no keys
+        access = AccessArgs(**app.args.get("access", {})) if app in ours else AccessArgs(insecure=insecure)
+        require_access(host, access.keys() if app in ours else None, access.insecure)
 
 
 @contextlib.contextmanager

@@ -6,6 +6,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from vlagents_ray.serve.auth import Keys, load_keys
 from vlagents_ray.wire.messages import DEFAULT_LIMITS, Limits
 
 
@@ -88,6 +89,10 @@ class AccessArgs(_Closed):
         if self.keys_file is not None and self.insecure:
             raise ValueError("keys_file and insecure exclude each other; keep one")
         return self
+
+    def keys(self) -> Keys | None:
+        """Those that this process knows of; None lets everybody in. `ConfigError` if they cannot be read."""
+        return None if self.insecure else load_keys(self.keys_file)
 
 
 class AutoscalingArgs(_Closed):

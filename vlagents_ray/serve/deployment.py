@@ -17,7 +17,7 @@ from starlette.types import ASGIApp
 
 from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
 from vlagents_ray.registry import policy_class
-from vlagents_ray.serve.auth import Caller, load_keys, require_access
+from vlagents_ray.serve.auth import Caller, require_access
 from vlagents_ray.serve.autoscaling import SESSIONS, UTILISATION, WAITING
 from vlagents_ray.serve.balance import Balance
 from vlagents_ray.serve.calls import Sender
@@ -51,7 +51,7 @@ class PolicyReplica:
     async def __init__(self, args: dict[str, Any]) -> None:  # type: ignore[misc]  # Serve awaits it
         self._args = ServerArgs(**args)
         self._app = serve.get_replica_context().app_name
-        self._keys = load_keys(self._args.access.keys_file)
+        self._keys = self._args.access.keys()
         require_access(_listens_at(), self._keys, self._args.access.insecure)
         agent = policy_class(self._args.policy).from_config(self._args.config)
         self._limits = self._args.limits.limits()
