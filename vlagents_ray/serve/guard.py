@@ -59,10 +59,12 @@ class Guard:
             await _refuse(error, headers.get(REQUEST_ID_HEADER) or uuid.uuid4().hex, scope, receive, send)
             return
         with on_behalf_of(caller):
-            if scope["type"] == "http":
-                await _Exchange(self._slow_s, send).run(self._app, scope, receive)
-            else:
+            if scope["type"] == "websocket":
                 await _Watched(caller, self._slow_s, self._idle_s, receive, send).run(self._app, scope)
+            elif headers.get("content-length", "0") != "0" or "transfer-encoding" in headers:
+                await _Upload(self._slow_s, send).run(self._app, scope, receive)
+            else:
+                await self._app(scope, receive, send)
 
 
 def _asks_for_health(scope: Scope) -> bool:
@@ -86,8 +88,8 @@ async def _refuse(error: VLAgentsError, request_id: str, scope: Scope, receive: 
     await answer(scope, receive, send)
 
 
-class _Exchange:
-    """One HTTP request, whose body has to be here in time."""
+class _Upload:
+    """An HTTP request whose body has to be here in time."""
 
     def __init__(self, slow_s: float, send: Send) -> None:
         self._slow_s = slow_s
