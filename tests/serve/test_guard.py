@@ -70,7 +70,7 @@ class Door:
 
     def stream(self, headers: dict[str, str]):
         url = self.url.replace("http", "ws") + "/v1/stream"
-        return connect(url, additional_headers=headers, ping_interval=None)
+        return connect(url, additional_headers=headers, ping_interval=None, close_timeout=1)
 
 
 @contextlib.contextmanager
@@ -276,6 +276,7 @@ def test_a_websocket_that_never_reads_its_replies_ends_with_its_sessions_alone(d
             additional_headers=bearer(door.tokens["ending"]),
             max_queue=1,
             ping_interval=None,
+            close_timeout=1,
         ) as stream:
             stream.send(encode_request(Request("reset", Obs())))
             wait_for(lambda: set(door.engine.sessions.ids()) > before)
@@ -291,13 +292,16 @@ def test_a_websocket_that_stays_silent_or_sends_half_a_message_is_cut_off() -> N
     engine = Engine(Big())
     engine.start()
     with served(Guard(build_ingress(engine, dict, Limits()), None, "noop", idle_s=SLOW_S)) as port:
-        with connect(f"ws://127.0.0.1:{port}/v1/stream", ping_interval=None) as silent:
-            half = silent.socket
-            half.sendall(b"\x82\xfe\x00\x7e" + bytes(8))  # a masked frame of 126 bytes, of which 4 follow
-            with pytest.raises(ConnectionClosed):
-                silent.recv(timeout=30)
+        with socket.create_connection(("127.0.0.1", port), timeout=30) as half:
+            half.sendall(
+                b"GET /v1/stream HTTP/1.1\r\nhost: x\r\nconnection: upgrade\r\nupgrade: websocket\r\n"
+                b"sec-websocket-version: 13\r\nsec-websocket-key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+            )
+            assert half.recv(4096).startswith(b"HTTP/1.1 101")
+            half.sendall(b"\x82\xfe\x00\x7e" + bytes(8))  # of a masked frame of 126 bytes, the first 4
+            assert half.recv(4096)[0] == 0x88  # the server closes
         with (
-            connect(f"ws://127.0.0.1:{port}/v1/stream", ping_interval=None) as silent,
+            connect(f"ws://127.0.0.1:{port}/v1/stream", ping_interval=None, close_timeout=1) as silent,
             pytest.raises(ConnectionClosed, match="silent"),
         ):
             silent.recv(timeout=30)
