@@ -47,7 +47,9 @@ def _name(process: psutil.Process) -> str:
     """Of what runs, whatever it is started by."""
     words = process.cmdline() or [process.name()]
     scripts = [Path(word).name for word in words if word.endswith(".py")]
-    return scripts[0] if scripts else Path(words[0].split()[0]).name
+    program = Path(words[0].split()[0]).name
+    # Ray's workers call themselves by what they do at the moment: "ray::Class.method".
+    return scripts[0] if scripts else program.partition(".")[0] if program.startswith("ray::") else program
 
 
 def _unix(pid: int) -> set[str]:
