@@ -176,13 +176,22 @@ def test_the_shared_memory_door_wants_a_key_before_anything_else(served: Served)
             assert isinstance(reply.error, Unauthorized)
 
 
-def test_a_replicas_own_port_wants_a_key_too(served: Served) -> None:
-    (port,) = {one.port for one in listeners(psutil.Process()) if one.process == REPLICA and one.host == "127.0.0.1"}
-    for path, wanted in (("/docs", 401), ("/v1/metadata", 401), ("/healthz", 200)):
-        connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-        with contextlib.closing(connection):
-            connection.request("GET", path)
-            assert connection.getresponse().status == wanted
+def test_a_replicas_own_ports_want_a_key_too(served: Served) -> None:
+    """That for HTTP, and that for WebSockets, whose only path is told with the metadata."""
+    ports = {one.port for one in listeners(psutil.Process()) if one.process == REPLICA and one.host == "127.0.0.1"}
+    found = set()
+    for port in ports:
+        for path in ("/docs", "/v1/metadata", "/v1/stream/guess"):
+            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+            with contextlib.closing(connection):
+                connection.request("GET", path)
+                found.add((port, connection.getresponse().status))
+    assert sorted(status for _, status in found) in ([400, 401], [401, 404])
+    _, metadata = served.status("/v1/metadata", {"x-api-key": served.tokens["arm"]})
+    stream = json.loads(metadata)["stream"]
+    with pytest.raises(InvalidStatus) as refused, connect(f"ws://127.0.0.1:{stream['port']}{stream['path']}"):
+        pytest.fail("was let in")
+    assert refused.value.response.status_code == 401
 
 
 def test_a_certificate_that_is_not_to_be_trusted_is_named_with_the_cure(served: Served, tmp_path: Path) -> None:

@@ -10,9 +10,9 @@ import time
 
 import pytest
 
-from vlagents_ray.wire import parallel
+from vlagents_ray.wire import cores, parallel
 
-needs_two_cores = pytest.mark.skipif(parallel._cores() < 2, reason="one core does nothing in parallel")
+needs_two_cores = pytest.mark.skipif(cores.allowed() < 2, reason="one core does nothing in parallel")
 
 
 @pytest.fixture(autouse=True)

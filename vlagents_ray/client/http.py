@@ -39,7 +39,7 @@ class HttpTransport:
     holds_sessions = False
 
     def __init__(self, url: str, codec: CodecChoice, credentials: Credentials = NOBODY, machine: str = "") -> None:
-        """With `machine`, its `boot_id`, the metadata is that of the least loaded replica there, if there is one."""
+        """With `machine` (see `MACHINE_HEADER`) the metadata is the least loaded replica's there, if there is one."""
         self._machine = machine
         self._credentials = credentials
         self._url = http_url(url)

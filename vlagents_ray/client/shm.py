@@ -21,7 +21,7 @@ import numpy as np
 from vlagents_ray.client.credentials import NOBODY, Credentials
 from vlagents_ray.client.transport import is_answer
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable
-from vlagents_ray.wire import compact
+from vlagents_ray.wire import compact, cores
 from vlagents_ray.wire.codecs import RAW
 from vlagents_ray.wire.frames import decode_replies, request_parts
 from vlagents_ray.wire.messages import LocalAddress, Reply, Request, boot_id
@@ -61,6 +61,7 @@ class ShmTransport:
         self._buffer = bytearray(_MESSAGE_BYTES)
         self._acts = compact.Writer()
         self._quick = True  # did the last answer come at once?
+        self._core = -1  # on which it was written
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
         """Connect to the server's socket; the metadata came with its address."""
@@ -158,6 +159,8 @@ class ShmTransport:
                 continue
             if is_answer(replies, requests):
                 self._quick = time.perf_counter() - begun < _QUICK_S
+                if self._quick:
+                    cores.leave(self._core)
                 return replies
 
     def _open(self, timeout_s: float) -> socket.socket:
@@ -206,7 +209,7 @@ class ShmTransport:
         size, control, _, _ = connection.recvmsg_into([self._buffer], _CONTROL)
         if size == 0:
             raise ConnectionResetError("the server hung up")
-        freed, flags = LocalAddress.REPLY.unpack_from(self._buffer)
+        freed, flags, self._core = LocalAddress.REPLY.unpack_from(self._buffer)
         if flags & LocalAddress.IN_FILE:
             descriptor = int.from_bytes(control[0][2][:4], sys.byteorder)
             with os.fdopen(descriptor, "rb") as file:

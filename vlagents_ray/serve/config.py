@@ -50,6 +50,24 @@ class SessionArgs(_Closed):
     idle_s: float = Field(default=600.0, gt=0, description="a session that sends nothing for so long is forgotten")
 
 
+class StreamArgs(_Closed):
+    """Each replica's own port for WebSockets, which saves the way through the proxy.
+
+    Clients find it by the metadata; those that do not reach it (a firewall, a tunnel) go through the proxy.
+    """
+
+    enabled: bool = True
+    ports: tuple[int, int] | None = Field(
+        default=None, description="first and last port to choose from; unset: any. Each replica of a node takes one"
+    )
+
+    @model_validator(mode="after")
+    def _ascending(self) -> StreamArgs:
+        if self.ports is not None and not 1 <= self.ports[0] <= self.ports[1] <= 65_535:
+            raise ValueError(f"ports: got {list(self.ports)}, want the first and the last one, such as [9000, 9015]")
+        return self
+
+
 class LimitArgs(_Closed):
     """What one request may hold; anything over gets 413. And how long its client may take."""
 
@@ -153,6 +171,7 @@ class ServerArgs(_Closed):
     sessions: SessionArgs = SessionArgs()
     limits: LimitArgs = LimitArgs()
     access: AccessArgs = AccessArgs()
+    stream: StreamArgs = StreamArgs()
     resources: ResourceArgs = ResourceArgs()
 
     @model_validator(mode="after")

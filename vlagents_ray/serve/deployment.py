@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import ray
 from ray import serve
+from ray.serve.config import HTTPOptions
 from starlette.types import ASGIApp
 
 from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
@@ -30,11 +31,12 @@ from vlagents_ray.serve.metrics import Exporter
 from vlagents_ray.serve.moving import Strays, export
 from vlagents_ray.serve.peers import Peers
 from vlagents_ray.serve.plasma import PlasmaDoor
-from vlagents_ray.serve.ports import EVERYWHERE
+from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK
 from vlagents_ray.serve.spread import Load, Place
 from vlagents_ray.serve.stats import LoadMeter, Visit
+from vlagents_ray.serve.stream import StreamDoor
 from vlagents_ray.wire.frames import decode_requests
-from vlagents_ray.wire.messages import PROTOCOL_VERSION, Reply, boot_id
+from vlagents_ray.wire.messages import PROTOCOL_VERSION, SERVERS_MACHINE, Reply, boot_id
 
 logger = logging.getLogger(__name__)
 
@@ -52,7 +54,7 @@ class PolicyReplica:
         self._args = ServerArgs(**args)
         self._app = serve.get_replica_context().app_name
         self._keys = self._args.access.keys()
-        require_access(_listens_at(), self._keys, self._args.access.insecure)
+        require_access(_http().host or EVERYWHERE, self._keys, self._args.access.insecure)
         agent = policy_class(self._args.policy).from_config(self._args.config)
         self._limits = self._args.limits.limits()
         self._engine = Engine(
@@ -74,7 +76,8 @@ class PolicyReplica:
         if hasattr(os, "memfd_create"):
             self._local = LocalDoor(self._engine, self._limits, self._admit if self._keys else None)
         self._plasma = PlasmaDoor(self._engine, self._limits) if self._local is not None else None
-        for door in (self._local, self._plasma):
+        self._stream = self._stream_door()
+        for door in (self._local, self._plasma, self._stream):
             if door is not None:
                 door.open()
         self._loading = asyncio.ensure_future(asyncio.to_thread(self._engine.start))
@@ -90,7 +93,7 @@ class PolicyReplica:
         slow_s, idle_s = self._args.limits.slow_s, self._args.sessions.idle_s
         return Guard(inside, self._keys, self._app, slow_s=slow_s, idle_s=idle_s)
 
-    def _admit(self, token: str) -> Caller | None:
+    def _admit(self, token: str | None) -> Caller | None:
         return None if self._keys is None else self._keys.check(token, self._app)
 
     async def refusal(self) -> str | None:
@@ -112,7 +115,17 @@ class PolicyReplica:
             "protocol": PROTOCOL_VERSION,
             "version": importlib.metadata.version("vlagents-ray"),
             "local": None if self._local is None else asdict(self._local.address),
+            "stream": None if self._stream is None else asdict(self._stream.address),
         }
+
+    def _stream_door(self) -> StreamDoor | None:
+        stream = self._args.stream
+        if not stream.enabled:
+            return None
+        admit = self._admit if self._keys else None
+        http = _http()  # if that is encrypted, nothing else shall be to see
+        host = os.environ.get(HOST) or (LOOPBACK if http.ssl_certfile else http.host or EVERYWHERE)
+        return StreamDoor(self._engine, self._limits, host, stream.ports, admit)
 
     async def attach(self, node: str = "", boot_id: str = "", must_be_near: bool = False) -> tuple[dict[str, Any], Any]:
         """For a client inside the cluster, on that node and machine: a replica's metadata, and its actor.
@@ -140,7 +153,7 @@ class PolicyReplica:
 
     async def _near(self, caller: str) -> dict[str, Any]:
         """The metadata of the least loaded replica on the machine with that boot id; there may be none: this one's."""
-        place = Place(boot_id=caller, must_be_near=True)
+        place = Place(boot_id=boot_id() if caller == SERVERS_MACHINE else caller, must_be_near=True)
         metadata, _ = await self._elsewhere(place) or (self.metadata(), None)
         return {key: value for key, value in metadata.items() if key != "plasma"}
 
@@ -221,17 +234,16 @@ class PolicyReplica:
         self._strays.close()
         await asyncio.to_thread(self._engine.close)
         await asyncio.to_thread(self._metrics.close)
-        for door in (self._local, self._plasma):
+        for door in (self._local, self._plasma, self._stream):
             if door is not None:
                 door.close()
 
 
-def _listens_at() -> str:
-    """The address that Serve lets clients in at."""
+def _http() -> HTTPOptions:
+    """Where Serve lets clients in, and its replicas listen."""
     from ray.serve.context import _get_global_client
 
-    host: str | None = _get_global_client().http_config.host
-    return host or EVERYWHERE
+    return _get_global_client().http_config
 
 
 def _stopping() -> bool:

@@ -30,7 +30,7 @@ from vlagents_ray.serve.auth import Caller
 from vlagents_ray.serve.calls import Sender
 from vlagents_ray.serve.engine import Engine
 from vlagents_ray.serve.stats import Visit
-from vlagents_ray.wire import compact
+from vlagents_ray.wire import compact, cores
 from vlagents_ray.wire.frames import decode_requests, encode_replies
 from vlagents_ray.wire.messages import Limits, LocalAddress, Reply, Request, boot_id
 
@@ -43,7 +43,7 @@ _CONTROL = socket.CMSG_SPACE(struct.calcsize("i"))  # for one descriptor
 _INLINE = 64 * 1024  # a longer reply travels in a memory file
 _BACKLOG = 128
 
-Admit = Callable[[str], "Caller | None"]  # who holds that key; `Unauthorized`, `Forbidden`
+Admit = Callable[[str | None], "Caller | None"]  # who holds that key; `Unauthorized`, `Forbidden`
 
 
 class LocalDoor:
@@ -83,7 +83,7 @@ class LocalDoor:
             return
         if len(self._clients) >= self._engine.sessions.limit:
             full = PolicyUnavailable(f"this replica has {len(self._clients)} local clients, its limit of sessions")
-            connection.send(LocalAddress.REPLY.pack(0, 0) + encode_replies([Reply(error=full)]))
+            connection.send(LocalAddress.REPLY.pack(0, 0, -1) + encode_replies([Reply(error=full)]))
             connection.close()
             return
         client = self.client(connection)
@@ -229,12 +229,12 @@ class LocalClient:
                 freed |= 1 << self._freed.pop()
             try:
                 if len(frame) <= _INLINE:
-                    self._connection.send(LocalAddress.REPLY.pack(freed, flags) + frame)
+                    self._connection.send(LocalAddress.REPLY.pack(freed, flags, cores.here()) + frame)
                     return
                 descriptor = os.memfd_create("vlagents-ray-reply")
                 try:
                     os.write(descriptor, frame)
-                    header = LocalAddress.REPLY.pack(freed, flags | LocalAddress.IN_FILE)
+                    header = LocalAddress.REPLY.pack(freed, flags | LocalAddress.IN_FILE, -1)
                     socket.send_fds(self._connection, [header], [descriptor])
                 finally:
                     os.close(descriptor)

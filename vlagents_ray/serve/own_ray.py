@@ -10,7 +10,7 @@ from pathlib import Path
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.haproxy import Front, haproxy_binary, ingress_environment
-from vlagents_ray.serve.ports import LOOPBACK, free_port, is_free
+from vlagents_ray.serve.ports import HOST, LOOPBACK, free_port, is_free
 from vlagents_ray.serve.reaper import MARK, reaped
 from vlagents_ray.serve.tls import Tls
 
@@ -41,7 +41,8 @@ def own_ray(
         folder = Path(name)
         # Ray starts its workers with a low priority, which would make a policy wait for whatever else runs here.
         environment = {"RAY_worker_niceness": "0"}
-        ours = {MARK: name, _ALONE: "0"}
+        # Where replicas listen for WebSockets. Not for the network where that is to see nothing but TLS.
+        ours = {MARK: name, _ALONE: "0", HOST: host if tls is None else LOOPBACK}
         front = None
         if (binary := haproxy_binary()) is not None:
             front = _front(folder, host, port, tls)

@@ -8,6 +8,7 @@ import socket
 from vlagents_ray.errors import ConfigError
 
 LOOPBACK, EVERYWHERE = "127.0.0.1", "0.0.0.0"  # noqa: S104 - compared, and tried
+HOST = "VLAGENTS_RAY_HOST"  # in the environment of a replica: where its server listens, if not where Serve does
 _PORTS = (30_000, 32_700)  # of HAProxy and the like
 _BLOCKS = (20_000, 30_000)
 

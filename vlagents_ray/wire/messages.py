@@ -13,10 +13,12 @@ from vlagents_ray.interface import Act, Obs
 PROTOCOL_VERSION = 1
 SESSION_HEADER = "x-session-id"
 REQUEST_ID_HEADER = "x-request-id"
-MACHINE_HEADER = "x-boot-id"  # with GET /v1/metadata: the caller's machine, see `boot_id`
+MACHINE_HEADER = "x-boot-id"  # with GET /v1/metadata: the caller's machine, see `boot_id`, or
+SERVERS_MACHINE = "server"  # that of whoever answers
 DEADLINE_HEADER = "x-deadline-ms"
 RANK_HEADER = "x-rank"
 NAME_CHARACTERS = 128  # of a session's or a request's id, at most
+STREAM_PATH = "/v1/stream/"  # on a replica's own port; something unguessable follows
 STREAM_BYTES = 16 * 2**20  # of one WebSocket message: what uvicorn takes, and Serve does not let us change
 
 Op = Literal["reset", "act", "close", "export"]
@@ -85,9 +87,17 @@ class LocalAddress:
     # names it: a frame, or with COMPACT the arrays of the acts that follow the message's header (see
     # `vlagents_ray.wire.compact`). A reply follows its header, or lies in a memory file that comes with it.
     REQUEST: ClassVar[struct.Struct] = struct.Struct("<IIQ")  # number of the memory file, flags, bytes there
-    REPLY: ClassVar[struct.Struct] = struct.Struct("<QI")  # bit n: memory file n is free again; flags
+    REPLY: ClassVar[struct.Struct] = struct.Struct("<QHh")  # bit n: memory file n is free again; flags; core or -1
     IN_FILE: ClassVar[int] = 1  # flag: the frame of the reply lies in the memory file that comes with it
     COMPACT: ClassVar[int] = 2  # flag: no frame
+
+
+@dataclass(frozen=True, slots=True)
+class StreamAddress:
+    """A port of the replica's own for WebSockets, on the host that answers for the server: `stream` in the metadata."""
+
+    port: int
+    path: str  # unguessable: only who may read the metadata knows it
 
 
 @dataclass(frozen=True, slots=True)

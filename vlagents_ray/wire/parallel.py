@@ -8,7 +8,6 @@ on its first calls, and from then on goes the faster one.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import queue
 import statistics
@@ -17,6 +16,8 @@ import time
 from collections import deque
 from collections.abc import Callable, Hashable, Sequence
 from typing import Any, Generic, TypeVar
+
+from vlagents_ray.wire import cores
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -89,9 +90,9 @@ class _Helpers:
 
     def _keep_off_this_core(self) -> None:
         """A kernel that packs threads that wake each other wakes them where the caller runs: after it."""
-        if _sched_getcpu is None:
+        if (here := cores.here()) < 0:
             return
-        elsewhere = os.sched_getaffinity(0) - {_sched_getcpu()}
+        elsewhere = os.sched_getaffinity(0) - {here}
         if elsewhere and elsewhere != self._elsewhere:
             with contextlib.suppress(OSError):  # forbidden here: they run where the kernel likes
                 for thread in self._threads:
@@ -124,14 +125,6 @@ class _Verdict:
             self.parallel = parallel_s < _GAIN * serial_s
 
 
-def _getcpu() -> Callable[[], int] | None:
-    """The C library's `sched_getcpu`, on Linux."""
-    if not hasattr(os, "sched_setaffinity"):
-        return None
-    return getattr(ctypes.CDLL(None), "sched_getcpu", None)
-
-
-_sched_getcpu = _getcpu()
 _helpers = _Helpers()
 _verdicts: dict[Hashable, _Verdict] = {}
 
@@ -141,7 +134,7 @@ def run(function: Callable[[Item], Result], items: Sequence[Item], kind: Hashabl
 
     `function` must be safe to call from other threads. An error is that of the first item that has one.
     """
-    if len(items) < 2 or _cores() < 2:
+    if len(items) < 2 or cores.allowed() < 2:
         return [function(item) for item in items]
     kind = (kind, len(items))
     verdict = _verdicts.get(kind)
@@ -172,14 +165,9 @@ def _run(function: Callable[[Item], Result], items: Sequence[Item], parallel: bo
     if not parallel:
         return [function(item) for item in items]
     batch = _Batch(function, items)
-    _helpers.summon(batch, min(len(items), _cores()) - 1)
+    _helpers.summon(batch, min(len(items), cores.allowed()) - 1)
     batch.work()
     return batch.wait()
-
-
-def _cores() -> int:
-    """Those that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _forget() -> None:

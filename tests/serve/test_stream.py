@@ -1,0 +1,222 @@
+"""A replica's own port for WebSockets, over an engine without Ray."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from eval_fakes import wait_for
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from vlagents_ray.client.stream import Stream
+from vlagents_ray.errors import ConfigError, MalformedMessage, MessageTooLarge, NotReset, PolicyUnavailable
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.serve.auth import Keys
+from vlagents_ray.serve.engine import Engine
+from vlagents_ray.serve.keyfile import new_key
+from vlagents_ray.serve.stream import StreamDoor
+from vlagents_ray.wire.frames import decode_reply, encode_request
+from vlagents_ray.wire.messages import STREAM_BYTES, Limits, Reply, Request
+from vlagents_ray.wire.probe import bytes_probe, is_answer
+
+BASE = urlsplit("http://127.0.0.1")
+
+
+class Echo(Agent):
+    """Answers what the camera shows, and as many bytes as it is asked for."""
+
+    def act(self, obs: Obs) -> Act:
+        return Act(np.array([obs.cameras["front"][0, 0, 0]]), info={"bytes": bytes(obs.info.get("bytes", 0))})
+
+
+@pytest.fixture
+def door() -> Iterator[StreamDoor]:
+    engine = Engine(Echo(), session_limit=3)
+    door = StreamDoor(engine, Limits(), "127.0.0.1")
+    door.open()
+    engine.start()
+    yield door
+    engine.close()
+    door.close()
+
+
+def stream(door: StreamDoor) -> Stream:
+    return Stream(BASE, door.address.port, door.address.path, 5)
+
+
+def ask(client: Stream, op: Any, pixel: int = 0, **info: Any) -> Reply:
+    obs = Obs({"front": np.full((16, 16, 3), pixel, np.uint8)}, info=info)
+    client.send(encode_request(Request(op, obs, request_id=os.urandom(4).hex())), 5)
+    return decode_reply(client.recv(5))
+
+
+def test_each_connection_is_a_session_that_ends_with_it(door: StreamDoor) -> None:
+    clients = [stream(door) for _ in range(3)]
+    for client in clients:
+        assert ask(client, "reset").error is None
+    for step in range(20):
+        for number, client in enumerate(clients):
+            act = ask(client, "act", 3 * step + number).act
+            assert act is not None
+            assert act.action.tolist() == [3 * step + number]
+    assert len(door.engine.sessions) == 3
+    clients[0].close()
+    clients[1]._socket.close()  # without a word
+    wait_for(lambda: len(door.engine.sessions) == 1)
+    assert ask(clients[2], "act", 9).act is not None
+    clients[2].close()
+    wait_for(lambda: len(door.engine.sessions) == 0)
+
+
+def test_who_does_not_know_the_path_is_not_let_in(door: StreamDoor) -> None:
+    for path in ("/", "/v1/stream", door.address.path[:-1], door.address.path + "x"):
+        with pytest.raises(InvalidStatus) as refused:
+            Stream(BASE, door.address.port, path, 5)
+        assert refused.value.response.status_code == 404
+    wait_for(lambda: not door._clients)
+
+
+def test_an_ordinary_websocket_client_is_served_too(door: StreamDoor) -> None:
+    with connect(f"ws://127.0.0.1:{door.address.port}{door.address.path}", compression=None) as socket_:
+        socket_.ping().wait(5)
+        probe = bytes_probe(300_000)
+        socket_.send(probe)
+        assert is_answer(socket_.recv(5))
+        socket_.send(encode_request(Request("reset", Obs())))
+        assert decode_reply(socket_.recv(5)).error is None
+
+
+def test_wrong_messages_are_answered_and_the_session_stays(door: StreamDoor) -> None:
+    with connect(f"ws://127.0.0.1:{door.address.port}{door.address.path}", compression=None) as client:
+
+        def error_of(message: str | bytes) -> Exception | None:
+            client.send(message)
+            return decode_reply(client.recv(5)).error
+
+        assert isinstance(error_of(encode_request(Request("act", Obs()))), NotReset)
+        assert error_of(encode_request(Request("reset", Obs()))) is None
+        assert isinstance(error_of("text"), MalformedMessage)
+        assert isinstance(error_of(b"nonsense"), MalformedMessage)
+        assert isinstance(error_of(b"VLA?\x01\x00\x00\x00nonsense"), MalformedMessage)
+        images = {f"c{i}": np.zeros((2, 2, 3), np.uint8) for i in range(17)}
+        assert isinstance(error_of(encode_request(Request("act", Obs(images)))), MessageTooLarge)
+        client.send(encode_request(Request("act", Obs({"front": np.full((8, 8, 3), 5, np.uint8)}))))
+        act = decode_reply(client.recv(5)).act
+        assert act is not None
+        assert act.action.tolist() == [5]
+
+
+@pytest.mark.parametrize("fragments", [True, False])
+def test_what_is_too_long_or_in_pieces_ends_the_connection_that_sent_it_alone(
+    door: StreamDoor, fragments: bool
+) -> None:
+    other = stream(door)
+    ask(other, "reset")
+    url = f"ws://127.0.0.1:{door.address.port}{door.address.path}"
+
+    def send() -> None:
+        with connect(url, compression=None) as client:
+            client.send([b"a", b"b"] if fragments else bytes(STREAM_BYTES + 1))
+            client.recv(5)
+
+    with pytest.raises(ConnectionClosed):
+        send()
+    act = ask(other, "act", 7).act
+    assert act is not None
+    assert act.action.tolist() == [7]
+    other.close()
+
+
+def test_a_client_that_takes_no_replies_holds_up_nobody(door: StreamDoor, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vlagents_ray.serve.stream._SLOW_S", 0.5)
+    slow, other = stream(door), stream(door)
+    for client in (slow, other):
+        ask(client, "reset")
+    frame = encode_request(Request("act", Obs({"front": np.zeros((2, 2, 3), np.uint8)}, info={"bytes": 3_000_000})))
+    for _ in range(4):
+        slow.send(frame, 5)
+    for pixel in range(50):
+        act = ask(other, "act", pixel).act
+        assert act is not None
+        assert act.action.tolist() == [pixel]
+    wait_for(lambda: len(door.engine.sessions) == 1)  # it was cut off
+    assert not [thread for thread in threading.enumerate() if thread.name == "stream-slow"]
+    slow.close()
+    other.close()
+
+
+def test_a_reply_longer_than_the_connection_holds_arrives_whole(door: StreamDoor) -> None:
+    client = stream(door)
+    ask(client, "reset")
+    for _ in range(3):
+        act = ask(client, "act", 1, bytes=9_000_000).act
+        assert act is not None
+        assert len(act.info["bytes"]) == 9_000_000
+    client.close()
+
+
+def test_the_limit_of_sessions_is_one_of_streams(door: StreamDoor) -> None:
+    clients = [stream(door) for _ in range(3)]
+    for client in clients:
+        ask(client, "reset")
+    with connect(f"ws://127.0.0.1:{door.address.port}{door.address.path}", compression=None) as late:
+        assert isinstance(decode_reply(late.recv(5)).error, PolicyUnavailable)
+        with pytest.raises(ConnectionClosed):
+            late.recv(5)
+    clients.pop().close()
+    wait_for(lambda: len(door._clients) == 2)
+    clients.append(stream(door))
+    assert ask(clients[-1], "reset").error is None
+    for client in clients:
+        client.close()
+
+
+def test_connections_that_say_nothing_make_way(door: StreamDoor) -> None:
+    silent = [socket.create_connection(("127.0.0.1", door.address.port)) for _ in range(70)]
+    client = stream(door)
+    assert ask(client, "reset").error is None
+    assert len(door._clients) <= 65
+    for each in silent:
+        each.close()
+    client.close()
+    wait_for(lambda: not door._clients)
+
+
+def test_a_door_takes_a_free_port_of_those_it_may() -> None:
+    engine = Engine(Echo())
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(ConfigError, match=str(port)):
+            StreamDoor(engine, Limits(), "127.0.0.1", (port, port))
+        door = StreamDoor(engine, Limits(), "127.0.0.1", (port, port + 20))
+        assert port < door.address.port <= port + 20
+        door.close()
+    engine.close()
+
+
+def test_where_there_are_keys_the_path_alone_is_not_enough(tmp_path: Path) -> None:
+    token, other = (new_key(tmp_path / "keys.json", name, apps=apps) for name, apps in (("arm", ()), ("x", ("pi0",))))
+    keys = Keys.from_file(tmp_path / "keys.json")
+    engine = Engine(Echo())
+    door = StreamDoor(engine, Limits(), "127.0.0.1", admit=lambda key: keys.check(key, "noop"))
+    door.open()
+    engine.start()
+    where = (BASE, door.address.port, door.address.path, 5)
+    for headers, status in (({}, 401), ({"x-api-key": "wrong"}, 401), ({"x-api-key": other}, 403)):
+        with pytest.raises(InvalidStatus) as refused:
+            Stream(*where, headers)
+        assert refused.value.response.status_code == status
+    client = Stream(*where, {"Authorization": f"Bearer {token}"})
+    assert ask(client, "reset").error is None
+    assert [name.partition("/")[0] for name in engine.sessions.ids()] == ["arm"]
+    client.close()
+    engine.close()
+    door.close()

@@ -1,0 +1,96 @@
+"""A WebSocket straight to a replica's own port, read and written by the thread that waits for the answer."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import time
+from collections.abc import Mapping
+from urllib.parse import SplitResult
+
+from websockets.client import ClientProtocol
+from websockets.frames import Frame, Opcode
+from websockets.protocol import State
+from websockets.uri import parse_uri
+
+_READ_BYTES = 256 * 1024
+
+
+class Stream:
+    """An open connection. No thread answers pings: it is for servers that leave it to the kernel to ask."""
+
+    def __init__(
+        self, base: SplitResult, port: int, path: str, timeout_s: float, headers: Mapping[str, str] | None = None
+    ) -> None:
+        """To `port` on the host of `base`; `OSError` or `InvalidHandshake` if nobody suitable answers."""
+        host = base.hostname or ""
+        deadline = time.monotonic() + timeout_s
+        self._protocol = ClientProtocol(
+            parse_uri(f"ws://{f'[{host}]' if ':' in host else host}:{port}{path}"), max_size=None
+        )
+        self._messages: list[bytes] = []
+        self._socket = socket.create_connection((host, port), timeout_s)
+        try:
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            request = self._protocol.connect()
+            request.headers.update(headers or {})
+            self._protocol.send_request(request)
+            self._flush(deadline)
+            while self._protocol.state is State.CONNECTING:
+                self._read(deadline)
+                if self._protocol.handshake_exc is not None:
+                    raise self._protocol.handshake_exc
+        except BaseException:
+            self._socket.close()
+            raise
+
+    def send(self, message: bytes, timeout_s: float) -> None:
+        """A binary message. `OSError` if the connection is gone, or the server does not take all of it in time."""
+        self._protocol.send_binary(message)
+        try:
+            self._flush(time.monotonic() + timeout_s)
+        except TimeoutError as error:
+            raise ConnectionAbortedError(f"the server took no message within {timeout_s:g} s") from error
+
+    def recv(self, timeout_s: float) -> bytes:
+        """The next binary message. `ConnectionClosed` or `OSError` if the connection is gone, `TimeoutError`."""
+        deadline = time.monotonic() + timeout_s
+        while not self._messages:
+            if self._protocol.state is not State.OPEN:
+                raise self._protocol.close_exc
+            self._read(deadline)
+        return self._messages.pop(0)
+
+    def close(self) -> None:
+        """Hang up; the server hears of it."""
+        with contextlib.suppress(OSError):
+            if self._protocol.state is State.OPEN:
+                self._protocol.send_close()
+                self._flush(time.monotonic() + 1.0)
+        self._socket.close()
+
+    def _read(self, deadline: float) -> None:
+        self._socket.settimeout(_left(deadline))
+        data = self._socket.recv(_READ_BYTES)
+        if data:
+            self._protocol.receive_data(data)
+        else:
+            self._protocol.receive_eof()
+        for event in self._protocol.events_received():
+            if isinstance(event, Frame) and event.opcode is Opcode.BINARY:
+                self._messages.append(bytes(event.data))
+        self._flush(deadline)
+
+    def _flush(self, deadline: float) -> None:
+        for piece in self._protocol.data_to_send():
+            if piece:
+                self._socket.settimeout(_left(deadline))
+                self._socket.sendall(piece)
+
+
+def _left(deadline: float) -> float:
+    left_s = deadline - time.monotonic()
+    if left_s <= 0:
+        raise TimeoutError
+    return left_s
