@@ -2,9 +2,8 @@
 
 The metadata tells a client the port and a path that nobody can guess, so that whoever may not read the one
 cannot use the other; where there are keys, a client shows its own once more. Messages are those of `WS /v1/stream`
-on the server's port, which stays for clients that do not reach this one.
-As with local clients the policy's own thread reads the sockets (see
-`vlagents_ray.serve.local`), and decodes what they bring.
+on the server's port, which stays for clients that do not reach this one. As with local clients the policy's own
+thread reads the sockets (see `vlagents_ray.serve.local`), and decodes what they bring.
 """
 
 from __future__ import annotations
