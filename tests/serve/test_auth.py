@@ -188,7 +188,7 @@ def test_off_loopback_somebody_must_have_decided_who_is_let_in(file: Path) -> No
     new_key(file, "arm")
     for host in ("127.0.0.1", "127.0.0.2", "localhost", "::1"):
         require_access(host, None, insecure=False)
-    for host in ("0.0.0.0", "192.0.2.1", "::", ""):  # noqa: S104 - what is refused
+    for host in ("0.0.0.0", "192.0.2.1", "::", "", "127.example.org"):  # noqa: S104 - what is refused
         with pytest.raises(ConfigError, match="--insecure"):
             require_access(host, None, insecure=False)
         require_access(host, Keys.from_file(file), insecure=False)

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import hmac
+import ipaddress
 import logging
 import os
 import threading
@@ -232,7 +233,10 @@ def _stamp(file: Path) -> object:
 
 def is_loopback(host: str) -> bool:
     """Is this an address of this machine that no other machine reaches?"""
-    return host in ("localhost", "::1") or host.startswith("127.")
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:  # a name
+        return host == "localhost"
 
 
 def require_access(host: str, keys: Keys | None, insecure: bool) -> None:
