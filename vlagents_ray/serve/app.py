@@ -64,5 +64,5 @@ def _gateway(args: ServerArgs) -> Application:
         "health_check_period_s": 5,
         "ray_actor_options": {"num_cpus": 0, "resources": {_HEAD: 0.001}},
     }
-    settings = args.model_dump(mode="json", include={"policy", "dialects", "limits", "sessions"})
+    settings = args.model_dump(mode="json", include={"policy", "dialects", "limits", "sessions", "access"})
     return serve.deployment(**options)(Gateway).bind(settings)

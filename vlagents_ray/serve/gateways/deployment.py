@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import importlib.metadata
 import logging
+from functools import partial
 from typing import Any
 
 from ray import serve
@@ -12,6 +13,7 @@ from ray import serve
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, PolicyUnavailable
+from vlagents_ray.serve.auth import Keys, require_access
 from vlagents_ray.serve.config import ServerArgs
 from vlagents_ray.serve.dialects.routes import require_fit
 from vlagents_ray.serve.gateways.config import GatewayArgs, GR00TArgs, VlagentsArgs
@@ -35,6 +37,9 @@ class Gateway:
 
     def _open(self, args: ServerArgs) -> None:
         wanted = args.dialects.gateways()
+        keys = args.access.keys()
+        for one in wanted.values():
+            require_access(one.host or _HOST, keys, args.access.insecure)
         listeners = {name: reserve(name, one.host or _HOST, one.port) for name, one in wanted.items()}
         try:
             app = serve.get_replica_context().app_name
@@ -43,11 +48,12 @@ class Gateway:
             for name, one in wanted.items():
                 house = House(
                     app=app,
-                    connect=_connector(app, one.rank),
+                    connect=_connector(app, one.rank, keyed=keys is not None),
                     limits=args.limits.limits(),
                     sessions=args.sessions.limit,
                     idle_s=args.sessions.idle_s,
                     contract=contract,
+                    check=None if keys is None else partial(_check, keys, app),
                 )
                 self._doors.append(_door(one, house, listeners[name]))
             for door in self._doors:
@@ -69,13 +75,25 @@ class Gateway:
 
 def _wait_for_policy(app: str) -> Contract | None:
     """The policy's contract, once it can act; raises what keeps it from loading."""
-    with RemoteAgent(f"serve://{app}", connect_timeout_s=_LOADING_S) as agent:
+    with RemoteAgent(f"serve://{app}", transport="handle", connect_timeout_s=_LOADING_S) as agent:
         return agent.contract
 
 
-def _connector(app: str, rank: RankName) -> Connect:
-    def connect(_key: str | None) -> RemoteAgent:
-        return RemoteAgent(f"serve://{app}", rank=rank, timeout_s=_ANSWER_S, connect_timeout_s=_ANSWER_S)
+def _check(keys: Keys, app: str, key: str | None) -> None:
+    keys.check(key, app)
+
+
+def _connector(app: str, rank: RankName, *, keyed: bool) -> Connect:
+    def connect(key: str | None) -> RemoteAgent:
+        # Who was let in without a key has none to show at the replica's shared memory; the handle asks for none.
+        return RemoteAgent(
+            f"serve://{app}",
+            transport="handle" if keyed and key is None else "auto",
+            rank=rank,
+            timeout_s=_ANSWER_S,
+            connect_timeout_s=_ANSWER_S,
+            api_key=key,
+        )
 
     return connect
 
