@@ -13,7 +13,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.gateways.talk import Connect
 from vlagents_ray.wire.messages import Limits
 
-_TAKEN_S = 5.0  # for a door that is being replaced to let go of its port
+_TAKEN_S = 2.0  # for a door that is being replaced to let go of its port
 _BACKLOG = 128
 
 Check = Callable[[str | None], Any]
