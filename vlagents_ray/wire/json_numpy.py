@@ -13,21 +13,28 @@ import numpy as np
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
 from vlagents_ray.wire.arrays import read_array
 from vlagents_ray.wire.messages import Limits
+from vlagents_ray.wire.tree import require_plain
 
 _KEYS = {"__numpy__", "dtype", "shape"}
 
 
-def loads(text: str | bytes, limits: Limits) -> Any:
-    """The value of a document; arrays are read-only. `MalformedMessage` or `MessageTooLarge` if it is none."""
+def loads(text: str | bytes, limits: Limits, levels: int = 0) -> Any:
+    """The value of a document; arrays are read-only. `MalformedMessage` or `MessageTooLarge` if it is none.
+
+    `levels` are those of the document's own, above the values whose nesting `limits` bounds.
+    """
     if len(text) > limits.body_bytes:
         raise MessageTooLarge(f"document: got {len(text)} bytes, the limit is {limits.body_bytes}")
+    marks: tuple[Any, ...] = (",", "[", "{") if isinstance(text, str) else (b",", b"[", b"{")
+    if sum(map(text.count, marks)) > limits.items:  # none of them is in base64
+        raise MessageTooLarge(f"document: more than {limits.items} values; send arrays as json-numpy writes them")
     try:
         value = json.loads(text, object_hook=_hook)
     except MalformedMessage:
         raise
     except (ValueError, RecursionError) as error:
         raise MalformedMessage(f"document: not JSON ({error})") from error
-    _check_size(value, limits)
+    require_plain(value, limits.depth + levels)
     return value
 
 
@@ -53,23 +60,6 @@ def _hook(node: dict[str, Any]) -> Any:
     if node.keys() != _KEYS:
         raise MalformedMessage(f"array: got keys {sorted(map(str, node))[:8]}, want {sorted(_KEYS)}")
     return read_array(decode_base64(node["__numpy__"], "array"), node["dtype"], node["shape"])
-
-
-def _check_size(value: Any, limits: Limits) -> None:
-    """Refuse what nests too deep or holds too many values, without recursion."""
-    items = 0
-    stack: list[tuple[Any, int]] = [(value, 0)]
-    while stack:
-        node, depth = stack.pop()
-        items += 1
-        if items > limits.items:
-            raise MessageTooLarge(f"document: more than {limits.items} values; send arrays instead of lists")
-        if isinstance(node, (dict, list)):
-            # An observation's own levels come on top of those of its `info`.
-            if depth >= limits.depth + 4:
-                raise MessageTooLarge(f"document: nested deeper than {limits.depth + 4}; flatten it")
-            children = node.values() if isinstance(node, dict) else node
-            stack.extend((child, depth + 1) for child in children)
 
 
 def _plain(value: Any) -> Any:

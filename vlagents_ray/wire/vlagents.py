@@ -24,6 +24,7 @@ RAW, JPEG, SHARED = "raw", "jpeg_encoded", "shared_memory"
 _TOP_3 = {"obs", "language_instruction", "goal_image", "goal_image_data_type"}
 _ROBOT_3 = {"cameras", "camera_data_type", "gripper", "joints", "xyzrpy", "tquat", "info"}
 _ROBOT_2 = {"cameras", "camera_data_type", "gripper", "state", "info"}
+_LEVELS = 4  # above the values in `info`: message, robots, robot, info
 _PARTS = ("joints", "xyzrpy", "tquat", "state")
 _TAKEN = {"self", "obs", "instruction", "contract"}  # arguments of `reset` that are no options
 
@@ -79,12 +80,12 @@ class Episode:
 
 def read_act(text: str | bytes, limits: Limits, segments: Segments) -> Seen:
     """The observation of an `act`."""
-    return _read(json_numpy.loads(text, limits), limits, segments)
+    return _read(json_numpy.loads(text, limits, _LEVELS), limits, segments)
 
 
 def read_reset(text: str | bytes, limits: Limits, segments: Segments) -> Episode:
     """What a `reset` of vlagents 0.2 says: `[observation, instruction, options]`."""
-    document = json_numpy.loads(text, limits)
+    document = json_numpy.loads(text, limits, _LEVELS)
     if not (isinstance(document, list) and len(document) == 3):
         raise MalformedMessage("reset: want [observation, instruction, options]")
     seen = _read(document[0], limits, segments)
