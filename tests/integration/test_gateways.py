@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import os
 import signal
@@ -166,9 +165,8 @@ def test_clients_go_on_when_the_replica_behind_the_gateway_dies(ports: Ports) ->
 
 def test_with_keys_on_only_who_has_one_is_served_and_a_revoked_one_is_not(tmp_path: Path) -> None:
     """GR00T's protocol carries a key, vlagents' does not: its door is opened on purpose, or not at all."""
-    file, key = tmp_path / "keys.json", new_key()
-    digest = hashlib.sha256(key.encode()).hexdigest()
-    file.write_text(json.dumps({"keys": [{"name": "arm", "sha256": digest}]}))
+    file = tmp_path / "keys.json"
+    key = new_key(file, "arm")
     observation = {"video": {"ego": np.full((1, 1, 8, 8, 3), 3, np.uint8)}, "language": {"task": [["abc"]]}}
     ports = Ports(free_port(), free_port())
     dialects = {"vlagents": {"port": ports.vlagents, "without_key": True}, "gr00t": {"port": ports.gr00t}}
