@@ -33,6 +33,7 @@ ENVS: dict[str, str] = {
 # import name -> extra of this package that installs it
 _EXTRAS = {
     "ray": "serve",
+    "msgpack": "serve",
     "starlette": "serve",
     "pydantic": "serve",
     "PIL": "serve",

@@ -13,7 +13,7 @@ import numpy as np
 import psutil
 
 from vlagents_ray import Act, Agent, Obs
-from vlagents_ray.contract import Contract
+from vlagents_ray.contract import ActionSpec, Contract
 
 
 class Reacher(Agent):
@@ -115,3 +115,32 @@ class Echo(Agent):
             "descriptors": len(os.listdir("/proc/self/fd")),
         }
         return Act(np.array([float(image[-1, -1, -1]) for image in obs.cameras.values()]), info=info)
+
+
+class Mirror(Agent):
+    """Says whose observation it was: a pixel, the first state's sum, acts so far, the instruction's number.
+
+    A white picture takes it two seconds.
+    """
+
+    contract = Contract(instruction=True, action=ActionSpec(dim=7, gripper_open=1.0, gripper_closed=0.0))
+
+    def __init__(self, chunk: int = 1, slow_s: float = 0.0) -> None:
+        self.chunk = chunk
+        self.slow_s = slow_s
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
+        self.number, self.acts = float(instruction.split()[-1]), 0
+        return {"pid": os.getpid()}
+
+    def act(self, obs: Obs) -> Act:
+        if obs.info.get("unnorm_key") == "broken":
+            raise RuntimeError("/no/path/of/ours")
+        pixel = float(obs.cameras["front"][-1, -1, -1])
+        time.sleep(2.0 if obs.cameras["front"].min() == 255 else self.slow_s)
+        self.acts += 1
+        total = float(next(iter(obs.state.values())).sum()) if obs.state else 0.0
+        row = [pixel, total, self.acts, self.number, 0.0, 0.0, 0.0 if obs.gripper is None else obs.gripper]
+        rows = np.tile(np.array(row, np.float32), (self.chunk, 1))
+        rows[:, 4] = np.arange(self.chunk)
+        return Act(rows)

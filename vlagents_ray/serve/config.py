@@ -6,6 +6,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from vlagents_ray.serve.dialects.config import DialectArgs
 from vlagents_ray.wire.messages import DEFAULT_LIMITS, Limits
 
 
@@ -144,6 +145,7 @@ class ServerArgs(_Closed):
     limits: LimitArgs = LimitArgs()
     stream: StreamArgs = StreamArgs()
     resources: ResourceArgs = ResourceArgs()
+    dialects: DialectArgs = Field(default=DialectArgs(), description="other systems' clients that may connect")
 
     @model_validator(mode="after")
     def _one_scaling(self) -> ServerArgs:

@@ -8,6 +8,7 @@ import json
 import logging
 import os
 from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,8 @@ from vlagents_ray.serve.autoscaling import SESSIONS, UTILISATION, WAITING
 from vlagents_ray.serve.balance import Balance
 from vlagents_ray.serve.calls import Sender
 from vlagents_ray.serve.config import ServerArgs
+from vlagents_ray.serve.dialects.door import House
+from vlagents_ray.serve.dialects.routes import describe, dialect_routes, require_fit
 from vlagents_ray.serve.engine import Engine
 from vlagents_ray.serve.ingress import build_ingress
 from vlagents_ray.serve.local import LocalDoor
@@ -59,6 +62,7 @@ class PolicyReplica:
             session_limit=self._args.sessions.limit,
             session_idle_s=self._args.sessions.idle_s,
             version=json.dumps([self._args.policy, self._args.config], sort_keys=True),
+            check=partial(require_fit, self._args.dialects),
         )
         self._load = LoadMeter(self._engine.queue)
         self._metrics = Exporter(self._engine, _tags(self._args.policy))
@@ -81,7 +85,8 @@ class PolicyReplica:
         self._watching = asyncio.ensure_future(self._watch_for_the_end())
 
     def __serve_build_asgi_app__(self) -> Starlette:
-        return build_ingress(self._engine, self.metadata, self._limits, self._near)
+        dialects = dialect_routes(self._args.dialects, House(self._engine, self.metadata, self._limits))
+        return build_ingress(self._engine, self.metadata, self._limits, self._near, dialects)
 
     def metadata(self) -> dict[str, Any]:
         """What `GET /v1/metadata` and `RemoteAgent.metadata` say."""
@@ -93,6 +98,7 @@ class PolicyReplica:
             "contract": None if contract is None else contract.to_json(),
             "protocol": PROTOCOL_VERSION,
             "version": importlib.metadata.version("vlagents-ray"),
+            "dialects": describe(self._args.dialects),
             "local": None if self._local is None else asdict(self._local.address),
             "stream": None if self._stream is None else asdict(self._stream.address),
         }

@@ -47,11 +47,14 @@ class Engine:
         session_limit: int = 1000,
         session_idle_s: float = 600.0,
         version: str = "",
+        check: Callable[[Contract | None], None] = lambda _: None,
     ) -> None:
         """With `batch_sizes` batches are padded up to the next of these; the largest is `max_batch_size`.
 
-        `version` is that of the policy and its settings: sessions move between equal ones only.
+        `version` is that of the policy and its settings: sessions move between equal ones only. `check` raises
+        what keeps a policy with that contract from being served.
         """
+        self._check = check
         self._agent = agent
         self._version = version
         self._batch_sizes = batch_sizes
@@ -155,6 +158,7 @@ class Engine:
     def _prepare(self) -> None:
         self._agent.initialize()
         self.contract = self._agent.contract
+        self._check(self.contract)
         self._copies = AgentCopies(self._agent)
         self._padding = Padding(self._batch_sizes, self._copies.make)
         self._copies.make()  # an agent that cannot be copied must fail now, not at the first reset

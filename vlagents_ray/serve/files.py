@@ -11,8 +11,10 @@ from pydantic import ValidationError
 from ray.serve.schema import ServeDeploySchema
 
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.interface import Agent
 from vlagents_ray.registry import names, policy_class
 from vlagents_ray.serve.config import ServerArgs
+from vlagents_ray.serve.dialects.routes import require_fit
 
 IMPORT_PATH = "vlagents_ray.serve.app:build"
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8000
@@ -62,8 +64,17 @@ def _checked(document: object, source: str) -> ServeDeploySchema:
                 args = ServerArgs(**app.args)
                 cls = policy_class(args.policy)
                 if not (app.runtime_env or {}):
-                    cls.from_config(args.config)
+                    _require_fit(args, cls.from_config(args.config))
     except ValidationError as error:
         lines = [f"- {'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors()]
         raise ConfigError(f"{source}:\n" + "\n".join(lines)) from error
     return config
+
+
+def _require_fit(args: ServerArgs, agent: Agent) -> None:
+    """Compare dialects and policy, if it can state its contract before it is loaded; a replica compares again."""
+    try:
+        contract = agent.contract
+    except Exception:  # noqa: BLE001 - its own, for want of what `initialize` brings
+        return
+    require_fit(args.dialects, contract)
