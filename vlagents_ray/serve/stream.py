@@ -165,7 +165,7 @@ class StreamClient:
 
     def _shake_hands(self, request: Handshake) -> None:
         known = secrets.compare_digest(request.path.encode(), self._door.path.encode())
-        refused = None if known else UnknownApp("no such path")
+        refused: VLAgentsError | None = None if known else UnknownApp("no such path")
         if known:
             try:
                 self._sender = Sender(self._door.engine, "websocket", caller=self._door.admit(self, request))
