@@ -45,6 +45,7 @@ def docs_page(metadata: dict[str, Any]) -> str:
 <p>A policy served by vlagents_ray {html.escape(str(metadata["version"]))}, protocol {metadata["protocol"]}.
 Choose a session id for each robot or environment and send it as <code>{SESSION_HEADER}</code> with every request:
 <code>reset</code> begins an episode, <code>act</code> gives the next action or chunk of actions.</p>
+<p>Where the server has API keys, send yours with every request: <code>Authorization: Bearer KEY</code>.</p>
 <h2>With curl</h2>
 <pre>curl -H '{SESSION_HEADER}: robot-1' -F 'obs={{"instruction": "push the cube to the goal", "gripper": 1.0}}' \\
      -F 'cameras.front=@front.jpg' http://HOST:8000/v1/reset

@@ -118,11 +118,12 @@ class Engine:
         owner: str = "",
         turn: str = "",
         transport: str = "",
+        quota: tuple[str, int | None] | None = None,
     ) -> Ticket:
         """A request made ready for the queue, its answer to go to `done`. What is wrong with it is raised here.
 
         `owner` is the connection that the session ends with; empty for a caller without one. `turn` is
-        whose turn it is in the queue, if that is more than this session.
+        whose turn it is in the queue, if that is more than this session. `quota`: see `SessionTable.open`.
         """
         self.require_ready()
         if request.op == "act":
@@ -136,7 +137,7 @@ class Engine:
             if obs is not None:
                 check_observation(obs, self.contract)
         if request.op == "reset":
-            self.sessions.open(session_id, owner, transport, turn)
+            self.sessions.open(session_id, owner, transport, turn, quota)
         rank = Rank.SIMULATION if request.rank == "simulation" else Rank.ROBOT
         return Ticket(session_id, request, done, rank, owner=turn, connection=owner, transport=transport)
 
