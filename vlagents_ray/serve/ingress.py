@@ -92,7 +92,7 @@ class _Door:
         if self._engine.ready:
             return PlainTextResponse("OK\n")
         unready = PolicyUnavailable("the policy is loading, or did not load; GET /v1/metadata says why")
-        return _problem(unready, request_id(http))
+        return problem_response(unready, request_id(http))
 
     async def show_metadata(self, http: HttpRequest) -> Response:
         machine = http.headers.get(MACHINE_HEADER)
