@@ -139,7 +139,11 @@ TARGETS = [
         ],
         lambda a: vla_eval.decode(a).payload["actions"][0],
         fence=FENCE,
-        trees=[{"payload": SEEN}, {"kind": "episode_start", "payload": {"task": {}}}],
+        trees=[
+            {"payload": SEEN},
+            {"kind": "hello", "payload": {"protocol_version": 1}},
+            {"kind": "episode_start", "payload": {"task": {}}},
+        ],
         encode=as_vla_eval,
     ),
 ]

@@ -269,8 +269,9 @@ def test_vla_eval_gets_one_row_a_step_and_a_new_chunk_after_the_last(house: tupl
 
 def test_vla_evals_errors_leave_the_connection(house: tuple[TestClient, Engine]) -> None:
     with house[0].websocket_connect("/vla-eval") as socket:
-        say(socket, "hello", {"protocol_version": 2}, 1)
-        assert hear(socket).kind == "error"
+        for version in (2, None, np.zeros(2)):
+            say(socket, "hello", {"protocol_version": version}, 1)
+            assert hear(socket).kind == "error"
         socket.send_bytes(b"junk")
         assert hear(socket).kind == "error"
         say(socket, "observation", {"images": {"front": np.zeros(3)}}, 3)

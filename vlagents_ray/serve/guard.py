@@ -11,13 +11,12 @@ import logging
 import uuid
 from contextlib import suppress
 
-from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from vlagents_ray.errors import MalformedMessage, TooManyRequests, Unauthorized, VLAgentsError
 from vlagents_ray.serve.auth import Caller, Keys, on_behalf_of, token_of
+from vlagents_ray.serve.problems import problem_response
 from vlagents_ray.wire.messages import REQUEST_ID_HEADER
-from vlagents_ray.wire.plain import PROBLEM_TYPE, problem
 
 logger = logging.getLogger(__name__)
 
@@ -74,12 +73,11 @@ def _asks_for_health(scope: Scope) -> bool:
 
 
 async def _refuse(error: VLAgentsError, request_id: str, scope: Scope, receive: Receive, send: Send) -> None:
-    headers = {}
+    answer = problem_response(error, request_id)
     if isinstance(error, Unauthorized):
-        headers["www-authenticate"] = 'Bearer realm="vlagents_ray"'
+        answer.headers["www-authenticate"] = 'Bearer realm="vlagents_ray"'
     if isinstance(error, TooManyRequests):
-        headers["retry-after"] = str(max(1, round(error.retry_after_s)))
-    answer = JSONResponse(problem(error, request_id), error.status, headers, PROBLEM_TYPE)
+        answer.headers["retry-after"] = str(max(1, round(error.retry_after_s)))
     if scope["type"] == "websocket":
         await receive()  # its "connect"
         if "websocket.http.response" not in scope.get("extensions", {}):
@@ -125,8 +123,8 @@ class _Upload:
                 raise
             _uncancel(task)
             late = MalformedMessage(f"body: not here within {self._slow_s:g} s; is the connection that slow?")
-            document = problem(late, uuid.uuid4().hex) | {"status": _TIMEOUT}
-            response = JSONResponse(document, _TIMEOUT, {"connection": "close"}, PROBLEM_TYPE)
+            response = problem_response(late, uuid.uuid4().hex, _TIMEOUT)
+            response.headers["connection"] = "close"
             await response(scope, receive, self._send)
         finally:
             timer.cancel()

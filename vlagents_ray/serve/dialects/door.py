@@ -18,6 +18,7 @@ from vlagents_ray.serve.conversation import Conversation
 from vlagents_ray.serve.dialects.config import Dialect
 from vlagents_ray.serve.engine import Engine
 from vlagents_ray.serve.problems import problem_response
+from vlagents_ray.serve.reading import INLINE_BYTES
 from vlagents_ray.serve.stats import Visit
 from vlagents_ray.wire.messages import Limits, Reply
 
@@ -26,7 +27,6 @@ T = TypeVar("T")
 logger = logging.getLogger(__name__)
 
 POLICY_VIOLATION, INTERNAL_ERROR, TRY_AGAIN_LATER = 1008, 1011, 1013  # WebSocket close codes
-_INLINE_BYTES = 512 * 1024  # a larger message is decoded beside the event loop, which others wait for
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ class Door:
 
 async def decoded(read: Callable[[bytes, Limits], T], data: bytes, limits: Limits) -> T:
     """What `read` makes of a message."""
-    if len(data) > _INLINE_BYTES:
+    if len(data) > INLINE_BYTES:
         return await asyncio.to_thread(read, data, limits)
     return read(data, limits)
 

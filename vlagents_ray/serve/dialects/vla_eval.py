@@ -50,10 +50,10 @@ class VlaEvalDoor(Door):
         except WebSocketDisconnect:
             return
         finally:
+            sender.release()
             reading.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await reading
-            sender.release()
 
     async def _answer(self, message: wire.Message | VLAgentsError, episode: _Episode) -> wire.Message | None:
         if isinstance(message, VLAgentsError):
@@ -69,7 +69,7 @@ class VlaEvalDoor(Door):
 
     def _hello(self, message: wire.Message) -> wire.Message:
         version = message.payload.get("protocol_version")
-        if version != wire.PROTOCOL_VERSION:
+        if type(version) is not int or version != wire.PROTOCOL_VERSION:
             error = MalformedMessage(f"protocol_version: got {str(version)[:20]}, want {wire.PROTOCOL_VERSION}")
             return _error(error, message.seq, uuid.uuid4().hex)
         known = self.house.metadata()
