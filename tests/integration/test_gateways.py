@@ -18,12 +18,10 @@ from eval_fakes import wait_for
 from gr00t_client import PolicyClient
 from peer_versions import package
 from peers import peers_python
-from rpyc_client import Client, document
 
 from tests.integration.conftest import SUPPORT, serving
 from vlagents_ray.bench.child import Child
 from vlagents_ray.serve.cluster import free_port
-from vlagents_ray.serve.keyfile import new_key
 
 ANSWER_S = 120.0  # the client's imports included
 
@@ -161,30 +159,3 @@ def test_clients_go_on_when_the_replica_behind_the_gateway_dies(ports: Ports) ->
         assert after[0][4]["resumed"] is True
         assert close_to([step[1] for step in after], 7, 1)
         assert client.ping()["status"] == "ok"
-
-
-def test_with_keys_on_only_who_has_one_is_served_and_a_revoked_one_is_not(tmp_path: Path) -> None:
-    """GR00T's protocol carries a key, vlagents' does not: its door is opened on purpose, or not at all."""
-    file = tmp_path / "keys.json"
-    key = new_key(file, "arm")
-    observation = {"video": {"ego": np.full((1, 1, 8, 8, 3), 3, np.uint8)}, "language": {"task": [["abc"]]}}
-    ports = Ports(free_port(), free_port())
-    dialects = {"vlagents": {"port": ports.vlagents, "without_key": True}, "gr00t": {"port": ports.gr00t}}
-    with serving("served_agents:Witness", dialects=dialects, access={"keys_file": str(file)}):
-        with Client(ports.vlagents) as robot:
-            assert robot.act(document(8, "x")) == [8, 0.5, 0.25, 1, 1]
-        for wrong in (None, "wrong"):
-            with PolicyClient(ports.gr00t, wrong) as client, pytest.raises(RuntimeError, match="unauthorized"):
-                client.get_action(observation)
-        with PolicyClient(ports.gr00t, key) as client:
-            assert client.get_action(observation)[0]["action"][0, 0].tolist() == [3, 0, -1, 3, 1]
-            file.unlink()
-            wait_for(lambda: _refused(lambda: client.get_action(observation)))
-
-
-def _refused(ask: Callable[[], object]) -> bool:
-    try:
-        ask()
-    except RuntimeError as error:
-        return "unauthorized" in str(error)
-    return False
