@@ -40,6 +40,7 @@ _EXTRAS = {
     "yaml": "serve",
     "typer": "serve",
     "rich": "serve",
+    "zmq": "gr00t",
     "matplotlib": "bench",
     "gymnasium": "sim",
     "av": "sim",

@@ -117,6 +117,24 @@ class Echo(Agent):
         return Act(np.array([float(image[-1, -1, -1]) for image in obs.cameras.values()]), info=info)
 
 
+class Witness(Agent):
+    """An action that tells what was seen: a pixel of the first camera, the first state, the gripper, the length of the
+    instruction, and which act of its session it is. Two rows, the second with the next number."""
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
+        self.instruction, self.acts = instruction or "", 0
+        return {"instruction": instruction, "options": dict(kwargs)}
+
+    def act(self, obs: Obs) -> Act:
+        time.sleep(obs.info.get("sleep_s", 0.0))
+        self.acts += 1
+        image = next(iter(obs.cameras.values()), np.zeros((1, 1, 3), np.uint8))
+        joints = next(iter(obs.state.values()), np.zeros(1))
+        seen = [image[0, -1, 0], joints[0], -1.0 if obs.gripper is None else obs.gripper, len(self.instruction)]
+        info = {"cameras": sorted(obs.cameras), "state": sorted(obs.state), "pid": os.getpid()}
+        return Act(np.array([[*seen, self.acts], [*seen, self.acts + 1]], np.float32), info=info)
+
+
 class Mirror(Agent):
     """Says whose observation it was: a pixel, the first state's sum, acts so far, the instruction's number.
 

@@ -19,7 +19,7 @@ from vlagents_ray.cli.keys import keys as keys_app
 from vlagents_ray.cli.settings import parse_settings
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.serve.cluster import running_server
-from vlagents_ray.serve.files import listens_at, read_deployment
+from vlagents_ray.serve.files import listens_at, read_deployment, with_dialect
 from vlagents_ray.serve.tls import Tls
 
 if TYPE_CHECKING:
@@ -50,6 +50,9 @@ def serve(
     serve_set: Annotated[
         list[str], typer.Option("--serve-set", metavar="KEY=VALUE", help="A setting of the server: batch.max_size=8.")
     ] = [],  # noqa: B006
+    vlagents_port: Annotated[
+        int | None, typer.Option(min=1, max=65535, help="Let clients of the package vlagents in at this port, too.")
+    ] = None,
     address: Address = None,
     keys: Annotated[
         Path | None,
@@ -67,6 +70,8 @@ def serve(
     """Serve a policy until Ctrl-C."""
     with _errors():
         config = read_deployment(source, _server_args(settings, serve_set))
+        if vlagents_port is not None:
+            config = with_dialect(config, "vlagents", {"port": vlagents_port})
         stated_host, stated_port = listens_at(config)
         host, port = host or stated_host, port or stated_port
         access: dict[str, Any] = {

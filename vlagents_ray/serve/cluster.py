@@ -22,7 +22,7 @@ from ray.serve.schema import ServeDeploySchema
 from vlagents_ray.errors import ConfigError, PolicyUnavailable
 from vlagents_ray.serve.auth import require_access
 from vlagents_ray.serve.config import AccessArgs
-from vlagents_ray.serve.files import IMPORT_PATH
+from vlagents_ray.serve.files import IMPORT_PATH, with_gateways_at
 from vlagents_ray.serve.haproxy import Front, wait_for_haproxy
 from vlagents_ray.serve.own_ray import own_ray
 from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK, free_port
@@ -63,6 +63,7 @@ def running_server(
     address, one of the two must be given somewhere.
     Raises `ConfigError` when the deployment fails, `PolicyUnavailable` when it takes too long.
     """
+    config = with_gateways_at(config, host)
     config = _access(config, keys_file, insecure)
     if address is None:  # else each replica says so, where it runs
         _require_access(config, host, insecure)

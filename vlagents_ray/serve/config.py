@@ -10,6 +10,8 @@ from vlagents_ray.serve.auth import Keys, load_keys
 from vlagents_ray.serve.dialects.config import DialectArgs
 from vlagents_ray.wire.messages import DEFAULT_LIMITS, Limits
 
+POLICY, GATEWAY = "Policy", "Gateway"  # the deployments of an application
+
 
 class _Closed(BaseModel):
     model_config = ConfigDict(extra="forbid")

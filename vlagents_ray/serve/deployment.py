@@ -53,7 +53,8 @@ class PolicyReplica:
     others loads in its constructor, so that Serve routes to it only when it can act too.
     """
 
-    async def __init__(self, args: dict[str, Any]) -> None:  # type: ignore[misc]  # Serve awaits it
+    async def __init__(self, args: dict[str, Any], gateway: Any = None) -> None:  # type: ignore[misc]
+        """Serve awaits it. `gateway` is a handle that nobody uses: it makes the gateway a part of the application."""
         self._args = ServerArgs(**args)
         self._app = serve.get_replica_context().app_name
         self._keys = self._args.access.keys()
@@ -261,8 +262,10 @@ def _stopping() -> bool:
 
 def _others_run() -> bool:
     """Does the application already have a replica that takes requests?"""
-    app = serve.status().applications.get(serve.get_replica_context().app_name)
-    return app is not None and any(d.replica_states.get("RUNNING", 0) > 0 for d in app.deployments.values())
+    context = serve.get_replica_context()
+    app = serve.status().applications.get(context.app_name)
+    policy = None if app is None else app.deployments.get(context.deployment)
+    return policy is not None and policy.replica_states.get("RUNNING", 0) > 0
 
 
 def _tags(policy: str) -> dict[str, str]:

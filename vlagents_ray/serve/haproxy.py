@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from vlagents_ray.errors import ConfigError, PolicyUnavailable
+from vlagents_ray.serve.config import POLICY
 from vlagents_ray.serve.ports import LOOPBACK, free_block, free_ports
 from vlagents_ray.serve.reaper import MARK
 
@@ -141,8 +142,10 @@ def wait_for_haproxy(serve: Any, apps: Mapping[str, str], stats_port: int, deadl
                 for row in rows
                 if row["pxname"] == f"http-{name}" and row["svname"].startswith("SERVE_REPLICA")
             ]
-            running = sum(d.replica_states.get("RUNNING", 0) for d in status[name].deployments.values())
-            if not (up and all(up) and (len(up) >= running or len(status[name].deployments) > 1)):
+            deployments = status[name].deployments
+            ours = [deployments[POLICY]] if POLICY in deployments else list(deployments.values())
+            running = sum(d.replica_states.get("RUNNING", 0) for d in ours)
+            if not (up and all(up) and (len(up) >= running or len(ours) > 1)):
                 late.append(name)
         if not late:
             return

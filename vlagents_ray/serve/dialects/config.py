@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+from vlagents_ray.serve.gateways.config import GatewayDialects
 from vlagents_ray.wire.mapping import KeyMapping
 from vlagents_ray.wire.messages import RankName
 from vlagents_ray.wire.presets import read_mapping
@@ -78,10 +79,8 @@ class VlaEval(Dialect):
     )
 
 
-class DialectArgs(BaseModel):
-    """Which are on."""
-
-    model_config = ConfigDict(extra="forbid")
+class DialectArgs(GatewayDialects):
+    """Which are on: these on the server's own port, and those that have one of their own."""
 
     openpi: OpenPi | None = None
     roboarena: RoboArena | None = None
@@ -89,7 +88,7 @@ class DialectArgs(BaseModel):
     vla_eval: VlaEval | None = None
 
     def on(self) -> Iterator[tuple[str, Dialect]]:
-        """Those, by name."""
+        """Those on the server's own port, by name."""
         for name in type(self).model_fields:
-            if (dialect := getattr(self, name)) is not None:
+            if isinstance(dialect := getattr(self, name), Dialect):
                 yield name, dialect

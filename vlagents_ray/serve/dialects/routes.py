@@ -19,6 +19,7 @@ from vlagents_ray.serve.dialects.openvla import OpenVLADoor
 from vlagents_ray.serve.dialects.roboarena import RoboArenaDoor
 from vlagents_ray.serve.dialects.vla_eval import VlaEvalDoor
 from vlagents_ray.serve.problems import problem_response
+from vlagents_ray.wire.presets import read_mapping
 
 
 class Root(WebSocketRoute):
@@ -69,7 +70,10 @@ def describe(args: DialectArgs) -> dict[str, Any]:
 
 def require_fit(args: DialectArgs, contract: Contract | None) -> None:
     """Raise `ConfigError` with whatever the policy needs and a mapping cannot give it."""
-    found = [f"- dialects.{name}: {line}" for name, dialect in args.on() for line in dialect.keys().lacks(contract)]
+    mappings = {name: dialect.keys() for name, dialect in args.on()}
+    if args.gr00t is not None:
+        mappings["gr00t"] = read_mapping(args.gr00t.mapping)
+    found = [f"- dialects.{name}: {line}" for name, mapping in mappings.items() for line in mapping.lacks(contract)]
     if found:
         raise ConfigError("dialects and policy do not fit:\n" + "\n".join(found))
 
