@@ -56,8 +56,11 @@ def own_ray(
             front.require()
         ray.init(num_cpus=num_cpus, include_dashboard=False, log_to_driver=show_logs, logging_level="WARNING")
         stack.callback(ray.shutdown)
-        # Whoever reaches the object store's socket in there reads and writes all observations.
-        Path(ray._private.worker.global_worker.node.get_session_dir_path()).chmod(0o700)
+        # Whoever reaches the object store's socket reads and writes all observations. (The folder would not stay
+        # closed: each of Ray's processes opens it to everybody when it starts.)
+        node = ray._private.worker.global_worker.node
+        for path in (node.plasma_store_socket_name, node.raylet_socket_name):
+            Path(path).chmod(0o600)
         yield front
 
 
