@@ -31,6 +31,13 @@ def test_a_comment_names_the_policy_that_must_be_served() -> None:
     assert one("<!-- test: serve scripted -->\n```python\n```\n").server == "scripted"
 
 
+@pytest.mark.parametrize("server", ["", ": serve deployments/openpi.yaml"])
+def test_a_block_may_be_for_other_systems_clients(server: str) -> None:
+    block = one(f"<!-- test{server} with peers -->\n```python\n```\n")
+    assert (block.peers, block.server) == (True, server.removeprefix(": serve ") or None)
+    assert not one("<!-- test -->\n```python\n```\n").peers
+
+
 def test_a_comment_says_why_a_block_is_not_run() -> None:
     assert one("<!-- not run: needs a robot -->\n```python\n```\n").not_run == "needs a robot"
 

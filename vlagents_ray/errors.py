@@ -10,7 +10,10 @@
     │   ├── UnknownSession       404        expired, closed, or never reset
     │   ├── UnknownApp           404        no such application on this server
     │   ├── NotReset             409        `act` before `reset`
-    │   └── ContractMismatch     409        robot or env and policy do not fit together
+    │   ├── ContractMismatch     409        robot or env and policy do not fit together
+    │   ├── Unauthorized         401        no API key, or none that is valid (any more)
+    │   └── Forbidden            403        a valid key, but not for this application
+    ├── TooManyRequests          429        over the rate or the sessions of the API key
     ├── PolicyFailed             500        the policy raised, or returned an unusable action
     │   └── InvalidAction        500
     ├── PolicyUnavailable        503        not ready yet, restarting, or full
@@ -110,6 +113,28 @@ class ContractMismatch(InvalidInput):
 
     code = "contract_mismatch"
     status = 409
+
+
+class Unauthorized(InvalidInput):
+    """The request brings no API key, or one that is unknown, revoked or expired."""
+
+    code = "unauthorized"
+    status = 401
+
+
+class Forbidden(InvalidInput):
+    """The API key is valid, but not for this application."""
+
+    code = "forbidden"
+    status = 403
+
+
+class TooManyRequests(VLAgentsError):
+    """The API key's requests come faster, or hold more sessions, than it allows; nothing was executed."""
+
+    code = "too_many_requests"
+    status = 429
+    retry_after_s: float = 1.0  # seconds after which the next request would be let in
 
 
 class PolicyFailed(VLAgentsError):

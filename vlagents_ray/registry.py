@@ -33,12 +33,14 @@ ENVS: dict[str, str] = {
 # import name -> extra of this package that installs it
 _EXTRAS = {
     "ray": "serve",
+    "msgpack": "serve",
     "starlette": "serve",
     "pydantic": "serve",
     "PIL": "serve",
     "yaml": "serve",
     "typer": "serve",
     "rich": "serve",
+    "zmq": "gr00t",
     "matplotlib": "bench",
     "gymnasium": "sim",
     "av": "record",

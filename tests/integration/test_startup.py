@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -19,6 +20,7 @@ from pathlib import Path
 import psutil
 import pytest
 from eval_fakes import wait_for
+from rpyc_client import Client, call
 
 from tests.integration.conftest import serving
 from vlagents_ray import ConfigError, Obs, RemoteAgent
@@ -105,9 +107,33 @@ def test_two_servers_on_one_machine_do_not_meet() -> None:
                     assert agent.act(Obs()).action.shape == (dim,)
 
 
-def test_a_taken_port_is_said_at_once() -> None:
-    import socket
+def test_the_command_line_opens_a_door_for_vlagents_and_closes_it() -> None:
+    port, robots = free_port(), free_port()
+    with command("serve", "noop", "--port", str(port), "--vlagents-port", str(robots)):
+        wait_for(lambda: _name_at(robots) == "noop")
+    with pytest.raises(ConnectionRefusedError):
+        Client(robots)
 
+
+def test_a_doors_taken_port_fails_the_deployment_and_is_named() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with (
+            pytest.raises(ConfigError, match=f"vlagents: cannot listen on 127.0.0.1:{port}"),
+            serving("noop", dialects={"vlagents": {"port": port}}),
+        ):
+            pytest.fail("served without its door")
+
+
+def test_a_policy_that_does_not_load_says_why_with_a_door_too() -> None:
+    with (
+        pytest.raises(ConfigError, match="no checkpoint here"),
+        serving("served_agents:Broken", dialects={"vlagents": {"port": free_port()}}),
+    ):
+        pytest.fail("served a policy that did not load")
+
+
+def test_a_taken_port_is_said_at_once() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -121,10 +147,12 @@ def test_a_taken_port_is_said_at_once() -> None:
 
 def test_serve_deploy_takes_the_same_file(tmp_path: Path) -> None:
     """Ray's own tools, on a cluster that Ray's own tools started."""
-    serve_port, dashboard, gcs = free_port(), free_port(), free_port()
+    serve_port, dashboard, gcs, robots = free_port(), free_port(), free_port(), free_port()
     text = (ROOT / "deployments" / "scripted.yaml").read_text()
     file = tmp_path / "scripted.yaml"
+    text = text.replace("args:\n", f"args:\n      dialects: {{vlagents: {{port: {robots}}}}}\n")
     file.write_text(text.replace("port: 8000", f"port: {serve_port}"))
+    assert "dialects" in file.read_text()
     assert str(serve_port) in file.read_text()
     bin_dir = Path(sys.executable).parent
     home = tempfile.mkdtemp(prefix="vr-")  # Unix sockets in it: the path must be short
@@ -149,6 +177,7 @@ def test_serve_deploy_takes_the_same_file(tmp_path: Path) -> None:
             obs, _ = env.reset(seed=0)
             agent.reset(obs, env.instruction, env="tabletop")
             env.step(agent.act(obs))
+        wait_for(lambda: _name_at(robots) == "scripted")
     finally:
         ours += [p for p in psutil.process_iter() if home in " ".join(_cmdline(p))]
         family = {child for p in ours if p.is_running() for child in p.children(recursive=True)} | set(ours)
@@ -159,6 +188,16 @@ def test_serve_deploy_takes_the_same_file(tmp_path: Path) -> None:
         for p in alive:
             p.kill()
         shutil.rmtree(home, ignore_errors=True)
+
+
+def _name_at(port: int) -> str | None:
+    """What the vlagents door on that port calls the policy."""
+    try:
+        with Client(port) as client:
+            client.send(call("name"))
+            return str(client.receive()[2][1])
+    except (OSError, EOFError):
+        return None
 
 
 def _cmdline(process: psutil.Process) -> list[str]:
@@ -180,6 +219,8 @@ def application(args: str) -> str:
         (application("{}"), "policy"),
         (application("{policy: noop, config: {xy: 1}}"), "xy"),
         (application("{policy: noop, batch: {max_size: 0}}"), "max_size"),
+        (application("{policy: noop, dialects: {vlagents: {}, gr00t: {port: 8080}}}"), "share port 8080"),
+        (application("{policy: noop, dialects: {gr00t: {mapping: gr01t}}}"), "gr01t"),
         (application("{policy: noop, replicas: 1, autoscaling: {}}"), "exclude each other"),
         ("applications: 3", "applications"),
         ("a: [", "YAML"),

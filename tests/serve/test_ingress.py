@@ -125,7 +125,7 @@ def test_health_is_503_until_the_policy_is_loaded() -> None:
         assert post(client, "reset").status_code == 503
 
 
-NAN = float("nan")
+NAN, HUGE = float("nan"), 10**400
 _IHDR = b"IHDR" + struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0)
 _IDAT = b"IDAT" + zlib.compress(b"few")
 HUGE_PNG = b"\x89PNG\r\n\x1a\n" + b"".join(
@@ -144,8 +144,8 @@ FAULTS: list[tuple[dict[str, Any], int, str]] = [
     *[({"obs": text}, 400, "malformed") for text in ("", "{", "null", "[1]", "nan", "[" * 9999, '{"a": 1}', "\xff")],
     *[({"obs": {**GOOD, key: 1}}, 400, "malformed") for key in ("camera", "images", "prompt", "session", "x" * 999)],
     *[({"obs": {**GOOD, "state": {"joints": x}}}, 422, "invalid_observation")
-      for x in ([NAN, 0], [float("inf"), 0], [1], [1, 2, 3], [[1, 2]], ["1", "2"], [None, 1], [True, 1], "12", 1)],
-    *[({"obs": {**GOOD, "gripper": x}}, 422, "invalid_observation") for x in (-0.1, 1.1, "open", [1], NAN, True)],
+      for x in ([NAN, 0], [float("inf"), 0], [1], [1, 2, 3], [[1, 2]], ["1", "2"], [None, 1], [True, 1], [HUGE, 1], 1)],
+    *[({"obs": {**GOOD, "gripper": x}}, 422, "invalid_observation") for x in (-0.1, 1.1, "open", [1], NAN, True, HUGE)],
     *[({"obs": {**GOOD, "state": x}}, 400, "malformed") for x in ([1], "joints", 3)],
     ({"obs": {**GOOD, "state": {}}}, 422, "missing_state"),
     ({"obs": {**GOOD, "state": {"joint": [1, 2]}}}, 422, "missing_state"),

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import socket
+import subprocess
 from pathlib import Path
 
 import pytest
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve import ports
-from vlagents_ray.serve.haproxy import behind_haproxy, ingress_environment
+from vlagents_ray.serve.haproxy import Front, ingress_environment
 from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK, free_ports, is_free
 
 
@@ -33,13 +34,22 @@ def test_haproxys_ports_are_different_ones_that_nobody_has(monkeypatch: pytest.M
         assert free_ports(3) == [first + 1, first + 2, first + 3]
 
 
-def test_a_single_address_is_haproxys_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for key, value in ingress_environment(tmp_path, "192.0.2.7", 8000).items():
+def test_haproxy_alone_faces_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    front = Front("192.0.2.7", 8000, inside=8001)
+    for key, value in ingress_environment(tmp_path, "/bin/true", front).items():
         monkeypatch.setenv(key, value)
-    assert behind_haproxy("192.0.2.7", 8000) == LOOPBACK
-    for host in (LOOPBACK, "localhost", EVERYWHERE):
-        assert behind_haproxy(host, 8000) == host
-    with pytest.raises(ConfigError, match=EVERYWHERE):
-        behind_haproxy("192.0.2.8", 8000)
-    monkeypatch.delenv("RAY_SERVE_ENABLE_HA_PROXY")
-    assert behind_haproxy("192.0.2.8", 8000) == "192.0.2.8"
+    assert "bind 192.0.2.7:8000\n" in front.settings()
+    assert f"server inside {LOOPBACK}:8001\n" in front.settings()
+    front.require()
+    monkeypatch.setenv("RAY_SERVE_HAPROXY_BALANCE_ALGORITHM", "leastconn")  # as a user may have it
+    with pytest.raises(ConfigError, match="to this function"):
+        front.require()
+
+
+def test_haproxy_starts_with_its_statistics_on_loopback(tmp_path: Path) -> None:
+    program = ingress_environment(tmp_path, "/bin/cat")["RAY_SERVE_HAPROXY_BINARY_PATH"]
+    settings = tmp_path / "haproxy.cfg"
+    settings.write_text("  bind *:9000\n    bind :9001\n    bind 192.0.2.7:9002\n")
+    shown = subprocess.run([program, "--", "-f", settings], capture_output=True, text=True, check=False).stdout
+    assert shown == "  bind 127.0.0.1:9000\n    bind 127.0.0.1:9001\n    bind 192.0.2.7:9002\n"
+    assert ingress_environment(tmp_path, "/bin/cat")["RAY_SERVE_HAPROXY_BINARY_PATH"] == program

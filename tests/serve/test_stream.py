@@ -6,6 +6,7 @@ import os
 import socket
 import threading
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -18,7 +19,9 @@ from websockets.sync.client import connect
 from vlagents_ray.client.stream import Stream
 from vlagents_ray.errors import ConfigError, MalformedMessage, MessageTooLarge, NotReset, PolicyUnavailable
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.serve.auth import Keys
 from vlagents_ray.serve.engine import Engine
+from vlagents_ray.serve.keyfile import new_key
 from vlagents_ray.serve.stream import StreamDoor
 from vlagents_ray.wire.frames import decode_reply, encode_request
 from vlagents_ray.wire.messages import STREAM_BYTES, Limits, Reply, Request
@@ -197,3 +200,23 @@ def test_a_door_takes_a_free_port_of_those_it_may() -> None:
         assert port < door.address.port <= port + 20
         door.close()
     engine.close()
+
+
+def test_where_there_are_keys_the_path_alone_is_not_enough(tmp_path: Path) -> None:
+    token, other = (new_key(tmp_path / "keys.json", name, apps=apps) for name, apps in (("arm", ()), ("x", ("pi0",))))
+    keys = Keys.from_file(tmp_path / "keys.json")
+    engine = Engine(Echo())
+    door = StreamDoor(engine, Limits(), "127.0.0.1", admit=lambda key: keys.check(key, "noop"))
+    door.open()
+    engine.start()
+    where = (BASE, door.address.port, door.address.path, 5)
+    for headers, status in (({}, 401), ({"x-api-key": "wrong"}, 401), ({"x-api-key": other}, 403)):
+        with pytest.raises(InvalidStatus) as refused:
+            Stream(*where, headers)
+        assert refused.value.response.status_code == status
+    client = Stream(*where, {"Authorization": f"Bearer {token}"})
+    assert ask(client, "reset").error is None
+    assert [name.partition("/")[0] for name in engine.sessions.ids()] == ["arm"]
+    client.close()
+    engine.close()
+    door.close()

@@ -2,7 +2,8 @@
 
 An HTML comment straight above a block says how it is tested. `<!-- test: serve scripted -->` runs it
 with a server of that policy in place of http://gpu-box:8000, `<!-- test -->` or no comment without
-one. Further lines of such a comment are code that is run before the block:
+one; ` with peers` at the end of either runs it with the Python that has other systems' clients.
+Further lines of such a comment are code that is run before the block:
 
     <!-- test: serve scripted
     obs = Obs(gripper=1.0) -->
@@ -20,6 +21,8 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+
+from peers import peers_python
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTED_HOST = "gpu-box:8000"
@@ -42,6 +45,7 @@ class Block:
     source: str
     server: str | None = None  # the policy that must be served meanwhile
     not_run: str | None = None  # why it is not run
+    peers: bool = False  # it is for the peers' Python
 
     def __str__(self) -> str:
         return f"line-{self.line}"
@@ -81,19 +85,21 @@ def _block(language: str, above: list[tuple[int, str]], code: list[tuple[int, st
         stripped = [(number, line.replace("<!--", "").replace("-->", "")) for number, line in above]
         mark, setup = stripped[0][1].strip(), stripped[1:]
     kind, _, rest = mark.partition(":")
-    server, reason = None, None
+    server, reason, peers = None, None, False
     if kind == "not run" and rest.strip():
         reason = rest.strip()
-    elif match := re.fullmatch(r"test(?:: serve (\S+))?", mark):
-        server = match[1]
+    elif match := re.fullmatch(r"test(?:: serve (\S+))?( with peers)?", mark):
+        server, peers = match[1], match[2] is not None
     else:
-        raise ValueError(f"line {above[0][0]}: {mark!r}, want 'test', 'test: serve POLICY' or 'not run: REASON'")
+        raise ValueError(
+            f"line {above[0][0]}: {mark!r}, want 'test', 'test: serve POLICY' ('with peers') or 'not run: REASON'"
+        )
     if language == "console":  # what begins with a prompt was typed, the rest is output
         code = [(number, line[2:]) for number, line in code if line.startswith("$ ")]
     kept = dict([*setup, *code])
     first = code[0][0] if code else above[0][0] if above else 0
     source = "\n".join(kept.get(number, "") for number in range(1, max(kept, default=0) + 1))
-    return Block(language, first, source, server, reason)
+    return Block(language, first, source, server, reason, peers)
 
 
 def run(block: Block, cwd: Path, host: str = DOCUMENTED_HOST) -> None:
@@ -101,7 +107,8 @@ def run(block: Block, cwd: Path, host: str = DOCUMENTED_HOST) -> None:
     source = block.source.replace(DOCUMENTED_HOST, host) + "\n"
     script = cwd / ("README.py" if block.language in PYTHON else "README.sh")
     script.write_text(source)
-    command = [sys.executable, str(script)] if block.language in PYTHON else ["bash", "-eu", "-o", "pipefail", script]
+    python = str(peers_python()) if block.peers else sys.executable
+    command = [python, str(script)] if block.language in PYTHON else ["bash", "-eu", "-o", "pipefail", script]
     done = subprocess.run(
         command, check=False, cwd=cwd, env=ENV, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=RUN_S
     )

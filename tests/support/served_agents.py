@@ -126,3 +126,50 @@ class Ticking(Agent):
         time.sleep(0.2)
         rows = np.arange(50.0)
         return Act(np.stack([np.full(50, obs.state["tick"][0]), rows], 1).astype(np.float32), info={"pid": os.getpid()})
+
+
+class Witness(Agent):
+    """An action that tells what was seen: a pixel of the first camera, the first state, the gripper, the length of the
+    instruction, and which act of its session it is. Two rows, the second with the next number."""
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
+        self.instruction, self.acts = instruction or "", 0
+        return {"instruction": instruction, "options": dict(kwargs)}
+
+    def act(self, obs: Obs) -> Act:
+        time.sleep(obs.info.get("sleep_s", 0.0))
+        self.acts += 1
+        image = next(iter(obs.cameras.values()), np.zeros((1, 1, 3), np.uint8))
+        joints = next(iter(obs.state.values()), np.zeros(1))
+        seen = [image[0, -1, 0], joints[0], -1.0 if obs.gripper is None else obs.gripper, len(self.instruction)]
+        info = {"cameras": sorted(obs.cameras), "state": sorted(obs.state), "pid": os.getpid()}
+        return Act(np.array([[*seen, self.acts], [*seen, self.acts + 1]], np.float32), info=info)
+
+
+class Mirror(Agent):
+    """Says whose observation it was: a pixel, the first state's sum, acts so far, the instruction's number.
+
+    A white picture takes it two seconds.
+    """
+
+    contract = Contract(instruction=True, action=ActionSpec(dim=7, gripper_open=1.0, gripper_closed=0.0))
+
+    def __init__(self, chunk: int = 1, slow_s: float = 0.0) -> None:
+        self.chunk = chunk
+        self.slow_s = slow_s
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
+        self.number, self.acts = float(instruction.split()[-1]), 0
+        return {"pid": os.getpid()}
+
+    def act(self, obs: Obs) -> Act:
+        if obs.info.get("unnorm_key") == "broken":
+            raise RuntimeError("/no/path/of/ours")
+        pixel = float(obs.cameras["front"][-1, -1, -1])
+        time.sleep(2.0 if obs.cameras["front"].min() == 255 else self.slow_s)
+        self.acts += 1
+        total = float(next(iter(obs.state.values())).sum()) if obs.state else 0.0
+        row = [pixel, total, self.acts, self.number, 0.0, 0.0, 0.0 if obs.gripper is None else obs.gripper]
+        rows = np.tile(np.array(row, np.float32), (self.chunk, 1))
+        rows[:, 4] = np.arange(self.chunk)
+        return Act(rows)

@@ -13,12 +13,14 @@ import typer
 from rich.table import Table
 
 from vlagents_ray.cli.bench import bench
-from vlagents_ray.cli.console import err, out
 from vlagents_ray.cli.console import errors as _errors
+from vlagents_ray.cli.console import out
+from vlagents_ray.cli.keys import keys as keys_app
 from vlagents_ray.cli.settings import parse_settings
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.serve.cluster import running_server
-from vlagents_ray.serve.files import listens_at, read_deployment
+from vlagents_ray.serve.files import listens_at, read_deployment, with_dialect
+from vlagents_ray.serve.tls import Tls
 
 if TYPE_CHECKING:
     from ray.serve.schema import ServeDeploySchema
@@ -48,18 +50,36 @@ def serve(
     serve_set: Annotated[
         list[str], typer.Option("--serve-set", metavar="KEY=VALUE", help="A setting of the server: batch.max_size=8.")
     ] = [],  # noqa: B006
+    vlagents_port: Annotated[
+        int | None, typer.Option(min=1, max=65535, help="Let clients of the package vlagents in at this port, too.")
+    ] = None,
     address: Address = None,
+    keys: Annotated[
+        Path | None,
+        typer.Option(help="File of the API keys (`vlagents-ray keys new`); default: VLAGENTS_RAY_KEYS_FILE or _KEYS."),
+    ] = None,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Let in whoever reaches the port, without keys.")
+    ] = False,
+    tls_cert: Annotated[Path | None, typer.Option(help="Certificate in PEM: serve https:// and wss://.")] = None,
+    tls_key: Annotated[Path | None, typer.Option(help="Its key, in PEM.")] = None,
+    tls_client_ca: Annotated[
+        Path | None, typer.Option(help="Who signs the certificates that clients must show, in PEM.")
+    ] = None,
 ) -> None:
     """Serve a policy until Ctrl-C."""
     with _errors():
         config = read_deployment(source, _server_args(settings, serve_set))
+        if vlagents_port is not None:
+            config = with_dialect(config, "vlagents", {"port": vlagents_port})
         stated_host, stated_port = listens_at(config)
         host, port = host or stated_host, port or stated_port
-        with running_server(config, host=host, port=port, address=address, show_logs=True) as server:
+        access: dict[str, Any] = {
+            "keys_file": keys, "insecure": insecure, "tls": _tls(tls_cert, tls_key, tls_client_ca)
+        }  # fmt: skip
+        with running_server(config, host=host, port=port, address=address, show_logs=True, **access) as server:
             for name, url in server.apps.items():
                 out.print(f"serving [bold]{name}[/] at {url}  (docs: {url}/docs, Ctrl-C stops)", highlight=False)
-            if host not in ("127.0.0.1", "localhost", "::1"):
-                err.print(f"[yellow]{host} lets anyone who reaches this port command the policy[/]", highlight=False)
             with contextlib.suppress(KeyboardInterrupt):
                 threading.Event().wait()
 
@@ -158,6 +178,7 @@ def demo(
 
 
 app.add_typer(bench, name="bench")
+app.add_typer(keys_app, name="keys")
 
 
 @app.command()
@@ -196,6 +217,14 @@ def doctor(port: Annotated[int, typer.Option(help="The port that a server would 
     from vlagents_ray.cli.doctor import run
 
     raise typer.Exit(run(out, port))
+
+
+def _tls(certificate: Path | None, key: Path | None, client_ca: Path | None) -> Tls | None:
+    if certificate is None and key is None and client_ca is None:
+        return None
+    if certificate is None or key is None:
+        raise ConfigError("TLS: give both --tls-cert and --tls-key")
+    return Tls(certificate, key, client_ca)
 
 
 def _server_args(settings: list[str], serve_set: list[str]) -> dict[str, Any]:

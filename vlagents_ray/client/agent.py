@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections import deque
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from vlagents_ray.client.connection import Connection
+from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.link import CodecChoice, Link, Wish
 from vlagents_ray.client.session import Episode, Session, copied, persist
 from vlagents_ray.client.ways import TransportName, choose
@@ -41,6 +43,10 @@ class RemoteAgent(Agent):
     "raw", "lossless" (PNG), "jpeg" or an `ImageCodec` with quality and subsampling force one.
     `agent.codec` says which is used, `agent.link` what was measured. Shared memory, plasma and the
     handle carry raw pixels.
+    `api_key` is for a server that asks for one; by default it is what `VLAGENTS_RAY_API_KEY` holds. With
+    `https://` and `wss://`, `ca` is a PEM file of those who may have signed the server's certificate, where that
+    is not one of the system's, and `certificate` the files of this client's own certificate and its key, for a
+    server that wants to see one.
     `rank` is the class of its requests: a "robot" goes before a "simulation".
 
     `connect_timeout_s` is how long `initialize` (called by the first `reset`) waits for a server
@@ -64,11 +70,14 @@ class RemoteAgent(Agent):
         codec: ImageCodec | Wish = "auto",
         rank: RankName = "robot",
         resume: bool = True,
+        api_key: str | None = None,
+        ca: str | os.PathLike[str] | None = None,
+        certificate: tuple[str | os.PathLike[str], str | os.PathLike[str]] | None = None,
     ) -> None:
         if rank not in RANKS:
             raise ConfigError(f"rank: got {rank!r}, want one of {list(RANKS)}")
         choice = CodecChoice(codec)
-        way = choose(url, transport, choice)
+        way = choose(url, transport, choice, Credentials(api_key, ca, certificate))
         self._join(Connection(url, way, choice, timeout_s, connect_timeout_s), rank, resume)
 
     def _join(self, connection: Connection, rank: RankName, resume: bool) -> None:

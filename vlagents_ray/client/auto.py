@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 from urllib.parse import urlsplit
 
+from vlagents_ray.client.credentials import NOBODY, Credentials
 from vlagents_ray.client.handle import HandleTransport
 from vlagents_ray.client.http import HttpTransport
 from vlagents_ray.client.link import CodecChoice
@@ -26,7 +27,10 @@ class AutoTransport:
     reaches a replica on this node whose socket is in another network namespace.
     """
 
-    def __init__(self, url: str, codec: CodecChoice, *, only_shm: bool = False) -> None:
+    def __init__(
+        self, url: str, codec: CodecChoice, credentials: Credentials = NOBODY, *, only_shm: bool = False
+    ) -> None:
+        self._credentials = credentials
         self._url = url
         self._codec = codec
         self._only_shm = only_shm
@@ -47,8 +51,12 @@ class AutoTransport:
         deadline = time.monotonic() + timeout_s
         parts = urlsplit(self._url)
         inside = HandleTransport(parts.netloc, must_be_near=self._only_shm) if parts.scheme == "serve" else None
-        door = inside or HttpTransport(self._url, self._codec, boot_id())
-        metadata = door.connect(timeout_s)
+        door = inside or HttpTransport(self._url, self._codec, self._credentials, boot_id())
+        try:
+            metadata = door.connect(timeout_s)
+        except BaseException:
+            door.close()
+            raise
         left_s = max(1.0, deadline - time.monotonic())
         near = self._near(metadata.get("local"), left_s)
         if near is not None or inside is None:
@@ -58,7 +66,7 @@ class AutoTransport:
         elif inside is not None:
             self._chosen = self._channel(inside, metadata, left_s) or inside
         else:
-            self._chosen = WebSocketTransport(self._url, self._codec)
+            self._chosen = WebSocketTransport(self._url, self._codec, self._credentials)
             self._chosen.connect(left_s)
         return metadata
 
@@ -87,7 +95,7 @@ class AutoTransport:
             if self._only_shm:
                 raise ConfigError(f"{self._url}: transport 'shm' needs the policy on this machine; it is on another")
             return None
-        transport = ShmTransport(local)
+        transport = ShmTransport(local, self._credentials)
         try:
             transport.connect(timeout_s)
         except PolicyUnavailable:  # another user's, or in a container with a network of its own

@@ -13,13 +13,16 @@ from collections.abc import Sequence
 from typing import Any
 from urllib.parse import SplitResult, urlsplit
 
+from vlagents_ray.client.credentials import KEY_VARIABLE, NOBODY, Credentials, tls_failure
 from vlagents_ray.client.link import CodecChoice
 from vlagents_ray.errors import (
     ConfigError,
     ConnectionLost,
     DeadlineExceeded,
+    Forbidden,
     MessageTooLarge,
     PolicyUnavailable,
+    Unauthorized,
     UnknownApp,
     VLAgentsError,
 )
@@ -35,9 +38,10 @@ class HttpTransport:
     name = "http"
     holds_sessions = False
 
-    def __init__(self, url: str, codec: CodecChoice, machine: str = "") -> None:
+    def __init__(self, url: str, codec: CodecChoice, credentials: Credentials = NOBODY, machine: str = "") -> None:
         """With `machine` (see `MACHINE_HEADER`) the metadata is the least loaded replica's there, if there is one."""
         self._machine = machine
+        self._credentials = credentials
         self._url = http_url(url)
         self._codec = codec
         self._session = uuid.uuid4().hex
@@ -70,7 +74,7 @@ class HttpTransport:
         headers = {SESSION_HEADER: self._session} | ({MACHINE_HEADER: self._machine} if self._machine else {})
         status, kind, body = self._exchange("GET", "/v1/metadata", None, headers, timeout_s)
         if status != 200:
-            raise _refusal(status, kind, body)
+            raise refusal(status, kind, body)
         metadata = _json(body)
         if not isinstance(metadata, dict) or "protocol" not in metadata:
             raise ConfigError(f"{self._url.geturl()}: answers, but is no vlagents_ray server ({body[:80]!r})")
@@ -89,14 +93,14 @@ class HttpTransport:
         status, kind, body = self._exchange("POST", f"/v1/{requests[0].op}", frame, headers, timeout_s)
         if status == 200:
             return decode_replies(body)
-        refusal = _refusal(status, kind, body)
-        return [Reply(request.request_id, error=refusal) for request in requests]
+        refused = refusal(status, kind, body)
+        return [Reply(request.request_id, error=refused) for request in requests]
 
     def _probe(self, probe: bytes, timeout_s: float) -> None:
         headers = {SESSION_HEADER: self._session, "content-type": "application/octet-stream"}
         status, kind, body = self._exchange("POST", "/v1/probe", probe, headers, timeout_s)
         if status != 200:
-            raise _refusal(status, kind, body)
+            raise refusal(status, kind, body)
 
     def close(self) -> None:
         """Close the connection; the next one may be to another replica, over another link."""
@@ -113,12 +117,15 @@ class HttpTransport:
     ) -> tuple[int, str, bytes]:
         connection = self._open(timeout_s)
         try:
-            connection.request(method, self._url.path.rstrip("/") + path, body, headers)
+            connection.request(method, self._url.path.rstrip("/") + path, body, headers | self._credentials.headers)
             answer = connection.getresponse()
             return answer.status, answer.headers.get("content-type", ""), answer.read()
         except TimeoutError as error:
             self._hang_up()
             raise DeadlineExceeded(f"{self._url.geturl()}: no answer within {timeout_s:g} s") from error
+        except ssl.SSLError as error:  # with TLS 1.3 the server looks at a client's certificate only now
+            self._hang_up()
+            raise tls_failure(self._url.geturl(), error) from error
         except (OSError, http.client.HTTPException) as error:
             self._hang_up()
             raise ConnectionLost(f"{self._url.geturl()}: {type(error).__name__}: {error}") from error
@@ -127,13 +134,17 @@ class HttpTransport:
         if self._connection is not None and _closed_by_peer(self._connection.sock):
             self._hang_up()
         if self._connection is None:
-            secure = self._url.scheme == "https"
-            cls = http.client.HTTPSConnection if secure else http.client.HTTPConnection
-            connection = cls(self._url.hostname or "", self._url.port, timeout=timeout_s)
+            host, port = self._url.hostname or "", self._url.port
+            context = self._credentials.context(self._url.geturl())
+            connection = (
+                http.client.HTTPConnection(host, port, timeout=timeout_s)
+                if context is None
+                else http.client.HTTPSConnection(host, port, timeout=timeout_s, context=context)
+            )
             try:
                 connection.connect()
             except ssl.SSLError as error:
-                raise PolicyUnavailable(f"{self._url.geturl()}: TLS failed ({error})") from error
+                raise tls_failure(self._url.geturl(), error) from error
             except OSError as error:
                 raise PolicyUnavailable(f"{self._url.geturl()}: cannot connect ({error}); is it running?") from error
             connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -160,12 +171,17 @@ def _closed_by_peer(sock: socket.socket | None) -> bool:
     return bool(poller.poll(0))
 
 
-def _refusal(status: int, kind: str, body: bytes) -> VLAgentsError:
+def refusal(status: int, kind: str, body: bytes) -> VLAgentsError:
+    """What the server, or a proxy before it, meant by an answer that is none."""
     if "json" in kind and isinstance(document := _json(body), dict):
         return read_error(document)
     text = body[:200].decode(errors="replace").strip()
     if status == 413:
         return MessageTooLarge(f"a proxy takes no body as large ({text}); raise its limit, or send JPEG")
+    if status in (401, 403):  # without a document, where a WebSocket's refusal cannot bring one
+        return (Unauthorized if status == 401 else Forbidden)(
+            f"the server refuses this API key, or that there is none (HTTP {status}); set api_key or {KEY_VARIABLE}"
+        )
     if status == 404:
         return UnknownApp(f"no application at this path ({text}); check the URL")
     if status == 500 or status in (502, 503, 504):  # the proxy's own: no replica is ready

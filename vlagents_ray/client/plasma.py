@@ -12,10 +12,10 @@ from typing import Any
 from vlagents_ray.client.handle import HandleTransport
 from vlagents_ray.client.shm import ShmTransport
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.wire.arrays import Buffer
 from vlagents_ray.wire.codecs import RAW
 from vlagents_ray.wire.frames import request_parts
 from vlagents_ray.wire.messages import LocalAddress, PlasmaAddress, Reply, Request
-from vlagents_ray.wire.tree import Buffer
 
 _CHUNK = 2**20  # bytes; Ray copies no longer ones in the calling thread
 _WRITE_MS = 1000  # the channel is free when a frame is written; if not, something is wrong with it

@@ -9,6 +9,7 @@ import mmap
 import os
 import select
 import socket
+import struct
 import sys
 import time
 from collections.abc import Sequence
@@ -17,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from vlagents_ray.client.credentials import NOBODY, Credentials
 from vlagents_ray.client.transport import is_answer
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable
 from vlagents_ray.wire import compact, cores
@@ -51,7 +53,8 @@ class ShmTransport:
     name = "shm"
     holds_sessions = True
 
-    def __init__(self, local: dict[str, Any]) -> None:
+    def __init__(self, local: dict[str, Any], credentials: Credentials = NOBODY) -> None:
+        self._credentials = credentials
         self._address = LocalAddress(**local)
         self._socket: socket.socket | None = None
         self._memories: list[_Memory] = []
@@ -166,12 +169,21 @@ class ShmTransport:
             connection.settimeout(timeout_s)
             try:
                 connection.connect(self.server())
+                if self._address.keyed:
+                    self._show_key(connection)
             except OSError as error:
                 connection.close()
                 raise PolicyUnavailable(f"{self.name}: the server's socket does not answer ({error})") from error
             connection.setblocking(False)
             self._socket = connection
         return self._socket
+
+    def _show_key(self, connection: socket.socket) -> None:
+        """To the server, and nobody else: the name of one that has ended is free for whoever takes it."""
+        peer = connection.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, struct.calcsize("3i"))
+        if struct.unpack("3i", peer)[1] != os.getuid():
+            raise PermissionError("it is another user's")
+        connection.send((self._credentials.api_key or "-").encode())
 
     def _memory(self, length: int) -> tuple[_Memory, int | None]:
         """Memory that holds `length` bytes and is free, with its descriptor if the server has yet to get it."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import time
+from collections.abc import Mapping
 from urllib.parse import SplitResult
 
 from websockets.client import ClientProtocol
@@ -18,7 +19,9 @@ _READ_BYTES = 256 * 1024
 class Stream:
     """An open connection. No thread answers pings: it is for servers that leave it to the kernel to ask."""
 
-    def __init__(self, base: SplitResult, port: int, path: str, timeout_s: float) -> None:
+    def __init__(
+        self, base: SplitResult, port: int, path: str, timeout_s: float, headers: Mapping[str, str] | None = None
+    ) -> None:
         """To `port` on the host of `base`; `OSError` or `InvalidHandshake` if nobody suitable answers."""
         host = base.hostname or ""
         deadline = time.monotonic() + timeout_s
@@ -30,7 +33,9 @@ class Stream:
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-            self._protocol.send_request(self._protocol.connect())
+            request = self._protocol.connect()
+            request.headers.update(headers or {})
+            self._protocol.send_request(request)
             self._flush(deadline)
             while self._protocol.state is State.CONNECTING:
                 self._read(deadline)

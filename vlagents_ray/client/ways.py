@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Literal, get_args
 from urllib.parse import urlsplit
 
+from vlagents_ray.client.credentials import NOBODY, Credentials
 from vlagents_ray.client.http import http_url
 from vlagents_ray.client.link import CodecChoice
 from vlagents_ray.errors import ConfigError
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 TransportName = Literal["auto", "shm", "plasma", "websocket", "http", "handle"]
 
 
-def choose(url: str, transport: str, codec: CodecChoice) -> Transport:
+def choose(url: str, transport: str, codec: CodecChoice, credentials: Credentials = NOBODY) -> Transport:
     """The transport for a URL; `ConfigError` if they do not go together."""
     scheme = urlsplit(url).scheme
     if transport not in get_args(TransportName):
@@ -36,13 +37,13 @@ def choose(url: str, transport: str, codec: CodecChoice) -> Transport:
     if transport == "http":
         from vlagents_ray.client.http import HttpTransport
 
-        return HttpTransport(url, codec)
+        return HttpTransport(url, codec, credentials)
     if transport == "websocket":
         from vlagents_ray.client.websocket import WebSocketTransport
 
-        return WebSocketTransport(url, codec)
+        return WebSocketTransport(url, codec, credentials)
     if not inside:
         http_url(url)  # raises for what is no URL of ours, before anything is tried
     from vlagents_ray.client.auto import AutoTransport
 
-    return AutoTransport(url, codec, only_shm=transport == "shm")
+    return AutoTransport(url, codec, credentials, only_shm=transport == "shm")

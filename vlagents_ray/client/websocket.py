@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import ssl
 import time
 from collections.abc import Sequence
 from typing import Any, Protocol
@@ -15,7 +16,8 @@ from typing import Any, Protocol
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 from websockets.sync.client import connect
 
-from vlagents_ray.client.http import HttpTransport, http_url
+from vlagents_ray.client.credentials import NOBODY, Credentials, tls_failure
+from vlagents_ray.client.http import HttpTransport, http_url, refusal
 from vlagents_ray.client.link import CodecChoice
 from vlagents_ray.client.stream import Stream
 from vlagents_ray.client.transport import is_answer
@@ -40,10 +42,18 @@ class _Socket(Protocol):
 class _Proxied:
     """A connection through the proxy, whose pings a thread answers."""
 
-    def __init__(self, url: str, timeout_s: float) -> None:
+    def __init__(self, url: str, credentials: Credentials, timeout_s: float) -> None:
         self._open = contextlib.ExitStack()
         self._connection = self._open.enter_context(
-            connect(url, open_timeout=timeout_s, close_timeout=1, compression=None, max_size=None)
+            connect(
+                url,
+                open_timeout=timeout_s,
+                close_timeout=1,
+                compression=None,
+                max_size=None,
+                ssl=credentials.context(url),
+                additional_headers=credentials.headers,
+            )
         )
         self.close = self._open.close
 
@@ -60,7 +70,8 @@ class WebSocketTransport:
     name = "websocket"
     holds_sessions = True
 
-    def __init__(self, url: str, codec: CodecChoice) -> None:
+    def __init__(self, url: str, codec: CodecChoice, credentials: Credentials = NOBODY) -> None:
+        self._credentials = credentials
         base = http_url(url)
         scheme = "wss" if base.scheme == "https" else "ws"
         self._base = base
@@ -73,7 +84,7 @@ class WebSocketTransport:
     def connect(self, timeout_s: float) -> dict[str, Any]:
         """The server's metadata, once it answers and has accepted the stream."""
         deadline = time.monotonic() + timeout_s
-        door = HttpTransport(self._base.geturl(), self._codec, SERVERS_MACHINE)
+        door = HttpTransport(self._base.geturl(), self._codec, self._credentials, SERVERS_MACHINE)
         try:
             metadata = door.connect(timeout_s)
         finally:
@@ -139,7 +150,8 @@ class WebSocketTransport:
         if self._address is None or self._unreachable:
             return None
         try:
-            return Stream(self._base, self._address.port, self._address.path, min(timeout_s, _DIRECT_S))
+            limit_s = min(timeout_s, _DIRECT_S)
+            return Stream(self._base, self._address.port, self._address.path, limit_s, self._credentials.headers)
         except TimeoutError:  # a firewall swallows the question: once is enough
             self._unreachable = True
         except (OSError, InvalidHandshake) as error:
@@ -148,8 +160,13 @@ class WebSocketTransport:
 
     def _proxied(self, timeout_s: float) -> _Proxied:
         try:
-            return _Proxied(self._url, timeout_s)
+            return _Proxied(self._url, self._credentials, timeout_s)
+        except ssl.SSLError as error:
+            raise tls_failure(self._url, error) from error
         except InvalidStatus as error:
+            if error.response.status_code in (401, 403, 429):
+                kind = error.response.headers.get("content-type", "")
+                raise refusal(error.response.status_code, kind, bytes(error.response.body or b"")) from error
             raise PolicyUnavailable(f"{self._url}: refused with HTTP {error.response.status_code}") from error
         except (OSError, InvalidHandshake, TimeoutError) as error:
             raise PolicyUnavailable(f"{self._url}: cannot connect ({error}); is it running?") from error

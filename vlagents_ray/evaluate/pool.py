@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -12,6 +13,7 @@ from typing import Any
 import ray
 from ray.exceptions import RayActorError, RayError
 
+from vlagents_ray.client.credentials import KEY_VARIABLE
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.evaluate.config import EvalConfig
 from vlagents_ray.evaluate.episode import Phase
@@ -223,5 +225,7 @@ def _lost(reason: str, stack: str = "") -> Report:
 
 def _runtime_env(config: EvalConfig) -> dict[str, Any]:
     given: dict[str, Any] = dict(config.runtime_env)
-    threads = dict.fromkeys(THREAD_VARIABLES, str(config.threads))
-    return given | {"env_vars": threads | given.get("env_vars", {})}
+    variables = dict.fromkeys(THREAD_VARIABLES, str(config.threads))
+    if key := os.environ.get(KEY_VARIABLE):  # for the policy's server, on nodes that do not know it
+        variables[KEY_VARIABLE] = key
+    return given | {"env_vars": variables | given.get("env_vars", {})}

@@ -10,17 +10,19 @@ from typing import Any
 from ray import serve
 from ray.serve import Application
 
-from vlagents_ray.serve.config import ServerArgs
+from vlagents_ray.serve.config import GATEWAY, POLICY, ServerArgs
 from vlagents_ray.serve.deployment import PolicyReplica
+from vlagents_ray.serve.gateways.deployment import Gateway
 
-DEPLOYMENT = "Policy"
-_OUTSIDE = {"replicas", "autoscaling", "resources"}  # a replica does not know them, nor restarts when they change
+_HEAD = "node:__internal_head__"  # a resource that Ray gives to the head node of any cluster
+# A replica does not know them, nor restarts when they change.
+_OUTSIDE: Any = {"replicas": True, "autoscaling": True, "resources": True, "dialects": {"gr00t", "vlagents"}}
 
 
 def build(args: ServerArgs) -> Application:
     """One policy as a Serve application. Ray passes the file's `args`, checked against `ServerArgs`."""
     options: dict[str, Any] = {
-        "name": DEPLOYMENT,
+        "name": POLICY,
         # A WebSocket session counts as a request as long as it lasts, so this must hold all sessions
         # besides two batches; it protects nothing, since the batch queue orders what waits.
         "max_ongoing_requests": args.sessions.limit + 2 * args.batch.max_size,
@@ -47,4 +49,20 @@ def build(args: ServerArgs) -> Application:
     replica = serve.ingress()(PolicyReplica)
     with warnings.catch_warnings():  # `metrics_interval_s`, whose successor is one variable for a whole cluster
         warnings.simplefilter("ignore", DeprecationWarning)
-        return serve.deployment(**options)(replica).bind(args.model_dump(mode="json", exclude=_OUTSIDE))
+        policy = serve.deployment(**options)(replica)
+    settings = args.model_dump(mode="json", exclude=_OUTSIDE)
+    return policy.bind(settings, _gateway(args)) if args.dialects.gateways() else policy.bind(settings)
+
+
+def _gateway(args: ServerArgs) -> Application:
+    """The process with the doors that have a port of their own, where clients will look for them: on the head node."""
+    options: dict[str, Any] = {
+        "name": GATEWAY,
+        "num_replicas": 1,
+        "graceful_shutdown_timeout_s": 10,
+        "graceful_shutdown_wait_loop_s": 0.1,  # no request waits here: its clients are behind its doors
+        "health_check_period_s": 5,
+        "ray_actor_options": {"num_cpus": 0, "resources": {_HEAD: 0.001}},
+    }
+    settings = args.model_dump(mode="json", include={"policy", "dialects", "limits", "sessions", "access"})
+    return serve.deployment(**options)(Gateway).bind(settings)

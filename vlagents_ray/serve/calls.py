@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from vlagents_ray.errors import DeadlineExceeded, NotReset, UnknownSession, VLAgentsError
+from vlagents_ray.serve.auth import Caller, current_caller
 from vlagents_ray.serve.batching import Ticket
 from vlagents_ray.wire.messages import Reply, Request
 
@@ -21,16 +22,27 @@ Done = Callable[[list[Reply]], None]
 class Sender:
     """Whoever sends requests: a connection, with which its sessions end, or a caller without one.
 
-    A request names its session, or means `session_id`, the sender's own.
+    A request names its session, or means `session_id`, the sender's own. Where the server has keys, the sessions
+    of one are out of reach for all others: the key's name is part of what the engine calls them.
     """
 
-    def __init__(self, engine: Engine, transport: str, session_id: str = "", *, connected: bool = True) -> None:
+    def __init__(
+        self,
+        engine: Engine,
+        transport: str,
+        session_id: str = "",
+        *,
+        connected: bool = True,
+        caller: Caller | None = None,
+    ) -> None:
+        """`caller` is whose key it is, by default that of the task that this is called in."""
         self._engine = engine
         self._transport = transport
         self._session_id = session_id or uuid.uuid4().hex
         self._owner = uuid.uuid4().hex if connected else ""
         self._sessions: set[str] = set()
         self._told = False  # to connect anew, and that its sessions follow
+        self._caller = caller or current_caller()
 
     def send(self, items: Sequence[Request | Reply], done: Done) -> Round:
         """Queue the requests of a frame. `done` gets all replies at once, in order, on whatever thread is last.
@@ -44,6 +56,7 @@ class Sender:
                 round_.put(index, item)
                 continue
             try:
+                self._admit(item, index)
                 ready.append(self._ticket(round_, index, item))
             except VLAgentsError as error:
                 strays = self._engine.strays if isinstance(error, UnknownSession) and item.op == "act" else None
@@ -84,7 +97,16 @@ class Sender:
         return self._engine.draining or self._told
 
     def _session(self, request: Request) -> str:
-        return request.session or self._session_id
+        session_id = request.session or self._session_id
+        return session_id if self._caller is None else f"{self._caller.name}/{session_id}"
+
+    def _admit(self, request: Request, index: int) -> None:
+        """What the caller's key says to it. The first of an HTTP request was counted by the guard; to close is free."""
+        if self._caller is None:
+            return
+        self._caller.admit(free=request.op == "close" or (index == 0 and not self._owner))
+        if self._caller.rank == "simulation":
+            request.rank = "simulation"
 
     def _ticket(self, round_: Round, index: int, request: Request) -> Ticket:
         session_id = self._session(request)
@@ -97,6 +119,7 @@ class Sender:
             owner=self._owner,
             turn=self._session_id,
             transport=self._transport,
+            quota=None if self._caller is None else (f"{self._caller.name}/", self._caller.sessions),
         )
         if self._owner:
             if request.op == "close":

@@ -1,19 +1,18 @@
 """Start Ray and Serve here, or use a running cluster, and serve a deployment as long as it is wanted.
 
 A server of our own gets HAProxy in front of its replicas where its binary is installed, with files
-and ports that no other server on the machine uses.
+and ports that no other server on the machine uses. It alone faces the network, if anything does.
 """
 
 from __future__ import annotations
 
 import contextlib
-import json
 import os
-import tempfile
+import ssl
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,15 +20,13 @@ from typing import Any
 from ray.serve.schema import ServeDeploySchema
 
 from vlagents_ray.errors import ConfigError, PolicyUnavailable
-from vlagents_ray.serve.haproxy import (
-    behind_haproxy,
-    haproxy_available,
-    ingress_environment,
-    is_foreign,
-    wait_for_haproxy,
-)
-from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK, free_port, is_free
-from vlagents_ray.serve.reaper import MARK, reaped
+from vlagents_ray.serve.auth import require_access
+from vlagents_ray.serve.config import AccessArgs
+from vlagents_ray.serve.files import IMPORT_PATH, with_gateways_at
+from vlagents_ray.serve.haproxy import Front, wait_for_haproxy
+from vlagents_ray.serve.own_ray import own_ray
+from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK, free_port
+from vlagents_ray.serve.tls import Tls
 
 __all__ = ["Server", "free_port", "running_server"]
 
@@ -40,7 +37,7 @@ _SHUTDOWN_S = 30.0
 class Server:
     """A running server."""
 
-    url: str  # http://host:port
+    url: str  # http(s)://host:port
     apps: Mapping[str, str] = field(default_factory=dict)  # application -> its URL
 
 
@@ -54,21 +51,32 @@ def running_server(
     num_cpus: int | None = None,
     show_logs: bool = False,
     timeout_s: float = 600.0,
+    keys_file: Path | None = None,
+    insecure: bool = False,
+    tls: Tls | None = None,
 ) -> Iterator[Server]:
     """Serve `config` for the length of the context, and take down on exit what was started here.
 
     `port` 0 takes a free one. `address` names a running Ray cluster (or "auto"); otherwise a local
     one is started, unless this process is connected already.
+    `keys_file` and `insecure` stand for `access` in the applications' args; unless `host` is a loopback
+    address, one of the two must be given somewhere.
     Raises `ConfigError` when the deployment fails, `PolicyUnavailable` when it takes too long.
     """
-    port = port or free_port(EVERYWHERE if is_foreign(host) else host)
+    config = with_gateways_at(config, host)
+    config = _access(config, keys_file, insecure)
+    if address is None:  # else each replica says so, where it runs
+        _require_access(config, host, insecure)
+    if tls is not None:
+        tls.check()
+    port = port or free_port(host)
     with contextlib.ExitStack() as stack:
-        stack.enter_context(_ray(address, host, port, num_cpus, show_logs))
+        http = stack.enter_context(_ray(address, host, port, tls, num_cpus, show_logs))
         from ray import serve
         from ray.serve._private.api import serve_start
 
         client = serve_start(
-            http_options={"host": behind_haproxy(host, port) if address is None else host, "port": port},
+            http_options=http,
             proxy_location="HeadOnly" if address is None else "EveryNode",
         )
         if running := sorted(serve.status().applications):
@@ -78,64 +86,88 @@ def running_server(
             )
         stack.callback(_shutdown, client)
         client.deploy_apps(config)
-        url = f"http://{LOOPBACK if host == EVERYWHERE else host}:{port}"
-        apps = {app.name: url + (app.route_prefix or "").rstrip("/") for app in config.applications}
+        url = f"{'http' if tls is None else 'https'}://{LOOPBACK if host == EVERYWHERE else host}:{port}"
+        paths = {app.name: (app.route_prefix or "").rstrip("/") for app in config.applications}
         deadline = time.monotonic() + timeout_s
-        _wait(serve, apps, deadline)
+        inside = _inside(http)
+        _wait(serve, {name: inside + path for name, path in paths.items()}, _our_apps(config), deadline)
         if address is None and (stats_port := os.environ.get("RAY_SERVE_HAPROXY_STATS_PORT")):
-            wait_for_haproxy(serve, apps, int(stats_port), deadline)
-        yield Server(url, apps)
+            wait_for_haproxy(serve, paths, int(stats_port), deadline)
+        yield Server(url, {name: url + path for name, path in paths.items()})
+
+
+def _access(config: ServeDeploySchema, keys_file: Path | None, insecure: bool) -> ServeDeploySchema:
+    """The deployment with what the command line says of access, if anything."""
+    if keys_file is not None and insecure:
+        raise ConfigError("keys and insecure exclude each other; keep one")
+    if keys_file is None and not insecure:
+        return config
+    access = {"insecure": True} if keys_file is None else {"keys_file": str(keys_file.absolute())}
+    changed = config.model_copy(deep=True)
+    for app in _our_apps(changed):
+        app.args["access"] = access
+    return changed
+
+
+def _our_apps(config: ServeDeploySchema) -> list[Any]:
+    return [app for app in config.applications if app.import_path == IMPORT_PATH]
+
+
+def _require_access(config: ServeDeploySchema, host: str, insecure: bool) -> None:
+    """`ConfigError` if an application lets others in without keys, or its keys cannot be read."""
+    ours = _our_apps(config)
+    for app in config.applications:  # another one asks for no keys
+        access = AccessArgs(**app.args.get("access", {})) if app in ours else AccessArgs(insecure=insecure)
+        require_access(host, access.keys() if app in ours else None, access.insecure)
 
 
 @contextlib.contextmanager
-def _ray(address: str | None, host: str, port: int, num_cpus: int | None, show_logs: bool) -> Iterator[None]:
+def _ray(
+    address: str | None, host: str, port: int, tls: Tls | None, num_cpus: int | None, show_logs: bool
+) -> Iterator[dict[str, Any]]:
+    """A Ray; yields Serve's options for where it is to listen."""
     import ray
 
-    if ray.is_initialized():
-        yield
+    if not ray.is_initialized() and address is None:
+        with own_ray(host, port, tls=tls, num_cpus=num_cpus, show_logs=show_logs) as front:
+            yield _behind(front, host, port, tls)
         return
-    if address is not None:
-        ray.init(address=address, log_to_driver=show_logs, logging_level="WARNING")
-        try:
-            yield
-        finally:
-            ray.shutdown()
-        return
-    if not is_free(host, port) or (is_foreign(host) and not is_free(LOOPBACK, port)):
-        raise ConfigError(f"cannot listen on {host}:{port}: it is taken; choose another --port or --host")
-    with tempfile.TemporaryDirectory(prefix="vlagents-ray-") as folder, contextlib.ExitStack() as stack:
-        # Ray starts its workers with a low priority, which would make a policy wait for whatever else runs here.
-        environment = {"RAY_worker_niceness": "0", MARK: folder, HOST: host}
-        if haproxy_available():
-            environment |= ingress_environment(Path(folder), host, port)
-        stack.enter_context(reaped(Path(folder)))
-        stack.enter_context(_environment(environment))
-        ray.init(num_cpus=num_cpus, include_dashboard=False, log_to_driver=show_logs, logging_level="WARNING")
-        stack.callback(ray.shutdown)
-        yield
+    if tls is not None:
+        raise ConfigError(
+            "TLS on a cluster that runs already: end it before Serve, in the cluster's load balancer, or name "
+            "ssl_certfile and ssl_keyfile under http_options in the deployment file"
+        )
+    bare = host in (LOOPBACK, "localhost", EVERYWHERE)
+    if os.environ.get("RAY_SERVE_ENABLE_HA_PROXY") == "1" and address is None and not bare:
+        raise ConfigError(
+            f"host {host}: with HAProxy Serve would find no replica at a single address; "
+            f"use {EVERYWHERE} (or {LOOPBACK}), or leave ray.init() to this function"
+        )
+    with contextlib.ExitStack() as stack:
+        if not ray.is_initialized():
+            ray.init(address=address, log_to_driver=show_logs, logging_level="WARNING")
+            stack.callback(ray.shutdown)
+        yield {"host": host, "port": port}
 
 
-@contextlib.contextmanager
-def _environment(values: Mapping[str, str]) -> Iterator[None]:
-    """Set variables for processes started inside the context; what the user has set stays.
-
-    A process that another server's process started has inherited that server's files and ports: those
-    are replaced.
-    """
-    inherited = MARK in os.environ
-    before = {key: os.environ.get(key) for key in values if inherited or key not in os.environ}
-    os.environ.update({key: values[key] for key in before})
-    try:
-        yield
-    finally:
-        for key, value in before.items():
-            if value is None:
-                os.environ.pop(key, None)
-            else:
-                os.environ[key] = value
+def _behind(front: Front | None, host: str, port: int, tls: Tls | None) -> dict[str, Any]:
+    """Where Serve listens itself, and with which certificate."""
+    if front is not None:
+        return {"host": LOOPBACK, "port": front.inside}
+    if tls is None:
+        return {"host": host, "port": port}
+    if tls.client_ca is not None:
+        raise ConfigError("TLS with certificates of clients needs HAProxy: pip install 'vlagents-ray[serve]'")
+    return {"host": host, "port": port, "ssl_certfile": str(tls.certificate), "ssl_keyfile": str(tls.key)}
 
 
-def _wait(serve: Any, apps: Mapping[str, str], deadline: float) -> None:
+def _inside(http: Mapping[str, Any]) -> str:
+    """Serve's own URL, for a process on its node."""
+    scheme = "https" if http.get("ssl_certfile") else "http"
+    return f"{scheme}://{LOOPBACK if http['host'] == EVERYWHERE else http['host']}:{http['port']}"
+
+
+def _wait(serve: Any, apps: Mapping[str, str], ours: Sequence[Any], deadline: float) -> None:
     """Until each application runs and its door answers; raises what keeps it from doing so."""
     while True:
         status = serve.status().applications
@@ -148,8 +180,10 @@ def _wait(serve: Any, apps: Mapping[str, str], deadline: float) -> None:
         if time.monotonic() > deadline:
             raise PolicyUnavailable(f"not running in time: { {n: str(status[n].status) for n in apps if n in status} }")
         time.sleep(0.1)
+    names = {app.name for app in ours}
     for name, url in apps.items():
         while (refusal := _refusal(url)) is not None:
+            refusal = (_said_inside(serve, name) if name in names else None) or refusal
             if "did not load" in refusal:
                 raise ConfigError(f"application {name!r}: {refusal}")
             if time.monotonic() > deadline:
@@ -159,16 +193,27 @@ def _wait(serve: Any, apps: Mapping[str, str], deadline: float) -> None:
 
 def _refusal(url: str) -> str | None:
     """Why `/healthz` is not 200 yet; None when it is."""
+    unverified = ssl._create_unverified_context() if url.startswith("https") else None  # noqa: S323 - our own door
     try:
-        with urllib.request.urlopen(f"{url}/healthz", timeout=5):  # noqa: S310 - our own http URL
+        with urllib.request.urlopen(f"{url}/healthz", timeout=5, context=unverified):  # noqa: S310 - our own URL
             return None
     except urllib.error.HTTPError as error:
-        body = error.read()
-        if "problem+json" in error.headers.get("content-type", ""):
-            return str(json.loads(body)["detail"])
+        error.close()
         return f"HTTP {error.code}"
     except OSError as error:
         return str(error)
+
+
+def _said_inside(serve: Any, app: str) -> str | None:
+    """Why the policy cannot act yet, which the door tells only whoever has a key."""
+    from ray.exceptions import RayError
+    from ray.serve.exceptions import RayServeException
+
+    try:
+        refusal: str | None = serve.get_app_handle(app).refusal.remote().result(timeout_s=5)
+    except (RayError, RayServeException, TimeoutError):
+        return None
+    return refusal
 
 
 def _reason(app: Any) -> str:

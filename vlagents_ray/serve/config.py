@@ -6,7 +6,11 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from vlagents_ray.serve.auth import Keys, load_keys
+from vlagents_ray.serve.dialects.config import DialectArgs
 from vlagents_ray.wire.messages import DEFAULT_LIMITS, Limits
+
+POLICY, GATEWAY = "Policy", "Gateway"  # the deployments of an application
 
 
 class _Closed(BaseModel):
@@ -68,8 +72,14 @@ class StreamArgs(_Closed):
 
 
 class LimitArgs(_Closed):
-    """What one request may hold; anything over gets 413."""
+    """What one request may hold; anything over gets 413. And how long its client may take."""
 
+    slow_s: float = Field(
+        default=30.0,
+        gt=0,
+        description="a request's body has to be here, a WebSocket's reply to be taken in this time; else its "
+        "connection is cut",
+    )
     body_bytes: int = Field(default=DEFAULT_LIMITS.body_bytes, ge=1024)
     pixels: int = Field(default=DEFAULT_LIMITS.pixels, ge=1, description="of one image")
     cameras: int = Field(default=DEFAULT_LIMITS.cameras, ge=0)
@@ -82,7 +92,28 @@ class LimitArgs(_Closed):
 
     def limits(self) -> Limits:
         """As the decoders take them."""
-        return Limits(**self.model_dump())
+        return Limits(**self.model_dump(exclude={"slow_s"}))
+
+
+class AccessArgs(_Closed):
+    """Who may use the server: `vlagents_ray.serve.auth`."""
+
+    keys_file: str | None = Field(
+        default=None,
+        description="path of the API keys, on every node the same; unset: what VLAGENTS_RAY_KEYS_FILE or "
+        "VLAGENTS_RAY_KEYS say where the replica runs",
+    )
+    insecure: bool = Field(default=False, description="let in anybody who reaches the port from another machine")
+
+    @model_validator(mode="after")
+    def _one(self) -> AccessArgs:
+        if self.keys_file is not None and self.insecure:
+            raise ValueError("keys_file and insecure exclude each other; keep one")
+        return self
+
+    def keys(self) -> Keys | None:
+        """Those that this process knows of; None lets everybody in. `ConfigError` if they cannot be read."""
+        return None if self.insecure else load_keys(self.keys_file)
 
 
 class AutoscalingArgs(_Closed):
@@ -142,8 +173,10 @@ class ServerArgs(_Closed):
     batch: BatchArgs = BatchArgs()
     sessions: SessionArgs = SessionArgs()
     limits: LimitArgs = LimitArgs()
+    access: AccessArgs = AccessArgs()
     stream: StreamArgs = StreamArgs()
     resources: ResourceArgs = ResourceArgs()
+    dialects: DialectArgs = Field(default=DialectArgs(), description="other systems' clients that may connect")
 
     @model_validator(mode="after")
     def _one_scaling(self) -> ServerArgs:

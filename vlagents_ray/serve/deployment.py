@@ -8,27 +8,33 @@ import json
 import logging
 import os
 from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 import numpy as np
 import ray
 from ray import serve
-from starlette.applications import Starlette
+from ray.serve.config import HTTPOptions
+from starlette.types import ASGIApp
 
 from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
 from vlagents_ray.registry import policy_class
+from vlagents_ray.serve.auth import Caller, require_access
 from vlagents_ray.serve.autoscaling import SESSIONS, UTILISATION, WAITING
 from vlagents_ray.serve.balance import Balance
 from vlagents_ray.serve.calls import Sender
 from vlagents_ray.serve.config import ServerArgs
+from vlagents_ray.serve.dialects.door import House
+from vlagents_ray.serve.dialects.routes import describe, dialect_routes, require_fit
 from vlagents_ray.serve.engine import Engine
+from vlagents_ray.serve.guard import Guard
 from vlagents_ray.serve.ingress import build_ingress
 from vlagents_ray.serve.local import LocalDoor
 from vlagents_ray.serve.metrics import Exporter
 from vlagents_ray.serve.moving import Strays, export
 from vlagents_ray.serve.peers import Peers
 from vlagents_ray.serve.plasma import PlasmaDoor
-from vlagents_ray.serve.ports import HOST
+from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK
 from vlagents_ray.serve.spread import Load, Place
 from vlagents_ray.serve.stats import LoadMeter, Visit
 from vlagents_ray.serve.stream import StreamDoor
@@ -47,8 +53,12 @@ class PolicyReplica:
     others loads in its constructor, so that Serve routes to it only when it can act too.
     """
 
-    async def __init__(self, args: dict[str, Any]) -> None:  # type: ignore[misc]  # Serve awaits it
+    async def __init__(self, args: dict[str, Any], gateway: Any = None) -> None:  # type: ignore[misc]
+        """Serve awaits it. `gateway` is a handle that nobody uses: it makes the gateway a part of the application."""
         self._args = ServerArgs(**args)
+        self._app = serve.get_replica_context().app_name
+        self._keys = self._args.access.keys()
+        require_access(_http().host or EVERYWHERE, self._keys, self._args.access.insecure)
         agent = policy_class(self._args.policy).from_config(self._args.config)
         self._limits = self._args.limits.limits()
         self._engine = Engine(
@@ -59,6 +69,7 @@ class PolicyReplica:
             session_limit=self._args.sessions.limit,
             session_idle_s=self._args.sessions.idle_s,
             version=json.dumps([self._args.policy, self._args.config], sort_keys=True),
+            check=partial(require_fit, self._args.dialects),
         )
         self._load = LoadMeter(self._engine.queue)
         self._metrics = Exporter(self._engine, _tags(self._args.policy))
@@ -66,7 +77,9 @@ class PolicyReplica:
         self._peers = Peers()
         self._strays = self._engine.strays = Strays(self._engine, self._peers)
         self._balance = Balance(self._engine, self._peers, self._load_of)
-        self._local = LocalDoor(self._engine, self._limits) if hasattr(os, "memfd_create") else None
+        self._local = None
+        if hasattr(os, "memfd_create"):
+            self._local = LocalDoor(self._engine, self._limits, self._admit if self._keys else None)
         self._plasma = PlasmaDoor(self._engine, self._limits) if self._local is not None else None
         self._stream = self._stream_door()
         for door in (self._local, self._plasma, self._stream):
@@ -80,8 +93,22 @@ class PolicyReplica:
         self._balance.start()
         self._watching = asyncio.ensure_future(self._watch_for_the_end())
 
-    def __serve_build_asgi_app__(self) -> Starlette:
-        return build_ingress(self._engine, self.metadata, self._limits, self._near)
+    def __serve_build_asgi_app__(self) -> ASGIApp:
+        dialects = dialect_routes(self._args.dialects, House(self._engine, self.metadata, self._limits))
+        inside = build_ingress(self._engine, self.metadata, self._limits, self._near, dialects)
+        slow_s, idle_s = self._args.limits.slow_s, self._args.sessions.idle_s
+        return Guard(inside, self._keys, self._app, slow_s=slow_s, idle_s=idle_s)
+
+    def _admit(self, token: str | None) -> Caller | None:
+        return None if self._keys is None else self._keys.check(token, self._app)
+
+    async def refusal(self) -> str | None:
+        """Why the policy cannot act yet; None when it can. For whoever started the server."""
+        try:
+            self._engine.require_ready()
+        except VLAgentsError as error:
+            return str(error)
+        return None
 
     def metadata(self) -> dict[str, Any]:
         """What `GET /v1/metadata` and `RemoteAgent.metadata` say."""
@@ -93,6 +120,7 @@ class PolicyReplica:
             "contract": None if contract is None else contract.to_json(),
             "protocol": PROTOCOL_VERSION,
             "version": importlib.metadata.version("vlagents-ray"),
+            "dialects": describe(self._args.dialects),
             "local": None if self._local is None else asdict(self._local.address),
             "stream": None if self._stream is None else asdict(self._stream.address),
         }
@@ -101,7 +129,10 @@ class PolicyReplica:
         stream = self._args.stream
         if not stream.enabled:
             return None
-        return StreamDoor(self._engine, self._limits, os.environ.get(HOST) or _serves_host(), stream.ports)
+        admit = self._admit if self._keys else None
+        http = _http()  # if that is encrypted, nothing else shall be to see
+        host = os.environ.get(HOST) or (LOOPBACK if http.ssl_certfile else http.host or EVERYWHERE)
+        return StreamDoor(self._engine, self._limits, host, stream.ports, admit)
 
     async def attach(self, node: str = "", boot_id: str = "", must_be_near: bool = False) -> tuple[dict[str, Any], Any]:
         """For a client inside the cluster, on that node and machine: a replica's metadata, and its actor.
@@ -215,6 +246,13 @@ class PolicyReplica:
                 door.close()
 
 
+def _http() -> HTTPOptions:
+    """Where Serve lets clients in, and its replicas listen."""
+    from ray.serve.context import _get_global_client
+
+    return _get_global_client().http_config
+
+
 def _stopping() -> bool:
     """Has Serve begun to stop this replica? It tells the load balancer, but has no hook for the user's class."""
     worker = ray._private.worker.global_worker
@@ -222,17 +260,12 @@ def _stopping() -> bool:
     return bool(actor._replica_impl._shutting_down)
 
 
-def _serves_host() -> str:
-    """Where Serve listens, and so its replicas."""
-    controller = serve.context._get_global_client()._controller
-    host: str = ray.get(controller.get_http_config.remote()).host
-    return host
-
-
 def _others_run() -> bool:
     """Does the application already have a replica that takes requests?"""
-    app = serve.status().applications.get(serve.get_replica_context().app_name)
-    return app is not None and any(d.replica_states.get("RUNNING", 0) > 0 for d in app.deployments.values())
+    context = serve.get_replica_context()
+    app = serve.status().applications.get(context.app_name)
+    policy = None if app is None else app.deployments.get(context.deployment)
+    return policy is not None and policy.replica_states.get("RUNNING", 0) > 0
 
 
 def _tags(policy: str) -> dict[str, str]:

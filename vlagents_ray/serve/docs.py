@@ -17,6 +17,7 @@ pre, code { font: 0.9em/1.4 ui-monospace, monospace; }
 pre { padding: 0.8rem; overflow-x: auto; border: 1px solid #8884; border-radius: 6px; }
 td, th { text-align: left; padding: 0.2rem 1rem 0.2rem 0; vertical-align: top; }
 """
+_DIALECTS = {"openpi": "openpi", "roboarena": "RoboArena", "openvla": "OpenVLA", "vla_eval": "vla-eval"}
 _TIMING = (
     ("decode_ms", "the request, whose last byte is here, out of its bytes"),
     ("queue_ms", "waiting for the policy"),
@@ -44,6 +45,7 @@ def docs_page(metadata: dict[str, Any]) -> str:
 <p>A policy served by vlagents_ray {html.escape(str(metadata["version"]))}, protocol {metadata["protocol"]}.
 Choose a session id for each robot or environment and send it as <code>{SESSION_HEADER}</code> with every request:
 <code>reset</code> begins an episode, <code>act</code> gives the next action or chunk of actions.</p>
+<p>Where the server has API keys, send yours with every request: <code>Authorization: Bearer KEY</code>.</p>
 <h2>With curl</h2>
 <pre>curl -H '{SESSION_HEADER}: robot-1' -F 'obs={{"instruction": "push the cube to the goal", "gripper": 1.0}}' \\
      -F 'cameras.front=@front.jpg' http://HOST:8000/v1/reset
@@ -69,7 +71,7 @@ which reach neither a session nor the policy. The answer, at once, is <code>VLA!
 bits, little-endian. With a one in place of the first zero, a frame follows, which is decoded first.</td></tr>
 <tr><td><code>GET /v1/metadata</code></td><td>Policy, checkpoint, contract, protocol version.</td></tr>
 <tr><td><code>GET /healthz</code></td><td>200 when the policy can act, 503 until then.</td></tr>
-</table>
+{_dialects(metadata)}</table>
 <p>A replica that stops hands its sessions over: the next request of the same session id goes on where it was.</p>
 <p>Headers: <code>{RANK_HEADER}</code>, <code>robot</code> (the default, goes first) or <code>simulation</code>;
 <code>{DEADLINE_HEADER}</code>, after which an answer is useless (504, and the request is dropped if it has
@@ -86,6 +88,15 @@ transport, class and outcome, latency, time by stage, batch sizes, queue depth, 
 <h2>This policy</h2>
 <pre>{html.escape(json.dumps(metadata, indent=2))}</pre>
 </body></html>"""
+
+
+def _dialects(metadata: dict[str, Any]) -> str:
+    """Rows of the table of paths; the mappings stand in the metadata."""
+    return "".join(
+        f"<tr><td><code>{html.escape(', '.join(one['paths']))}</code></td><td>Clients of {_DIALECTS.get(name, name)}, "
+        f"as they are.</td></tr>\n"
+        for name, one in (metadata.get("dialects") or {}).items()
+    )
 
 
 def _first_line(cls: type) -> str:

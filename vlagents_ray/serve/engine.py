@@ -47,11 +47,14 @@ class Engine:
         session_limit: int = 1000,
         session_idle_s: float = 600.0,
         version: str = "",
+        check: Callable[[Contract | None], None] = lambda _: None,
     ) -> None:
         """With `batch_sizes` batches are padded up to the next of these; the largest is `max_batch_size`.
 
-        `version` is that of the policy and its settings: sessions move between equal ones only.
+        `version` is that of the policy and its settings: sessions move between equal ones only. `check` raises
+        what keeps a policy with that contract from being served.
         """
+        self._check = check
         self._agent = agent
         self._version = version
         self._batch_sizes = batch_sizes
@@ -115,11 +118,12 @@ class Engine:
         owner: str = "",
         turn: str = "",
         transport: str = "",
+        quota: tuple[str, int | None] | None = None,
     ) -> Ticket:
         """A request made ready for the queue, its answer to go to `done`. What is wrong with it is raised here.
 
         `owner` is the connection that the session ends with; empty for a caller without one. `turn` is
-        whose turn it is in the queue, if that is more than this session.
+        whose turn it is in the queue, if that is more than this session. `quota`: see `SessionTable.open`.
         """
         self.require_ready()
         if request.op == "act":
@@ -133,7 +137,7 @@ class Engine:
             if obs is not None:
                 check_observation(obs, self.contract)
         if request.op == "reset":
-            self.sessions.open(session_id, owner, transport, turn)
+            self.sessions.open(session_id, owner, transport, turn, quota)
         rank = Rank.SIMULATION if request.rank == "simulation" else Rank.ROBOT
         return Ticket(session_id, request, done, rank, owner=turn, connection=owner, transport=transport)
 
@@ -155,6 +159,7 @@ class Engine:
     def _prepare(self) -> None:
         self._agent.initialize()
         self.contract = self._agent.contract
+        self._check(self.contract)
         self._copies = AgentCopies(self._agent)
         self._padding = Padding(self._batch_sizes, self._copies.make)
         self._copies.make()  # an agent that cannot be copied must fail now, not at the first reset

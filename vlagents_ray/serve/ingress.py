@@ -13,7 +13,7 @@ from __future__ import annotations
 import logging
 import time
 import uuid
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from typing import Any, cast
 
 from starlette.applications import Starlette
@@ -21,7 +21,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 from starlette.requests import Request as HttpRequest
 from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
-from starlette.routing import Route, WebSocketRoute
+from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.types import Message
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
@@ -29,6 +29,7 @@ from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, UnknownApp,
 from vlagents_ray.serve.calls import Sender
 from vlagents_ray.serve.docs import docs_page
 from vlagents_ray.serve.engine import Engine
+from vlagents_ray.serve.problems import problem_response
 from vlagents_ray.serve.reading import Requests, request_id, session_id
 from vlagents_ray.serve.stats import Visit
 from vlagents_ray.wire.frames import CONTENT_TYPE, encode_replies
@@ -40,7 +41,6 @@ from vlagents_ray.wire.messages import (
     Reply,
     Request,
 )
-from vlagents_ray.wire.plain import PROBLEM_TYPE, problem
 from vlagents_ray.wire.probe import answer, is_probe, probed_frame
 
 logger = logging.getLogger(__name__)
@@ -53,8 +53,12 @@ def build_ingress(
     metadata: Callable[[], dict[str, Any]],
     limits: Limits,
     near: Callable[[str], Awaitable[dict[str, Any]]] | None = None,
+    dialects: Sequence[BaseRoute] = (),
 ) -> Starlette:
-    """The ASGI application of a replica; `near` gives the metadata for a caller on the machine with that boot id."""
+    """The ASGI application of a replica; `near` gives the metadata for a caller on the machine with that boot id.
+
+    `dialects` are the routes of other systems' clients, see `vlagents_ray.serve.dialects`.
+    """
     door = _Door(engine, metadata, limits, near)
     return Starlette(
         routes=[
@@ -64,6 +68,7 @@ def build_ingress(
             Route("/v1/metadata", door.show_metadata),
             Route("/healthz", door.health),
             Route("/docs", door.docs),
+            *dialects,
         ],
         exception_handlers={HTTPException: _http_problem},
     )
@@ -83,7 +88,11 @@ class _Door:
         self._near = near
 
     async def health(self, http: HttpRequest) -> Response:
-        return self._when_ready(http, lambda: PlainTextResponse("OK\n"))
+        """Asks for no key, so it tells nothing else."""
+        if self._engine.ready:
+            return PlainTextResponse("OK\n")
+        unready = PolicyUnavailable("the policy is loading, or did not load; GET /v1/metadata says why")
+        return problem_response(unready, request_id(http))
 
     async def show_metadata(self, http: HttpRequest) -> Response:
         machine = http.headers.get(MACHINE_HEADER)
@@ -101,7 +110,7 @@ class _Door:
         except ClientDisconnect:
             return Response(status_code=499)
         except VLAgentsError as error:
-            return _problem(error, request_id(http))
+            return problem_response(error, request_id(http))
 
     async def _probed(self, message: bytes) -> bytes:
         if (frame := probed_frame(message)) is not None:
@@ -114,8 +123,7 @@ class _Door:
         try:
             self._engine.require_ready()
         except VLAgentsError as error:
-            document = problem(error, request_id(http)) | {"status": 503}
-            return JSONResponse(document, status_code=503, media_type=PROBLEM_TYPE)
+            return problem_response(error, request_id(http), 503)
         return answer()
 
     def endpoint(self, op: Op) -> Callable[[HttpRequest], Awaitable[Response]]:
@@ -144,7 +152,7 @@ class _Door:
                     logger.exception("%s failed (request %s)", op, name)
                     error = VLAgentsError("internal error; the server's log has the details")
                 visit.refused(error.code)
-                return _problem(error, name)
+                return problem_response(error, name)
 
         return handle
 
@@ -203,15 +211,12 @@ def _timed(http: HttpRequest, visit: Visit) -> HttpRequest:
     return HttpRequest(http.scope, receive)
 
 
-def _problem(error: VLAgentsError, request_id: str) -> Response:
-    return JSONResponse(problem(error, request_id), status_code=error.status, media_type=PROBLEM_TYPE)
-
-
 async def _http_problem(http: HttpRequest, error: Exception) -> Response:
     """What the router refuses: an unknown path, or a method that a path does not take."""
     refused = cast(HTTPException, error)
     if refused.status_code == 404:
-        return _problem(UnknownApp("no such path; GET /docs lists what there is"), request_id(http))
+        return problem_response(UnknownApp("no such path; GET /docs lists what there is"), request_id(http))
     cause = MalformedMessage(f"{refused.detail}; GET /docs lists what there is")
-    document = problem(cause, request_id(http)) | {"status": refused.status_code}
-    return JSONResponse(document, status_code=refused.status_code, media_type=PROBLEM_TYPE, headers=refused.headers)
+    response = problem_response(cause, request_id(http), refused.status_code)
+    response.headers.update(refused.headers or {})
+    return response

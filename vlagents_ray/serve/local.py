@@ -26,6 +26,7 @@ from typing import ClassVar
 import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavailable, VLAgentsError
+from vlagents_ray.serve.auth import Caller
 from vlagents_ray.serve.calls import Sender
 from vlagents_ray.serve.engine import Engine
 from vlagents_ray.serve.stats import Visit
@@ -42,16 +43,20 @@ _CONTROL = socket.CMSG_SPACE(struct.calcsize("i"))  # for one descriptor
 _INLINE = 64 * 1024  # a longer reply travels in a memory file
 _BACKLOG = 128
 
+Admit = Callable[[str | None], "Caller | None"]  # who holds that key; `Unauthorized`, `Forbidden`
+
 
 class LocalDoor:
     """Listens from `open` on; everything else happens where the batch queue hears."""
 
-    def __init__(self, engine: Engine, limits: Limits) -> None:
+    def __init__(self, engine: Engine, limits: Limits, admit: Admit | None = None) -> None:
+        """`admit`, where there are keys, says whose a client's is, or raises that it is none."""
         self._engine = engine
         self._limits = limits
+        self._admit = admit
         self._clients: set[LocalClient] = set()
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
-        self.address = LocalAddress(f"vlagents-ray-{secrets.token_hex(16)}", boot_id())
+        self.address = LocalAddress(f"vlagents-ray-{secrets.token_hex(16)}", boot_id(), keyed=admit is not None)
 
     def open(self) -> None:
         """Start to listen; before the engine starts."""
@@ -87,7 +92,7 @@ class LocalDoor:
 
     def client(self, connection: socket.socket) -> LocalClient:
         """What serves a connection that was let in."""
-        return LocalClient(connection, self._engine, self._limits, self._clients.discard)
+        return LocalClient(connection, self._engine, self._limits, self._clients.discard, self._admit)
 
 
 class LocalClient:
@@ -96,7 +101,12 @@ class LocalClient:
     name: ClassVar[str] = "shm"
 
     def __init__(
-        self, connection: socket.socket, engine: Engine, limits: Limits, gone: Callable[[LocalClient], None]
+        self,
+        connection: socket.socket,
+        engine: Engine,
+        limits: Limits,
+        gone: Callable[[LocalClient], None],
+        admit: Admit | None = None,
     ) -> None:
         self._connection = connection
         self._engine = engine
@@ -106,6 +116,7 @@ class LocalClient:
         self._kept: dict[int, weakref.ref[np.ndarray]] = {}  # what views each file, and if only to be collected
         self._freed: set[int] = set()  # of which the client has yet to be told
         self._acts = compact.Reader(limits)
+        self._admit = admit  # until the client has shown its key
         self._sender = Sender(engine, self.name)
         self._sending = threading.Lock()  # the end may be heard beside a batch, whose replies still come
         self._ended = False
@@ -127,6 +138,9 @@ class LocalClient:
             return
         descriptors = [int.from_bytes(data[:4], sys.byteorder) for _, _, data in control]
         try:
+            if self._admit is not None:
+                self._show(self._admit, bytes(buffer[:size]))
+                return
             requests = self.read(memoryview(buffer)[:size], descriptors)
             visit.decoded(requests)
             self._sender.send(requests, lambda replies: self._answer(visit, replies))
@@ -135,6 +149,11 @@ class LocalClient:
         finally:
             for descriptor in descriptors:
                 os.close(descriptor)
+
+    def _show(self, admit: Admit, key: bytes) -> None:
+        """The client's first message. Without a right key there, all others are taken for a key, and refused."""
+        self._sender = Sender(self._engine, self.name, caller=admit(key.decode(errors="replace")))
+        self._admit = None
 
     def release(self) -> None:
         """Forget the sessions and give their memory back."""

@@ -27,7 +27,7 @@ from vlagents_ray.wire.messages import (
 from vlagents_ray.wire.plain import CAMERA_PREFIX, request_from_parts
 
 _SESSION_ID = re.compile(r"[\x21-\x7e]{1,128}")
-_INLINE_BYTES = 512 * 1024  # a larger body is decoded beside the event loop, which others wait for
+INLINE_BYTES = 512 * 1024  # a larger body is decoded beside the event loop, which others wait for
 
 
 class Requests:
@@ -94,7 +94,7 @@ class Requests:
             raise MalformedMessage(f"form: {text}") from error
         if document is None:
             raise MalformedMessage("form: no part 'obs'; send a JSON document, {} at least")
-        if sum(map(len, files.values())) > _INLINE_BYTES:
+        if sum(map(len, files.values())) > INLINE_BYTES:
             return await asyncio.to_thread(request_from_parts, op, document, files, limits)
         return request_from_parts(op, document, files, limits)
 
@@ -111,7 +111,7 @@ class Requests:
 
     async def decode(self, frame: bytes) -> list[Request | Reply]:
         """The requests of a frame."""
-        if len(frame) > _INLINE_BYTES:
+        if len(frame) > INLINE_BYTES:
             return await asyncio.to_thread(decode_requests, frame, self._limits)
         return decode_requests(frame, self._limits)
 

@@ -31,7 +31,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import PolicyUnavailable, UnknownSession
+from vlagents_ray.errors import PolicyUnavailable, TooManyRequests, UnknownSession
 from vlagents_ray.interface import Agent
 
 logger = logging.getLogger(__name__)
@@ -201,11 +201,23 @@ class SessionTable:
         session.used = time.monotonic()
         return session
 
-    def open(self, session_id: str, owner: str = "", transport: str = "", connection: str = "") -> Session:
-        """The session, made if it is new, now `owner`'s; `PolicyUnavailable` when the replica is full."""
+    def open(
+        self,
+        session_id: str,
+        owner: str = "",
+        transport: str = "",
+        connection: str = "",
+        quota: tuple[str, int | None] | None = None,
+    ) -> Session:
+        """The session, made if it is new, now `owner`'s; `PolicyUnavailable` when the replica is full.
+
+        `quota` says how many there may be whose names begin so; `TooManyRequests` for one more.
+        """
         with self._lock:
             session = self._sessions.get(session_id)
             if session is None:
+                if quota is not None and quota[1] is not None:
+                    self._require_below(quota[0], quota[1])
                 if len(self._sessions) >= self.limit:
                     self._drop_idle()
                 if len(self._sessions) >= self.limit:
@@ -218,6 +230,14 @@ class SessionTable:
         session.used = time.monotonic()
         session.owner, session.transport, session.connection = owner, transport, connection
         return session
+
+    def _require_below(self, prefix: str, limit: int) -> None:
+        if sum(name.startswith(prefix) for name in self._sessions) >= limit:
+            self._drop_idle()
+        if sum(name.startswith(prefix) for name in self._sessions) >= limit:
+            raise TooManyRequests(
+                f"key {prefix.rstrip('/')!r} holds {limit} sessions here, as many as it allows; close one"
+            )
 
     def close(self, session_id: str) -> None:
         """Forget the session; unknown ids are none."""

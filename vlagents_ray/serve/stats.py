@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from vlagents_ray.serve.batching import BatchQueue
@@ -81,9 +81,9 @@ class Visit:
 
     __slots__ = ("_asked", "_decoded", "_stats", "arrived", "transport")
 
-    def __init__(self, stats: Stats, transport: str, op: str = "unknown") -> None:
+    def __init__(self, stats: Stats, transport: str, op: str = "unknown", rank: str = "robot") -> None:
         self._stats = stats
-        self._asked: Sequence[tuple[str, str]] = ((op, "robot"),)
+        self._asked: Sequence[tuple[str, str]] = ((op, rank),)
         self.transport = transport
         self.arrived = self._decoded = time.perf_counter()  # s
 
@@ -91,6 +91,14 @@ class Visit:
         """The requests are out of their bytes; a `Reply` stands for one that was wrong."""
         self._decoded = time.perf_counter()
         self._asked = [(i.op, i.rank) if isinstance(i, Request) else ("unknown", "robot") for i in items]
+
+    def arrive(self) -> None:
+        """Its last byte is here."""
+        self.arrived = self._decoded = time.perf_counter()
+
+    def decoded_one(self) -> None:
+        """Its one request, of the kind that the visit began with, is out of its bytes."""
+        self._decoded = time.perf_counter()
 
     def frame(self, replies: Sequence[Reply]) -> bytes:
         """The replies as a frame, in which `timing` is complete."""
@@ -113,18 +121,28 @@ class Visit:
         document = reply_to_json(reply)
         document.pop("timing")
         text = _json(document)
-        ended = time.perf_counter()
-        reply.timing["decode_ms"] = (self._decoded - self.arrived) * 1e3
-        reply.timing["encode_ms"] = (ended - begun) * 1e3
-        reply.timing["total_ms"] = (ended - self.arrived) * 1e3
-        self._record([reply])
+        self._written(reply, begun)
         return f'{text[:-1]},"timing":{_json(reply.timing)}}}'.encode()
+
+    def written(self, reply: Reply, write: Callable[[], T]) -> T:
+        """What `write` makes of a reply for another system's client, `timing` complete after it; not of an error."""
+        begun = time.perf_counter()
+        data = write()
+        self._written(reply, begun)
+        return data
 
     def refused(self, code: str) -> None:
         """The answer to all of it is the error with this code, or nobody waits for one."""
         total_ms = (time.perf_counter() - self.arrived) * 1e3
         for op, rank in self._asked:
             self._stats.handled((op, self.transport, rank, code, total_ms, 0.0, 0.0, 0.0, 0.0))
+
+    def _written(self, reply: Reply, begun: float) -> None:
+        ended = time.perf_counter()
+        reply.timing["decode_ms"] = (self._decoded - self.arrived) * 1e3
+        reply.timing["encode_ms"] = (ended - begun) * 1e3
+        reply.timing["total_ms"] = (ended - self.arrived) * 1e3
+        self._record([reply])
 
     def _tell_decoding(self, replies: Sequence[Reply]) -> None:
         decode_ms = (self._decoded - self.arrived) * 1e3

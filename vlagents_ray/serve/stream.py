@@ -1,9 +1,9 @@
 """A replica's own port for WebSockets: no proxy between the robot and the policy's thread.
 
 The metadata tells a client the port and a path that nobody can guess, so that whoever may not read the one
-cannot use the other. Messages are those of `WS /v1/stream` on the server's port, which stays for clients that
-do not reach this one. As with local clients the policy's own thread reads the sockets (see
-`vlagents_ray.serve.local`), and decodes what they bring.
+cannot use the other; where there are keys, a client shows its own once more. Messages are those of `WS /v1/stream`
+on the server's port, which stays for clients that do not reach this one. As with local clients the policy's own
+thread reads the sockets (see `vlagents_ray.serve.local`), and decodes what they bring.
 """
 
 from __future__ import annotations
@@ -20,9 +20,11 @@ from websockets.http11 import Request as Handshake
 from websockets.protocol import State
 from websockets.server import ServerProtocol
 
-from vlagents_ray.errors import ConfigError, MalformedMessage, PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import ConfigError, MalformedMessage, PolicyUnavailable, UnknownApp, VLAgentsError
+from vlagents_ray.serve.auth import Caller, token_of
 from vlagents_ray.serve.calls import Sender
 from vlagents_ray.serve.engine import Engine
+from vlagents_ray.serve.local import Admit
 from vlagents_ray.serve.stats import Visit
 from vlagents_ray.wire.frames import decode_requests, encode_replies
 from vlagents_ray.wire.messages import STREAM_BYTES, STREAM_PATH, Limits, Reply, StreamAddress
@@ -43,8 +45,19 @@ _KEEPALIVE = (("TCP_KEEPIDLE", 20), ("TCP_KEEPINTVL", 5), ("TCP_KEEPCNT", 3), ("
 class StreamDoor:
     """Listens from `open` on; everything else happens where the batch queue hears."""
 
-    def __init__(self, engine: Engine, limits: Limits, host: str, ports: tuple[int, int] | None = None) -> None:
-        """At a port between `ports`, both included; None: any. `ConfigError` if all are taken."""
+    def __init__(
+        self,
+        engine: Engine,
+        limits: Limits,
+        host: str,
+        ports: tuple[int, int] | None = None,
+        admit: Admit | None = None,
+    ) -> None:
+        """At a port between `ports`, both included; None: any. `ConfigError` if all are taken.
+
+        `admit`, where there are keys, says whose a client's is, or raises that it is none.
+        """
+        self._admit = admit
         self.engine = engine
         self.limits = limits
         self.path = STREAM_PATH + secrets.token_urlsafe(24)
@@ -63,9 +76,13 @@ class StreamDoor:
         for client in list(self._clients):
             client.release()
 
-    def admit(self, client: StreamClient) -> None:
-        """It knew the path."""
+    def admit(self, client: StreamClient, request: Handshake) -> Caller | None:
+        """The client knows the path. Whose key it shows, where that is asked; `Unauthorized`, `Forbidden`."""
+        caller = None
+        if self._admit is not None:
+            caller = self._admit(token_of({name.lower(): value for name, value in request.headers.raw_items()}))
         self._strangers.pop(client, None)
+        return caller
 
     def gone(self, client: StreamClient) -> None:
         """Its connection is closed."""
@@ -148,11 +165,19 @@ class StreamClient:
 
     def _shake_hands(self, request: Handshake) -> None:
         known = secrets.compare_digest(request.path.encode(), self._door.path.encode())
+        refused: VLAgentsError | None = None if known else UnknownApp("no such path")
         if known:
-            self._door.admit(self)
-        full = self._door.full() if known else None
+            try:
+                self._sender = Sender(self._door.engine, "websocket", caller=self._door.admit(self, request))
+            except VLAgentsError as error:
+                refused = error
+        full = self._door.full() if refused is None else None
         with self._sending:
-            response = self._protocol.accept(request) if known else self._protocol.reject(404, "no such path\n")
+            response = (
+                self._protocol.accept(request)
+                if refused is None
+                else self._protocol.reject(refused.status, f"{refused}\n")
+            )
             self._protocol.send_response(response)
             if full is not None and self._protocol.state is State.OPEN:
                 self._protocol.send_binary(encode_replies([Reply(error=full)]))

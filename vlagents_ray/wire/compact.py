@@ -20,9 +20,9 @@ import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge
 from vlagents_ray.interface import Act, Obs
+from vlagents_ray.wire.arrays import Buffer
 from vlagents_ray.wire.frames import check_request
 from vlagents_ray.wire.messages import Limits, RankName, Reply, Request
-from vlagents_ray.wire.tree import Buffer
 
 _ALIGN = 64
 _ID_BYTES = 40  # of a request's id

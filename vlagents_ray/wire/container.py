@@ -13,8 +13,8 @@ import struct
 from typing import Any
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge
+from vlagents_ray.wire.arrays import Buffer
 from vlagents_ray.wire.messages import PROTOCOL_VERSION, Limits
-from vlagents_ray.wire.tree import Buffer
 
 _PREFIX = struct.Struct("<3sBI")
 _ALIGN = 8

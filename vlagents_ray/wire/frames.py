@@ -19,11 +19,12 @@ from vlagents_ray.errors import (
     from_code,
 )
 from vlagents_ray.interface import Act
+from vlagents_ray.wire.arrays import Buffer
 from vlagents_ray.wire.codecs import RAW, ImageCodec
 from vlagents_ray.wire.container import assemble, dump, pack, unpack
 from vlagents_ray.wire.messages import DEFAULT_LIMITS, NAME_CHARACTERS, OPS, RANKS, Limits, Op, Reply, Request
 from vlagents_ray.wire.observations import is_number, read_obs, write_obs
-from vlagents_ray.wire.tree import Buffer, Reader, Writer
+from vlagents_ray.wire.tree import Reader, Writer
 
 CONTENT_TYPE = "application/x-vlagents-frame"
 _OPTIONAL: dict[str, Any] = {

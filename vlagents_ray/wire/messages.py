@@ -81,6 +81,7 @@ class LocalAddress:
 
     socket: str  # name of a Unix socket in the abstract namespace, which no file system keeps
     boot_id: str  # of the machine, as Linux drew it when it started
+    keyed: bool = False  # is the first message on a connection the client's API key? Only a refusal is answered
 
     # What a request brings lies in a memory file of the client's, handed over with the message that first
     # names it: a frame, or with COMPACT the arrays of the acts that follow the message's header (see

@@ -33,15 +33,18 @@ def read_obs(node: Any, reader: Reader, limits: Limits) -> Obs:
         raise InvalidObservation(f"gripper: got {str(gripper)[:40]!r}, want a number in [0, 1] where 1 = open")
     reader.decode_images(cameras.values())
     return Obs(
-        cameras={name: _read_camera(name, image, reader, limits) for name, image in cameras.items()},
+        cameras={name: as_camera(name, reader.blob(image), limits) for name, image in cameras.items()},
         gripper=None if gripper is None else float(gripper),
-        state={name: _read_state(name, part, reader, limits) for name, part in state.items()},
+        state={
+            name: as_state(name, reader.blob(part) if isinstance(part, dict) else part, limits)
+            for name, part in state.items()
+        },
         info=reader.value(info),
     )
 
 
-def _read_camera(name: str, node: Any, reader: Reader, limits: Limits) -> np.ndarray:
-    image = reader.blob(node)
+def as_camera(name: str, image: Any, limits: Limits) -> np.ndarray:
+    """`image` as it is, if it is (H, W, 3) uint8 RGB within the limits; `name` is for the error."""
     if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
         got = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
         raise InvalidObservation(f"camera {name!r}: got {got}, want (H, W, 3) uint8 RGB")
@@ -50,20 +53,26 @@ def _read_camera(name: str, node: Any, reader: Reader, limits: Limits) -> np.nda
     return image
 
 
-def _read_state(name: str, node: Any, reader: Reader, limits: Limits) -> np.ndarray:
-    part = reader.blob(node) if isinstance(node, dict) else node
+def as_state(name: str, part: Any, limits: Limits) -> np.ndarray:
+    """`part`, a list of numbers or an array, as (D,) float32 within the limits; `name` is for the error."""
     if isinstance(part, list):
         if len(part) > limits.state_values:
             raise MessageTooLarge(f"state {name!r}: got {len(part)} values, the limit is {limits.state_values}")
         if not all(is_number(x) for x in part):
             raise InvalidObservation(f"state {name!r}: want a list of numbers")
-        return np.asarray(part, dtype=np.float32)
+        return _single(np.array(part, dtype=np.float64))
     if not isinstance(part, np.ndarray) or part.ndim != 1 or part.dtype.kind not in "fiu":
         got = f"{part.shape} {part.dtype}" if isinstance(part, np.ndarray) else type(part).__name__
         raise InvalidObservation(f"state {name!r}: got {got}, want (D,) float32")
     if part.size > limits.state_values:
         raise MessageTooLarge(f"state {name!r}: got {part.size} values, the limit is {limits.state_values}")
-    return part.astype(np.float32, copy=False)
+    return _single(part)
+
+
+def _single(part: np.ndarray) -> np.ndarray:
+    """As float32; what is too large for it becomes infinite, which `check_observation` refuses."""
+    with np.errstate(over="ignore"):
+        return part.astype(np.float32, copy=False)
 
 
 def write_obs(obs: Obs, writer: Writer, codec: ImageCodec) -> dict[str, Any]:
@@ -82,5 +91,7 @@ def write_obs(obs: Obs, writer: Writer, codec: ImageCodec) -> dict[str, Any]:
 
 
 def is_number(value: object) -> bool:
-    """A number, and no bool, which JSON and Python tell apart differently."""
-    return isinstance(value, (int, float)) and not isinstance(value, bool)
+    """A number that a float can hold, and no bool, which JSON and Python tell apart differently."""
+    if isinstance(value, int):
+        return not isinstance(value, bool) and value.bit_length() < 1024
+    return isinstance(value, float)

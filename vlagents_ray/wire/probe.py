@@ -14,7 +14,7 @@ import os
 import struct
 
 from vlagents_ray.errors import MalformedMessage
-from vlagents_ray.wire.tree import Buffer
+from vlagents_ray.wire.arrays import Buffer
 
 _HEAD = struct.Struct("<4sI")
 _ASK, _TELL = b"VLA?", b"VLA!"

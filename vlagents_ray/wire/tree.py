@@ -6,19 +6,15 @@ What JSON cannot say becomes `{"$": [kind, blob index, ...]}`:
 
 from __future__ import annotations
 
-import math
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
+from vlagents_ray.wire.arrays import Buffer, is_plain, read_array
 from vlagents_ray.wire.codecs import decode_files
 from vlagents_ray.wire.messages import Limits
-
-Buffer = bytes | memoryview
-_DTYPE = re.compile(r"[<|][biuf][1248]")  # no objects, no structures, no text
 
 
 class Writer:
@@ -30,7 +26,7 @@ class Writer:
     def array(self, value: np.ndarray) -> dict[str, Any]:
         """The reference to an array, whose bytes become a blob without a copy where possible."""
         dtype = value.dtype.newbyteorder("<").str
-        if not _DTYPE.fullmatch(dtype):
+        if not is_plain(dtype):
             raise InvalidInput(f"array: got dtype {value.dtype}, want bool, integers or floats; convert it")
         data = np.ascontiguousarray(value, dtype=dtype)
         self.blobs.append(data.data.cast("B") if data.size else b"")
@@ -107,7 +103,7 @@ class Reader:
             raise MalformedMessage(f"reference: got {str(node)[:80]}, want {{'$': [kind, blob, ...]}}")
         kind, *rest = reference
         if kind == "nd" and len(rest) == 3:
-            return self._array(self._get(rest[0]), rest[1], rest[2])
+            return read_array(self._get(rest[0]), rest[1], rest[2])
         if kind == "img" and len(rest) == 1:
             return self._image(rest[0])
         if kind == "bin" and len(rest) == 1:
@@ -128,22 +124,22 @@ class Reader:
             raise MalformedMessage(f"reference: got blob {str(index)[:20]}, want one of {len(self._blobs)}")
         return self._blobs[index]
 
-    @staticmethod
-    def _array(data: Buffer, dtype: Any, shape: Any) -> np.ndarray:
-        if not isinstance(dtype, str) or not _DTYPE.fullmatch(dtype):
-            raise MalformedMessage(f"array: got dtype {str(dtype)[:20]!r}, want one like '<f4' or '|u1'")
-        if not isinstance(shape, list) or len(shape) > 8 or not all(type(n) is int and n >= 0 for n in shape):
-            raise MalformedMessage(f"array: got shape {str(shape)[:80]}, want up to 8 non-negative integers")
-        try:
-            kind = np.dtype(dtype)
-        except TypeError as error:
-            raise MalformedMessage(f"array: got dtype {dtype!r}, which is none of numpy's") from error
-        if math.prod(shape) * kind.itemsize != len(data):
-            raise MalformedMessage(f"array: got {len(data)} bytes, want {shape} of {dtype}")
-        return np.frombuffer(data, kind).reshape(shape)
-
 
 def _reference(node: Any) -> list[Any]:
     """The list in `{"$": [kind, blob, ...]}`; empty for anything else."""
     reference = node.get("$") if isinstance(node, dict) else None
     return reference if isinstance(reference, list) else []
+
+
+def require_plain(value: Any, depth: int) -> None:
+    """Raise unless `value`, out of a message of others, is what the wire carries, its keys text, `depth` at most."""
+    if isinstance(value, (dict, list)):
+        if depth <= 0:
+            raise MessageTooLarge("message: nested too deep; flatten it")
+        for key in value if isinstance(value, dict) else ():
+            if not isinstance(key, str):
+                raise MalformedMessage(f"message: got key {str(key)[:40]!r}, want text")
+        for item in value.values() if isinstance(value, dict) else value:
+            require_plain(item, depth - 1)
+    elif value is not None and not isinstance(value, (bool, int, float, str, bytes, np.ndarray, np.generic)):
+        raise MalformedMessage(f"message: got a {type(value).__name__}, want plain values and arrays")

@@ -1,0 +1,315 @@
+"""Keys, encryption and sockets of a real server that other machines may reach."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import os
+import re
+import socket
+import ssl
+import stat
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import grpc
+import numpy as np
+import psutil
+import pytest
+from certificates import Authority, authority
+from listeners import Listener, listeners
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from vlagents_ray import ConfigError, ConnectionLost, Forbidden, Obs, RemoteAgent, Unauthorized, VLAgentsError
+from vlagents_ray.client.ways import TransportName
+from vlagents_ray.serve.cluster import running_server
+from vlagents_ray.serve.files import deployment
+from vlagents_ray.serve.keyfile import new_key, revoke
+from vlagents_ray.serve.tls import Tls
+from vlagents_ray.wire.frames import decode_replies, encode_requests
+from vlagents_ray.wire.messages import LocalAddress, Request
+
+EVERYWHERE = "0.0.0.0"  # noqa: S104 - what this is about
+WAYS: tuple[TransportName, ...] = ("http", "websocket", "shm", "auto")
+
+
+LIMITS = {"pixels": 64 * 64, "cameras": 2, "state_values": 8, "depth": 3, "items": 100, "body_bytes": 2**20, "text": 50}
+TOO_MUCH = {
+    "pixels": Obs(cameras={"front": np.zeros((65, 64, 3), np.uint8)}),
+    "cameras": Obs(cameras={name: np.zeros((8, 8, 3), np.uint8) for name in "abc"}),
+    "states": Obs(state={name: np.zeros(1, np.float32) for name in "abc"}),
+    "state_values": Obs(state={"joints": np.zeros(9, np.float32)}),
+    "depth": Obs(info={"a": {"b": {"c": {"d": 1}}}}),
+    "items": Obs(info={"a": list(range(101))}),
+    "body_bytes": Obs(info={"a": np.zeros(2**21, np.uint8)}),
+}
+
+
+@dataclass
+class Served:
+    url: str
+    keys: Path
+    tokens: dict[str, str]
+    ca: Authority
+
+    def agent(self, who: str | None, **options: object) -> RemoteAgent:
+        key = self.tokens.get(who, who) if who is not None else ""
+        return RemoteAgent(self.url, api_key=key, **{"ca": self.ca.file, **options})  # type: ignore[arg-type]
+
+    @property
+    def trust(self) -> ssl.SSLContext:
+        return ssl.create_default_context(cafile=self.ca.file)
+
+    def status(self, path: str, headers: dict[str, str] | None = None) -> tuple[int, bytes]:
+        parts = urlsplit(self.url)
+        connection = http.client.HTTPSConnection(parts.hostname or "", parts.port, timeout=10, context=self.trust)
+        with contextlib.closing(connection):
+            connection.request("GET", path, headers=headers or {})
+            answer = connection.getresponse()
+            return answer.status, answer.read()
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    folder = tmp_path_factory.mktemp("access")
+    ca = authority(folder, "ca")
+    keys = folder / "keys.json"
+    tokens = {name: new_key(keys, name) for name in ("arm", "leaver")} | {"other": new_key(keys, "other", apps=("x",))}
+    tls = Tls(*ca.sign("server"))
+    config = deployment("noop", limits=LIMITS)
+    with running_server(config, host=EVERYWHERE, num_cpus=2, keys_file=keys, tls=tls, timeout_s=120) as server:
+        yield Served(server.url, keys, tokens, ca)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_key_is_let_in_over_tls(served: Served, way: TransportName) -> None:
+    assert served.url.startswith("https://")
+    with served.agent("arm", transport=way) as agent:
+        agent.reset(Obs(), "x")
+        assert agent.act(Obs()).action.shape == (7,)
+        assert agent.transport == ("shm" if way == "auto" else way)
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_nobody_else_is(served: Served, way: TransportName) -> None:
+    for who, error in ((None, Unauthorized), ("wrong", Unauthorized), ("other", Forbidden)):
+        with pytest.raises(error), served.agent(who, transport=way) as agent:
+            agent.reset(Obs(), "x")
+
+
+@pytest.mark.parametrize("path", ["/docs", "/v1/metadata", "/nope", "/-/routes", "/stats", "/metrics"])
+def test_no_path_tells_anything_without_a_key(served: Served, path: str) -> None:
+    status, body = served.status(path)
+    assert status == (404 if path == "/-/routes" else 401)
+    assert b"noop" not in body
+    assert served.status("/healthz") == (200, b"OK\n")
+
+
+def test_a_websocket_is_refused_before_it_is_accepted(served: Served) -> None:
+    url = served.url.replace("https", "wss") + "/v1/stream"
+    for token, status in (("wrong", 401), (served.tokens["other"], 403)):
+        with (
+            pytest.raises(InvalidStatus) as refused,
+            connect(url, ssl=served.trust, additional_headers={"authorization": f"Api-Key {token}"}),
+        ):
+            pytest.fail("was let in")
+        assert refused.value.response.status_code == status
+
+
+@pytest.mark.parametrize("way", ["http", "websocket", "shm", "handle", "plasma"])
+def test_every_door_refuses_what_is_over_the_limits_and_goes_on(served: Served, way: TransportName) -> None:
+    url = "serve://noop" if way in ("handle", "plasma") else served.url
+    with RemoteAgent(
+        url, transport=way, api_key=served.tokens["arm"], ca=served.ca.file, codec="raw", timeout_s=20
+    ) as agent:
+        agent.reset(Obs(), "x")
+        for limit, obs in TOO_MUCH.items():
+            with pytest.raises(VLAgentsError) as refused:
+                agent.act(obs)
+            assert refused.value.code == "too_large", limit
+        with pytest.raises(VLAgentsError) as refused:
+            agent.reset(Obs(), "x" * 51)
+        assert refused.value.code == "too_large"
+        agent.reset(Obs(), "x")
+        agent.act(Obs())
+
+
+def test_a_revoked_key_is_shut_out_of_every_door_within_seconds(served: Served) -> None:
+    url = served.url.replace("https", "wss") + "/v1/stream"
+    with contextlib.ExitStack() as stack:
+        agents = {way: stack.enter_context(served.agent("leaver", transport=way)) for way in WAYS}
+        for agent in agents.values():
+            agent.reset(Obs(), "x")
+        headers = {"x-api-key": served.tokens["leaver"]}
+        idle = stack.enter_context(connect(url, ssl=served.trust, additional_headers=headers))
+        bystander = stack.enter_context(served.agent("arm"))
+        bystander.reset(Obs(), "x")
+        begun = time.monotonic()
+        revoke(served.keys, "leaver")
+        with pytest.raises(ConnectionClosed, match="revoked"):
+            idle.recv(timeout=30)
+        assert time.monotonic() - begun < 20
+        for agent in agents.values():
+            with pytest.raises((Unauthorized, ConnectionLost)):
+                agent.act(Obs())
+            with pytest.raises(Unauthorized):
+                agent.reset(Obs(), "x")
+        bystander.act(Obs())
+
+
+def test_the_shared_memory_door_wants_a_key_before_anything_else(served: Served) -> None:
+    status, body = served.status("/v1/metadata", {"x-api-key": served.tokens["arm"]})
+    assert status == 200
+    local = json.loads(body)["local"]
+    assert local["keyed"]
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as door:
+        door.settimeout(10)
+        door.connect(f"\0{local['socket']}")
+        for message in (b"wrong", b"-", encode_requests([Request("reset", Obs())])):
+            door.send(message)
+            (reply,) = decode_replies(door.recv(2**17)[LocalAddress.REPLY.size :])
+            assert isinstance(reply.error, Unauthorized)
+
+
+def test_a_replicas_own_ports_want_a_key_too(served: Served) -> None:
+    """That for HTTP, and that for WebSockets, whose only path is told with the metadata."""
+    ports = {one.port for one in listeners(psutil.Process()) if one.process == REPLICA and one.host == "127.0.0.1"}
+    found = set()
+    for port in ports:
+        for path in ("/docs", "/v1/metadata", "/v1/stream/guess"):
+            connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
+            with contextlib.closing(connection):
+                connection.request("GET", path)
+                found.add((port, connection.getresponse().status))
+    assert sorted(status for _, status in found) in ([400, 401], [401, 404])
+    _, metadata = served.status("/v1/metadata", {"x-api-key": served.tokens["arm"]})
+    stream = json.loads(metadata)["stream"]
+    with pytest.raises(InvalidStatus) as refused, connect(f"ws://127.0.0.1:{stream['port']}{stream['path']}"):
+        pytest.fail("was let in")
+    assert refused.value.response.status_code == 401
+
+
+def test_a_certificate_that_is_not_to_be_trusted_is_named_with_the_cure(served: Served, tmp_path: Path) -> None:
+    for ca in (None, authority(tmp_path, "stranger").file):
+        with pytest.raises(ConfigError, match="ca="), served.agent("arm", ca=ca) as agent:
+            agent.reset(Obs(), "x")
+    with pytest.raises(ConfigError, match="not PEM files"), served.agent("arm", ca=served.keys) as agent:
+        agent.reset(Obs(), "x")
+
+
+def test_requests_that_never_end_are_cut_off(served: Served) -> None:
+    parts = urlsplit(served.url)
+    begun = time.monotonic()
+    with (
+        socket.create_connection(("127.0.0.1", parts.port or 0), timeout=60) as raw,
+        served.trust.wrap_socket(raw, server_hostname="127.0.0.1") as slow,
+        served.agent("arm", transport="http") as bystander,
+    ):
+        slow.sendall(b"POST /v1/reset HTTP/1.1\r\nhost: x\r\n")
+        bystander.reset(Obs(), "x")
+        bystander.act(Obs())
+        answer = slow.recv(4096)
+        assert not answer or b" 408 " in answer.partition(b"\r\n")[0]
+    assert time.monotonic() - begun < 50
+
+
+# Who may use which socket of a running server. "token": whoever has the cluster's token, which lies in a file of the
+# user who started it; "key": whoever has an API key; "user": processes of the user who started it; "machine": any
+# process of this machine, which can read numbers there, and set nothing.
+REPLICA = "ray::ServeReplica:noop:Policy"
+WHO = [
+    (r"haproxy", "tcp", "front", "key"),
+    (r"haproxy", "tcp", "local", "machine"),  # Serve's own port, which asks for a key; metrics; statistics
+    (r"haproxy", "udp", "any", "nobody"),  # its log goes out there; it does not read
+    (r"haproxy", "unix", r".*/vlagents-ray-[^/]*/.*/admin\.sock.*", "user"),
+    (r"ray::HAProxyManager", "unix", r".*/vlagents-ray-[^/]*/.*/metrics\.sock", "user"),
+    (r"ray::HAProxyManager|ray::ServeController|ray::ProxyActor|ray::IDLE.*|driver", "tcp", "local", "token"),
+    (r"gcs_server|raylet", "tcp", "local", "token"),
+    (r"raylet", "unix", r".*/sockets/(raylet|plasma_store)", "user"),
+    (r"ray::DashboardAgent|ray::RuntimeEnvAgent|agent\.py", "tcp", "local", "token"),
+    (r"monitor\.py|dashboard\.py", "tcp", "local", "machine"),  # metrics of Ray itself
+    (REPLICA, "tcp", "local", "key"),  # and its worker's own, which wants the token
+    (REPLICA, "tcp", "any", "token"),  # calls between deployments: see below
+    (REPLICA, "unix", r"@vlagents-ray-[0-9a-f]{32}", "key"),
+    (REPLICA, "unix", r".*/sockets/\.?vla[0-9a-f]{8}", "user"),
+]  # fmt: skip
+
+
+def who(one: Listener, front: int) -> str | None:
+    for process, kind, where, allowed in WHO:
+        if not re.fullmatch(process, one.process) or kind != one.kind:
+            continue
+        if kind == "unix":
+            fits = re.fullmatch(where, one.host)
+        else:
+            fits = {"front": one.port == front, "local": one.is_local, "any": not one.is_local or kind == "udp"}[where]
+        if fits:
+            return allowed
+    return None
+
+
+def is_private(path: Path) -> bool:
+    """Does its own mode, or that of a folder that it is in, keep other users out?"""
+    path = path if path.exists() else path.with_name(path.name.removeprefix("."))  # renamed since it was bound
+    path = path if path.exists() else path.parent  # HAProxy's is bound under another name, in a folder of ours
+    return any(not stat.S_IMODE(place.stat().st_mode) & 0o077 for place in (path, *path.parents))
+
+
+def test_every_socket_of_a_running_server_is_known_and_closed_to_strangers(served: Served) -> None:
+    front = urlsplit(served.url).port or 0
+    found = {one: who(one, front) for one in listeners(psutil.Process())}
+    unknown = [one for one, allowed in found.items() if allowed is None]
+    assert not unknown
+    open_to_others = {one for one in found if not one.is_local and one.kind == "tcp"}
+    assert {one.process for one in open_to_others} == {"haproxy", REPLICA}
+    assert [one.port for one in open_to_others if one.process == "haproxy"] == [front]
+    assert len(open_to_others) == 2
+    for one, allowed in found.items():
+        if one.kind == "unix" and allowed == "user":
+            assert is_private(Path(one.host)), one
+
+
+def test_calls_between_deployments_want_the_clusters_token(served: Served) -> None:
+    """It is the only port of Ray's that other machines reach, and it runs what it is sent."""
+    (port,) = {
+        one.port
+        for one in listeners(psutil.Process())
+        if one.process == REPLICA and not one.is_local and one.kind == "tcp"
+    }
+    for metadata in ((), (("authorization", "Bearer wrong"),)):
+        with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
+            call = channel.unary_unary("/ray.serve.ASGIService/HandleRequest")
+            with pytest.raises(grpc.RpcError) as refused:
+                call(b"", timeout=10, metadata=metadata)
+            assert refused.value.code() == grpc.StatusCode.UNAUTHENTICATED
+
+
+def test_statistics_and_metrics_are_on_loopback_alone(served: Served) -> None:
+    for name in ("RAY_SERVE_HAPROXY_STATS_PORT", "RAY_SERVE_HAPROXY_METRICS_PORT"):
+        port = int(os.environ[name])
+        socket.create_connection(("127.0.0.1", port), timeout=5).close()
+        with pytest.raises(OSError, match="refused"):
+            socket.create_connection(("127.0.0.2", port), timeout=5).close()
+
+
+def test_off_loopback_nothing_starts_until_somebody_decides_who_is_let_in(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="--insecure"), running_server(deployment("noop"), host=EVERYWHERE):
+        pytest.fail("started")
+    with (
+        pytest.raises(ConfigError, match="keys new"),
+        running_server(deployment("noop"), host=EVERYWHERE, keys_file=tmp_path / "none.json"),
+    ):
+        pytest.fail("started")
+
+
+def test_files_that_are_no_certificate_are_refused_before_anything_starts(tmp_path: Path) -> None:
+    certificate, key = authority(tmp_path, "a").sign("server")
+    other = authority(tmp_path, "b").sign("server")[1]
+    for tls in (Tls(certificate, other), Tls(tmp_path / "none", key), Tls(certificate, key, client_ca=key)):
+        with pytest.raises(ConfigError, match="TLS"), running_server(deployment("noop"), tls=tls):
+            pytest.fail("started")

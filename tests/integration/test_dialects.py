@@ -1,0 +1,132 @@
+"""Other systems' own clients, as PyPI has them, against one batched replica: each gets its own answers."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+import yaml
+from peers import drive, peers_python
+from websockets.sync.client import connect
+
+from vlagents_ray.serve.cluster import Server, running_server
+from vlagents_ray.serve.files import IMPORT_PATH, read_deployment
+from vlagents_ray.wire import openpi
+
+CALLS = 12
+DIALECTS = {
+    "openpi": {"mapping": "openpi-libero"},
+    "roboarena": {"mapping": {"preset": "roboarena", "action_gripper": {"index": 6}}},  # Mirror's rows have 7 numbers
+    "openvla": {},
+    "vla_eval": {},
+}
+
+
+@pytest.fixture(scope="module")
+def python() -> Path:
+    return peers_python()
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    """Two applications of one deployment file: at the root, and under /pi."""
+    args = {"policy": "served_agents:Mirror", "config": {"slow_s": 0.002}, "batch": {"max_size": 8}}
+    names = {"root": ("/", DIALECTS), "pi": ("/pi", {"openpi": DIALECTS["openpi"]})}
+    apps = [
+        {"name": name, "route_prefix": prefix, "import_path": IMPORT_PATH, "args": {**args, "dialects": dialects}}
+        for name, (prefix, dialects) in names.items()
+    ]
+    file = tmp_path_factory.mktemp("deployment") / "two.yaml"
+    file.write_text(yaml.safe_dump({"applications": apps}))
+    with running_server(read_deployment(str(file)), num_cpus=4) as server:
+        yield server
+
+
+def websocket(server: Server, path: str = "") -> str:
+    return server.url.replace("http://", "ws://") + path
+
+
+def url_for(client: str, server: Server) -> str:
+    if client == "openvla":
+        return server.url
+    return websocket(server, "/vla-eval" if client == "vla_eval" else "")
+
+
+def require_own_answers(said: list[list[Any]], client: str) -> None:
+    """Pixel, state, instruction are the sender's; its acts are counted from 1 in each episode."""
+    for one in said:
+        acts = 0
+        previous = None
+        for sent, rows in one:
+            stateless = client == "openvla"
+            acts = 1 if stateless or sent["task"] != previous else acts + 1
+            previous = sent["task"]
+            number = 0.0 if stateless else sent["number"]
+            assert [row[:4] for row in rows] == [[sent["pixel"], number, acts, float(previous.split()[-1])]]
+
+
+@pytest.mark.parametrize("clients", [1, 8])
+@pytest.mark.parametrize("client", ["openpi", "roboarena", "openvla", "vla_eval"])
+def test_the_real_clients_get_their_own_answers(server: Server, python: Path, client: str, clients: int) -> None:
+    said = drive(python, client, url_for(client, server), clients, CALLS)
+    assert [len(one) for one in said] == [CALLS] * clients
+    require_own_answers(said, client)
+
+
+@pytest.mark.parametrize("path", ["/openpi", "/pi", "/pi/", "/pi/openpi"])
+def test_openpi_takes_a_whole_url_with_a_path(server: Server, python: Path, path: str) -> None:
+    require_own_answers(drive(python, "openpi", websocket(server, path), 1, 4), "openpi")
+
+
+def test_openpis_client_reads_the_key_that_is_missing(server: Server, python: Path) -> None:
+    ((said,),) = drive(python, "openpi_error", websocket(server), 1, 1)
+    assert "observation/wrist_image" in said
+    assert "Traceback" not in said.partition("Error in inference server:")[2]
+
+
+def test_openvlas_own_words_with_the_json_module_patched(server: Server, python: Path) -> None:
+    require_own_answers(drive(python, "openvla_patched", server.url, 1, 1), "openvla")
+
+
+def test_vla_eval_runs_a_benchmark_by_its_own_orchestrator(server: Server, python: Path) -> None:
+    ((result,),) = drive(python, "vla_eval_run", websocket(server, "/vla-eval"), 1, 3)
+    assert result["server_info"]["model_server"] == "served_agents:Mirror"
+    assert (result["mean_success"], result["num_errors"]) == (1.0, 0)
+    assert [episode["steps"] for episode in result["tasks"][0]["episodes"]] == [7, 7, 7]
+
+
+def test_pings_are_answered_while_the_policy_thinks(server: Server) -> None:
+    white = np.full((8, 8, 3), 255, np.uint8)
+    obs = {"observation/image": white, "observation/wrist_image": white, "observation/state": np.zeros(8)}
+    with connect(websocket(server), compression=None, ping_interval=None) as socket:
+        socket.recv()
+        socket.send(openpi.encode(obs | {"prompt": "task 1"}))
+        for _ in range(10):  # two seconds of thinking, ten round trips
+            assert socket.ping().wait(10)
+        with pytest.raises(TimeoutError):
+            socket.recv(timeout=0)
+        assert openpi.decode(socket.recv(timeout=30))["actions"][0, 0] == 255
+
+
+def test_all_of_them_at_once_beside_our_own(server: Server, python: Path) -> None:
+    failed: list[BaseException] = []
+
+    def run(client: str) -> None:
+        try:
+            require_own_answers(drive(python, client, url_for(client, server), 3, CALLS), client)
+        except BaseException as error:  # noqa: BLE001 - raised below
+            failed.append(error)
+
+    threads = [threading.Thread(target=run, args=(client,)) for client in DIALECTS]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert failed == []
+    assert httpx.get(f"{server.url}/healthz").status_code == 200
+    assert httpx.get(f"{server.url}/v1/metadata").json()["dialects"].keys() == DIALECTS.keys()

@@ -1,0 +1,43 @@
+"""API keys at the doors with ports of their own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from eval_fakes import wait_for
+from gr00t_client import PolicyClient
+from rpyc_client import Client, document
+
+from tests.integration.conftest import serving
+from vlagents_ray.serve.cluster import free_port
+from vlagents_ray.serve.keyfile import new_key
+
+
+def test_with_keys_on_only_who_has_one_is_served_and_a_revoked_one_is_not(tmp_path: Path) -> None:
+    """GR00T's protocol carries a key, vlagents' does not: its door is opened on purpose, or not at all."""
+    file = tmp_path / "keys.json"
+    key = new_key(file, "arm")
+    observation = {"video": {"ego": np.full((1, 1, 8, 8, 3), 3, np.uint8)}, "language": {"task": [["abc"]]}}
+    robots, arms = free_port(), free_port()
+    dialects = {"vlagents": {"port": robots, "without_key": True}, "gr00t": {"port": arms}}
+    with serving("served_agents:Witness", dialects=dialects, access={"keys_file": str(file)}):
+        with Client(robots) as robot:
+            assert robot.act(document(8, "x")) == [8, 0.5, 0.25, 1, 1]
+        for wrong in (None, "wrong"):
+            with PolicyClient(arms, wrong) as client, pytest.raises(RuntimeError, match="unauthorized"):
+                client.get_action(observation)
+        with PolicyClient(arms, key) as client:
+            assert client.get_action(observation)[0]["action"][0, 0].tolist() == [3, 0, -1, 3, 1]
+            file.unlink()
+            wait_for(lambda: _refused(lambda: client.get_action(observation)))
+
+
+def _refused(ask: Callable[[], object]) -> bool:
+    try:
+        ask()
+    except RuntimeError as error:
+        return "unauthorized" in str(error)
+    return False

@@ -1,0 +1,161 @@
+"""The real clients of vlagents, and GR00T's, on one batched replica of a real server."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from eval_fakes import wait_for
+from gr00t_client import PolicyClient
+from peer_versions import package
+from peers import peers_python
+
+from tests.integration.conftest import SUPPORT, serving
+from vlagents_ray.bench.child import Child
+from vlagents_ray.serve.cluster import free_port
+
+ANSWER_S = 120.0  # the client's imports included
+
+
+@dataclass(frozen=True)
+class Ports:
+    vlagents: int
+    gr00t: int
+
+
+@pytest.fixture(scope="module")
+def ports() -> Iterator[Ports]:
+    """One replica with both doors."""
+    ports = Ports(free_port(), free_port())
+    dialects = {"vlagents": {"port": ports.vlagents}, "gr00t": {"port": ports.gr00t}}
+    with serving("served_agents:Witness", batch={"max_size": 8}, dialects=dialects):
+        yield ports
+
+
+class Robot:
+    """A process with the real client of vlagents."""
+
+    def __init__(self, port: int, mode: str, version: Sequence[Path] = ()) -> None:
+        script = str(SUPPORT / "vlagents_robot.py")
+        alone = {"PYTHONPATH": os.pathsep.join(map(str, version)), "WANDB_MODE": "offline"}
+        words = [str(peers_python()), script, "127.0.0.1", str(port), "Witness", mode]
+        self.child = Child(f"vlagents {mode}", words, alone)
+
+    def say(self, **wish: Any) -> Any:
+        return self.child.ask(json.dumps(wish), ANSWER_S)
+
+    def act(self, pixel: int, instruction: str = "abc", **more: Any) -> list:
+        """[action rows] of each call."""
+        answer = self.say(pixel=pixel, joints=0.5, gripper=0.25, instruction=instruction, **more)
+        if isinstance(answer, dict):
+            raise RuntimeError(answer["error"])  # noqa: TRY004 - what the robot was told
+        return [[step[1] for step in act] for act in answer]
+
+
+@contextlib.contextmanager
+def robots(port: int, *modes: str, version: Sequence[Path] = ()) -> Iterator[list[Robot]]:
+    with contextlib.ExitStack() as stack:
+        found = [Robot(port, mode, version) for mode in modes]
+        for robot in found:
+            stack.enter_context(robot.child)
+        yield found
+
+
+def at_once(*calls: Callable[[], object]) -> list[object]:
+    """What each of the calls returns, each made by a thread of its own."""
+    results: dict[int, object] = {}
+
+    def run(number: int) -> None:
+        try:
+            results[number] = calls[number]()
+        except Exception as error:  # noqa: BLE001 - compared by the test
+            results[number] = error
+
+    threads = [threading.Thread(target=run, args=(number,)) for number in range(len(calls))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(300)
+    return [results[number] for number in range(len(calls))]
+
+
+def close_to(rows: list, pixel: int, acts: int, text: int = 3) -> bool:
+    want = [[pixel, 0.5, 0.25, text, acts], [pixel, 0.5, 0.25, text, acts + 1]]
+    return bool(np.allclose(rows, want, atol=[2, 1e-6, 1e-6, 0, 0]))  # JPEG moves a pixel a little
+
+
+def test_vlagents_0_3_raw_jpeg_and_shared_memory_at_once(ports: Ports) -> None:
+    """Every client gets its own answers, and one's end leaves the others' memory where it is."""
+    with robots(ports.vlagents, "raw", "jpeg", "shm", "shm") as fleet:
+        assert at_once(*(lambda r=robot: r.say(say="is_initialized") for robot in fleet)) == [True] * 4  # type: ignore[misc]
+        assert fleet[0].say(say="git_status").keys() == {"vlagents_ray"}
+        answers = at_once(*(lambda r=r, i=i: r.act(50 * i, calls=40) for i, r in enumerate(fleet)))  # type: ignore[misc]
+        for i, acts in enumerate(answers):
+            assert isinstance(acts, list), acts
+            assert len(acts) == 40
+            assert all(close_to(rows, 50 * i, number + 1) for number, rows in enumerate(acts))
+        segments = fleet[3].say(say="segments")
+        assert fleet[2].say(say="close") == "closed"
+        assert segments
+        assert all((Path("/dev/shm") / name).exists() for name in segments)
+        assert close_to(fleet[3].act(99)[0], 99, 41)
+        assert close_to(fleet[0].act(98, "other words")[0], 98, 1, text=11)
+    assert not any((Path("/dev/shm") / name).exists() for name in segments)
+
+
+def test_vlagents_0_2_resets_and_acts(ports: Ports) -> None:
+    with robots(ports.vlagents, "raw", "shm", version=[package("vlagents==0.2.0")]) as fleet:
+        for i, robot in enumerate(fleet):
+            with pytest.raises(RuntimeError, match="not_reset"):
+                robot.act(10)
+            wish = {"pixel": 10 + i, "joints": 0.5, "gripper": 0.25, "kwargs": {"seed": 3}}
+            assert robot.say(reset="pick it", **wish) == {"instruction": "pick it", "options": {"seed": 3}}
+            [[rows]] = robot.act(20 + i)
+            assert close_to(rows, 20 + i, 1, text=7)
+
+
+def test_gr00t_clients_at_once_beside_vlagents(ports: Ports) -> None:
+    def observation(pixel: int) -> dict[str, Any]:
+        return {
+            "video": {"ego": np.full((1, 1, 32, 32, 3), pixel, np.uint8)},
+            "state": {"arm": np.full((1, 1, 3), 0.5, np.float32)},
+            "language": {"task": [["abc"]]},
+        }
+
+    def episode(pixel: int) -> list[list[float]]:
+        with PolicyClient(ports.gr00t) as client:
+            return [client.get_action(observation(pixel))[0]["action"][0, 0].tolist() for _ in range(60)]
+
+    with robots(ports.vlagents, "raw") as [robot]:
+        *episodes, acts = at_once(
+            *(lambda p=pixel: episode(p) for pixel in range(10, 70, 10)),  # type: ignore[misc]
+            lambda: robot.act(5, calls=20),
+        )
+    assert episodes == [[[pixel, 0.5, -1, 3, i + 1] for i in range(60)] for pixel in range(10, 70, 10)]
+    assert isinstance(acts, list), acts
+    assert all(close_to(rows, 5, number + 1) for number, rows in enumerate(acts))
+
+
+def test_clients_go_on_when_the_replica_behind_the_gateway_dies(ports: Ports) -> None:
+    """The last test of the server: its replica is killed, and Serve replaces it."""
+    with robots(ports.vlagents, "shm") as [robot], PolicyClient(ports.gr00t) as client:
+        wish = {"pixel": 7, "joints": 0.5, "gripper": 0.25, "instruction": "abc"}
+        [before] = robot.say(**wish)
+        pid = before[0][4]["pid"]
+        client.ping()
+        os.kill(pid, signal.SIGKILL)
+        wait_for(lambda: not Path(f"/proc/{pid}").exists() or "Z" in Path(f"/proc/{pid}/stat").read_text().split()[2])
+        [after] = robot.say(**wish)
+        assert after[0][4]["pid"] != pid
+        assert after[0][4]["resumed"] is True
+        assert close_to([step[1] for step in after], 7, 1)
+        assert client.ping()["status"] == "ok"

@@ -1,0 +1,308 @@
+"""The guard before the robots' door: keys and slow clients, on a real HTTP server without Ray."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import http.client
+import json
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import uvicorn
+from eval_fakes import wait_for
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from vlagents_ray import Forbidden, Obs, RemoteAgent, TooManyRequests, Unauthorized
+from vlagents_ray.interface import Act, Agent
+from vlagents_ray.serve import auth
+from vlagents_ray.serve.auth import Keys
+from vlagents_ray.serve.engine import Engine
+from vlagents_ray.serve.guard import Guard
+from vlagents_ray.serve.ingress import build_ingress
+from vlagents_ray.serve.keyfile import new_key, revoke
+from vlagents_ray.serve.ports import free_port
+from vlagents_ray.wire.messages import PROTOCOL_VERSION, Limits
+
+SLOW_S = 1.0
+TOKENS = {
+    "arm": {"sessions": 2},
+    "lab": {},
+    "other": {"apps": ("pi0",)},
+    "slow": {"rate": 3},
+    "sim": {"rank": "simulation"},
+    "leaver": {},
+    "ending": {},
+}
+
+
+class Big(Agent):
+    """Tells more than any socket takes without being read."""
+
+    def act(self, obs: Obs) -> Act:
+        return Act(np.zeros(2, np.float32), info={"much": np.zeros(int(obs.info.get("bytes", 1)), np.uint8)})
+
+
+@dataclass
+class Door:
+    url: str
+    port: int
+    engine: Engine
+    file: Path
+    tokens: dict[str, str]
+
+    def agent(self, name: str, transport: str = "http", **options: object) -> RemoteAgent:
+        return RemoteAgent(self.url, transport=transport, api_key=self.tokens[name], **options)  # type: ignore[arg-type]
+
+    def get(self, path: str, headers: dict[str, str] | None = None) -> tuple[int, dict[str, str], bytes]:
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=10)
+        with contextlib.closing(connection):
+            connection.request("GET", path, headers=headers or {})
+            answer = connection.getresponse()
+            return answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read()
+
+    def stream(self, headers: dict[str, str]):
+        url = self.url.replace("http", "ws") + "/v1/stream"
+        return connect(url, additional_headers=headers, ping_interval=None, close_timeout=1)
+
+
+@contextlib.contextmanager
+def served(app: Guard) -> Iterator[int]:
+    """On a port of this machine."""
+    port = free_port()
+    server = uvicorn.Server(
+        uvicorn.Config(app, port=port, log_level="critical", lifespan="off", ws="websockets-sansio")
+    )
+    thread = threading.Thread(target=lambda: asyncio.run(server.serve()))
+    thread.start()
+    wait_for(lambda: server.started)
+    try:
+        yield port
+    finally:
+        server.should_exit = server.force_exit = True
+        thread.join()
+
+
+@pytest.fixture(scope="module")
+def door(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Door]:
+    before, auth._LOOK_S = auth._LOOK_S, 0.0
+    file = tmp_path_factory.mktemp("keys") / "keys.json"
+    tokens = {name: new_key(file, name, **allowed) for name, allowed in TOKENS.items()}  # type: ignore[arg-type]
+    engine = Engine(Big())
+    engine.start()
+    inside = build_ingress(
+        engine, lambda: {"policy": "p", "version": "0", "protocol": PROTOCOL_VERSION}, Limits(body_bytes=2**24)
+    )
+    guard = Guard(inside, Keys.from_file(file), "noop", slow_s=SLOW_S, idle_s=3600)
+    with served(guard) as port:
+        yield Door(f"http://127.0.0.1:{port}", port, engine, file, tokens)
+    engine.close()
+    auth._LOOK_S = before
+
+
+def bearer(token: str) -> dict[str, str]:
+    return {"authorization": f"Bearer {token}"}
+
+
+@pytest.mark.parametrize(
+    "path", ["/docs", "/v1/metadata", "/v1/act", "/v1/probe", "/", "/nope", "/healthz/", "//healthz"]
+)
+def test_no_path_answers_without_a_key(door: Door, path: str) -> None:
+    for headers in ({}, bearer("wrong"), {"x-api-key": "wrong"}):
+        status, said, body = door.get(path, headers)
+        assert status == 401
+        assert said["www-authenticate"].startswith("Bearer")
+        document = json.loads(body)
+        assert document["code"] == "unauthorized"
+        assert document["request_id"]
+    status, said, body = door.get(path, bearer(door.tokens["other"]))
+    assert (status, json.loads(body)["code"]) == (403, "forbidden")
+
+
+def test_a_request_id_of_the_callers_own_comes_back_with_the_refusal(door: Door) -> None:
+    _, _, body = door.get("/v1/metadata", {"x-request-id": "mine"})
+    assert json.loads(body)["request_id"] == "mine"
+
+
+def test_health_alone_needs_no_key_and_tells_nothing(door: Door) -> None:
+    assert door.get("/healthz")[0::2] == (200, b"OK\n")
+
+
+def test_a_right_key_is_let_in_by_each_header(door: Door) -> None:
+    token = door.tokens["lab"]
+    for headers in (bearer(token), {"authorization": f"Api-Key {token}"}, {"x-api-key": token}):
+        assert door.get("/v1/metadata", headers)[0] == 200
+        with door.stream(headers) as stream:
+            stream.ping().wait(5)
+
+
+def test_a_websocket_is_refused_before_it_is_accepted(door: Door) -> None:
+    for headers, status in (({}, 401), (bearer("wrong"), 401), (bearer(door.tokens["other"]), 403)):
+        with pytest.raises(InvalidStatus) as refused, door.stream(headers):
+            pytest.fail("was let in")
+        assert refused.value.response.status_code == status
+        assert json.loads(refused.value.response.body or b"")["status"] == status
+
+
+@pytest.mark.parametrize("transport", ["http", "websocket", "auto"])
+def test_a_client_without_a_right_key_hears_so_at_once(door: Door, transport: str) -> None:
+    begun = time.monotonic()
+    for token, error in ((None, Unauthorized), ("wrong", Unauthorized), (door.tokens["other"], Forbidden)):
+        with pytest.raises(error), RemoteAgent(door.url, transport=transport, api_key=token) as agent:  # type: ignore[arg-type]
+            agent.reset(Obs(), "x")
+    assert time.monotonic() - begun < 20  # it tries no further for the 60 s that a server may take to start
+
+
+def test_the_key_may_come_from_the_environment(door: Door, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VLAGENTS_RAY_API_KEY", door.tokens["lab"])
+    with RemoteAgent(door.url, transport="websocket") as agent:
+        agent.reset(Obs(), "x")
+        assert door.tokens["lab"] not in repr(vars(agent._connection.transport))
+
+
+def test_one_keys_session_is_out_of_reach_for_another(door: Door) -> None:
+    def post(token: str, op: str) -> tuple[int, bytes]:
+        connection = http.client.HTTPConnection("127.0.0.1", door.port, timeout=10)
+        with contextlib.closing(connection):
+            headers = {"x-session-id": "shared", "content-type": "application/json", **bearer(token)}
+            connection.request("POST", f"/v1/{op}", b'{"obs": {}}' if op == "close" else b"{}", headers)
+            answer = connection.getresponse()
+            return answer.status, answer.read()
+
+    assert post(door.tokens["lab"], "reset")[0] == 200
+    assert post(door.tokens["lab"], "act")[0] == 200
+    status, body = post(door.tokens["arm"], "act")
+    assert (status, json.loads(body)["code"]) == (404, "unknown_session")
+    assert post(door.tokens["arm"], "close")[0] in (200, 400)
+    assert post(door.tokens["lab"], "act")[0] == 200
+
+
+@pytest.mark.parametrize("transport", ["http", "websocket"])
+def test_a_key_holds_no_more_sessions_than_it_may(door: Door, transport: str) -> None:
+    with door.agent("arm", transport) as first, door.agent("arm", transport) as second:
+        first.reset(Obs(), "x")
+        second.reset(Obs(), "x")
+        with door.agent("arm", transport) as third, pytest.raises(TooManyRequests, match="2 sessions"):
+            third.reset(Obs(), "x")
+        with door.agent("lab", transport) as other:
+            other.reset(Obs(), "x")
+        first.reset(Obs(), "again")
+        second.close()
+        wait_for(lambda: sum(name.startswith("arm/") for name in door.engine.sessions.ids()) < 2)
+        with door.agent("arm", transport) as third:
+            third.reset(Obs(), "x")
+    wait_for(lambda: not any(name.startswith("arm/") for name in door.engine.sessions.ids()))
+
+
+def test_too_many_requests_are_told_when_to_come_again(door: Door) -> None:
+    found = [door.get("/v1/metadata", bearer(door.tokens["slow"])) for _ in range(12)]
+    limited = [headers for status, headers, _ in found if status == 429]
+    assert limited
+    assert all(int(headers["retry-after"]) >= 1 for headers in limited)
+    with door.agent("slow", "websocket") as agent:
+        wait_for(lambda: door.get("/v1/metadata", bearer(door.tokens["slow"]))[0] == 200)
+        errors = []
+        for _ in range(12):
+            try:
+                agent.reset(Obs(), "x")
+            except TooManyRequests as error:
+                errors.append(error)
+        assert errors
+
+
+def test_a_simulations_key_makes_all_its_requests_simulations(door: Door) -> None:
+    ranks = []
+    queue = door.engine.queue
+    put = queue.put
+
+    def watched(*tickets: object) -> None:
+        ranks.extend(ticket.rank.name for ticket in tickets)  # type: ignore[attr-defined]
+        put(*tickets)  # type: ignore[arg-type]
+
+    queue.put = watched  # type: ignore[method-assign]
+    try:
+        for name in ("sim", "lab"):
+            with door.agent(name, rank="robot") as agent:
+                agent.reset(Obs(), "x")
+                agent.act(Obs())
+    finally:
+        queue.put = put  # type: ignore[method-assign]
+    assert ranks == ["SIMULATION"] * 3 + ["ROBOT"] * 3  # reset, act, close
+
+
+def test_a_revoked_key_hangs_up_its_websockets_and_no_others(door: Door) -> None:
+    with door.stream(bearer(door.tokens["leaver"])) as idle, door.agent("lab", "websocket") as other:
+        other.reset(Obs(), "x")
+        revoke(door.file, "leaver")
+        with pytest.raises(ConnectionClosed) as closed:
+            idle.recv(timeout=10)
+        assert closed.value.rcvd is not None
+        assert closed.value.rcvd.code == 1008
+        assert "revoked" in closed.value.rcvd.reason
+        other.act(Obs())
+
+
+def test_a_body_that_does_not_come_is_cut_off(door: Door) -> None:
+    with door.agent("lab") as bystander, socket.create_connection(("127.0.0.1", door.port), timeout=30) as slow:
+        bystander.reset(Obs(), "x")
+        head = f"POST /v1/reset HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {door.tokens['lab']}\r\n"
+        head += "x-session-id: slow\r\ncontent-type: application/json\r\ncontent-length: 100\r\n\r\n{"
+        slow.sendall(head.encode())
+        answer = slow.recv(65536)
+        assert answer.startswith(b"HTTP/1.1 408")
+        assert b"problem+json" in answer
+        bystander.act(Obs())
+    assert "lab/slow" not in door.engine.sessions.ids()
+
+
+def test_a_websocket_that_never_reads_its_replies_ends_with_its_sessions_alone(door: Door) -> None:
+    from vlagents_ray.wire.frames import encode_request
+    from vlagents_ray.wire.messages import Request
+
+    with door.agent("lab", "websocket") as bystander:
+        bystander.reset(Obs(), "x")
+        before = set(door.engine.sessions.ids())
+        deaf = socket.create_connection(("127.0.0.1", door.port), timeout=30)
+        with connect(
+            door.url.replace("http", "ws") + "/v1/stream",
+            sock=deaf,
+            additional_headers=bearer(door.tokens["ending"]),
+            max_queue=1,
+            ping_interval=None,
+            close_timeout=1,
+        ) as stream:
+            stream.send(encode_request(Request("reset", Obs())))
+            wait_for(lambda: set(door.engine.sessions.ids()) > before)
+            for _ in range(30):
+                stream.send(encode_request(Request("act", Obs(info={"bytes": 2**20}))))
+            wait_for(lambda: set(door.engine.sessions.ids()) == before)
+            bystander.act(Obs())
+            with contextlib.suppress(OSError):
+                deaf.shutdown(socket.SHUT_RDWR)
+
+
+def test_a_websocket_that_stays_silent_or_sends_half_a_message_is_cut_off() -> None:
+    engine = Engine(Big())
+    engine.start()
+    with served(Guard(build_ingress(engine, dict, Limits()), None, "noop", idle_s=SLOW_S)) as port:
+        with socket.create_connection(("127.0.0.1", port), timeout=30) as half:
+            half.sendall(
+                b"GET /v1/stream HTTP/1.1\r\nhost: x\r\nconnection: upgrade\r\nupgrade: websocket\r\n"
+                b"sec-websocket-version: 13\r\nsec-websocket-key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+            )
+            assert half.recv(4096).startswith(b"HTTP/1.1 101")
+            half.sendall(b"\x82\xfe\x00\x7e" + bytes(8))  # of a masked frame of 126 bytes, the first 4
+            assert half.recv(4096)[0] == 0x88  # the server closes
+        with (
+            connect(f"ws://127.0.0.1:{port}/v1/stream", ping_interval=None, close_timeout=1) as silent,
+            pytest.raises(ConnectionClosed, match="silent"),
+        ):
+            silent.recv(timeout=30)
+    engine.close()

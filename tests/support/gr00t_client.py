@@ -1,0 +1,92 @@
+"""A client as GR00T's own `PolicyClient` is (gr00t/policy/server_client.py): a REQ socket, msgpack, .npy files.
+
+GR00T is not on PyPI; this follows its code, and its answers are decoded by numpy's own reader.
+"""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import msgpack
+import numpy as np
+import zmq
+
+
+def encode(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        file = io.BytesIO()
+        np.save(file, value, allow_pickle=False)
+        return {"__ndarray_class__": True, "as_npy": file.getvalue()}
+    return value
+
+
+def encode_packed(value: Any) -> Any:
+    """As msgpack_numpy does, which GR00T's newest client uses."""
+    if isinstance(value, np.ndarray):
+        return {b"nd": True, b"type": value.dtype.str, b"kind": b"", b"shape": value.shape, b"data": value.tobytes()}
+    return value
+
+
+def decode(value: Any) -> Any:
+    if "__ModalityConfig_class__" in value:
+        return value["as_json"]
+    if "__ndarray_class__" in value:
+        return np.load(io.BytesIO(value["as_npy"]), allow_pickle=False)
+    if b"nd" in value:
+        return np.ndarray(buffer=value[b"data"], dtype=value[b"type"], shape=value[b"shape"])
+    return value
+
+
+class PolicyClient:
+    """`get_action`, `reset`, `ping`, `get_modality_config`."""
+
+    def __init__(
+        self, port: int, api_token: str | None = None, timeout_ms: int = 30_000, *, packed: bool = False
+    ) -> None:
+        self.context = zmq.Context()
+        self.api_token = api_token
+        self.encode = encode_packed if packed else encode
+        self.socket = self.context.socket(zmq.REQ)
+        self.socket.setsockopt(zmq.RCVTIMEO, timeout_ms)
+        self.socket.setsockopt(zmq.LINGER, 0)
+        self.socket.connect(f"tcp://127.0.0.1:{port}")
+
+    def call_endpoint(self, endpoint: str, data: Any = None, requires_input: bool = True) -> Any:
+        request: dict[str, Any] = {"endpoint": endpoint}
+        if requires_input:
+            request["data"] = data
+        if self.api_token:
+            request["api_token"] = self.api_token
+        self.socket.send(msgpack.packb(request, default=self.encode))
+        response = msgpack.unpackb(self.socket.recv(), object_hook=decode)
+        if isinstance(response, dict) and "error" in response:
+            raise RuntimeError(f"Server error: {response['error']}")
+        return response
+
+    def ping(self) -> Any:
+        return self.call_endpoint("ping", requires_input=False)
+
+    def get_action(self, observation: dict, options: dict | None = None) -> tuple[dict, dict]:
+        """N1.6 and newer."""
+        return tuple(self.call_endpoint("get_action", {"observation": observation, "options": options}))
+
+    def get_action_n15(self, observation: dict) -> dict:
+        """N1.5."""
+        return self.call_endpoint("get_action", observation)
+
+    def reset(self, options: dict | None = None) -> dict:
+        return self.call_endpoint("reset", {"options": options})
+
+    def get_modality_config(self) -> dict:
+        return self.call_endpoint("get_modality_config", requires_input=False)
+
+    def close(self) -> None:
+        self.socket.close()
+        self.context.term()
+
+    def __enter__(self) -> PolicyClient:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()

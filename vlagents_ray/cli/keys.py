@@ -1,0 +1,82 @@
+"""`vlagents-ray keys`: make, list and revoke the API keys of a server."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from vlagents_ray.cli.console import err, errors, out
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.serve.auth import FILE_VARIABLE
+from vlagents_ray.serve.keyfile import Key, new_key, read_keys, revoke
+
+keys = typer.Typer(no_args_is_help=True, help="The API keys of a server: make, list and revoke them.")
+File = Annotated[
+    Path | None, typer.Option("--file", help=f"The key file; default: {FILE_VARIABLE}, or keys.json in this folder.")
+]
+Name = Annotated[str, typer.Argument(help="Who has the key: arm-1, lab, …")]
+_DAY_S = 86_400
+
+
+@keys.command("new")
+def new(
+    name: Name,
+    file: File = None,
+    app: Annotated[list[str], typer.Option(help="An application that it is for, repeatable; default: all.")] = [],  # noqa: B006
+    rate: Annotated[float | None, typer.Option(help="Requests a second, at each replica.")] = None,
+    sessions: Annotated[int | None, typer.Option(min=1, help="Sessions held at once, at each replica.")] = None,
+    rank: Annotated[str | None, typer.Option(help="'simulation': none of its requests goes before a robot's.")] = None,
+    days: Annotated[float | None, typer.Option(help="It expires after so many days.")] = None,
+) -> None:
+    """Make a key. It is shown this once; the file keeps its hash."""
+    with errors():
+        expires = None if days is None else time.time() + days * _DAY_S
+        place = _file(file)
+        token = new_key(place, name, apps=tuple(app), rate=rate, sessions=sessions, rank=rank, expires=expires)
+        err.print(f"key [bold]{escape(name)}[/] added to {escape(str(place))}; it is not shown again:", highlight=False)
+        out.print(token, highlight=False, markup=False, soft_wrap=True)
+
+
+@keys.command("list")
+def list_(file: File = None) -> None:
+    """List the keys, and what each allows."""
+    with errors():
+        table = Table("name", "for", "requests/s", "sessions", "class", "state")
+        for key in read_keys(_existing(file)):
+            limits = ("any" if value is None else f"{value:g}" for value in (key.rate, key.sessions))
+            table.add_row(key.name, ", ".join(key.apps) or "all", *limits, key.rank or "any", _state(key))
+        out.print(table)
+
+
+@keys.command("revoke")
+def revoke_(name: Name, file: File = None) -> None:
+    """Revoke a key. Running servers notice within seconds, and hang up on whoever used it."""
+    with errors():
+        revoke(_existing(file), name)
+        out.print(f"key {name} revoked", highlight=False, markup=False)
+
+
+def _state(key: Key) -> str:
+    if key.revoked:
+        return "[red]revoked[/]"
+    if key.expires is None:
+        return "[green]valid[/]"
+    date = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(key.expires))
+    return f"[green]until {date}[/]" if key.expires > time.time() else f"[red]expired {date}[/]"
+
+
+def _file(file: Path | None) -> Path:
+    return file or Path(os.environ.get(FILE_VARIABLE) or "keys.json")
+
+
+def _existing(file: Path | None) -> Path:
+    place = _file(file)
+    if not place.is_file():
+        raise ConfigError(f"keys file {place} does not exist; `vlagents-ray keys new NAME --file {place}` makes it")
+    return place
