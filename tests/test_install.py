@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
 import venv
 import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -78,6 +80,64 @@ obs = Obs(cameras={"front": np.zeros((8, 8, 3), np.uint8)}, gripper=1.0)
 print(decode(encode_jpeg(obs.cameras["front"])).shape)
 """
     assert run(robot, code) == "(8, 8, 3)"
+
+
+def test_the_import_takes_half_a_second_at_the_most(robot: Path) -> None:
+    code = "import time, vlagents_ray, vlagents_ray.robot; print(time.process_time())"  # the interpreter's start, too
+    assert min(float(run(robot, code)) for _ in range(3)) < 0.5
+
+
+@pytest.fixture(scope="module")
+def url() -> Iterator[str]:
+    """A server of this checkout, without Ray."""
+    command = [sys.executable, str(ROOT / "tests/support/plain_door.py"), "127.0.0.1"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as server:
+        try:
+            assert server.stdout is not None
+            yield f"http://127.0.0.1:{int(server.stdout.readline())}"
+        finally:
+            server.terminate()
+
+
+@pytest.mark.parametrize("transport", ["websocket", "http"])
+def test_a_robot_drives_a_server_in_80_mb(robot: Path, url: str, transport: str) -> None:
+    code = f"""
+import re
+import numpy as np
+from vlagents_ray import ChunkPlayer, Obs, RemoteAgent
+from vlagents_ray.robot import run_loop
+obs = Obs(cameras={{name: np.zeros((224, 224, 3), np.uint8) for name in ("front", "wrist")}}, gripper=1.0)
+
+class Arm:
+    def observe(self):
+        return obs
+    def apply(self, action):
+        assert action.shape == (7,)
+    def stop(self):
+        pass
+
+with RemoteAgent({url!r}, transport={transport!r}) as agent:
+    agent.reset(obs, "stack")
+    assert agent.act(obs).action.shape == (7,)
+    with ChunkPlayer(agent, mode="async", safe="zero") as player:
+        report = run_loop(Arm(), player, hz=50, seconds=0.5)
+    assert report.jitter["ticks"] > 0
+    print(re.search("VmRSS:[^0-9]*([0-9]+) kB", open("/proc/self/status").read())[1])
+"""
+    assert int(run(robot, code)) < 80_000
+
+
+def test_a_robot_without_the_extra_is_told_how_to_record(robot: Path, tmp_path: Path) -> None:
+    code = f"""
+from vlagents_ray.errors import MissingDependency
+from vlagents_ray.robot.record import Recorder
+try:
+    Recorder({str(tmp_path)!r}, 50)
+except MissingDependency as error:
+    print(error)
+"""
+    assert "pip install 'vlagents-ray[record]'" in run(robot, code)
 
 
 def test_what_a_robot_lacks_is_asked_for_by_the_extra_that_brings_it(robot: Path) -> None:

@@ -3,7 +3,7 @@
 This is the light install: it needs numpy, simplejpeg and websockets, and loads neither ray nor torch.
 """
 
-from vlagents_ray.client import RemoteAgent
+from vlagents_ray.client import ChunkPlayer, RemoteAgent
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.errors import (
     ConfigError,
@@ -29,6 +29,7 @@ __all__ = [
     "ActionSpec",
     "Agent",
     "CameraSpec",
+    "ChunkPlayer",
     "ConfigError",
     "ConnectionLost",
     "Contract",

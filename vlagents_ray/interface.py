@@ -37,6 +37,17 @@ DEPTH = "depth"  # {camera: (H, W) float32, metres; or uint16, millimetres}
 HIGH_RES = "high_res"  # {camera: (H, W, 3) uint8 RGB}, for the record only, never for the policy
 SAMPLES = "samples"  # in an observation: how many draws from its action distribution the policy shall return, N
 DISTRIBUTION = "distribution"  # in the Act: {"mean", "std": shaped as the action; "samples": (N, *action)} float32
+CAPTURED = "captured_at"  # in an observation: when the sensors were read, s since 1970 (`time.time`)
+DEADLINE = "deadline_ms"  # in an observation: no answer is wanted after this long; `RemoteAgent` gives it up then
+# Real-time chunking (Black, Galliker & Levine 2025, https://arxiv.org/abs/2506.07339), in an observation: what the
+# robot will do while the policy thinks. The first DELAY rows of LEFTOVER will have been executed when the answer
+# comes, so the new chunk begins with them; the later ones are what it should go on from smoothly.
+LEFTOVER = "leftover_actions"  # (H', D) float32: the current plan from this observation's tick on
+DELAY = "delay_ticks"  # int: ticks until the answer comes, the longest measured of late
+# In the Act of a chunk player:
+SAFE = "safe"  # str: this is the safe action, and why; absent where it is the policy's
+AGE = "age_ticks"  # int: ticks between the observation that the action was made from, and now
+SILENT = "silent_s"  # float: for how long an answer has been waited for, retries included; 0.0 if none is
 
 
 @dataclass(slots=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -10,7 +12,17 @@ import numpy as np
 import pytest
 from in_process import Replicas
 
-from vlagents_ray import Act, Agent, ConfigError, ConnectionLost, NotReset, Obs, PolicyFailed, PolicyUnavailable
+from vlagents_ray import (
+    Act,
+    Agent,
+    ConfigError,
+    ConnectionLost,
+    InvalidObservation,
+    NotReset,
+    Obs,
+    PolicyFailed,
+    PolicyUnavailable,
+)
 from vlagents_ray.contract import Contract
 
 
@@ -129,6 +141,40 @@ def test_when_nobody_lives_the_loss_is_raised_in_time_and_a_later_act_goes_on(
     served.dead.clear()
     act = agent.act(obs(4))
     assert act.action.tolist() == [1, 2, 4]
+    agent.close()
+
+
+def test_a_server_that_stops_and_starts_again_is_waited_for(replicas: Callable[[int], Replicas]) -> None:
+    served = replicas(1)
+    agent = served.agent()
+    agent.reset(obs(1), "stack")
+    agent.act(obs(2))
+    agent._connection.timeout_s = 0.3
+    served.dead.add(0)
+    served.stopping = True
+    with pytest.raises(PolicyUnavailable, match="gone"):
+        agent.act(obs(3))
+    served.dead.clear()
+    threading.Timer(0.1, lambda: setattr(served, "stopping", False)).start()
+    agent._connection.timeout_s = 30.0
+    assert agent.act(obs(4)).action.tolist() == [1, 2, 4]
+    agent.close()
+
+
+def test_an_observation_may_allow_less_time(replicas: Callable[[int], Replicas]) -> None:
+    served = replicas(1)
+    agent = served.agent(timeout_s=30.0)
+    agent.reset(obs(1), "stack")
+    served.dead.add(0)
+    begun = time.monotonic()
+    hasty = obs(2)
+    hasty.info["deadline_ms"] = 100
+    with pytest.raises((ConnectionLost, PolicyUnavailable)):
+        agent.act(hasty)
+    assert time.monotonic() - begun < 15
+    hasty.info["deadline_ms"] = -1
+    with pytest.raises(InvalidObservation, match="deadline_ms"):
+        agent.act(hasty)
     agent.close()
 
 

@@ -9,7 +9,7 @@ from typing import Any
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.connection import Connection
 from vlagents_ray.client.link import CodecChoice
-from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable
+from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable, UnknownApp
 from vlagents_ray.interface import Agent
 from vlagents_ray.serve.calls import Sender
 from vlagents_ray.serve.engine import Engine
@@ -26,6 +26,7 @@ class Replicas:
         self.dead: set[int] = set()
         self.prefer = 0  # where new connections go, if that one lives and does not stop
         self.lose_reply = False  # of the next frame, after it was acted on
+        self.stopping = False  # the server has no application any more, or none yet
         self.frames: list[int] = []  # requests in each frame that was sent
         for engine in self.engines:
             engine.strays = Strays(engine, _Others(self, engine))
@@ -57,6 +58,8 @@ class InProcess:
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
         """To the preferred replica, or the first that is there."""
+        if self._replicas.stopping:
+            raise UnknownApp("no application at this path")
         numbered = sorted(enumerate(self._replicas.engines), key=lambda one: one[0] != self._replicas.prefer)
         for number, engine in numbered:
             if number not in self._replicas.dead and not engine.draining:

@@ -13,7 +13,7 @@ import numpy as np
 import psutil
 
 from vlagents_ray import Act, Agent, Obs
-from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 
 
 class Reacher(Agent):
@@ -115,6 +115,17 @@ class Echo(Agent):
             "descriptors": len(os.listdir("/proc/self/fd")),
         }
         return Act(np.array([float(image[-1, -1, -1]) for image in obs.cameras.values()]), info=info)
+
+
+class Ticking(Agent):
+    """Rows that name the observation that they answer and their own number, after 0.2 s."""
+
+    contract = Contract(state={"tick": StateSpec(1)}, action=ActionSpec(dim=2, delta=False), chunk=50)
+
+    def act(self, obs: Obs) -> Act:
+        time.sleep(0.2)
+        rows = np.arange(50.0)
+        return Act(np.stack([np.full(50, obs.state["tick"][0]), rows], 1).astype(np.float32), info={"pid": os.getpid()})
 
 
 class Witness(Agent):

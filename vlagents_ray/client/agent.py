@@ -18,10 +18,11 @@ from vlagents_ray.errors import (
     ConfigError,
     ConnectionLost,
     DeadlineExceeded,
+    InvalidObservation,
     PolicyFailed,
     UnknownSession,
 )
-from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.interface import DEADLINE, Act, Agent, Obs
 from vlagents_ray.wire.codecs import RAW, ImageCodec
 from vlagents_ray.wire.messages import RANKS, RankName, Reply, Request
 
@@ -49,7 +50,8 @@ class RemoteAgent(Agent):
     `rank` is the class of its requests: a "robot" goes before a "simulation".
 
     `connect_timeout_s` is how long `initialize` (called by the first `reset`) waits for a server
-    that is still loading; `timeout_s` is how long a `reset` or `act` may take.
+    that is still loading; `timeout_s` is how long a `reset` or `act` may take; an observation's
+    `info["deadline_ms"]` allows its `act` less.
 
     When the replica stops, dies or has more sessions than others, the session goes on at another one within
     `timeout_s`: moved with all its state if the old replica still lives, else begun again with the same
@@ -167,7 +169,8 @@ class RemoteAgent(Agent):
         ]
         for session in siblings:
             session.episode = None
-        replies = self._call(siblings, [s.reset(episode) for s, episode in zip(siblings, episodes, strict=True)])
+        requests = [session.reset(episode) for session, episode in zip(siblings, episodes, strict=True)]
+        replies = self._call(siblings, requests, self._connection.timeout_s)
         infos: list[dict[str, Any] | Exception] = []
         for session, episode, reply in zip(siblings, episodes, replies, strict=True):
             if reply.error is None:
@@ -203,7 +206,8 @@ class RemoteAgent(Agent):
         siblings = self._siblings(sessions)
         if len(obs) != len(siblings):
             raise ConfigError(f"act_batch: got {len(obs)} observations for {len(siblings)} sessions")
-        replies = self._call(siblings, [session.act(one) for session, one in zip(siblings, obs, strict=True)])
+        requests = [session.act(one) for session, one in zip(siblings, obs, strict=True)]
+        replies = self._call(siblings, requests, min([self._connection.timeout_s, *_deadlines_s(obs)]))
         round_trip_ms = (time.perf_counter() - begun) * 1e3
         return [self._take(*each, round_trip_ms) for each in zip(siblings, obs, replies, strict=True)]
 
@@ -220,10 +224,10 @@ class RemoteAgent(Agent):
             found.append(agent._session)
         return found
 
-    def _call(self, sessions: Sequence[Session], requests: Sequence[Request]) -> list[Reply]:
+    def _call(self, sessions: Sequence[Session], requests: Sequence[Request], timeout_s: float) -> list[Reply]:
         if self._resume:
-            return persist(self._connection, sessions, requests)
-        return self._connection.call(requests, self._connection.timeout_s)
+            return persist(self._connection, sessions, requests, timeout_s)
+        return self._connection.call(requests, timeout_s)
 
     def _take(self, session: Session, obs: Obs, reply: Reply, round_trip_ms: float) -> Act | Exception:
         episode = session.episode
@@ -238,3 +242,12 @@ class RemoteAgent(Agent):
         if "total_ms" in timing:
             timing["wire_ms"] = round_trip_ms - timing["total_ms"]
         return reply.act
+
+
+def _deadlines_s(obs: Sequence[Obs]) -> list[float]:
+    """After how long the senders of observations want no answer any more; of one message, the soonest counts."""
+    stated = [one.info[DEADLINE] for one in obs if DEADLINE in one.info]
+    for value in stated:
+        if not isinstance(value, (int, float)) or not value > 0:
+            raise InvalidObservation(f"info[{DEADLINE!r}]: got {value!r}, want milliseconds above 0")
+    return [value / 1e3 for value in stated]

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import ConfigError, ConnectionLost, PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import ConfigError, ConnectionLost, PolicyUnavailable, UnknownApp, VLAgentsError
 from vlagents_ray.wire.messages import PROTOCOL_VERSION, Reply, Request
 
 if TYPE_CHECKING:
@@ -76,6 +76,9 @@ class Connection:
             replies = self.transport.call(requests, left_s)
         except VLAgentsError as error:
             replies = [Reply(request.request_id, error=error) for request in requests]
+        for reply in replies:
+            if isinstance(reply.error, UnknownApp):  # it was there: the server is stopping, or starting again
+                reply.error = PolicyUnavailable(f"{self.url}: the application is gone ({reply.error})")
         if len(replies) != len(requests):  # an answer to the frame as a whole
             whole = replies[0].error or PolicyUnavailable(f"got {len(replies)} replies to {len(requests)} requests")
             replies = [Reply(request.request_id, error=whole) for request in requests]

@@ -50,6 +50,7 @@ class HttpTransport:
     def connect(self, timeout_s: float) -> dict[str, Any]:
         """The server's metadata, as soon as it answers; retries while it is not ready."""
         begun = time.monotonic()
+        unknown_since: float | None = None
         pause_s = 0.05
         while True:
             left_s = begun + timeout_s - time.monotonic()
@@ -60,8 +61,10 @@ class HttpTransport:
                     raise PolicyUnavailable(
                         f"{self._url.geturl()}: not ready within {timeout_s:g} s ({error})"
                     ) from error
+                unknown_since = None
             except UnknownApp:
-                if time.monotonic() - begun > _UNKNOWN_APP_S:
+                unknown_since = unknown_since or time.monotonic()
+                if time.monotonic() - unknown_since > _UNKNOWN_APP_S or pause_s > left_s:
                     raise
             time.sleep(pause_s)
             pause_s = min(1.0, pause_s * 1.5)

@@ -82,14 +82,16 @@ class Session:
         return self.reset(self.episode)
 
 
-def persist(connection: Connection, sessions: Sequence[Session], requests: Sequence[Request]) -> list[Reply]:
+def persist(
+    connection: Connection, sessions: Sequence[Session], requests: Sequence[Request], timeout_s: float
+) -> list[Reply]:
     """The replies to one request of each session, from another replica if theirs is gone.
 
-    Tried until the connection's `timeout_s` is over; then the reply is the last error. What was begun
+    Tried until `timeout_s` is over; then the reply is the last error. What was begun
     again for it says so in `act.info["resumed"]`.
     """
-    deadline = time.monotonic() + connection.timeout_s
-    replies = connection.call(requests, connection.timeout_s)
+    deadline = time.monotonic() + timeout_s
+    replies = connection.call(requests, timeout_s)
     lost: set[int] = set()  # whose state no replica has
     resumed: set[int] = set()
     pause_s = 0.0

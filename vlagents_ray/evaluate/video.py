@@ -11,54 +11,15 @@ from __future__ import annotations
 import io
 import os
 import re
-from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from vlagents_ray.errors import EnvFailed
+from vlagents_ray.errors import EnvFailed, InvalidObservation
 from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.jobs import EpisodeKey
 from vlagents_ray.interface import HIGH_RES, Obs
-from vlagents_ray.registry import require
+from vlagents_ray.mp4 import Mp4
 
 DEFAULT_FPS = 20.0  # of an env whose contract states no control rate
-
-
-class _Track:
-    """One camera's video under way."""
-
-    def __init__(self, shape: tuple[int, int, int], fps: float) -> None:
-        self._av: Any = require("av")
-        self._shape = shape
-        height, width = shape[:2]
-        self._pad = (height % 2, width % 2)  # yuv420p halves both sides
-        self._file = io.BytesIO()
-        self._container = self._av.open(self._file, "w", format="mp4")
-        self._stream = self._container.add_stream(
-            "libx264",
-            rate=Fraction(fps).limit_denominator(1000),
-            options={"preset": "ultrafast", "crf": "23", "threads": "1"},
-        )
-        self._stream.height, self._stream.width = height + self._pad[0], width + self._pad[1]
-        self._stream.pix_fmt = "yuv420p"
-
-    def add(self, image: np.ndarray) -> None:
-        if image.shape != self._shape or image.dtype != np.uint8:
-            raise EnvFailed(f"got an image of {image.shape} {image.dtype}, want {self._shape} uint8 as in its reset")
-        if any(self._pad):
-            image = np.pad(image, ((0, self._pad[0]), (0, self._pad[1]), (0, 0)), mode="edge")
-        frame = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
-        self._container.mux(self._stream.encode(frame))
-
-    def finish(self) -> bytes:
-        self._container.mux(self._stream.encode(None))
-        self._container.close()
-        return self._file.getvalue()
-
-    def abandon(self) -> None:
-        self._container.close()
 
 
 class VideoRecorder:
@@ -66,21 +27,26 @@ class VideoRecorder:
 
     def __init__(self, fps: float | None = None) -> None:
         self._fps = fps or DEFAULT_FPS
-        self._tracks: dict[str, _Track] = {}
+        self._tracks: dict[str, tuple[io.BytesIO, Mp4]] = {}
 
     def add(self, obs: Obs) -> None:
         """Append every camera's image, (H, W, 3) uint8 RGB; a high-resolution view replaces its camera's."""
         for name, image in (obs.cameras | obs.info.get(HIGH_RES, {})).items():
             if name not in self._tracks:
-                self._tracks[name] = _Track(image.shape, self._fps)
-            self._tracks[name].add(image)
+                file = io.BytesIO()
+                self._tracks[name] = file, Mp4(file, image.shape, self._fps)
+            try:
+                self._tracks[name][1].add(image)
+            except InvalidObservation as error:
+                raise EnvFailed(f"camera {name!r}: {error}") from error
 
     def finish(self) -> dict[str, bytes]:
         """The MP4 files by camera; the recorder is empty afterwards."""
         videos = {}
         while self._tracks:
-            name, track = self._tracks.popitem()
-            videos[name] = track.finish()
+            name, (file, track) = self._tracks.popitem()
+            track.finish()
+            videos[name] = file.getvalue()
         return dict(sorted(videos.items()))
 
     def __enter__(self) -> VideoRecorder:
@@ -88,7 +54,7 @@ class VideoRecorder:
 
     def __exit__(self, *exc: object) -> None:
         while self._tracks:
-            self._tracks.popitem()[1].abandon()
+            self._tracks.popitem()[1][1].abandon()
 
 
 def save_videos(out: Path, result: EpisodeResult, videos: dict[str, bytes]) -> list[str]:

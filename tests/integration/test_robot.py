@@ -1,0 +1,172 @@
+"""A control loop against a slow server, which is also killed and restarted under it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from serve_command import free_address, serving
+
+from vlagents_ray import Act, Agent, Obs, RemoteAgent
+from vlagents_ray.client.chunks import ChunkPlayer
+from vlagents_ray.client.ways import TransportName
+from vlagents_ray.robot import Watchdog, run_loop
+from vlagents_ray.robot.__main__ import main
+from vlagents_ray.robot.pacing import empty_loop
+
+HZ = 50.0
+ROWS = 50
+PATIENCE_S = 90.0
+
+pytestmark = pytest.mark.slow
+
+
+class Counter:
+    """A robot that sees the number of the tick."""
+
+    def __init__(self) -> None:
+        self.tick = -2  # the loop shows a reset what comes before its first tick
+
+    def observe(self) -> Obs:
+        self.tick += 1
+        return Obs(
+            {"front": np.zeros((224, 224, 3), np.uint8)}, state={"tick": np.array([max(0, self.tick)], np.float32)}
+        )
+
+    def apply(self, action: np.ndarray) -> None:
+        pass
+
+    def stop(self) -> None:
+        pass
+
+
+class Witness(Agent):
+    """Keeps what a player returned, and checks that nothing stale is among it."""
+
+    def __init__(self, player: ChunkPlayer, robot: Counter) -> None:
+        self.player, self.robot = player, robot
+        self.acts: list[Act] = []
+        self.longest_s = 0.0
+
+    @property
+    def contract(self) -> Any:
+        return self.player.contract
+
+    def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:
+        return self.player.reset(obs, instruction, **kwargs)
+
+    def act(self, obs: Obs) -> Act:
+        begun = time.perf_counter()
+        act = self.player.act(obs)
+        self.longest_s = max(self.longest_s, time.perf_counter() - begun)
+        self.acts.append(act)
+        if "safe" in act.info:
+            assert act.action.tolist() == self.acts[-2].action.tolist()  # hold
+        else:
+            asked, row = act.action.tolist()
+            assert asked + row == self.robot.tick, "an action of another tick"
+        return act
+
+    def good_since(self, tick: int) -> int:
+        """Actions of the policy made from what was seen after `tick`."""
+        return sum("safe" not in act.info and act.action[0] > tick for act in self.acts)
+
+
+@pytest.fixture(scope="module")
+def address() -> str:
+    return free_address()
+
+
+@pytest.fixture(scope="module")
+def server(address: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[contextlib.ExitStack]:
+    """What has the server at `address` running, and may be closed."""
+    with contextlib.ExitStack() as running:
+        running.enter_context(serving("served_agents:Ticking", tmp_path_factory.mktemp("log") / "log", address))
+        yield running
+
+
+@contextlib.contextmanager
+def witness(address: str, transport: TransportName) -> Iterator[Witness]:
+    robot = Counter()
+    agent = RemoteAgent(f"http://{address}", transport=transport)
+    with ChunkPlayer(agent, mode="async") as player:
+        yield Witness(player, robot)
+
+
+@pytest.mark.parametrize("transport", ["websocket", "shm"])
+def test_no_tick_is_without_an_action_though_an_answer_takes_ten_ticks(
+    server: contextlib.ExitStack, address: str, transport: TransportName
+) -> None:
+    with witness(address, transport) as seen:
+        report = run_loop(seen.robot, seen, hz=HZ, seconds=5)
+    machine = empty_loop(HZ, 2)
+    assert report.safe_ticks == 0
+    assert report.jitter["on_time"] > 0.9 * machine["on_time"]
+    assert len({act.info["chunk"] for act in seen.acts}) > 5
+
+
+def test_the_command_drives_records_and_reports(
+    server: contextlib.ExitStack, address: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ["--seconds", "2", "--baseline", "0.5", "--record", str(tmp_path), "--instruction", "stack the cups"]
+    assert main([f"http://{address}", *options]) == 0
+    said = capsys.readouterr().out
+    assert "empty loop" in said
+    assert "ticks without an action of the policy: 0" in said
+    assert f"recorded: 1 episodes in {tmp_path}" in said
+    info = json.loads((tmp_path / "meta/info.json").read_text())
+    assert (info["total_episodes"], info["fps"]) == (1, 50)
+
+
+def test_a_killed_replica_and_a_restarted_server_cost_safe_ticks_and_nothing_else(
+    server: contextlib.ExitStack, address: str, tmp_path: Path
+) -> None:
+    barks: list[str] = []
+    with contextlib.ExitStack() as stack:
+        seen = stack.enter_context(witness(address, "websocket"))
+        script = _disasters(seen, server, stack, address, tmp_path)
+        deadline = time.monotonic() + PATIENCE_S
+        next(script)
+        report = run_loop(
+            seen.robot,
+            seen,
+            hz=HZ,
+            watchdog=Watchdog(barks.append, {"server": 2.0}),
+            until=lambda: time.monotonic() > deadline or next(script, True),
+        )
+        assert next(script, True), f"no resumption: {report}"
+    assert report.safe_ticks > 2 * ROWS  # both times, the server was gone for longer than a chunk lasts
+    assert seen.longest_s < 1.0  # no tick waited for a server that was gone for seconds
+    assert barks
+
+
+def _disasters(
+    seen: Witness, server: contextlib.ExitStack, stack: contextlib.ExitStack, address: str, folder: Path
+) -> Iterator[bool]:
+    """What happens, tick by tick, each once the robot has been driven for a while."""
+    yield False
+    while seen.good_since(0) < ROWS:
+        yield False
+    os.kill(seen.acts[-1].info["pid"], signal.SIGKILL)
+    killed = seen.robot.tick
+    while seen.good_since(killed + 2 * ROWS) < ROWS:
+        yield False
+
+    def restart() -> None:
+        server.close()
+        stack.enter_context(serving("served_agents:Ticking", folder / "log", address))
+
+    again = threading.Thread(target=restart)
+    again.start()
+    stopped = seen.robot.tick
+    while again.is_alive() or seen.good_since(stopped + 2 * ROWS) < ROWS:
+        yield False

@@ -1,0 +1,209 @@
+"""The control loop: its schedule, what it does when things go wrong, and what it reports."""
+
+from __future__ import annotations
+
+import gc
+import os
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from vlagents_ray import Act, ActionSpec, Agent, CameraSpec, ConfigError, Contract, Obs, PolicyFailed, StateSpec
+from vlagents_ray.client.chunks import ChunkPlayer
+from vlagents_ray.errors import InvalidAction
+from vlagents_ray.robot import Guard, Watchdog, run_loop
+from vlagents_ray.robot.__main__ import main
+from vlagents_ray.robot.pacing import Pacer, empty_loop, jitter, undisturbed
+from vlagents_ray.robot.simulated import SimulatedRobot
+
+HZ = 200.0
+
+
+class Going(Agent):
+    """Absolute targets that grow by 0.01 a tick."""
+
+    contract = Contract(action=ActionSpec(dim=2, delta=False, low=-1.0, high=1.0))
+
+    def __init__(self, *, wrong_at: int | None = None, done_at: int | None = None, slow_at: int | None = None) -> None:
+        self.wrong_at, self.done_at, self.slow_at = wrong_at, done_at, slow_at
+        self.instruction: str | None = None
+        self.tick = 0
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
+        self.instruction, self.tick = instruction, 0
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        assert obs.info["captured_at"] <= time.time()
+        tick, self.tick = self.tick, self.tick + 1
+        if tick == self.slow_at:
+            time.sleep(5.5 / HZ)
+        value = 7.0 if tick == self.wrong_at else 0.01 * tick
+        return Act(np.full(2, value, np.float32), done=tick == self.done_at)
+
+
+class Watched(SimulatedRobot):
+    """Keeps what it was commanded."""
+
+    def __init__(self, contract: Contract | None = None) -> None:
+        super().__init__(contract)
+        self.commanded: list[float] = []
+        self.stops = 0
+
+    def apply(self, action: np.ndarray) -> None:
+        super().apply(action)
+        self.commanded.append(round(float(action[0]), 4))
+
+    def stop(self) -> None:
+        super().stop()
+        self.stops += 1
+
+
+def test_the_schedule_does_not_drift_and_says_what_it_missed() -> None:
+    pacer = Pacer(HZ)
+    begun = time.perf_counter()
+    ticks = [pacer.wait() for _ in range(10)]
+    time.sleep(4 / HZ)
+    ticks += [pacer.wait() for _ in range(10)]
+    assert ticks == sorted(set(ticks))
+    assert pacer.missed == ticks[-1] + 1 - len(ticks) >= 3
+    assert time.perf_counter() - begun >= ticks[-1] / HZ
+    assert min(pacer.late_s) >= 0
+
+
+def test_jitter_counts_a_missed_tick_as_one_that_was_late() -> None:
+    told = jitter([0.0001, 0.0001, 0.003], missed=1)
+    assert told["on_time"] == 0.5
+    assert told["p50_ms"] == pytest.approx(0.1)
+    assert told["max_ms"] == pytest.approx(3.0)
+
+
+def test_an_empty_loop_measures_the_machine() -> None:
+    told = empty_loop(HZ, 0.2)
+    assert told["ticks"] + told["missed"] == 40
+
+
+def test_the_process_is_left_as_it_was() -> None:
+    def settings() -> tuple[object, ...]:
+        nice = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+        return gc.isenabled(), gc.get_freeze_count(), sys.getswitchinterval(), nice
+
+    before = settings()
+    with undisturbed() as done:
+        assert not gc.isenabled()
+        assert done
+    assert settings() == before
+
+
+def test_a_robot_is_driven_for_as_long_as_was_said_and_then_stopped() -> None:
+    robot, agent = Watched(Going.contract), Going()
+    report = run_loop(robot, agent, hz=HZ, seconds=0.2, instruction="go")
+    assert report.jitter["ticks"] + report.jitter["missed"] == 40
+    assert robot.commanded == [round(0.01 * i, 4) for i in range(int(report.jitter["ticks"]))]
+    assert (robot.stops, agent.instruction, report.safe_ticks) == (1, "go", 0)
+
+
+def test_a_slow_tick_costs_the_ticks_that_it_covers_and_no_others() -> None:
+    robot = Watched(Going.contract)
+    report = run_loop(robot, Going(slow_at=5), hz=HZ, seconds=0.3)
+    assert report.jitter["missed"] >= 4  # the sixth begins late, but in its time
+    assert report.jitter["ticks"] + report.jitter["missed"] == 60
+
+
+def test_the_loop_ends_when_the_policy_is_done_or_the_caller_says_so() -> None:
+    robot = Watched(Going.contract)
+    report = run_loop(robot, Going(done_at=7), hz=HZ)
+    assert report.done
+    assert len(robot.commanded) == 8
+    report = run_loop(robot, Going(), hz=HZ, until=lambda: len(robot.commanded) >= 12)
+    assert not report.done
+    assert len(robot.commanded) == 12
+
+
+def test_an_action_out_of_bounds_never_reaches_the_robot_which_is_stopped() -> None:
+    robot = Watched(Going.contract)
+    with pytest.raises(InvalidAction, match="above the limit 1"):
+        run_loop(robot, Going(wrong_at=3), hz=HZ, seconds=1)
+    assert robot.commanded == [0, 0.01, 0.02]
+    assert robot.stops == 1
+
+
+def test_with_a_player_the_loop_goes_on_with_a_safe_action() -> None:
+    robot = Watched(Going.contract)
+    player = ChunkPlayer(Going(wrong_at=3), deadline_s=30.0, check=Guard(Going.contract))
+    report = run_loop(robot, player, hz=HZ, until=lambda: len(robot.commanded) >= 6)
+    player.close()
+    assert robot.commanded == [0, 0.01, 0.02, 0.02, 0.04, 0.05]
+    assert report.safe_ticks == 1
+
+
+def test_a_chunk_needs_a_player() -> None:
+    class Chunks(Agent):
+        def act(self, obs: Obs) -> Act:
+            return Act(np.zeros((5, 7), np.float32))
+
+    with pytest.raises(InvalidAction, match="ChunkPlayer"):
+        run_loop(Watched(), Chunks(), hz=HZ, seconds=1)
+
+
+def test_a_robot_is_stopped_when_the_reset_fails() -> None:
+    class Refusing(Agent):
+        def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
+            raise PolicyFailed("no weights")
+
+    robot = Watched()
+    with pytest.raises(PolicyFailed):
+        run_loop(robot, Refusing(), hz=HZ)
+    assert robot.stops == 1
+
+
+def test_a_hanging_loop_is_noticed_by_the_watchdog() -> None:
+    stopped = threading.Event()
+
+    class Hanging(Going):
+        def act(self, obs: Obs) -> Act:
+            if self.tick == 3:
+                assert stopped.wait(30)  # until the watchdog has stopped the robot
+            return super().act(obs)
+
+    report = run_loop(
+        Watched(Going.contract),
+        Hanging(done_at=5),
+        hz=HZ,
+        watchdog=Watchdog(lambda _: stopped.set(), {"loop": 0.1, "server": 60.0}),
+    )
+    assert [bark.partition(":")[0] for bark in report.barks] == ["loop"]
+
+
+@pytest.mark.parametrize("options", [{"hz": 0.0}, {"hz": float("nan")}, {"hz": 50.0, "seconds": 0.0}])
+def test_a_rate_or_a_time_of_nothing_is_refused(options: dict) -> None:
+    with pytest.raises(ConfigError, match="above 0"):
+        run_loop(Watched(), Going(), **options)
+
+
+def test_the_simulated_robot_gives_what_a_contract_asks_for() -> None:
+    contract = Contract(
+        cameras={"left": CameraSpec(48, 64)},
+        state={"joints": StateSpec(3), "pose": StateSpec(6)},
+        action=ActionSpec(dim=4, delta=True, gripper_open=1.0, gripper_closed=-1.0),
+    )
+    robot = SimulatedRobot(contract)
+    first = robot.observe()
+    assert first.cameras["left"].shape == (48, 64, 3)
+    assert {name: part.shape for name, part in first.state.items()} == {"joints": (3,), "pose": (6,)}
+    for _ in range(20):
+        robot.apply(np.array([0.1, 0, 0, 0.05], np.float32))
+        last = robot.observe()
+    assert last.state["joints"][0] > 1
+    assert (last.cameras["left"] != first.cameras["left"]).any()
+    assert first.gripper is not None
+    assert last.gripper is not None
+    assert last.gripper > first.gripper
+
+
+def test_the_command_says_what_it_cannot_do(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["nonsense"]) == 2
+    assert "want http(s)://" in capsys.readouterr().err

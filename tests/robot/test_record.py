@@ -1,0 +1,186 @@
+"""Recordings in LeRobot's format: what was seen and done, whatever becomes of the disk or the process."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import av
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from vlagents_ray import ConfigError, Obs
+from vlagents_ray.errors import InvalidObservation
+from vlagents_ray.robot.dataset import Dataset
+from vlagents_ray.robot.record import Recorder
+
+FPS = 25
+SIDE = 48
+
+
+def obs(i: int, side: int = SIDE) -> Obs:
+    state = {"joints": np.array([i, -i], np.float32), "left/force": np.array([0.5])}
+    cameras = {"front": np.full((side, side, 3), 10 * i % 256, np.uint8), "left/wrist": np.zeros((33, 47, 3), np.uint8)}
+    return Obs(cameras, 0.25, state, {"captured_at": 1e9 + i / FPS})
+
+
+def action(i: int) -> np.ndarray:
+    return np.array([i, i + 0.5, 1], np.float32)
+
+
+def record(root: Path, frames: int, instruction: str = "stack the cups") -> None:
+    with Recorder(root, FPS, frames=1000) as recorder, recorder.episode(instruction):
+        for i in range(frames):
+            recorder.add(obs(i), action(i), tick=2 * i, safe=i == 3)
+
+
+def info(root: Path) -> dict:
+    return json.loads((root / "meta/info.json").read_text())
+
+
+def test_an_episode_holds_what_was_seen_and_done(tmp_path: Path) -> None:
+    record(tmp_path, 12)
+    rows = pq.read_table(tmp_path / "data/chunk-000/file-000.parquet").to_pydict()
+    assert rows["action"] == [action(i).tolist() for i in range(12)]
+    assert rows["observation.state"] == [[i, -i, 0.5, 0.25] for i in range(12)]
+    assert rows["tick"] == [2 * i for i in range(12)]
+    assert rows["safe"] == [i == 3 for i in range(12)]
+    assert rows["captured_at"] == [1e9 + i / FPS for i in range(12)]
+    assert rows["timestamp"] == pytest.approx([i / FPS for i in range(12)])
+    with av.open(str(tmp_path / "videos/observation.images.front/chunk-000/file-000.mp4")) as video:
+        frames = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
+    assert [round(float(frame.mean()) / 10) for frame in frames] == list(range(12))
+    about = info(tmp_path)
+    assert about["codebase_version"] == "v3.0"
+    assert (about["total_episodes"], about["total_frames"], about["total_tasks"], about["fps"]) == (1, 12, 1, FPS)
+    features = about["features"]
+    assert features["observation.state"]["names"] == ["joints_0", "joints_1", "left/force_0", "gripper"]
+    assert features["observation.images.left_wrist"]["shape"] == [34, 48, 3]  # made even
+    assert not (tmp_path / "unfinished").exists() or not any((tmp_path / "unfinished").iterdir())
+
+
+def test_a_dataset_goes_on_with_the_next_episode(tmp_path: Path) -> None:
+    record(tmp_path, 5)
+    record(tmp_path, 7, "unstack the cups")
+    record(tmp_path, 3)
+    rows = [pq.read_table(tmp_path / f"data/chunk-000/file-{i:03d}.parquet").to_pydict() for i in range(3)]
+    assert [row["episode_index"][0] for row in rows] == [0, 1, 2]
+    assert [row["task_index"][0] for row in rows] == [0, 1, 0]
+    assert [row["index"] for row in rows] == [list(range(5)), list(range(5, 12)), list(range(12, 15))]
+    episode = pq.read_table(tmp_path / "meta/episodes/chunk-000/file-001.parquet").to_pylist()[0]
+    assert episode["tasks"] == ["unstack the cups"]
+    assert (episode["dataset_from_index"], episode["dataset_to_index"]) == (5, 12)
+    assert info(tmp_path)["splits"] == {"train": "0:3"}
+
+
+def test_statistics_are_those_of_all_frames(tmp_path: Path) -> None:
+    record(tmp_path, 5)
+    record(tmp_path, 9)
+    told = json.loads((tmp_path / "meta/stats.json").read_text())
+    values = np.stack([action(i) for i in [*range(5), *range(9)]])
+    for name, expected in (("mean", values.mean(0)), ("std", values.std(0)), ("max", values.max(0)), ("count", [14])):
+        assert told["action"][name] == pytest.approx(expected), name
+    seen = np.array([10 * i for i in [*range(5), *range(9)]]) / 255
+    image = {name: np.ravel(value) for name, value in told["observation.images.front"].items()}
+    assert image["mean"] == pytest.approx([seen.mean()] * 3)
+    assert image["std"] == pytest.approx([seen.std()] * 3)
+    assert (image["min"][0], image["max"][0]) == pytest.approx((0, 80 / 255))
+
+
+def test_adding_never_waits_and_what_is_dropped_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    going, gate = threading.Event(), threading.Event()
+    begin = Dataset.begin
+
+    def slow(self: Dataset, instruction: str) -> object:
+        going.set()
+        assert gate.wait(30)
+        return begin(self, instruction)
+
+    monkeypatch.setattr(Dataset, "begin", slow)
+    with Recorder(tmp_path, FPS, frames=4) as recorder, recorder.episode("stack"):
+        assert going.wait(30)
+        for i in range(10):
+            recorder.add(obs(i), action(i), tick=i)
+        assert recorder.dropped == 6
+        gate.set()
+    assert pq.read_table(tmp_path / "data/chunk-000/file-000.parquet")["tick"].to_pylist() == [0, 1, 2, 3]
+
+
+def test_a_frame_is_recorded_as_it_was_when_it_was_added(tmp_path: Path) -> None:
+    seen, done = obs(1), action(1)
+    with Recorder(tmp_path, FPS) as recorder, recorder.episode("stack"):
+        recorder.add(seen, done, tick=0)
+        seen.state["joints"][:] = 99
+        done[:] = 99
+    rows = pq.read_table(tmp_path / "data/chunk-000/file-000.parquet").to_pydict()
+    assert (rows["observation.state"][0][0], rows["action"][0][0]) == (1, 1)
+
+
+def test_a_frame_unlike_the_first_costs_its_episode_and_is_told(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path, FPS)
+    for side in (SIDE, 2 * SIDE, SIDE):
+        with recorder.episode("stack"):
+            recorder.add(obs(0), action(0), tick=0)
+            recorder.add(obs(1, side), action(1), tick=1)
+    with pytest.raises(InvalidObservation, match=r"want .* as before"):
+        recorder.close()
+    assert info(tmp_path)["total_episodes"] == 2
+
+
+def test_an_episode_without_frames_leaves_nothing(tmp_path: Path) -> None:
+    record(tmp_path, 0)
+    assert not (tmp_path / "meta").exists()
+
+
+def test_a_killed_process_loses_the_running_episode_and_no_other(tmp_path: Path) -> None:
+    code = f"""
+import os, pathlib, signal, sys, time
+import numpy as np
+from vlagents_ray import Obs
+from vlagents_ray.robot.record import Recorder
+recorder = Recorder(pathlib.Path({str(tmp_path)!r}), {FPS}, frames=1000)
+for episode in range(3):
+    with recorder.episode("stack"):
+        for i in range(6):
+            recorder.add(Obs({{"front": np.zeros((48, 48, 3), np.uint8)}}), np.zeros(2, np.float32), tick=i)
+        while episode == 2:  # killed in the third
+            if list(pathlib.Path({str(tmp_path)!r}).glob("unfinished/*.mp4")) and recorder.episodes == 2:
+                print("recording", flush=True)
+                time.sleep(60)
+            time.sleep(0.01)
+"""
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "recording\n"
+        os.kill(process.pid, signal.SIGKILL)
+    assert info(tmp_path)["total_episodes"] == 2
+    assert len(list(tmp_path.glob("data/*/*.parquet"))) == 2
+    dataset = Dataset(tmp_path, FPS)
+    assert dataset.episodes == 2
+    assert not (tmp_path / "unfinished").exists()
+
+
+def test_what_info_does_not_count_is_removed(tmp_path: Path) -> None:
+    record(tmp_path, 3)
+    for name in ("data/chunk-000/file-001.parquet", "videos/observation.images.front/chunk-000/file-001.mp4"):
+        (tmp_path / name).write_bytes(b"whole, but of an episode that was not counted")
+    record(tmp_path, 4)
+    assert pq.read_table(tmp_path / "data/chunk-000/file-001.parquet").num_rows == 4
+
+
+def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.tex").write_text("...")
+    with pytest.raises(ConfigError, match="no LeRobotDataset"):
+        Recorder(tmp_path, FPS)
+
+
+def test_a_dataset_of_another_rate_is_not_mixed_in(tmp_path: Path) -> None:
+    record(tmp_path, 2)
+    with pytest.raises(ConfigError, match="has fps 25, want 50"):
+        Recorder(tmp_path, 50)

@@ -1,0 +1,129 @@
+"""What stands between a policy and the motors: bounds, and silence that is noticed."""
+
+from __future__ import annotations
+
+import queue
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from vlagents_ray import ActionSpec, ConfigError, Contract
+from vlagents_ray.errors import InvalidAction
+from vlagents_ray.robot import Guard, Watchdog
+
+BARK_S = 30.0  # generous: a watchdog that never barks is what fails
+
+
+def row(*values: float) -> np.ndarray:
+    return np.array(values, np.float32)
+
+
+GUARD = Guard(Contract(action=ActionSpec(dim=3, low=-1.0, high=1.0)))
+
+
+@pytest.mark.parametrize(
+    ("action", "said"),
+    [
+        (row(0, 0), r"got \(2,\) float32, want \(3,\)"),
+        (np.zeros((1, 3), np.float32), "single row"),
+        (np.zeros(3, np.int64), "int64"),
+        (row(0, np.nan, 0), "finite"),
+        (row(0, np.inf, 0), "finite"),
+        (row(0, 0, -1.01), r"action\[2\]: got -1.01, below the limit -1"),
+        (row(0, 1.01, 0), r"action\[1\]: got 1.01, above the limit 1"),
+    ],
+)
+def test_an_action_that_breaks_the_contract_is_refused_by_its_number(action: np.ndarray, said: str) -> None:
+    with pytest.raises(InvalidAction, match=said):
+        GUARD(action)
+
+
+def test_an_action_within_the_contract_passes_as_it_is() -> None:
+    action = row(-1, 0, 1)
+    assert GUARD(action) is action
+
+
+def test_the_stricter_of_the_contracts_and_ones_own_bounds_holds() -> None:
+    guard = Guard(Contract(action=ActionSpec(low=-1.0, high=1.0)), high=np.array([2.0, 0.1]))
+    guard(row(1, 0.1))
+    for action in (row(1.5, 0), row(0, 0.2)):
+        with pytest.raises(InvalidAction, match="above"):
+            guard(action)
+
+
+def test_a_jump_is_refused_and_a_first_action_is_none() -> None:
+    guard = Guard(max_step=np.array([0.1, 5.0]))
+    guard(row(9, 9))
+    guard(row(0.05, 4), row(0, 0))
+    with pytest.raises(InvalidAction, match=r"action\[0\]: got 0.2 after 0"):
+        guard(row(0.2, 0), row(0, 0))
+
+
+class Barks:
+    def __init__(self) -> None:
+        self.heard: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()
+
+    def __call__(self, reason: str) -> None:
+        self.heard.put((reason.partition(":")[0], threading.current_thread().name))
+
+    def next(self) -> str:
+        name, thread = self.heard.get(timeout=BARK_S)
+        assert thread == "vlagents-ray-watchdog"
+        return name
+
+
+def test_silence_calls_the_stop_hook_once_from_a_thread_of_its_own() -> None:
+    barks = Barks()
+    with Watchdog(barks, {"server": 0.05}) as watchdog:
+        assert barks.next() == "server"
+        time.sleep(0.2)  # several times the limit
+        assert barks.heard.empty()
+    assert len(watchdog.barks) == 1
+
+
+def test_after_recovery_a_new_silence_calls_it_again() -> None:
+    barks = Barks()
+    with Watchdog(barks, {"server": 0.05}) as watchdog:
+        for _ in range(3):
+            assert barks.next() == "server"
+            watchdog.heard("server")
+
+
+def test_what_is_heard_often_enough_is_left_alone() -> None:
+    barks = Barks()
+    with Watchdog(barks, {"server": 60.0, "loop": 0.05}) as watchdog:
+        for _ in range(10):
+            watchdog.heard("server")
+            time.sleep(0.01)
+        assert barks.next() == "loop"  # a hanging control loop
+    assert [bark.partition(":")[0] for bark in watchdog.barks] == ["loop"]
+
+
+def test_news_that_is_old_already_does_not_end_a_silence() -> None:
+    barks = Barks()
+    with Watchdog(barks, {"server": 0.1}) as watchdog:
+        assert barks.next() == "server"
+        watchdog.heard("server", ago_s=0.2)
+        time.sleep(0.2)
+        assert barks.heard.empty()
+
+
+def test_a_stop_hook_that_fails_does_not_end_the_watch() -> None:
+    calls: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+    def broken(reason: str) -> None:
+        calls.put(reason)
+        raise OSError("no bus")
+
+    with Watchdog(broken, {"server": 0.05}) as watchdog:
+        calls.get(timeout=BARK_S)
+        watchdog.heard("server")
+        calls.get(timeout=BARK_S)
+    assert isinstance(watchdog.error, OSError)
+
+
+def test_a_limit_of_nothing_is_refused() -> None:
+    with pytest.raises(ConfigError, match="above 0"):
+        Watchdog(print, {"server": 0.0})

@@ -1,0 +1,86 @@
+"""Asks a policy in the background: one request at a time, and never one that nobody wants any more."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass
+
+from vlagents_ray.interface import Act, Agent, Obs
+
+_CLOSE_S = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What came of a request."""
+
+    tick: int  # of its observation
+    result: Act | Exception
+    came_at: float  # s, of `time.monotonic`
+
+
+class Asker:
+    """A thread that calls `agent.act`; the thread that asks is never kept waiting.
+
+    The agent is used by nobody else meanwhile: `during` waits for the request under way.
+    """
+
+    def __init__(self, agent: Agent) -> None:
+        self._agent = agent
+        self._changed = threading.Condition()
+        self._job: tuple[int, Obs] | None = None
+        self._answer: Answer | None = None
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, name="vlagents-ray-asker", daemon=True)
+        self._thread.start()
+
+    @property
+    def idle(self) -> bool:
+        """Is there neither a request under way nor an answer to be taken?"""
+        return self._job is None and self._answer is None
+
+    def ask(self, tick: int, obs: Obs) -> None:
+        """Begin a request; `obs` is the asker's from now on. Only while `idle`."""
+        with self._changed:
+            self._job = tick, obs
+            self._changed.notify_all()
+
+    def take(self, wait_s: float = 0.0) -> Answer | None:
+        """The answer, if there is one within `wait_s`."""
+        if self._answer is None and wait_s > 0:
+            with self._changed:
+                self._changed.wait_for(lambda: self._answer is not None, wait_s)
+        with self._changed:
+            answer, self._answer = self._answer, None
+        return answer
+
+    def settle(self) -> None:
+        """Wait for the request under way, which takes as long as the agent lets it, and drop its answer."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._job is None)
+            self._answer = None
+
+    def close(self) -> None:
+        """Close the agent as soon as its request is over, which is waited for, but not for long."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        self._thread.join(_CLOSE_S)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._job is not None or self._closing)
+                job = self._job
+            if job is None:
+                break
+            tick, obs = job
+            try:
+                result: Act | Exception = self._agent.act(obs)
+            except Exception as error:  # noqa: BLE001 - raised or reported where the answer is taken
+                result = error
+            with self._changed:
+                self._job, self._answer = None, Answer(tick, result, time.monotonic())
+                self._changed.notify_all()
+        self._agent.close()

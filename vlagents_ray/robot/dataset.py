@@ -1,0 +1,191 @@
+"""A LeRobotDataset v3.0 on disk: Parquet and MP4, written an episode at a time.
+
+The layout, names and columns are those of LeRobot 0.4.4 (`lerobot/datasets/utils.py`, `lerobot_dataset.py`), which
+may put many episodes into a file and need not; here each has files of its own, so that an episode is there as a
+whole or not at all. Files get their names when they are whole, `meta/info.json` last; what is left of an
+episode that `info.json` does not count is removed when the dataset is opened again.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.registry import require
+from vlagents_ray.robot.episode import NUMBERS, Episode
+from vlagents_ray.robot.statistics import Stats, joined, of_values
+
+VERSION = "v3.0"
+FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
+DATA, VIDEO, EPISODES = f"data/{FILE}.parquet", f"videos/{{video_key}}/{FILE}.mp4", f"meta/episodes/{FILE}.parquet"
+FILES_IN_CHUNK = 1000
+_UNFINISHED = "unfinished"  # folder of the running episode
+
+
+class Dataset:
+    """A dataset to which episodes are added; opened again, it goes on where it was."""
+
+    def __init__(self, root: Path, fps: float, robot_type: str | None = None) -> None:
+        self.root = root
+        self._pq: Any = require("pyarrow.parquet")
+        self._pa: Any = require("pyarrow")
+        require("av")
+        rate = int(fps) if float(fps).is_integer() else fps
+        self.info: dict[str, Any] = {
+            "codebase_version": VERSION,
+            "robot_type": robot_type,
+            "total_episodes": 0,
+            "total_frames": 0,
+            "total_tasks": 0,
+            "chunks_size": FILES_IN_CHUNK,
+            "data_files_size_in_mb": 100,
+            "video_files_size_in_mb": 200,
+            "fps": rate,
+            "splits": {},
+            "data_path": DATA,
+            "video_path": VIDEO,
+            "features": {},
+        }
+        self._stats: dict[str, Stats] = {}
+        self.tasks: list[str] = []
+        if (root / "meta/info.json").exists():
+            self._open(rate)
+        elif root.is_dir() and any(path.name != _UNFINISHED for path in root.iterdir()):
+            raise ConfigError(f"{root}: is no LeRobotDataset, and not empty; record into a new folder")
+        self._sweep()
+
+    @property
+    def episodes(self) -> int:
+        """How many there are."""
+        return int(self.info["total_episodes"])
+
+    def begin(self, instruction: str) -> Episode:
+        """An episode to be filled, and then given to `save` or abandoned."""
+        folder = self.root / _UNFINISHED
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir(parents=True)
+        return Episode(folder, instruction, self.info["fps"], self.info["features"] or None)
+
+    def save(self, episode: Episode) -> None:
+        """Make a finished episode part of the dataset."""
+        number, frames = self.episodes, len(episode.rows["action"])
+        place = {"chunk_index": number // FILES_IN_CHUNK, "file_index": number % FILES_IN_CHUNK}
+        first = int(self.info["total_frames"])
+        if episode.instruction not in self.tasks:
+            self.tasks.append(episode.instruction)
+        rows = {key: np.stack(values) for key, values in episode.rows.items()}
+        index = np.arange(frames)
+        rows |= {
+            "timestamp": (index / self.info["fps"]).astype(np.float32),
+            "frame_index": index,
+            "episode_index": np.full(frames, number),
+            "index": first + index,
+            "task_index": np.full(frames, self.tasks.index(episode.instruction)),
+        }
+        stats = {key: of_values(values.reshape(frames, -1)) for key, values in rows.items()}
+        stats |= {key: images.result() for key, images in episode.images.items()}
+        about: dict[str, Any] = {"episode_index": number, "tasks": [episode.instruction], "length": frames}
+        about |= {f"data/{name}": value for name, value in place.items()}
+        about |= {"dataset_from_index": first, "dataset_to_index": first + frames}
+        for key in episode.videos:
+            about |= {f"videos/{key}/{name}": value for name, value in place.items()}
+            about |= {f"videos/{key}/from_timestamp": 0.0, f"videos/{key}/to_timestamp": frames / self.info["fps"]}
+        about |= {f"meta/episodes/{name}": value for name, value in place.items()}
+        about |= {f"stats/{key}/{name}": v.tolist() for key, one in stats.items() for name, v in one.items()}
+
+        for key, (path, video) in episode.videos.items():
+            video.finish()
+            _move(path, self.root / VIDEO.format(video_key=key, **place))
+        self._parquet(self._table(rows), DATA.format(**place))
+        self._parquet(self._tasks_table(), "meta/tasks.parquet")
+        self._parquet(self._pa.Table.from_pylist([about]), EPISODES.format(**place))
+        stats = joined(self._stats, stats)
+        total = {"total_episodes": number + 1, "total_frames": first + frames, "total_tasks": len(self.tasks)}
+        info = self.info | total | {"features": episode.features, "splits": {"train": f"0:{number + 1}"}}
+        plain = {key: {name: v.tolist() for name, v in one.items()} for key, one in stats.items()}
+        self._json(plain, "meta/stats.json")
+        self._json(info, "meta/info.json")
+        self.info, self._stats = info, stats
+
+    def _open(self, fps: float) -> None:
+        info = json.loads((self.root / "meta/info.json").read_text())
+        for key, mine in (("codebase_version", VERSION), ("fps", fps), ("data_path", DATA), ("video_path", VIDEO)):
+            if info.get(key) != mine:
+                raise ConfigError(f"{self.root}: has {key} {info.get(key)!r}, want {mine!r}; record into a new folder")
+        self.info = info
+        stats = json.loads((self.root / "meta/stats.json").read_text())
+        self._stats = {key: {name: np.array(value) for name, value in one.items()} for key, one in stats.items()}
+        table = self._pq.read_table(self.root / "meta/tasks.parquet")
+        self.tasks = table.column("__index_level_0__").to_pylist()
+
+    def _sweep(self) -> None:
+        """Remove what a crash left: the running episode, and one that was about to be counted."""
+        shutil.rmtree(self.root / _UNFINISHED, ignore_errors=True)
+        number = self.episodes
+        stray = FILE.format(chunk_index=number // FILES_IN_CHUNK, file_index=number % FILES_IN_CHUNK)
+        for path in [*self.root.glob(f"data/{stray}.*"), *self.root.glob(f"videos/*/{stray}.*")]:
+            path.unlink()
+        for path in self.root.glob(f"meta/episodes/{stray}.*"):
+            path.unlink()
+
+    def _table(self, rows: Mapping[str, np.ndarray]) -> Any:
+        pa = self._pa
+        columns = {}
+        for key, values in rows.items():
+            if values.ndim == 1:
+                columns[key] = pa.array(values, getattr(pa, _ARROW[NUMBERS[key]])())
+            else:
+                flat = pa.array(np.ascontiguousarray(values, np.float32).ravel())
+                columns[key] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
+        return pa.table(columns)
+
+    def _tasks_table(self) -> Any:
+        """As pandas writes a frame whose index are the tasks, which is how LeRobot reads it."""
+        pa, name = self._pa, "__index_level_0__"
+        text: dict[str, Any] = {"pandas_type": "unicode", "numpy_type": "object"}
+        columns: list[dict[str, Any]] = [
+            {"name": "task_index", "field_name": "task_index", "pandas_type": "int64", "numpy_type": "int64"},
+            {"name": None, "field_name": name, **text},
+        ]
+        pandas = {
+            "index_columns": [name],
+            "column_indexes": [{"name": None, "field_name": None, **text, "metadata": {"encoding": "UTF-8"}}],
+            "columns": [{**column, "metadata": None} for column in columns],
+            "creator": {"library": "pyarrow", "version": pa.__version__},
+            "pandas_version": "2.2.0",
+        }
+        table = pa.table({"task_index": pa.array(range(len(self.tasks)), pa.int64()), name: pa.array(self.tasks)})
+        return table.replace_schema_metadata({"pandas": json.dumps(pandas)})
+
+    def _parquet(self, table: Any, name: str) -> None:
+        part = self._part(name)
+        self._pq.write_table(table, part, compression="snappy")
+        _move(part, self.root / name)
+
+    def _json(self, value: object, name: str) -> None:
+        part = self._part(name)
+        part.write_text(json.dumps(value, indent=4, ensure_ascii=False))
+        _move(part, self.root / name)
+
+    def _part(self, name: str) -> Path:
+        folder = self.root / _UNFINISHED
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder / name.replace("/", "_")
+
+
+_ARROW = {"float64": "float64", "float32": "float32", "int64": "int64", "bool": "bool_"}
+
+
+def _move(part: Path, path: Path) -> None:
+    """Give a whole file its name, after it has reached the disk."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with part.open("rb") as file:
+        os.fsync(file.fileno())
+    os.replace(part, path)

@@ -1,0 +1,80 @@
+"""A robot without hardware: what it takes to try the loop, the recording and a server."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.interface import Obs
+
+_SIDE = 224  # px
+_DOT = 16
+_SMOOTHING = 0.5  # share of the way to its target that a joint goes in a tick
+
+
+class SimulatedRobot:
+    """An arm whose joints follow their commands, and two cameras that see it as a dot on a still picture.
+
+    It takes what the policy's contract says: `dim` numbers, absolute targets or deltas of the joints, the
+    last of them the gripper if the contract says how it is opened. It gives the cameras, of the size, and the
+    parts of the state, which are joints, that the contract names; else `front`, `wrist` and `joints`.
+    """
+
+    def __init__(self, contract: Contract | None = None) -> None:
+        contract = contract or Contract()
+        self._action: ActionSpec = contract.action
+        self._parts = {name: spec.dim for name, spec in (contract.state or {"joints": StateSpec()}).items()}
+        self._pictures = {
+            name: _picture(camera.height or _SIDE, camera.width or _SIDE)
+            for name, camera in (contract.cameras or {"front": CameraSpec(), "wrist": CameraSpec()}).items()
+        }
+        self._joints = np.zeros(self._action.dim or 7, np.float32)
+        self._target = self._joints.copy()
+        self.applied = 0  # actions
+        self.stopped = False
+
+    def observe(self) -> Obs:
+        """The state now; arrays of its own each time."""
+        self._joints = self._joints + _SMOOTHING * (self._target - self._joints)
+        state = {
+            name: np.resize(self._joints, dim if dim is not None else len(self._joints)).astype(np.float32)
+            for name, dim in self._parts.items()
+        }
+        return Obs({name: self._seen(still) for name, still in self._pictures.items()}, self._opening(), state)
+
+    def apply(self, action: np.ndarray) -> None:
+        """Set the joints' targets, rad."""
+        self.applied += 1
+        self.stopped = False
+        if self._action.delta:
+            self._target = self._target + action
+        else:
+            self._target = action.copy()
+
+    def stop(self) -> None:
+        """Stay where it is."""
+        self._target = self._joints.copy()
+        self.stopped = True
+
+    def _opening(self) -> float:
+        spec = self._action
+        if spec.gripper_open is None or spec.gripper_closed is None or spec.gripper_open == spec.gripper_closed:
+            return 1.0
+        share = (float(self._joints[-1]) - spec.gripper_closed) / (spec.gripper_open - spec.gripper_closed)
+        return min(1.0, max(0.0, share))
+
+    def _seen(self, still: np.ndarray) -> np.ndarray:
+        image = still.copy()
+        height, width = image.shape[:2]
+        turn = float(self._joints[0])
+        x = round((0.5 + 0.4 * np.sin(turn)) * (width - _DOT))
+        y = round((0.5 + 0.4 * np.cos(turn)) * (height - _DOT))
+        image[max(0, y) : y + _DOT, max(0, x) : x + _DOT] = (220, 40, 40)
+        return image
+
+
+def _picture(height: int, width: int) -> np.ndarray:
+    """Something that a camera might see, for the codecs: gradients with a little noise. (H, W, 3) uint8."""
+    y, x = np.mgrid[:height, :width]
+    noise = np.random.default_rng(0).integers(0, 8, (height, width))
+    return np.stack([x * 200 // width + noise, y * 200 // height + noise, (x + y) % 160 + noise], -1).astype(np.uint8)
