@@ -197,6 +197,20 @@ def test_rows_beyond_the_horizon_are_never_executed(playing: Playing) -> None:
     assert agent.seen[0]["t"] == 0
 
 
+def test_rows_of_an_observation_from_before_the_loop_hung_are_not_executed(
+    playing: Playing, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    agent, player = playing(Counting(gated=True), mode="async", max_age_s=0.5)
+    assert play(player, range(2)) == [0, 0.1]
+    now = time.monotonic()
+    monkeypatch.setattr("vlagents_ray.client.chunks.time.monotonic", lambda: now + 1.0)
+    assert "older than max_age_s" in player.act(obs(2)).info["safe"]
+    let(agent, player)  # the answer to tick 1, as old
+    assert "older than max_age_s" in player.act(obs(3)).info["safe"]
+    let(agent, player)  # to tick 3, from after it went on
+    assert play(player, range(4, 5)) == [3.1]
+
+
 @pytest.mark.parametrize("failure", [PolicyFailed("out of memory"), PolicyUnavailable("restarting")])
 def test_a_policy_in_trouble_gives_safe_actions_until_it_answers_again(playing: Playing, failure: Exception) -> None:
     agent, player = playing(Counting(gated=True, rows=1), mode="async")
@@ -268,7 +282,14 @@ def test_act_before_reset_is_refused() -> None:
 
 @pytest.mark.parametrize(
     "options",
-    [{"mode": "fast"}, {"execute": 0}, {"horizon": 0}, {"merge": "average"}, {"real_time_chunking": True}],
+    [
+        {"mode": "fast"},
+        {"execute": 0},
+        {"horizon": 0},
+        {"max_age_s": 0},
+        {"merge": "average"},
+        {"real_time_chunking": True},
+    ],
 )
 def test_options_that_mean_nothing_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(ConfigError):

@@ -126,6 +126,24 @@ def test_no_path_answers_without_a_key(door: Door, path: str) -> None:
     assert (status, json.loads(body)["code"]) == (403, "forbidden")
 
 
+def test_without_keys_pages_of_other_sites_are_refused(door: Door) -> None:
+    """A browser on the robot's machine says whose page asks, and reaches loopback."""
+    open_door = Guard(
+        build_ingress(door.engine, lambda: {"policy": "p", "version": "0", "protocol": PROTOCOL_VERSION}, Limits()),
+        None,
+        "noop",
+    )
+    with served(open_door) as port:
+        own = Door(f"http://127.0.0.1:{port}", port, door.engine, door.file, {})
+        assert own.get("/v1/metadata", {"origin": "https://evil.example"})[0] == 403
+        assert own.get("/v1/metadata", {"origin": "null"})[0] == 403
+        assert own.get("/v1/metadata", {"origin": own.url})[0] == 200
+        assert own.get("/v1/metadata")[0] == 200
+        with pytest.raises(InvalidStatus) as refused, own.stream({"origin": "https://evil.example"}):
+            pass
+        assert refused.value.response.status_code == 403
+
+
 def test_a_request_id_of_the_callers_own_comes_back_with_the_refusal(door: Door) -> None:
     _, _, body = door.get("/v1/metadata", {"x-request-id": "mine"})
     assert json.loads(body)["request_id"] == "mine"

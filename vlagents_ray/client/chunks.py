@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -24,6 +25,7 @@ Check = Callable[[np.ndarray, "np.ndarray | None"], np.ndarray]
 
 _WAITING = "waiting for an answer: the last one's rows are executed"
 _LATE = "the answer came so late that the ticks of all its rows were over"
+_OLD = "the plan is older than max_age_s"
 _DELAYS = 10  # requests of which the longest delay is taken
 
 
@@ -50,7 +52,9 @@ class ChunkPlayer(Agent):
     Without a deadline, errors are raised.
 
     `reset` may block: it begins the episode and, with a deadline, waits for the first chunk.
-    `horizon` is the number of rows of a chunk that may be executed at all, so the age of an action at most.
+    `horizon` is the number of rows of a chunk that may be executed at all; `max_age_s` is how long ago an
+    observation may have been handed to `act` for an action made from it to be executed: ticks don't pass while the
+    loop itself hangs, time does.
     `timeout_s` gives a request up after that long (default: as the agent does). `check`, such as a
     `vlagents_ray.robot.Guard`, sees every action before it is returned; one that it refuses is replaced.
 
@@ -69,6 +73,7 @@ class ChunkPlayer(Agent):
         deadline_s: float | None = None,
         timeout_s: float | None = None,
         horizon: int | None = None,
+        max_age_s: float | None = None,
         safe: Safe = "auto",
         grippers: Sequence[int] | None = None,
         check: Check | None = None,
@@ -78,6 +83,8 @@ class ChunkPlayer(Agent):
         for name, value in (("execute", execute), ("horizon", horizon)):
             if value is not None and value < 1:
                 raise ConfigError(f"{name}: got {value}, want at least 1, or None")
+        if max_age_s is not None and not max_age_s > 0:
+            raise ConfigError(f"max_age_s: got {max_age_s}, want above 0, or None")
         if mode != "async" and (merge != "newest" or real_time_chunking):
             raise ConfigError(f"merge and real_time_chunking: got them with mode {mode!r}, want mode='async'")
         self._agent = agent
@@ -86,6 +93,7 @@ class ChunkPlayer(Agent):
         self._deadline_s = 0.0 if deadline_s is None and mode == "async" else deadline_s
         self._timeout_s = timeout_s
         self._horizon = horizon
+        self._max_age_s = max_age_s
         self._safe_choice, self._grippers = safe, grippers
         self._check = check
         self._real_time = real_time_chunking
@@ -98,7 +106,7 @@ class ChunkPlayer(Agent):
         self._plan.clear()
         self._tick: int | None = None  # of the next `act`; None outside an episode
         self._chunks = 0
-        self._asked = -1  # tick of the last request
+        self._asked, self._asked_at = -1, 0.0  # tick and time (s, of `time.monotonic`) of the last request
         self._waiting_since: float | None = None
         self._trouble = _WAITING
         self._delays: deque[int] = deque(maxlen=_DELAYS)
@@ -127,8 +135,8 @@ class ChunkPlayer(Agent):
         if self._deadline_s is not None:
             spec = ActionSpec() if self._contract is None else self._contract.action
             self._safe = SafeAction(self._safe_choice, spec, self._grippers)
+            self._note_asked(0)
             self._take(0, self._agent.act(obs), 0)
-            self._asked = 0
             if self._asker is None:
                 self._asker = Asker(self._agent)
         self._tick = 0
@@ -148,7 +156,7 @@ class ChunkPlayer(Agent):
         begun = time.monotonic()
         if self._asker is None or self._deadline_s is None:
             if self._wants(tick):
-                self._asked = tick
+                self._note_asked(tick)
                 self._take(tick, self._agent.act(_stamped(obs, self._extras(tick))), tick)
         else:
             self._ask_in_time(self._asker, obs, tick, begun + self._deadline_s)
@@ -164,9 +172,16 @@ class ChunkPlayer(Agent):
             self._agent.close()
         self._begin()
 
+    def _note_asked(self, tick: int) -> None:
+        self._asked, self._asked_at = tick, time.monotonic()
+
+    def _at(self, tick: int) -> Step | None:
+        """What is to be done at `tick`, by chunks that are young enough."""
+        return self._plan.at(tick, -math.inf if self._max_age_s is None else time.monotonic() - self._max_age_s)
+
     def _wants(self, tick: int) -> bool:
         """Is an answer to this tick's observation wanted?"""
-        step = self._plan.at(tick)
+        step = self._at(tick)
         if step is None:
             return True
         if step.chunk.done:
@@ -179,13 +194,13 @@ class ChunkPlayer(Agent):
         """Take what has come, ask if it is time to, and wait for the answer as long as is allowed and needed."""
         self._receive(asker.take(), tick)
         if asker.idle and self._wants(tick):
-            self._asked = tick
+            self._note_asked(tick)
             if self._waiting_since is None:
                 self._waiting_since = time.monotonic()
             asker.ask(tick, _stamped(copied(obs), self._extras(tick)))
         while not asker.idle and (left_s := deadline - time.monotonic()) > 0:
             fresh = self._mode != "async" and self._asked == tick
-            if not fresh and self._plan.at(tick) is not None:
+            if not fresh and self._at(tick) is not None:
                 break
             self._receive(asker.take(left_s), tick)
 
@@ -207,7 +222,7 @@ class ChunkPlayer(Agent):
         rows = Act(check_action(act.action, self._contract)).rows()[: self._horizon]
         if self._mode == "open_loop" and act.done and self._execute is not None:
             rows = rows[: self._execute]
-        late = self._plan.add(Chunk(self._chunks, asked, rows, act.done, act.info), now)
+        late = self._plan.add(Chunk(self._chunks, asked, rows, act.done, act.info, self._asked_at), now)
         self._trouble = _LATE if late == len(rows) else _WAITING
         self._chunks += 1
         self._delays.append(now - asked)
@@ -221,9 +236,9 @@ class ChunkPlayer(Agent):
         return extras
 
     def _chosen(self, obs: Obs, tick: int) -> Act:
-        step = self._plan.at(tick)
+        step = self._at(tick)
         silent_s = 0.0 if self._waiting_since is None else time.monotonic() - self._waiting_since
-        reason = self._trouble
+        reason = _OLD if step is None and self._plan.at(tick) is not None else self._trouble
         if step is not None:
             try:
                 action = step.action if self._check is None else self._check(step.action, self._last)

@@ -39,6 +39,7 @@ class Chunk:
     rows: np.ndarray  # (H, D) float32
     done: bool
     info: dict[str, Any]  # of the policy's Act
+    asked_at: float = 0.0  # s, of `time.monotonic`
 
     @property
     def end(self) -> int:
@@ -84,9 +85,9 @@ class Plan:
             self._chunks.append(chunk)
         return min(len(chunk.rows), now - chunk.tick)
 
-    def at(self, tick: int) -> Step | None:
-        """What is to be done at `tick`; None if no chunk reaches that far."""
-        covering = [chunk for chunk in self._chunks if chunk.tick <= tick < chunk.end]
+    def at(self, tick: int, since: float = -math.inf) -> Step | None:
+        """What is to be done at `tick`; None if no chunk that was asked for at `since` or later reaches that far."""
+        covering = [c for c in self._chunks if c.tick <= tick < c.end and c.asked_at >= since]
         if not covering:
             return None
         newest = covering[-1]

@@ -50,6 +50,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
                 real_time_chunking=options.rtc,
                 deadline_s=options.deadline_ms / 1e3,
                 horizon=options.horizon,
+                max_age_s=options.max_age_s,
                 safe=options.safe,
                 check=Guard(contract, max_step=options.max_step),
             )
@@ -98,6 +99,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--mode", choices=("open_loop", "ensemble", "async"), default="async", help="see ChunkPlayer (%(default)s)")
     add("--execute", type=int, metavar="N", help="rows of a chunk to execute before asking again")
     add("--horizon", type=int, metavar="N", help="rows of a chunk that may be executed at all")
+    add("--max-age-s", type=float, metavar="S", help="how old the observation behind an action may be")
     add("--merge", choices=(*MERGES, ENSEMBLE), default="newest", help="of chunks that overlap (%(default)s)")
     add("--rtc", action="store_true", help="real-time chunking: send what is left of the plan, and the delay")
     add("--deadline-ms", type=float, default=0.0, help="how long a tick may wait for an action (%(default)s)")
