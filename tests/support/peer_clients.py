@@ -100,6 +100,24 @@ def openpi_error(url: str, client: int, calls: int) -> list[Any]:
     return ["no error"]
 
 
+def openpi_keyed(url: str, client: int, calls: int) -> Any:
+    """The fragment of the URL is the API key, which this client sends by itself. What it gets, or why nothing."""
+    from openpi_client.websocket_client_policy import WebsocketClientPolicy
+    from websockets.exceptions import InvalidStatus
+
+    address, _, key = url.partition("#")
+    element = {
+        "observation/image": image(client),
+        "observation/wrist_image": image(0),
+        "observation/state": np.zeros(8),
+        "prompt": "abc",
+    }
+    try:
+        return WebsocketClientPolicy(address, api_key=key or None).infer(element)["actions"].tolist()
+    except InvalidStatus as error:
+        return error.response.status_code
+
+
 def openvla(url: str, client: int, calls: int) -> list[Any]:
     """requests and json-numpy, as OpenVLA documents it: plain, and in every second call encoded twice."""
     import json_numpy

@@ -1,4 +1,4 @@
-"""API keys at the doors with ports of their own."""
+"""API keys by the protocols of other systems."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from eval_fakes import wait_for
 from gr00t_client import PolicyClient
+from peers import drive, peers_python
 from rpyc_client import Client, document
 
 from tests.integration.conftest import serving
@@ -22,8 +23,16 @@ def test_with_keys_on_only_who_has_one_is_served_and_a_revoked_one_is_not(tmp_pa
     key = new_key(file, "arm")
     observation = {"video": {"ego": np.full((1, 1, 8, 8, 3), 3, np.uint8)}, "language": {"task": [["abc"]]}}
     robots, arms = free_port(), free_port()
-    dialects = {"vlagents": {"port": robots, "without_key": True}, "gr00t": {"port": arms}}
-    with serving("served_agents:Witness", dialects=dialects, access={"keys_file": str(file)}):
+    dialects = {
+        "vlagents": {"port": robots, "without_key": True},
+        "gr00t": {"port": arms},
+        "openpi": {"mapping": "openpi-libero"},
+    }
+    with serving("served_agents:Witness", dialects=dialects, access={"keys_file": str(file)}) as server:
+        url = server.url.replace("http://", "ws://")
+        answers = [drive(peers_python(), "openpi_keyed", f"{url}#{shown}", 1, 1) for shown in (key, "wrong", "")]
+        assert [row[3:] for row in answers[0][0]] == [[3, 1], [3, 2]]  # "abc"; its first act
+        assert answers[1:] == [[401], [401]]
         with Client(robots) as robot:
             assert robot.act(document(8, "x")) == [8, 0.5, 0.25, 1, 1]
         for wrong in (None, "wrong"):
