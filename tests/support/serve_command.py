@@ -6,7 +6,6 @@ import contextlib
 import os
 import shlex
 import shutil
-import signal
 import socket
 import subprocess
 import time
@@ -47,7 +46,7 @@ def serving(policy: str, log: Path, address: str | None = None) -> Iterator[str]
             time.sleep(0.2)
         yield address
     finally:
-        server.send_signal(signal.SIGINT)
+        server.terminate()  # as Ctrl-C, which what a shell runs in the background never hears
         try:
             server.wait(STOP_S)
         except subprocess.TimeoutExpired:
