@@ -1,0 +1,50 @@
+"""A connection that its server ends politely, as RFC 6455 has it: a last message, and then the line."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from urllib.parse import SplitResult, urlsplit
+
+import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.server import ServerConnection, serve
+
+from vlagents_ray.client.stream import Stream
+
+
+@pytest.fixture
+def base() -> Iterator[SplitResult]:
+    def answer_and_close(connection: ServerConnection) -> None:
+        if connection.recv() == b"answer first":
+            connection.send(b"answered")
+        connection.close()
+
+    with serve(answer_and_close, "127.0.0.1", 0) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield urlsplit(f"http://127.0.0.1:{server.socket.getsockname()[1]}")
+        server.shutdown()
+        thread.join()
+
+
+@pytest.fixture
+def stream(base: SplitResult) -> Iterator[Stream]:
+    assert base.port is not None
+    stream = Stream(base, base.port, "/", 5)
+    yield stream
+    stream.close()
+
+
+def test_a_server_that_closes_in_place_of_an_answer_is_a_connection_that_is_gone(stream: Stream) -> None:
+    stream.send(b"nothing", 5)
+    with pytest.raises((ConnectionClosed, OSError), match="1000"):
+        stream.recv(30)
+
+
+def test_a_server_that_closes_after_an_answer_is_noticed_by_the_next_request(stream: Stream) -> None:
+    stream.send(b"answer first", 5)
+    assert stream.recv(30) == b"answered"
+    with pytest.raises((ConnectionClosed, OSError)):  # noqa: PT012 - by whichever hears of it
+        stream.send(b"answer first", 5)
+        stream.recv(30)
