@@ -104,6 +104,12 @@ class Watchdog:
                 self._barked.discard(name)
                 self._changed.notify_all()
 
+    @property
+    def silent(self) -> list[str]:
+        """What it barked about and has not heard since."""
+        with self._changed:
+            return sorted(self._barked)
+
     def start(self) -> None:
         """Watch from now on."""
         with self._changed:
