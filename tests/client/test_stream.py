@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Iterator
 from urllib.parse import SplitResult, urlsplit
@@ -10,7 +11,9 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
 
+from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.stream import Stream
+from vlagents_ray.client.websocket import _Proxied
 
 
 @pytest.fixture
@@ -48,3 +51,14 @@ def test_a_server_that_closes_after_an_answer_is_noticed_by_the_next_request(str
     with pytest.raises((ConnectionClosed, OSError)):  # noqa: PT012 - by whichever hears of it
         stream.send(b"answer first", 5)
         stream.recv(30)
+
+
+def test_the_key_is_in_no_log(base: SplitResult, caplog: pytest.LogCaptureFixture) -> None:
+    credentials = Credentials("the-secret-key")
+    assert base.port is not None
+    with caplog.at_level(logging.DEBUG):
+        Stream(base, base.port, "/", 5, credentials.headers).close()
+        _Proxied(f"ws://127.0.0.1:{base.port}/", credentials, 5).close()
+    client = [record.getMessage() for record in caplog.records if not record.name.startswith("websockets.server")]
+    assert "> Sec-WebSocket-Version: 13" in client  # the others are logged
+    assert not [line for line in client if "the-secret-key" in line]

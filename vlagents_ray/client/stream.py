@@ -13,6 +13,8 @@ from websockets.frames import Frame, Opcode
 from websockets.protocol import State
 from websockets.uri import parse_uri
 
+from vlagents_ray.client.credentials import WEBSOCKET_LOG
+
 _READ_BYTES = 256 * 1024
 
 
@@ -26,7 +28,7 @@ class Stream:
         host = base.hostname or ""
         deadline = time.monotonic() + timeout_s
         self._protocol = ClientProtocol(
-            parse_uri(f"ws://{f'[{host}]' if ':' in host else host}:{port}{path}"), max_size=None
+            parse_uri(f"ws://{f'[{host}]' if ':' in host else host}:{port}{path}"), max_size=None, logger=WEBSOCKET_LOG
         )
         self._messages: list[bytes] = []
         self._socket = socket.create_connection((host, port), timeout_s)

@@ -16,7 +16,7 @@ from typing import Any, Protocol
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 from websockets.sync.client import connect
 
-from vlagents_ray.client.credentials import NOBODY, Credentials, tls_failure
+from vlagents_ray.client.credentials import NOBODY, WEBSOCKET_LOG, Credentials, tls_failure
 from vlagents_ray.client.http import HttpTransport, http_url, refusal
 from vlagents_ray.client.link import CodecChoice
 from vlagents_ray.client.stream import Stream
@@ -53,6 +53,7 @@ class _Proxied:
                 max_size=None,
                 ssl=credentials.context(url),
                 additional_headers=credentials.headers,
+                logger=WEBSOCKET_LOG,
             )
         )
         self.close = self._open.close
