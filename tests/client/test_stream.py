@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import logging
+import socket
 import threading
 from collections.abc import Iterator
 from urllib.parse import SplitResult, urlsplit
 
 import pytest
 from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request
+from websockets.server import ServerProtocol
 from websockets.sync.server import ServerConnection, serve
 
 from vlagents_ray.client.credentials import Credentials
@@ -62,3 +65,29 @@ def test_the_key_is_in_no_log(base: SplitResult, caplog: pytest.LogCaptureFixtur
     client = [record.getMessage() for record in caplog.records if not record.name.startswith("websockets.server")]
     assert "> Sec-WebSocket-Version: 13" in client  # the others are logged
     assert not [line for line in client if "the-secret-key" in line]
+
+
+def test_a_proxy_that_takes_nothing_does_not_hold_up_the_sender() -> None:
+    def shake_hands() -> None:
+        connection, _ = listener.accept()
+        with connection:
+            protocol = ServerProtocol()
+            protocol.receive_data(connection.recv(65536))
+            [request] = protocol.events_received()
+            assert isinstance(request, Request)
+            protocol.send_response(protocol.accept(request))
+            connection.sendall(b"".join(protocol.data_to_send()))
+            given_up.wait(30)
+
+    given_up = threading.Event()
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        thread = threading.Thread(target=shake_hands)
+        thread.start()
+        proxied = _Proxied(f"ws://127.0.0.1:{listener.getsockname()[1]}/", Credentials(""), 5)
+        with pytest.raises((ConnectionClosed, OSError)):
+            proxied.send(bytes(32 * 1024 * 1024), 0.2)
+        in_time = not given_up.is_set() and thread.is_alive()
+        given_up.set()
+        thread.join()
+        proxied.close()
+    assert in_time  # not because the other side ended
