@@ -101,6 +101,17 @@ def test_the_process_is_left_as_it_was() -> None:
     assert settings() == before
 
 
+@pytest.mark.parametrize("real_time", [False, True])
+def test_where_threads_have_no_priorities_the_loop_does_without(
+    monkeypatch: pytest.MonkeyPatch, *, real_time: bool
+) -> None:
+    monkeypatch.setattr(sys, "platform", "darwin")
+    monkeypatch.delattr(os, "sched_getscheduler")
+    monkeypatch.setattr(os, "getpriority", lambda *_: os.kill(2**22 + 1, 0))  # no such process
+    with undisturbed(real_time=real_time) as done:
+        assert "no priority (only on Linux)" in done
+
+
 def test_a_robot_is_driven_for_as_long_as_was_said_and_then_stopped() -> None:
     robot, agent = Watched(Going.contract), Going()
     report = run_loop(robot, agent, hz=HZ, seconds=0.2, instruction="go")

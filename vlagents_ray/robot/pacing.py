@@ -129,7 +129,9 @@ def undisturbed(*, real_time: bool = False) -> Iterator[list[str]]:
 
 
 def _prioritise(real_time: bool, undo: contextlib.ExitStack) -> str:
-    thread = threading.get_native_id()  # on Linux, both calls are about a thread
+    if not sys.platform.startswith("linux"):  # where both calls are about a thread
+        return "no priority (only on Linux)"
+    thread = threading.get_native_id()
     try:
         if real_time:
             before, param = os.sched_getscheduler(thread), os.sched_getparam(thread)
