@@ -127,6 +127,11 @@ def test_a_slow_tick_costs_the_ticks_that_it_covers_and_no_others() -> None:
     assert report.jitter["ticks"] + report.jitter["missed"] == 60
 
 
+def test_ticks_after_the_end_are_not_counted_as_missed() -> None:
+    report = run_loop(Watched(Going.contract), Going(slow_at=9), hz=HZ, seconds=10 / HZ)
+    assert report.jitter["ticks"] + report.jitter["missed"] == 10
+
+
 def test_the_loop_ends_when_the_policy_is_done_or_the_caller_says_so() -> None:
     robot = Watched(Going.contract)
     report = run_loop(robot, Going(done_at=7), hz=HZ)

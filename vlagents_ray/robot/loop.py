@@ -134,7 +134,7 @@ def _drive(
                 collected = time.monotonic()
             tick = pacer.wait()
             if ticks is not None and tick >= ticks:
-                pacer.forget()
+                pacer.forget(ticks)
                 break
             obs = _observed(robot)
             act = agent.act(obs)

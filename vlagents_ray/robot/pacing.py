@@ -60,10 +60,11 @@ class Pacer:
         self.ticks += 1
         return self._tick
 
-    def forget(self) -> None:
-        """Leave the tick that just began out of what is counted."""
+    def forget(self, end: int) -> None:
+        """Leave the tick that just began, and those missed from `end` on, out of what is counted."""
         self.late_s.pop()
         self.ticks -= 1
+        self.missed -= self._tick - end
 
     def since_tick_s(self) -> float:
         """Time since this tick was due."""
