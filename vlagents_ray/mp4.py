@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 from fractions import Fraction
 from pathlib import Path
@@ -54,5 +55,6 @@ class Mp4:
         self._container.close()
 
     def abandon(self) -> None:
-        """Give the encoder back; the video is of no use."""
-        self._container.close()
+        """Give the encoder back; the video is of no use, so it may be that its end cannot be written."""
+        with contextlib.suppress(OSError):  # PyAV's errors of the disk are OSErrors
+            self._container.close()

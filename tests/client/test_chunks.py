@@ -24,6 +24,7 @@ from vlagents_ray import (
     PolicyFailed,
     PolicyUnavailable,
 )
+from vlagents_ray.client.asking import Asker
 from vlagents_ray.client.chunks import ChunkPlayer
 from vlagents_ray.errors import InvalidAction
 from vlagents_ray.interface import DELAY, LEFTOVER
@@ -353,3 +354,47 @@ def test_real_time_chunking_over_the_wire_joins_chunks_without_a_jump(real_time:
     assert len(chunks) > 3
     jumps = np.abs(np.diff(actions) - 0.1)
     assert (jumps.max() < 1e-4) == real_time
+
+
+def test_a_player_is_driven_again_while_its_last_request_is_under_way(playing: Playing) -> None:
+    class Connected(Counting):
+        busy = False
+        overlapped = False
+
+        def initialize(self) -> None:
+            self.overlapped |= self.busy
+
+        def act(self, obs: Obs) -> Act:
+            self.busy = True
+            try:
+                return super().act(obs)
+            finally:
+                self.busy = False
+
+    agent, player = playing(Connected(gated=True), mode="async")
+    play(player, range(2))
+    wait_for(lambda: len(agent.seen) == 2)
+    opener = threading.Timer(0.2, agent.gate.release)
+    opener.start()
+    player.initialize()  # as the next run of a loop does
+    opener.join()
+    assert isinstance(agent, Connected)
+    assert not agent.overlapped
+
+
+def test_an_asker_is_not_idle_between_its_request_and_the_answer() -> None:
+    idle: list[bool] = []
+
+    class Watched(Asker):
+        def __setattr__(self, name: str, value: object) -> None:
+            super().__setattr__(name, value)
+            if threading.current_thread().name == "vlagents-ray-asker":
+                idle.append(self.idle)
+
+    agent = Counting()
+    asker = Watched(agent)
+    asker.ask(0, obs(0))
+    assert asker.take(30) is not None
+    asker.close()
+    assert idle
+    assert not any(idle)

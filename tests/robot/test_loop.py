@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import gc
 import os
+import signal
+import subprocess
 import sys
 import threading
 import time
+import weakref
 
 import numpy as np
 import pytest
@@ -98,6 +101,17 @@ def test_the_process_is_left_as_it_was() -> None:
     assert settings() == before
 
 
+@pytest.mark.parametrize("real_time", [False, True])
+def test_where_threads_have_no_priorities_the_loop_does_without(
+    monkeypatch: pytest.MonkeyPatch, *, real_time: bool
+) -> None:
+    monkeypatch.setattr(sys, "platform", "darwin")
+    monkeypatch.delattr(os, "sched_getscheduler")
+    monkeypatch.setattr(os, "getpriority", lambda *_: os.kill(2**22 + 1, 0))  # no such process
+    with undisturbed(real_time=real_time) as done:
+        assert "no priority (only on Linux)" in done
+
+
 def test_a_robot_is_driven_for_as_long_as_was_said_and_then_stopped() -> None:
     robot, agent = Watched(Going.contract), Going()
     report = run_loop(robot, agent, hz=HZ, seconds=0.2, instruction="go")
@@ -111,6 +125,11 @@ def test_a_slow_tick_costs_the_ticks_that_it_covers_and_no_others() -> None:
     report = run_loop(robot, Going(slow_at=5), hz=HZ, seconds=0.3)
     assert report.jitter["missed"] >= 4  # the sixth begins late, but in its time
     assert report.jitter["ticks"] + report.jitter["missed"] == 60
+
+
+def test_ticks_after_the_end_are_not_counted_as_missed() -> None:
+    report = run_loop(Watched(Going.contract), Going(slow_at=9), hz=HZ, seconds=10 / HZ)
+    assert report.jitter["ticks"] + report.jitter["missed"] == 10
 
 
 def test_the_loop_ends_when_the_policy_is_done_or_the_caller_says_so() -> None:
@@ -176,6 +195,112 @@ def test_a_hanging_loop_is_noticed_by_the_watchdog() -> None:
         watchdog=Watchdog(lambda _: stopped.set(), {"loop": 0.1, "server": 60.0}),
     )
     assert [bark.partition(":")[0] for bark in report.barks] == ["loop"]
+
+
+def test_a_robot_that_the_watchdog_stopped_stays_so_until_the_server_is_heard_again() -> None:
+    robot = Watched(Going.contract)
+    at_bark: list[int] = []
+
+    class Silent(Going):
+        def act(self, obs: Obs) -> Act:
+            act = super().act(obs)
+            silent_s = 60.0 if at_bark and self.tick < at_bark[0] + 20 else 0.0
+            if not at_bark and self.tick > 3:
+                silent_s = 60.0
+            return Act(act.action, info={"silent_s": silent_s})
+
+    agent = Silent()
+
+    def bark(_: str) -> None:
+        robot.stop()
+        at_bark.append(agent.tick)
+
+    report = run_loop(
+        robot,
+        agent,
+        hz=HZ,
+        until=lambda: bool(at_bark) and agent.tick > at_bark[0] + 30,
+        watchdog=Watchdog(bark, {"server": 0.1}),
+    )
+    ticks = [round(100 * value) for value in robot.commanded]
+    applied = [tick for tick in ticks if at_bark[0] + 1 < tick < at_bark[0] + 19]
+    assert applied == []
+    assert ticks[-1] >= at_bark[0] + 25  # and goes on then
+    assert sum(n for reason, n in report.safe.items() if "no word of the server" in reason) >= 17
+
+
+def test_an_action_that_a_hanging_loop_was_late_with_is_not_applied() -> None:
+    robot = Watched(Going.contract)
+    barked = threading.Event()
+
+    class Hanging(Going):
+        def act(self, obs: Obs) -> Act:
+            if self.tick == 3:
+                assert barked.wait(30)
+            return super().act(obs)
+
+    run_loop(robot, Hanging(done_at=5), hz=HZ, watchdog=Watchdog(lambda _: barked.set(), {"loop": 0.1}))
+    assert 0.03 not in robot.commanded
+    assert robot.commanded[-1] == 0.05
+
+
+def test_a_loop_that_runs_for_days_keeps_no_more_than_it_needs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vlagents_ray.robot.pacing.KEPT_TICKS", 10)
+    monkeypatch.setattr("vlagents_ray.robot.loop._COLLECT_S", 0.05)
+    living: weakref.WeakSet[Failure] = weakref.WeakSet()
+    most = 0
+
+    class Failure(Exception):
+        pass
+
+    class Failing(Going):
+        def act(self, obs: Obs) -> Act:
+            nonlocal most
+            try:
+                raise Failure
+            except Failure as error:
+                kept = error  # a cycle: the error's traceback, this frame, the error
+                living.add(kept)
+            most = max(most, len(living))
+            act = super().act(obs)
+            return Act(act.action * 0, info={"safe": f"no answer within {self.tick} s"})
+
+    report = run_loop(Watched(Going.contract), Failing(), hz=1000, seconds=1.0)
+    ticks = report.jitter["ticks"]
+    assert ticks + report.jitter["missed"] == 1000
+    assert most < max(ticks / 2, 20)
+    assert len(report.safe) <= 101
+    assert report.safe_ticks == ticks
+    pacer = Pacer(1000)
+    for _ in range(30):
+        pacer.wait()
+    assert len(pacer.late_s) == 10
+    assert jitter(pacer.late_s, pacer.missed, pacer.ticks)["ticks"] == 30
+
+
+@pytest.mark.parametrize("wish", [signal.SIGTERM, signal.SIGHUP, signal.SIGINT])
+def test_the_command_stops_the_robot_when_it_is_told_to_end(wish: signal.Signals) -> None:
+    code = """
+import sys, time
+import vlagents_ray.robot.__main__ as command
+
+def run(options):
+    try:
+        print("moving", flush=True)
+        time.sleep(60)
+    finally:
+        print("stopped", flush=True)
+
+command._run = run
+command.main(["http://nowhere"])
+"""
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "moving\n"
+        process.send_signal(wish)
+        assert process.stdout.read() == "stopped\n"
 
 
 @pytest.mark.parametrize("options", [{"hz": 0.0}, {"hz": float("nan")}, {"hz": 50.0, "seconds": 0.0}])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import av
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
+from eval_fakes import wait_for
 
 from vlagents_ray import ConfigError, Obs
 from vlagents_ray.errors import InvalidObservation
@@ -131,6 +133,26 @@ def test_a_frame_unlike_the_first_costs_its_episode_and_is_told(tmp_path: Path) 
     with pytest.raises(InvalidObservation, match=r"want .* as before"):
         recorder.close()
     assert info(tmp_path)["total_episodes"] == 2
+
+
+def test_a_full_disk_costs_its_episode_and_no_later_one(tmp_path: Path) -> None:
+    noise = np.random.default_rng(0)
+    recorder = Recorder(tmp_path, FPS, frames=1000)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, limits[1]))  # a file that grows longer cannot be written
+    try:
+        with recorder.episode("stack"):
+            for i in range(100):
+                camera = noise.integers(0, 255, (2 * SIDE, 2 * SIDE, 3), np.uint8)
+                recorder.add(Obs({"front": camera}), action(i), tick=i)
+        wait_for(lambda: recorder._queue.empty() or not recorder._thread.is_alive())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with recorder.episode("stack"):
+        recorder.add(obs(0), action(0), tick=0)
+    with pytest.raises(OSError, match="too large"):
+        recorder.close()
+    assert info(tmp_path)["total_episodes"] == 1
 
 
 def test_an_episode_without_frames_leaves_nothing(tmp_path: Path) -> None:

@@ -61,6 +61,12 @@ def test_a_jump_is_refused_and_a_first_action_is_none() -> None:
         guard(row(0.2, 0), row(0, 0))
 
 
+@pytest.mark.parametrize("max_step", [float("nan"), -0.1, np.array([0.1, np.nan])])
+def test_a_largest_step_that_would_bound_nothing_is_refused(max_step: float | np.ndarray) -> None:
+    with pytest.raises(ConfigError, match="max_step"):
+        Guard(max_step=max_step)
+
+
 class Barks:
     def __init__(self) -> None:
         self.heard: queue.SimpleQueue[tuple[str, str]] = queue.SimpleQueue()

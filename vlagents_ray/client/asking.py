@@ -81,6 +81,7 @@ class Asker:
             except Exception as error:  # noqa: BLE001 - raised or reported where the answer is taken
                 result = error
             with self._changed:
-                self._job, self._answer = None, Answer(tick, result, time.monotonic())
+                self._answer = Answer(tick, result, time.monotonic())
+                self._job = None  # last: `idle` takes no lock
                 self._changed.notify_all()
         self._agent.close()

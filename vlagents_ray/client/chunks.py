@@ -121,7 +121,9 @@ class ChunkPlayer(Agent):
         return None if self._contract is None else replace(self._contract, chunk=1)
 
     def initialize(self) -> None:
-        """Initialize the policy."""
+        """Initialize the policy; one that was driven before may still be asked, which is waited for."""
+        if self._asker is not None:
+            self._asker.settle()
         self._agent.initialize()
 
     def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import ssl
 from dataclasses import dataclass, field
@@ -10,6 +11,9 @@ from urllib.parse import urlsplit
 from vlagents_ray.errors import ConfigError, ConnectionLost, VLAgentsError
 
 KEY_VARIABLE = "VLAGENTS_RAY_API_KEY"
+WEBSOCKET_LOG = logging.getLogger("vlagents_ray.client.websocket.protocol")
+"""For websockets, which at DEBUG logs the headers that it sends: all but the key."""
+WEBSOCKET_LOG.addFilter(lambda record: "authorization" not in str(record.args).lower())
 _Path = str | os.PathLike[str]
 
 

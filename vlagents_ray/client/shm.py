@@ -101,6 +101,11 @@ class ShmTransport:
 
     def hand_over(self, connection: socket.socket, requests: Sequence[Request], deadline: float) -> None:
         """Put requests where the server reads them, and say so. `TimeoutError`, `OSError` if that fails."""
+        while sum(memory.busy for memory in self._memories) >= LocalAddress.FILES:  # with requests that were given up
+            try:
+                self.receive(connection)
+            except BlockingIOError:
+                self.wait(connection, select.POLLIN, deadline)
         written = self._acts.write(requests)
         if written is not None:
             memory, descriptor = self._memory(written.size)

@@ -13,6 +13,8 @@ from websockets.frames import Frame, Opcode
 from websockets.protocol import State
 from websockets.uri import parse_uri
 
+from vlagents_ray.client.credentials import WEBSOCKET_LOG
+
 _READ_BYTES = 256 * 1024
 
 
@@ -26,7 +28,7 @@ class Stream:
         host = base.hostname or ""
         deadline = time.monotonic() + timeout_s
         self._protocol = ClientProtocol(
-            parse_uri(f"ws://{f'[{host}]' if ':' in host else host}:{port}{path}"), max_size=None
+            parse_uri(f"ws://{f'[{host}]' if ':' in host else host}:{port}{path}"), max_size=None, logger=WEBSOCKET_LOG
         )
         self._messages: list[bytes] = []
         self._socket = socket.create_connection((host, port), timeout_s)
@@ -46,7 +48,8 @@ class Stream:
             raise
 
     def send(self, message: bytes, timeout_s: float) -> None:
-        """A binary message. `OSError` if the connection is gone, or the server does not take all of it in time."""
+        """A binary message. As `recv`, `OSError` also if the server does not take all of it in time."""
+        self._check_open()
         self._protocol.send_binary(message)
         try:
             self._flush(time.monotonic() + timeout_s)
@@ -57,8 +60,7 @@ class Stream:
         """The next binary message. `ConnectionClosed` or `OSError` if the connection is gone, `TimeoutError`."""
         deadline = time.monotonic() + timeout_s
         while not self._messages:
-            if self._protocol.state is not State.OPEN:
-                raise self._protocol.close_exc
+            self._check_open()
             self._read(deadline)
         return self._messages.pop(0)
 
@@ -69,6 +71,13 @@ class Stream:
                 self._protocol.send_close()
                 self._flush(time.monotonic() + 1.0)
         self._socket.close()
+
+    def _check_open(self) -> None:
+        """`ConnectionClosed` or `OSError` unless it is; a server that said goodbye has yet to hang up."""
+        if self._protocol.state is State.CLOSED:
+            raise self._protocol.close_exc
+        if self._protocol.state is not State.OPEN:
+            raise ConnectionResetError(f"the server closes the connection ({self._protocol.close_rcvd})")
 
     def _read(self, deadline: float) -> None:
         self._socket.settimeout(_left(deadline))

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import socket
 import ssl
+import struct
 import time
 from collections.abc import Sequence
 from typing import Any, Protocol
@@ -16,7 +18,7 @@ from typing import Any, Protocol
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 from websockets.sync.client import connect
 
-from vlagents_ray.client.credentials import NOBODY, Credentials, tls_failure
+from vlagents_ray.client.credentials import NOBODY, WEBSOCKET_LOG, Credentials, tls_failure
 from vlagents_ray.client.http import HttpTransport, http_url, refusal
 from vlagents_ray.client.link import CodecChoice
 from vlagents_ray.client.stream import Stream
@@ -53,11 +55,15 @@ class _Proxied:
                 max_size=None,
                 ssl=credentials.context(url),
                 additional_headers=credentials.headers,
+                logger=WEBSOCKET_LOG,
             )
         )
         self.close = self._open.close
 
     def send(self, message: bytes, timeout_s: float) -> None:
+        # Kept by the kernel, as websockets sends without a limit: a proxy that hangs would hold up a robot for minutes.
+        limit = struct.pack("@ll", int(timeout_s), int(timeout_s % 1 * 1e6))
+        self._connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
         self._connection.send(message)
 
     def recv(self, timeout_s: float) -> bytes:
@@ -104,11 +110,11 @@ class WebSocketTransport:
                 f"{self._url}: got {len(frame)} bytes, the limit of a WebSocket message is {STREAM_BYTES}; "
                 f"send JPEG, or use transport='http'"
             )
-        socket = self._stream(timeout_s)
+        connection = self._stream(timeout_s)
         try:
-            socket.send(frame, timeout_s)
+            connection.send(frame, timeout_s)
             while True:
-                data = socket.recv(max(0.0, deadline - time.monotonic()))
+                data = connection.recv(max(0.0, deadline - time.monotonic()))
                 replies = decode_replies(data)
                 if is_answer(replies, requests):
                     return replies
@@ -119,10 +125,10 @@ class WebSocketTransport:
             raise ConnectionLost(f"{self._url}: {error}; reset before the next act") from error
 
     def _probe(self, probe: bytes, timeout_s: float) -> None:
-        socket = self._stream(timeout_s)
+        connection = self._stream(timeout_s)
         try:
-            socket.send(probe, timeout_s)
-            data = socket.recv(timeout_s)
+            connection.send(probe, timeout_s)
+            data = connection.recv(timeout_s)
         except TimeoutError as error:
             self.close()  # its answer may come later, and would be taken for another's
             raise DeadlineExceeded(

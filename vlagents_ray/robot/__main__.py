@@ -5,8 +5,10 @@ from __future__ import annotations
 import argparse
 import contextlib
 import importlib
+import signal
 import sys
-from collections.abc import Callable, Sequence
+import threading
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from vlagents_ray.client.agent import RemoteAgent
@@ -26,11 +28,28 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Returns the exit status: 0 if every tick had an action of the policy, 1 if not, 2 if it could not run."""
     options = _parser().parse_args(arguments)
     try:
-        report = _run(options)
+        with _told_to_end():
+            report = _run(options)
     except VLAgentsError as error:
         print(f"{type(error).__name__}: {error}", file=sys.stderr)  # noqa: T201
         return 2
     return 1 if report.safe_ticks else 0
+
+
+@contextlib.contextmanager
+def _told_to_end() -> Iterator[None]:
+    """Let SIGTERM (systemd's) and SIGHUP (a terminal that is closed) end the loop, which stops the robot, as Ctrl-C."""
+
+    def end(number: int, _: object) -> None:
+        signal.signal(number, signal.SIG_IGN)  # once is enough: a second one would break the stop off
+        sys.exit(128 + number)
+
+    with contextlib.ExitStack() as undo:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGTERM, signal.SIGHUP):
+                if signal.getsignal(number) == signal.SIG_DFL:  # nohup ignores it
+                    undo.callback(signal.signal, number, signal.signal(number, end))
+        yield
 
 
 def _run(options: argparse.Namespace) -> LoopReport:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol
@@ -12,9 +14,12 @@ import numpy as np
 
 from vlagents_ray.errors import ConfigError, InvalidAction
 from vlagents_ray.interface import CAPTURED, SAFE, SILENT, Agent, Obs
-from vlagents_ray.robot.pacing import SPIN_S, Pacer, jitter, undisturbed
+from vlagents_ray.robot.pacing import KEPT_TICKS, SPIN_S, Pacer, jitter, undisturbed
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import Guard, Watchdog
+
+_REASONS = 100  # that a report tells apart
+_COLLECT_S = 2.0
 
 
 class Robot(Protocol):
@@ -41,7 +46,7 @@ class LoopReport:
     jitter: dict[str, float] = field(default_factory=dict)  # see `vlagents_ray.robot.pacing.jitter`
     work_p50_ms: float = 0.0  # from when a tick was due until its action was applied
     work_p99_ms: float = 0.0
-    safe: dict[str, int] = field(default_factory=dict)  # reason -> ticks with the safe action
+    safe: dict[str, int] = field(default_factory=dict)  # reason -> ticks with the safe action, or none
     barks: list[str] = field(default_factory=list)  # of the watchdog
     done: bool = False  # the policy considered its task finished
     means: list[str] = field(default_factory=list)  # what was done against jitter
@@ -50,6 +55,12 @@ class LoopReport:
     def safe_ticks(self) -> int:
         """Ticks without an action of the policy."""
         return sum(self.safe.values())
+
+    def count(self, reason: str) -> None:
+        """One more tick without an action of the policy. Reasons may hold numbers: not all of them are told apart."""
+        if reason not in self.safe and len(self.safe) >= _REASONS:
+            reason = "other reasons"
+        self.safe[reason] = self.safe.get(reason, 0) + 1
 
 
 def run_loop(
@@ -74,7 +85,9 @@ def run_loop(
     with a safe action instead is a `ChunkPlayer(..., check=guard)`. However the loop ends, `robot.stop()` is called.
 
     `watchdog` hears "loop" at every tick and "server" as long as the agent's answers come (`act.info["silent_s"]`);
-    it watches while the loop runs. `recorder` gets an episode; one that ends by an exception is kept, too.
+    it watches while the loop runs. After it barked, the robot is stopped and commanded nothing until what was silent
+    is heard again; an action that a hanging loop was late with is not applied. `recorder` gets an episode; one that
+    ends by an exception is kept, too. A signal such as SIGTERM is the caller's to turn into an exception.
     """
     if seconds is not None and not seconds > 0:
         raise ConfigError(f"seconds: got {seconds}, want above 0, or None")
@@ -109,33 +122,47 @@ def _drive(
     seconds: float | None,
     until: Callable[[], bool],
 ) -> None:
-    work_s: list[float] = []
+    work_s: deque[float] = deque(maxlen=KEPT_TICKS)
+    collected = time.monotonic()
     ticks = None if seconds is None else pacer.ticks_in(seconds)
     last: np.ndarray | None = None
+    stopped = False  # by the watchdog
     try:
         while not report.done and not until():
+            if time.monotonic() - collected > _COLLECT_S:  # in the idle time: it is off, and failed requests are cycles
+                gc.collect()
+                collected = time.monotonic()
             tick = pacer.wait()
             if ticks is not None and tick >= ticks:
-                pacer.late_s.pop()
+                pacer.forget(ticks)
                 break
             obs = _observed(robot)
             act = agent.act(obs)
             if act.action.ndim != 1:
                 raise InvalidAction(f"action: got {act.action.shape}, want one row; wrap the agent in a ChunkPlayer")
-            last = guard(act.action, last)
-            robot.apply(last)
+            action = guard(act.action, last)
+            report.done = act.done
+            silent: list[str] = []
+            if watchdog is not None:
+                silent = watchdog.silent
+                watchdog.heard("loop")
+                watchdog.heard("server", act.info.get(SILENT, 0.0))
+            if silent:
+                if not stopped:
+                    robot.stop()  # again: the watchdog's may have come just before the last action
+                stopped = True
+                report.count(f"stopped by the watchdog: no word of the {' and the '.join(silent)}")
+                continue
+            stopped, last = False, action
+            robot.apply(action)
             work_s.append(pacer.since_tick_s())
             reason = act.info.get(SAFE)
             if reason is not None:
-                report.safe[reason] = report.safe.get(reason, 0) + 1
-            if watchdog is not None:
-                watchdog.heard("loop")
-                watchdog.heard("server", act.info.get(SILENT, 0.0))
+                report.count(reason)
             if recorder is not None:
-                recorder.add(obs, last, tick=tick, safe=reason is not None)
-            report.done = act.done
+                recorder.add(obs, action, tick=tick, safe=reason is not None)
     finally:
-        report.jitter = jitter(pacer.late_s, pacer.missed)
+        report.jitter = jitter(pacer.late_s, pacer.missed, pacer.ticks)
         if work_s:
             report.work_p50_ms = float(np.median(work_s)) * 1e3
             report.work_p99_ms = float(np.quantile(work_s, 0.99)) * 1e3

@@ -9,7 +9,8 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -18,6 +19,8 @@ from vlagents_ray.errors import ConfigError
 SPIN_S = 0.001
 """A sleeping thread is woken late by some tens of microseconds, on a busy machine by more: the end is not slept."""
 ON_TIME_S = 0.002
+KEPT_TICKS = 200_000
+"""Of which the lateness is kept: a loop may run for days."""
 _SWITCH_S = 0.0005  # how long another thread may keep the interpreter when the loop's is due; Python's is 5 ms
 _NICE = -10
 _FIFO = 10
@@ -34,7 +37,8 @@ class Pacer:
             raise ConfigError(f"hz: got {hz}, want a rate above 0")
         self.period_s = 1.0 / hz
         self.missed = 0
-        self.late_s: list[float] = []  # of each tick that began
+        self.ticks = 0  # that began
+        self.late_s: deque[float] = deque(maxlen=KEPT_TICKS)  # of the last ones that began
         self._spin_s = spin_s
         self._begin = time.perf_counter()
         self._tick = -1
@@ -53,7 +57,14 @@ class Pacer:
         while (now := time.perf_counter()) < due:
             time.sleep(0)  # gives the interpreter and the core to whoever wants them
         self.late_s.append(now - due)
+        self.ticks += 1
         return self._tick
+
+    def forget(self, end: int) -> None:
+        """Leave the tick that just began, and those missed from `end` on, out of what is counted."""
+        self.late_s.pop()
+        self.ticks -= 1
+        self.missed -= self._tick - end
 
     def since_tick_s(self) -> float:
         """Time since this tick was due."""
@@ -64,14 +75,17 @@ class Pacer:
         return max(1, round(seconds / self.period_s))
 
 
-def jitter(late_s: list[float], missed: int) -> dict[str, float]:
-    """Of ticks: how many, how many were missed, which share began within 2 ms of when they were due, how late in ms."""
+def jitter(late_s: Sequence[float], missed: int, ticks: int | None = None) -> dict[str, float]:
+    """Of ticks: how many, how many were missed, which share began within 2 ms of when they were due, how late in ms.
+
+    `late_s` may be that of the last of `ticks` only, for which they stand then.
+    """
     late_ms = np.array(late_s or [math.nan]) * 1e3
-    due = len(late_s) + missed
+    ticks = len(late_s) if ticks is None else ticks
     return {
-        "ticks": len(late_s),
+        "ticks": ticks,
         "missed": missed,
-        "on_time": float((late_ms <= ON_TIME_S * 1e3).sum()) / max(1, due),
+        "on_time": float((late_ms <= ON_TIME_S * 1e3).mean()) * ticks / max(1, ticks + missed),
         "p50_ms": float(np.median(late_ms)),
         "p99_ms": float(np.quantile(late_ms, 0.99)),
         "max_ms": float(late_ms.max()),
@@ -85,17 +99,17 @@ def empty_loop(hz: float, seconds: float, *, real_time: bool = False) -> dict[st
         ticks = pacer.ticks_in(seconds)
         while pacer.wait() < ticks - 1:
             pass
-    return jitter(pacer.late_s, pacer.missed)
+    return jitter(pacer.late_s, pacer.missed, pacer.ticks)
 
 
 @contextlib.contextmanager
 def undisturbed(*, real_time: bool = False) -> Iterator[list[str]]:
     """Keep this process's own disturbances from the calling thread; yields what was done, in words.
 
-    The garbage collector is put off until the end (a collection of a large heap takes tens of milliseconds;
-    what is not in cycles is freed as ever), other threads give the interpreter back within 0.5 ms, and where
-    the user may (root, or `ulimit -e`), the thread goes before others of this machine. `real_time` asks for
-    SCHED_FIFO instead, before everything that is not real-time (`ulimit -r`).
+    The garbage collector is put off until the end, or until it is called: a collection of a large heap takes tens of
+    milliseconds; what is there already is left out, what is not in cycles is freed as ever. Other threads give the
+    interpreter back within 0.5 ms, and where the user may (root, or `ulimit -e`), the thread goes before others of
+    this machine. `real_time` asks for SCHED_FIFO instead, before everything that is not real-time (`ulimit -r`).
 
     Measured on 2 cores at 50 Hz, p99 of lateness: beside two busy processes 2.8 ms as it is, 0.6 ms with the
     priority, 0.02 ms with SCHED_FIFO; beside a busy Python thread of the same process 5.3 ms as it is, 1.3 ms so.
@@ -116,7 +130,9 @@ def undisturbed(*, real_time: bool = False) -> Iterator[list[str]]:
 
 
 def _prioritise(real_time: bool, undo: contextlib.ExitStack) -> str:
-    thread = threading.get_native_id()  # on Linux, both calls are about a thread
+    if not sys.platform.startswith("linux"):  # where both calls are about a thread
+        return "no priority (only on Linux)"
+    thread = threading.get_native_id()
     try:
         if real_time:
             before, param = os.sched_getscheduler(thread), os.sched_getparam(thread)

@@ -33,6 +33,8 @@ class Guard:
         self._low = _bounds("low", max, spec.low, low)
         self._high = _bounds("high", min, spec.high, high)
         self._max_step = None if max_step is None else np.asarray(max_step, np.float64)
+        if self._max_step is not None and not (self._max_step >= 0).all():  # with NaN any step would pass
+            raise ConfigError(f"max_step: got {max_step}, want 0 or above, or None")
 
     def __call__(self, action: np.ndarray, last: np.ndarray | None = None) -> np.ndarray:
         """`action`, (D,) float32, if it may reach the robot; `last` is what was commanded before."""
@@ -103,6 +105,12 @@ class Watchdog:
             if name in self._barked and ago_s < self._limits[name]:
                 self._barked.discard(name)
                 self._changed.notify_all()
+
+    @property
+    def silent(self) -> list[str]:
+        """What it barked about and has not heard since."""
+        with self._changed:
+            return sorted(self._barked)
 
     def start(self) -> None:
         """Watch from now on."""

@@ -36,7 +36,6 @@ from vlagents_ray.wire.messages import Limits, LocalAddress, Reply, Request, boo
 
 logger = logging.getLogger(__name__)
 
-_FILES = 16  # memory files of one client, which needs more than one if the policy keeps what it saw
 _KEPT = 8  # of them that a policy may keep
 _MESSAGE_BYTES = 256 * 1024
 _CONTROL = socket.CMSG_SPACE(struct.calcsize("i"))  # for one descriptor
@@ -204,8 +203,10 @@ class LocalClient:
     def _add(self, number: int, descriptor: int) -> None:
         try:
             size = os.fstat(descriptor).st_size
-            if size > 2 * self._limits.body_bytes or number >= _FILES:
-                raise MessageTooLarge(f"local: memory file {number} of {size} bytes; {_FILES} files are the limit")
+            if size > 2 * self._limits.body_bytes or number >= LocalAddress.FILES:
+                raise MessageTooLarge(
+                    f"local: memory file {number} of {size} bytes; {LocalAddress.FILES} files are the limit"
+                )
             # A file that could shrink would kill this process when it is read.
             if not fcntl.fcntl(descriptor, fcntl.F_GET_SEALS) & fcntl.F_SEAL_SHRINK:
                 raise MalformedMessage("local: the memory file is not sealed against shrinking")

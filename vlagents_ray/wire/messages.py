@@ -90,6 +90,7 @@ class LocalAddress:
     REPLY: ClassVar[struct.Struct] = struct.Struct("<QHh")  # bit n: memory file n is free again; flags; core or -1
     IN_FILE: ClassVar[int] = 1  # flag: the frame of the reply lies in the memory file that comes with it
     COMPACT: ClassVar[int] = 2  # flag: no frame
+    FILES: ClassVar[int] = 16  # of one client, which needs more than one if the policy keeps what it saw
 
 
 @dataclass(frozen=True, slots=True)
