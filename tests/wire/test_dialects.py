@@ -138,6 +138,17 @@ def test_few_bytes_do_not_become_much_memory() -> None:
         openvla.decode(b'{"a":' + b"[" * 1 + b"[]," * 5_000_000 + b"1]}")
 
 
+def test_few_bytes_do_not_become_many_texts() -> None:
+    def said(texts: int, arrays: int = 1) -> bytes:
+        data = ("\u4e00" * texts).encode("utf-32-le")
+        return msgpack.packb({f"p{i}": {b"__ndarray__": True, b"data": data, b"dtype": "<U1"} for i in range(arrays)})
+
+    assert len(openpi.decode(said(9_000))["p0"]) == 9_000
+    for message in (said(1_000_000), said(900, 20)):
+        with pytest.raises(MessageTooLarge, match="texts"):
+            openpi.decode(message)
+
+
 @pytest.mark.parametrize("dtype", ["|O", "|V8", "<c8", "|S4", "<M8[s]", ">f4", "<f1", "O8", "f4,f4", 3, None])
 def test_arrays_of_anything_but_numbers_are_refused(dtype: Any) -> None:
     fields = {"data": bytes(8), "dtype": dtype, "shape": [1]}
