@@ -34,7 +34,11 @@ plain = st.none() | st.booleans() | st.integers(-(2**53), 2**53) | st.floats(all
 names = st.text(max_size=8).filter(lambda name: not name.startswith("__") and name != "encoded")
 messages = st.dictionaries(
     names,
-    st.recursive(plain | arrays, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(names, inner, max_size=3)),
+    st.recursive(
+        plain | arrays,
+        lambda inner: st.lists(inner, max_size=3) | st.dictionaries(names, inner, max_size=3),
+        max_leaves=16,  # no deeper than the limits allow
+    ),
     max_size=4,
 )
 
