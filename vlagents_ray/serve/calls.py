@@ -88,7 +88,7 @@ class Sender:
     def release(self) -> None:
         """The connection is gone, and its sessions with it, unless it was told to go elsewhere: those are fetched."""
         if self._owner and not self._told and not self._engine.draining:
-            self._engine.sessions.close_owned(self._owner, self._sessions)
+            self._engine.sessions.close_owned(self._owner, tuple(self._sessions))  # a thread of Strays may add one
 
     def _shall_leave(self) -> bool:
         """Is the client to connect anew, which takes its sessions to another replica?"""
