@@ -232,7 +232,7 @@ def test_oft_clients_get_all_rows_of_a_chunk() -> None:
         state = json.loads(openvla.encode(np.array([0, 0, 0, 0, 0, 1, 0.0, 0.0]), twice=False))
         full = {"full_image": body(9)["image"], "state": state, "instruction": "task 4"}
         rows = openvla.decode(b'{"rows": %s}' % client.post("/act", json=full).content)[0]["rows"]
-        assert [row.tolist() for row in rows] == [[9, 1, 1, 4, i, 0, 1] for i in range(3)]
+        assert [row.tolist() for row in rows] == [[9, 1, 1, 4, i, 0, 0] for i in range(3)]  # closed
 
 
 @pytest.mark.parametrize(
