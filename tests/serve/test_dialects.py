@@ -120,6 +120,19 @@ def test_a_sessions_end_is_its_connections(house: tuple[TestClient, Engine]) -> 
     assert len(engine.sessions) == before
 
 
+def test_a_replica_that_stops_keeps_no_session_that_nobody_will_ask_for() -> None:
+    with serving(Mirror(), ALL) as (client, engine):
+        with client.websocket_connect("/openpi") as pi, client.websocket_connect("/vla-eval") as benchmark:
+            pi.receive_bytes()
+            call(pi, libero(1))
+            say(benchmark, "observation", seen(1), 1)
+            assert hear(benchmark).kind == "action"
+            engine.draining = True
+            assert client.post("/act", json=body(5)).status_code == 200
+            assert len(engine.sessions) == 2
+        assert len(engine.sessions) == 0
+
+
 def test_openpi_and_roboarena_share_the_root(house: tuple[TestClient, Engine]) -> None:
     with house[0].websocket_connect("/") as socket:
         config = openpi.decode(socket.receive_bytes())

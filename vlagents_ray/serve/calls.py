@@ -90,9 +90,12 @@ class Sender:
             if timer is not None:
                 timer.cancel()
 
-    def release(self) -> None:
-        """The connection is gone, and its sessions with it, unless it was told to go elsewhere: those are fetched."""
-        if self._owner and not self._told and not self._engine.draining:
+    def release(self, *, for_good: bool = False) -> None:
+        """The connection is gone, and its sessions with it, unless it was told to go elsewhere: those are fetched.
+
+        `for_good`: never, as its protocol has no words for that.
+        """
+        if self._owner and (for_good or not (self._told or self._engine.draining)):
             self._engine.sessions.close_owned(self._owner, tuple(self._sessions))  # a thread of Strays may add one
 
     def _shall_leave(self) -> bool:

@@ -47,7 +47,7 @@ class OpenVLADoor(Door):
                 try:
                     reply = await self.conversation(sender).act(obs, instruction, name)
                 finally:
-                    sender.release()
+                    sender.release(for_good=True)
             return Response(visit.written(reply, lambda: self._answer(reply, twice)), media_type="application/json")
         except ClientDisconnect:
             visit.refused("disconnected")
