@@ -6,6 +6,7 @@ import json
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from starlette.websockets import WebSocketDisconnect
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract
 from vlagents_ray.errors import ConfigError, PolicyFailed
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.serve.auth import Keys
 from vlagents_ray.serve.config import ServerArgs
 from vlagents_ray.serve.dialects.config import DialectArgs
 from vlagents_ray.serve.dialects.door import House
@@ -24,7 +26,9 @@ from vlagents_ray.serve.dialects.routes import describe, dialect_routes, require
 from vlagents_ray.serve.docs import docs_page
 from vlagents_ray.serve.engine import Engine
 from vlagents_ray.serve.files import deployment
+from vlagents_ray.serve.guard import Guard
 from vlagents_ray.serve.ingress import build_ingress
+from vlagents_ray.serve.keyfile import new_key
 from vlagents_ray.wire import openpi, openvla, vla_eval
 from vlagents_ray.wire.messages import Limits
 
@@ -116,6 +120,19 @@ def test_a_sessions_end_is_its_connections(house: tuple[TestClient, Engine]) -> 
     assert len(engine.sessions) == before
 
 
+def test_a_replica_that_stops_keeps_no_session_that_nobody_will_ask_for() -> None:
+    with serving(Mirror(), ALL) as (client, engine):
+        with client.websocket_connect("/openpi") as pi, client.websocket_connect("/vla-eval") as benchmark:
+            pi.receive_bytes()
+            call(pi, libero(1))
+            say(benchmark, "observation", seen(1), 1)
+            assert hear(benchmark).kind == "action"
+            engine.draining = True
+            assert client.post("/act", json=body(5)).status_code == 200
+            assert len(engine.sessions) == 2
+        assert len(engine.sessions) == 0
+
+
 def test_openpi_and_roboarena_share_the_root(house: tuple[TestClient, Engine]) -> None:
     with house[0].websocket_connect("/") as socket:
         config = openpi.decode(socket.receive_bytes())
@@ -199,12 +216,36 @@ def test_openvla_keeps_a_session_that_has_a_name(house: tuple[TestClient, Engine
     assert count("task 2", "robot-a") == 1
 
 
+def test_each_key_has_openvla_sessions_of_its_own_and_pays_once_a_request(tmp_path: Path) -> None:
+    keys = {name: new_key(tmp_path / "keys", name, rate=rate) for name, rate in (("a", None), ("b", None), ("slow", 1))}
+    engine = Engine(Mirror())
+    engine.start()
+    routes = dialect_routes(DialectArgs(openvla={}), House(engine, lambda: METADATA, LIMITS))
+    inside = build_ingress(engine, lambda: METADATA, LIMITS, dialects=routes)
+    with TestClient(Guard(inside, Keys.from_file(tmp_path / "keys"), "app")) as client:
+
+        def act(key: str, pixel: int, **headers: str) -> Any:
+            headers["authorization"] = f"Bearer {keys[key]}"
+            answer = client.post("/act", json=body(pixel), headers=headers)
+            assert answer.status_code == 200, answer.text
+            return openvla.decode(b'{"action": %s}' % answer.content)[0]["action"][:3].tolist()
+
+        named = {"x-session-id": "robot"}
+        for step in (1, 2, 3):
+            assert act("a", 5, **named) == [5, 0, step]
+        assert act("b", 6, **named) == [6, 0, 1]
+        assert act("a", 7, **named) == [7, 0, 4]
+        assert act("slow", 8) == [8, 0, 1]  # a reset and an act, of the one request that its rate holds
+        assert sorted(engine.sessions.ids()) == ["a/robot", "b/robot"]
+    engine.close()
+
+
 def test_oft_clients_get_all_rows_of_a_chunk() -> None:
     with serving(Mirror(chunk=3), {"openvla": {"mapping": "openvla-oft", "chunk": True}}) as (client, _):
         state = json.loads(openvla.encode(np.array([0, 0, 0, 0, 0, 1, 0.0, 0.0]), twice=False))
         full = {"full_image": body(9)["image"], "state": state, "instruction": "task 4"}
         rows = openvla.decode(b'{"rows": %s}' % client.post("/act", json=full).content)[0]["rows"]
-        assert [row.tolist() for row in rows] == [[9, 1, 1, 4, i, 0, 1] for i in range(3)]
+        assert [row.tolist() for row in rows] == [[9, 1, 1, 4, i, 0, 0] for i in range(3)]  # closed
 
 
 @pytest.mark.parametrize(

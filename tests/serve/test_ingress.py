@@ -76,6 +76,18 @@ def good_act(client: TestClient) -> None:
     assert document["timing"].keys() >= {"queue_ms", "inference_ms", "decode_ms", "encode_ms", "total_ms"}
 
 
+def test_a_form_that_does_not_say_how_long_it_is_has_the_limit_of_all(client: TestClient) -> None:
+    def form() -> Iterator[bytes]:
+        yield b'--b\r\ncontent-disposition: form-data; name="cameras.front"; filename="f"\r\n\r\n'
+        for _ in range(20):
+            yield bytes(100_000)
+        yield b"\r\n--b--\r\n"
+
+    headers = {"x-session-id": "a", "content-type": "multipart/form-data; boundary=b"}
+    answer = client.post("/v1/act", content=form(), headers=headers)
+    assert (answer.status_code, answer.json()["code"]) == (413, "too_large")
+
+
 def test_curl_style_reset_and_act(client: TestClient) -> None:
     good_act(client)
 

@@ -254,6 +254,35 @@ def test_a_full_replica_says_so(served: tuple[Engine, LocalDoor]) -> None:
         one.close()
 
 
+def test_who_leaves_before_hearing_that_the_replica_is_full_keeps_nobody_out(served: tuple[Engine, LocalDoor]) -> None:
+    engine, door = served
+    engine.sessions.limit = 1
+    one, busy = client(door), threading.Event()
+    call(one, request("reset"), 5)
+    engine.queue.later(lambda: busy.wait(10) and None)  # the door opens when all of them are gone
+    for _ in range(3):
+        with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as gone:
+            gone.connect(f"\0{door.address.socket}")
+    busy.set()
+    assert call(one, request("act"), 5).error is None
+    one.close()
+    wait_for(lambda: not door._clients)
+    with contextlib.closing(client(door)) as other:
+        assert call(other, request("reset"), 5).error is None
+
+
+@pytest.mark.parametrize("message", [bytes(LocalAddress.REQUEST.size), b""])
+def test_descriptors_that_a_message_brings_are_all_closed(served: tuple[Engine, LocalDoor], message: bytes) -> None:
+    before = len(os.listdir("/proc/self/fd"))
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as odd, open(os.devnull) as file:
+        odd.settimeout(5)
+        odd.connect(f"\0{served[1].address.socket}")
+        socket.send_fds(odd, [message], [file.fileno()] * 2)
+        odd.recv(1000)  # an error, or the end
+    wait_for(lambda: not served[1]._clients)
+    assert len(os.listdir("/proc/self/fd")) == before
+
+
 def test_faults_are_answered_and_harm_nobody(served: tuple[Engine, LocalDoor]) -> None:
     good = client(served[1])
     call(good, request("reset"), 5)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,13 +18,19 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from vlagents_ray.client.stream import Stream
-from vlagents_ray.errors import ConfigError, MalformedMessage, MessageTooLarge, NotReset, PolicyUnavailable
+from vlagents_ray.errors import (
+    ConfigError,
+    MalformedMessage,
+    MessageTooLarge,
+    NotReset,
+    PolicyUnavailable,
+)
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.serve.auth import Keys
 from vlagents_ray.serve.engine import Engine
 from vlagents_ray.serve.keyfile import new_key
 from vlagents_ray.serve.stream import StreamDoor
-from vlagents_ray.wire.frames import decode_reply, encode_request
+from vlagents_ray.wire.frames import decode_reply, decode_requests, encode_request
 from vlagents_ray.wire.messages import STREAM_BYTES, Limits, Reply, Request
 from vlagents_ray.wire.probe import bytes_probe, is_answer
 
@@ -188,6 +195,68 @@ def test_connections_that_say_nothing_make_way(door: StreamDoor) -> None:
         each.close()
     client.close()
     wait_for(lambda: not door._clients)
+
+
+def test_what_nobody_foresaw_ends_the_connection_that_it_came_by_alone(
+    door: StreamDoor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def decode(frame: bytes, limits: Limits) -> list[Request | Reply]:
+        if frame == b"surprise":
+            raise RuntimeError
+        return decode_requests(frame, limits)
+
+    monkeypatch.setattr("vlagents_ray.serve.stream.decode_requests", decode)
+    other, client = stream(door), stream(door)
+    for each in (other, client):
+        ask(each, "reset")
+    client.send(b"surprise", 5)
+    with pytest.raises(ConnectionClosed):
+        client.recv(5)
+    client.close()
+    wait_for(lambda: len(door.engine.sessions) == len(door._clients) == 1)
+    assert ask(other, "act", 7).act is not None
+    other.close()
+
+
+def test_who_does_not_wait_for_answers_fills_no_memory_and_gets_them_all(
+    door: StreamDoor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hurry = threading.Event()
+
+    def act(_self: Echo, obs: Obs) -> Act:
+        if not hurry.is_set():
+            time.sleep(0.005)
+        return Act(obs.cameras["front"][0, :1, 0])
+
+    monkeypatch.setattr(Echo, "act", act)
+    frames = [
+        encode_request(Request("act", Obs({"front": np.full((64, 64, 3), i % 256, np.uint8)}), request_id=str(i)))
+        for i in range(1000)
+    ]
+    with connect(f"ws://127.0.0.1:{door.address.port}{door.address.path}", compression=None) as client:
+        client.send(encode_request(Request("reset", Obs())))
+        assert decode_reply(client.recv(5)).error is None
+        sending = threading.Thread(target=lambda: [client.send(frame) for frame in frames])
+        sending.start()
+        (one,) = door._clients
+        wait_for(lambda: one._paused or not sending.is_alive())
+        assert sending.is_alive()
+        assert door.engine.queue.depth() < 300
+        hurry.set()
+        replies = [decode_reply(client.recv(10)) for _ in frames]
+        sending.join(10)
+    assert [reply.request_id for reply in replies] == [str(i) for i in range(1000)]
+    assert all(reply.act is not None for reply in replies)
+    wait_for(lambda: not door._clients)
+
+
+def test_without_keys_pages_of_other_sites_are_refused(door: StreamDoor) -> None:
+    """Of a name that leads here, too."""
+    where = (BASE, door.address.port, door.address.path, 5)
+    for host in ("evil.example", f"evil.example:{door.address.port}"):
+        with pytest.raises(InvalidStatus) as refused:
+            Stream(*where, {"Origin": f"http://{host}"})
+        assert refused.value.response.status_code == 403
 
 
 def test_a_door_takes_a_free_port_of_those_it_may() -> None:

@@ -34,7 +34,11 @@ plain = st.none() | st.booleans() | st.integers(-(2**53), 2**53) | st.floats(all
 names = st.text(max_size=8).filter(lambda name: not name.startswith("__") and name != "encoded")
 messages = st.dictionaries(
     names,
-    st.recursive(plain | arrays, lambda inner: st.lists(inner, max_size=3) | st.dictionaries(names, inner, max_size=3)),
+    st.recursive(
+        plain | arrays,
+        lambda inner: st.lists(inner, max_size=3) | st.dictionaries(names, inner, max_size=3),
+        max_leaves=16,  # no deeper than the limits allow
+    ),
     max_size=4,
 )
 
@@ -136,6 +140,17 @@ def test_few_bytes_do_not_become_much_memory() -> None:
         assert peak < 100e6
     with pytest.raises(MessageTooLarge):
         openvla.decode(b'{"a":' + b"[" * 1 + b"[]," * 5_000_000 + b"1]}")
+
+
+def test_few_bytes_do_not_become_many_texts() -> None:
+    def said(texts: int, arrays: int = 1) -> bytes:
+        data = ("\u4e00" * texts).encode("utf-32-le")
+        return msgpack.packb({f"p{i}": {b"__ndarray__": True, b"data": data, b"dtype": "<U1"} for i in range(arrays)})
+
+    assert len(openpi.decode(said(9_000))["p0"]) == 9_000
+    for message in (said(1_000_000), said(900, 20)):
+        with pytest.raises(MessageTooLarge, match="texts"):
+            openpi.decode(message)
 
 
 @pytest.mark.parametrize("dtype", ["|O", "|V8", "<c8", "|S4", "<M8[s]", ">f4", "<f1", "O8", "f4,f4", 3, None])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import struct
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from vlagents_ray.errors import (
     MissingCamera,
     VLAgentsError,
 )
+from vlagents_ray.images import encode_jpeg
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.wire.codecs import JPEG, RAW, ImageCodec
 from vlagents_ray.wire.container import pack
@@ -196,6 +198,46 @@ def test_pixels_are_limited_before_memory_is_taken() -> None:
     jpeg[at + 5 : at + 9] = struct.pack(">HH", 60_000, 60_000)
     with pytest.raises(MessageTooLarge, match="60000x60000"):
         decode_request(bytes(jpeg))
+
+
+IMAGE_NODE, BYTES_NODE = {"$": ["img", 0]}, {"$": ["bin", 1]}
+
+
+@pytest.mark.parametrize(
+    "requests",
+    [
+        [{"op": "act", "obs": {"cameras": {"a": IMAGE_NODE}}}] * 400,
+        [{"op": "act", "obs": {"info": {"a": [IMAGE_NODE] * 400}}}],
+        [{"op": "act", "obs": {"info": {"a": [BYTES_NODE] * 1500}}}],
+    ],
+)
+def test_a_small_file_that_is_named_again_and_again_does_not_become_much_memory(requests: list[dict]) -> None:
+    limits = Limits(body_bytes=100_000, pixels=256 * 256, cameras=2)
+    file = encode_jpeg(np.zeros((256, 256, 3), np.uint8))
+    frame = b"".join(pack({"requests": requests}, [file, bytes(50_000)]))
+    tracemalloc.start()
+    answers = decode_requests(frame, limits)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert isinstance(answers[-1], Reply)
+    assert isinstance(answers[-1].error, MessageTooLarge)
+    assert peak < 50 * limits.body_bytes  # 750 without a limit
+
+
+def test_images_of_as_many_requests_as_a_frame_may_hold_are_decoded() -> None:
+    seen = [Obs({"front": np.zeros((224, 224, 3), np.uint8)})] * 1000
+    answers = decode_requests(encode_requests([Request("act", obs) for obs in seen], JPEG))
+    assert all(isinstance(answer, Request) for answer in answers)
+
+
+def test_a_header_of_millions_of_values_is_refused_unread() -> None:
+    header = b'{"op":"act","blobs":[],"obs":{"info":{"a":[' + b"[]," * 1_000_000 + b"1]}}}"
+    tracemalloc.start()
+    with pytest.raises(MessageTooLarge, match="values"):
+        decode_requests(b"VLA\x01" + struct.pack("<I", len(header)) + header)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 5 * len(header)
 
 
 def test_a_body_over_the_limit_is_too_large() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -147,6 +148,20 @@ def test_too_many_values_and_too_deep_ones_are_refused() -> None:
         gr00t.read_request(b"\x91" * 100_000, LIMITS)
     with pytest.raises(MessageTooLarge):
         gr00t.read_request(bytes(2000), Limits(body_bytes=1024))
+
+
+def test_a_header_made_to_be_searched_for_long_is_refused_at_once() -> None:
+    header = b"{'descr': '<f4', 'fortran_order': False, 'shape': (" + b"1" * 28 + b"x"
+    file = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header
+    begun = time.process_time()
+    with pytest.raises(MalformedMessage):
+        gr00t.read_request(said("get_action", {"a": {"__ndarray_class__": True, "as_npy": file}}), LIMITS)
+    assert time.process_time() - begun < 1.0  # each digit doubled it once, 28 take ten seconds
+
+
+def test_arrays_of_text_count_by_their_texts() -> None:
+    with pytest.raises(MessageTooLarge, match="values"):
+        gr00t.read_request(said("get_action", {str(i): np.full((60, 100), "x") for i in range(2)}), LIMITS)
 
 
 @given(st.binary(max_size=300))

@@ -130,7 +130,12 @@ def test_a_grippers_command_is_turned_to_their_polarity() -> None:
     libero = PRESETS["openpi-libero"].rows(action, ours)
     assert libero[:, 6].tolist() == [-1, 1]
     assert action[:, 6].tolist() == [1, 0]
-    assert PRESETS["openvla"].rows(action[0], ours).tolist() == [action[0].tolist()]
+    for openvla in ("openvla", "openvla-oft"):  # its clients turn it into LIBERO's themselves
+        assert PRESETS[openvla].rows(action, ours).tolist() == action.tolist()
+        assert PRESETS[openvla].rows(libero, ActionSpec(7, gripper_open=-1.0, gripper_closed=1.0))[:, 6].tolist() == [
+            1,
+            0,
+        ]
     assert PRESETS["openpi-libero"].rows(action, None).tolist() == action.tolist()
     with pytest.raises(InvalidAction, match="6"):
         PRESETS["openpi-libero"].rows(np.zeros(3), ours)

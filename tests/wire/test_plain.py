@@ -16,6 +16,12 @@ from vlagents_ray.wire.plain import problem, reply_to_json, request_from_parts
 IMAGE = np.full((16, 16, 3), 200, np.uint8)
 
 
+def test_a_document_of_millions_of_values_is_refused_unread() -> None:
+    document = b'{"info":{"a":[' + b"[]," * 1_000_000 + b"1]}}"
+    with pytest.raises(MessageTooLarge, match="values in its JSON"):
+        request_from_parts("act", document, {}, Limits())
+
+
 def test_a_request_is_read_from_json_and_images() -> None:
     document = {
         "instruction": "push",

@@ -136,6 +136,13 @@ def test_what_is_wrong_is_refused_by_name(value: object, error: type[Exception])
         act(value)
 
 
+def test_the_cameras_of_all_robots_are_counted_before_one_is_decoded() -> None:
+    file = base64.b64encode(encode_jpeg(np.zeros((8, 8, 3), np.uint8))).decode()
+    one = {"cameras": {f"c{i}": file for i in range(9)}, "camera_data_type": "jpeg_encoded"}
+    with pytest.raises(MessageTooLarge, match="cameras: got 18"):
+        act({"obs": {"left": one, "right": one}})
+
+
 def test_a_document_of_too_many_values_is_refused() -> None:
     with pytest.raises(MessageTooLarge, match="values"):
         act(robot(info={"list": [0] * 20_000}))

@@ -80,12 +80,13 @@ class Keys:
         self._look()
         digest = hashlib.sha256(token.encode(errors="surrogateescape")).digest()
         found: bytes | None = None
-        for known in self._keys:  # all of them, whichever it is, so that the time tells nothing
+        keys = self._keys  # which another thread may replace
+        for known in keys:  # all of them, whichever it is, so that the time tells nothing
             if hmac.compare_digest(known, digest):
                 found = known
         if found is None:
             raise Unauthorized("this API key is not known here; ask whoever runs the server for one")
-        caller = Caller(self, found, self._keys[found].name, app)
+        caller = Caller(self, found, keys[found].name, app)
         caller.admit(free=True)
         return caller
 

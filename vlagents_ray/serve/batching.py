@@ -113,6 +113,10 @@ class BatchQueue:
         """The end of `watch`, in such a call."""
         self._ears.unwatch(file)
 
+    def later(self, call: Callable[[], None]) -> None:
+        """Have `call` called as if a watched file were ready. Any thread."""
+        self._ears.later(call)
+
     def hurries(self) -> bool:
         """Does a full batch wait for the policy, so that answers to simulations can be sent while it runs?"""
         return self._returning.slow and self._waiting.sessions >= self._max

@@ -33,14 +33,19 @@ class Sender:
         session_id: str = "",
         *,
         connected: bool = True,
+        counted: bool | None = None,
         caller: Caller | None = None,
     ) -> None:
-        """`caller` is whose key it is, by default that of the task that this is called in."""
+        """`caller` is whose key it is, by default that of the task that this is called in.
+
+        `counted`: was each first request counted for the key when it came? By default those without a connection.
+        """
         self._engine = engine
         self._transport = transport
         self._session_id = session_id or uuid.uuid4().hex
         self._owner = uuid.uuid4().hex if connected else ""
         self._sessions: set[str] = set()
+        self._counted = not connected if counted is None else counted
         self._told = False  # to connect anew, and that its sessions follow
         self._caller = caller or current_caller()
 
@@ -85,10 +90,13 @@ class Sender:
             if timer is not None:
                 timer.cancel()
 
-    def release(self) -> None:
-        """The connection is gone, and its sessions with it, unless it was told to go elsewhere: those are fetched."""
-        if self._owner and not self._told and not self._engine.draining:
-            self._engine.sessions.close_owned(self._owner, self._sessions)
+    def release(self, *, for_good: bool = False) -> None:
+        """The connection is gone, and its sessions with it, unless it was told to go elsewhere: those are fetched.
+
+        `for_good`: never, as its protocol has no words for that.
+        """
+        if self._owner and (for_good or not (self._told or self._engine.draining)):
+            self._engine.sessions.close_owned(self._owner, tuple(self._sessions))  # a thread of Strays may add one
 
     def _shall_leave(self) -> bool:
         """Is the client to connect anew, which takes its sessions to another replica?"""
@@ -96,15 +104,22 @@ class Sender:
             self._told = True
         return self._engine.draining or self._told
 
+    @property
+    def session_id(self) -> str:
+        """What the engine calls the sender's own session."""
+        return self._named(self._session_id)
+
     def _session(self, request: Request) -> str:
-        session_id = request.session or self._session_id
+        return self._named(request.session or self._session_id)
+
+    def _named(self, session_id: str) -> str:
         return session_id if self._caller is None else f"{self._caller.name}/{session_id}"
 
     def _admit(self, request: Request, index: int) -> None:
         """What the caller's key says to it. The first of an HTTP request was counted by the guard; to close is free."""
         if self._caller is None:
             return
-        self._caller.admit(free=request.op == "close" or (index == 0 and not self._owner))
+        self._caller.admit(free=request.op == "close" or (index == 0 and self._counted))
         if self._caller.rank == "simulation":
             request.rank = "simulation"
 

@@ -14,6 +14,7 @@ import os
 import select
 import selectors
 import threading
+from collections import deque
 from collections.abc import Callable
 from typing import Protocol
 
@@ -41,6 +42,7 @@ class Ears:
         self._lent = threading.Event()
         self._turn = threading.Lock()  # held while the reader runs callbacks
         self._closed = False
+        self._calls: deque[Callable[[], None]] = deque()
 
     def watch(self, file: HasFileno, ready: Callable[[], None]) -> None:
         """Call `ready` whenever `file` can be read. Before the owner's first `hear`, or in a callback."""
@@ -49,6 +51,12 @@ class Ears:
     def unwatch(self, file: HasFileno) -> None:
         """The end of `watch`, in a callback."""
         self._selector.unregister(file)
+
+    def later(self, call: Callable[[], None]) -> None:
+        """Have `call` called as a callback is; after `close`, not any more. Any thread."""
+        if not self._closed:
+            self._calls.append(call)
+            self.wake()
 
     def wake(self) -> None:
         """End the `hear` that is under way, or the next one. Any thread."""
@@ -107,6 +115,7 @@ class Ears:
             if key.data is None:
                 with contextlib.suppress(BlockingIOError):
                     os.read(self._wake_read, 4096)
+                self._call_back()
                 continue
             try:
                 key.data()
@@ -114,3 +123,10 @@ class Ears:
                 logger.exception("a local client's door failed")
                 with contextlib.suppress(KeyError, ValueError):  # it may have been unwatched, or closed, already
                     self._selector.unregister(key.fileobj)
+
+    def _call_back(self) -> None:
+        while self._calls:
+            try:
+                self._calls.popleft()()
+            except Exception:
+                logger.exception("what was to be called later failed")

@@ -9,14 +9,13 @@ from __future__ import annotations
 import asyncio
 import logging
 import uuid
-from collections.abc import Mapping
 from contextlib import suppress
-from urllib.parse import urlsplit
 
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from vlagents_ray.errors import Forbidden, MalformedMessage, TooManyRequests, Unauthorized, VLAgentsError
+from vlagents_ray.errors import MalformedMessage, TooManyRequests, Unauthorized, VLAgentsError
 from vlagents_ray.serve.auth import Caller, Keys, on_behalf_of, token_of
+from vlagents_ray.serve.origin import require_own_page
 from vlagents_ray.serve.problems import problem_response
 from vlagents_ray.wire.messages import REQUEST_ID_HEADER
 
@@ -53,7 +52,7 @@ class Guard:
         caller: Caller | None = None
         try:
             if self._keys is None:
-                _require_own_page(headers)
+                require_own_page(headers)  # on loopback, which any page that the robot's user opens reaches
             elif not _asks_for_health(scope):
                 caller = self._keys.check(token_of(headers), self._name)
                 if scope["type"] == "http":
@@ -68,13 +67,6 @@ class Guard:
                 await _Upload(self._slow_s, send).run(self._app, scope, receive)
             else:
                 await self._app(scope, receive, send)
-
-
-def _require_own_page(headers: Mapping[str, str]) -> None:
-    """A server without keys is on loopback, where any page that the robot's user opens in a browser reaches it, too."""
-    origin = headers.get("origin")
-    if origin is not None and urlsplit(origin).netloc != headers.get("host"):
-        raise Forbidden(f"origin {origin[:100]}: a page of another site commands no robot; serve with keys to let it")
 
 
 def _asks_for_health(scope: Scope) -> bool:

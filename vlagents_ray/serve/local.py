@@ -17,9 +17,9 @@ import os
 import secrets
 import socket
 import struct
-import sys
 import threading
 import weakref
+from array import array
 from collections.abc import Callable, Sequence
 from typing import ClassVar
 
@@ -29,6 +29,7 @@ from vlagents_ray.errors import MalformedMessage, MessageTooLarge, PolicyUnavail
 from vlagents_ray.serve.auth import Caller
 from vlagents_ray.serve.calls import Sender
 from vlagents_ray.serve.engine import Engine
+from vlagents_ray.serve.porter import Porter
 from vlagents_ray.serve.stats import Visit
 from vlagents_ray.wire import compact, cores
 from vlagents_ray.wire.frames import decode_requests, encode_replies
@@ -55,12 +56,13 @@ class LocalDoor:
         self._admit = admit
         self._clients: set[LocalClient] = set()
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
+        self._porter = Porter(self._listener, self._welcome)
         self.address = LocalAddress(f"vlagents-ray-{secrets.token_hex(16)}", boot_id(), keyed=admit is not None)
 
     def open(self) -> None:
         """Start to listen; before the engine starts."""
         self.listen()
-        self._engine.queue.watch(self._listener, self._accept)
+        self._engine.queue.watch(self._listener, self._porter.accept)
 
     def listen(self) -> None:
         """Give the socket its name."""
@@ -70,19 +72,19 @@ class LocalDoor:
     def close(self) -> None:
         """Hang up; after the engine has ended."""
         self._listener.close()
+        self._porter.close()
         for client in list(self._clients):
             client.release()
 
-    def _accept(self) -> None:
-        connection, _ = self._listener.accept()
-        connection.setblocking(False)
+    def _welcome(self, connection: socket.socket) -> None:
         if peer_uid(connection) != os.getuid():
             logger.warning("a process of another user tried the local door")
             connection.close()
             return
         if len(self._clients) >= self._engine.sessions.limit:
             full = PolicyUnavailable(f"this replica has {len(self._clients)} local clients, its limit of sessions")
-            connection.send(LocalAddress.REPLY.pack(0, 0, -1) + encode_replies([Reply(error=full)]))
+            with contextlib.suppress(OSError):  # gone already
+                connection.send(LocalAddress.REPLY.pack(0, 0, -1) + encode_replies([Reply(error=full)]))
             connection.close()
             return
         client = self.client(connection)
@@ -122,6 +124,13 @@ class LocalClient:
 
     def ready(self) -> None:
         """A message, or the end of the connection, is there."""
+        try:
+            self._listen()
+        except Exception:
+            logger.exception("local client: hung up on it")
+            self._hang_up()
+
+    def _listen(self) -> None:
         visit = Visit(self._engine.stats, self.name)
         buffer = _buffers.bytes
         try:
@@ -131,12 +140,11 @@ class LocalClient:
         except OSError as error:
             logger.info("local client: %s", error)
             size, control = 0, []
-        if not size:
-            self._engine.queue.unwatch(self._connection)
-            self.release()
-            return
-        descriptors = [int.from_bytes(data[:4], sys.byteorder) for _, _, data in control]
+        descriptors = [number for _, _, data in control for number in array("i", data[: len(data) // 4 * 4])]
         try:
+            if not size:
+                self._hang_up()
+                return
             if self._admit is not None:
                 self._show(self._admit, bytes(buffer[:size]))
                 return
@@ -154,6 +162,11 @@ class LocalClient:
         self._sender = Sender(self._engine, self.name, caller=admit(key.decode(errors="replace")))
         self._admit = None
 
+    def _hang_up(self) -> None:
+        if not self._ended:
+            self._engine.queue.unwatch(self._connection)
+            self.release()
+
     def release(self) -> None:
         """Forget the sessions and give their memory back."""
         self._sender.release()
@@ -169,7 +182,7 @@ class LocalClient:
             raise MalformedMessage(f"local: got {len(message)} bytes, want at least {LocalAddress.REQUEST.size}")
         number, flags, length = LocalAddress.REQUEST.unpack_from(message)
         if descriptors:
-            self._add(number, descriptors.pop())
+            self._add(number, descriptors.pop(0))
         memory = self._memory(number, length)
         if flags & LocalAddress.COMPACT:
             return self._acts.read(message[LocalAddress.REQUEST.size :], memory)

@@ -10,6 +10,7 @@ from typing import cast
 from starlette.exceptions import HTTPException
 from starlette.formparsers import MultiPartException
 from starlette.requests import Request as HttpRequest
+from starlette.types import Message, Receive
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge
 from vlagents_ray.wire.frames import CONTENT_TYPE, check_request, decode_requests
@@ -28,6 +29,10 @@ from vlagents_ray.wire.plain import CAMERA_PREFIX, request_from_parts
 
 _SESSION_ID = re.compile(r"[\x21-\x7e]{1,128}")
 INLINE_BYTES = 512 * 1024  # a larger body is decoded beside the event loop, which others wait for
+
+
+class _TooLong(MultiPartException):
+    """A form, of which the parser then closes the files."""
 
 
 class Requests:
@@ -78,7 +83,7 @@ class Requests:
         document: str | bytes | None = None
         files: dict[str, bytes] = {}
         try:
-            async with http.form(
+            async with HttpRequest(http.scope, self._limited(http)).form(
                 max_files=limits.cameras + 1, max_fields=limits.cameras + 1, max_part_size=limits.body_bytes
             ) as form:
                 for name, part in form.multi_items():
@@ -90,6 +95,8 @@ class Requests:
                     else:
                         raise MalformedMessage(f"form: unknown part {name!r}, want 'obs' and files 'cameras.<name>'")
         except (MultiPartException, HTTPException) as error:
+            if isinstance(error, _TooLong) or isinstance(error.__context__, _TooLong):
+                raise MessageTooLarge(f"body: over {limits.body_bytes} bytes, the limit") from None
             text = error.message if isinstance(error, MultiPartException) else error.detail
             raise MalformedMessage(f"form: {text}") from error
         if document is None:
@@ -97,6 +104,20 @@ class Requests:
         if sum(map(len, files.values())) > INLINE_BYTES:
             return await asyncio.to_thread(request_from_parts, op, document, files, limits)
         return request_from_parts(op, document, files, limits)
+
+    def _limited(self, http: HttpRequest) -> Receive:
+        """What a form's body comes by: the parser has a limit for each part alone, and none for files."""
+        size = 0
+
+        async def receive() -> Message:
+            nonlocal size
+            message = await http.receive()
+            size += len(message.get("body", b""))
+            if size > self._limits.body_bytes:
+                raise _TooLong("body")
+            return message
+
+        return receive
 
     async def body(self, http: HttpRequest) -> bytes:
         """All of it, if it is not over the limit."""

@@ -25,9 +25,11 @@ from vlagents_ray.serve.auth import Caller, token_of
 from vlagents_ray.serve.calls import Sender
 from vlagents_ray.serve.engine import Engine
 from vlagents_ray.serve.local import Admit
+from vlagents_ray.serve.origin import require_own_page
+from vlagents_ray.serve.porter import Porter
 from vlagents_ray.serve.stats import Visit
 from vlagents_ray.wire.frames import decode_requests, encode_replies
-from vlagents_ray.wire.messages import STREAM_BYTES, STREAM_PATH, Limits, Reply, StreamAddress
+from vlagents_ray.wire.messages import STREAM_BYTES, STREAM_PATH, Limits, Reply, Request, StreamAddress
 from vlagents_ray.wire.probe import answer, is_probe, probed_frame
 
 logger = logging.getLogger(__name__)
@@ -36,6 +38,7 @@ _BACKLOG = 128
 _READ_BYTES = 256 * 1024
 _SLOW_S = 10.0  # for a client to take a reply that its connection does not hold
 _STRANGERS = 64  # connections that have not said yet what they want
+_UNANSWERED = 256  # messages of one client, at most: what more it sends waits in its connection
 _UNSUPPORTED_DATA, _TRY_AGAIN_LATER = 1003, 1013  # close codes
 
 # A peer that vanished is noticed by the kernel: after 20 s of silence it asks every 5 s, three times.
@@ -64,23 +67,28 @@ class StreamDoor:
         self._clients: set[StreamClient] = set()
         self._strangers: dict[StreamClient, None] = {}  # in the order they came
         self._listener = _listen(host, ports)
+        self._porter = Porter(self._listener, self._welcome)
         self.address = StreamAddress(self._listener.getsockname()[1], self.path)
 
     def open(self) -> None:
         """Let clients in; before the engine starts."""
-        self.engine.queue.watch(self._listener, self._accept)
+        self.engine.queue.watch(self._listener, self._porter.accept)
 
     def close(self) -> None:
         """Hang up; after the engine has ended."""
         self._listener.close()
+        self._porter.close()
         for client in list(self._clients):
             client.release()
 
     def admit(self, client: StreamClient, request: Handshake) -> Caller | None:
         """The client knows the path. Whose key it shows, where that is asked; `Unauthorized`, `Forbidden`."""
         caller = None
-        if self._admit is not None:
-            caller = self._admit(token_of({name.lower(): value for name, value in request.headers.raw_items()}))
+        headers = {name.lower(): value for name, value in request.headers.raw_items()}
+        if self._admit is None:
+            require_own_page(headers)
+        else:
+            caller = self._admit(token_of(headers))
         self._strangers.pop(client, None)
         return caller
 
@@ -96,9 +104,7 @@ class StreamDoor:
             return None
         return PolicyUnavailable(f"this replica has {held - 1} streams, its limit of sessions")
 
-    def _accept(self) -> None:
-        connection, _ = self._listener.accept()
-        connection.setblocking(False)
+    def _welcome(self, connection: socket.socket) -> None:
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         for name, value in _KEEPALIVE:
@@ -124,9 +130,20 @@ class StreamClient:
         self._unsent = bytearray()
         self._slow = False  # a thread sends what the connection does not hold
         self._ended = False
+        self._heard = True  # does the batch queue hear it?
+        self._paused = False  # not to be heard until some of its messages are answered
+        self._unanswered = 0
+        self._unanswered_bytes = 0  # with their images decoded
 
     def ready(self) -> None:
         """Bytes, or the end of the connection, are there."""
+        try:
+            self._listen()
+        except Exception:
+            logger.exception("stream client: hung up on it")
+            self.hang_up()
+
+    def _listen(self) -> None:
         try:
             data = self._connection.recv(_READ_BYTES)
         except BlockingIOError:
@@ -148,12 +165,31 @@ class StreamClient:
                 self._hear(event)
         if not data or self._protocol.state in (State.CLOSING, State.CLOSED):
             self.hang_up()
+            return
+        with self._sending:
+            self._paused = self._has_much()
+        if self._paused:
+            self._unhear()
 
     def hang_up(self) -> None:
         """Forget the client; where the batch queue hears."""
         if not self._ended:
-            self._door.engine.queue.unwatch(self._connection)
+            self._unhear()
             self.release()
+
+    def _unhear(self) -> None:
+        if self._heard:
+            self._heard = False
+            self._door.engine.queue.unwatch(self._connection)
+
+    def _hear_again(self) -> None:
+        if not self._ended and not self._heard:
+            self._heard = True
+            self._door.engine.queue.watch(self._connection, self.ready)
+
+    def _has_much(self) -> bool:
+        """In the queue, of which it has not been told the answers. With the lock held."""
+        return self._unanswered >= _UNANSWERED or self._unanswered_bytes > self._door.limits.body_bytes
 
     def release(self) -> None:
         """Close the connection and end its sessions."""
@@ -200,7 +236,11 @@ class StreamClient:
                 return
             requests = decode_requests(message, self._door.limits)
             visit.decoded(requests)
-            self._sender.send(requests, lambda replies: self._send(visit.frame(replies)))
+            size = len(message) + sum(map(_image_bytes, requests))
+            with self._sending:
+                self._unanswered += 1
+                self._unanswered_bytes += size
+            self._sender.send(requests, lambda replies: self._answer(visit, replies, size))
         except VLAgentsError as error:
             self._send(visit.frame([Reply(error=error)]))
 
@@ -210,6 +250,17 @@ class StreamClient:
                 if isinstance(request, Reply) and request.error is not None:
                     raise request.error
         return answer(message)
+
+    def _answer(self, visit: Visit, replies: list[Reply], size: int) -> None:
+        with self._sending:
+            self._unanswered -= 1
+            self._unanswered_bytes -= size
+            again = self._paused and not self._has_much()
+            if again:
+                self._paused = False
+        if again:
+            self._door.engine.queue.later(self._hear_again)
+        self._send(visit.frame(replies))
 
     def _send(self, message: bytes) -> None:
         with self._sending:
@@ -260,6 +311,13 @@ class StreamClient:
         self._unsent.clear()
         with contextlib.suppress(OSError):  # gone by itself
             self._connection.shutdown(socket.SHUT_RDWR)
+
+
+def _image_bytes(request: Request | Reply) -> int:
+    if isinstance(request, Reply):
+        return 0
+    seen = request.history if request.obs is None else [request.obs, *request.history]
+    return sum(image.nbytes for obs in seen for image in obs.cameras.values())
 
 
 def _listen(host: str, ports: tuple[int, int] | None) -> socket.socket:

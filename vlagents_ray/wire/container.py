@@ -18,6 +18,8 @@ from vlagents_ray.wire.messages import PROTOCOL_VERSION, Limits
 
 _PREFIX = struct.Struct("<3sBI")
 _ALIGN = 8
+_SHORT = 2**20  # bytes of JSON, too few for much memory
+_VALUES = 1_000_000  # in longer JSON
 dump = json.JSONEncoder(separators=(",", ":")).encode  # made once: `json.dumps` makes one each time
 
 
@@ -54,8 +56,10 @@ def unpack(data: Buffer, limits: Limits) -> tuple[dict[str, Any], list[Buffer]]:
     at = _PREFIX.size + length
     if at > len(view):
         raise MalformedMessage(f"frame: ends inside its header ({len(view)} of {at} bytes); it was truncated")
+    text = bytes(view[_PREFIX.size : at])
+    require_few_values(text)
     try:
-        header = json.loads(bytes(view[_PREFIX.size : at]))
+        header = json.loads(text)
     except (ValueError, RecursionError) as error:
         raise MalformedMessage(f"frame: the header is not JSON ({error})") from error
     lengths = header.get("blobs") if isinstance(header, dict) else None
@@ -71,3 +75,12 @@ def unpack(data: Buffer, limits: Limits) -> tuple[dict[str, Any], list[Buffer]]:
     if at != len(view):
         raise MalformedMessage(f"frame: {len(view) - at} bytes follow its last blob")
     return header, blobs
+
+
+def require_few_values(text: bytes | str) -> None:
+    """`MessageTooLarge` for JSON that would take much more memory, and much longer to read, than its bytes do."""
+    if len(text) <= _SHORT:
+        return
+    data = text.encode("utf-8", "replace") if isinstance(text, str) else text
+    if sum(map(data.count, (b",", b"[", b"{"))) > _VALUES:
+        raise MessageTooLarge(f"message: more than {_VALUES} values in its JSON; send arrays instead of lists")

@@ -24,7 +24,7 @@ from vlagents_ray.wire.codecs import RAW, ImageCodec
 from vlagents_ray.wire.container import assemble, dump, pack, unpack
 from vlagents_ray.wire.messages import DEFAULT_LIMITS, NAME_CHARACTERS, OPS, RANKS, Limits, Op, Reply, Request
 from vlagents_ray.wire.observations import is_number, read_obs, write_obs
-from vlagents_ray.wire.tree import Reader, Writer
+from vlagents_ray.wire.tree import Budget, Reader, Writer
 
 CONTENT_TYPE = "application/x-vlagents-frame"
 _OPTIONAL: dict[str, Any] = {
@@ -75,7 +75,7 @@ def _write_request(request: Request, writer: Writer, codec: ImageCodec) -> dict[
 def decode_request(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> Request:
     """The request in a frame. Its arrays view `data`; nothing in it is executed or unpickled."""
     header, blobs = unpack(data, limits)
-    return _read_request(header, blobs, limits)
+    return _read_request(header, Reader(blobs, limits), limits)
 
 
 def decode_requests(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> list[Request | Reply]:
@@ -87,22 +87,22 @@ def decode_requests(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> list[Reque
     if len(nodes) > limits.requests:
         raise MessageTooLarge(f"requests: got {len(nodes)}, the limit is {limits.requests} in one frame")
     read: list[Request | Reply] = []
+    budget = Budget(limits)
     for node in nodes:
         try:
-            read.append(_read_request(node, blobs, limits))
+            read.append(_read_request(node, Reader(blobs, limits, budget), limits))
         except InvalidInput as error:
             name = node.get("request_id")
             read.append(Reply(name if isinstance(name, str) else "", error=error))
     return read
 
 
-def _read_request(node: dict[str, Any], blobs: list[Buffer], limits: Limits) -> Request:
+def _read_request(node: dict[str, Any], reader: Reader, limits: Limits) -> Request:
     unknown = node.keys() - _REQUEST_KEYS
     if unknown:
         raise MalformedMessage(f"request: unknown keys {sorted(unknown)}, want some of {sorted(_REQUEST_KEYS)}")
     if node.get("op") not in OPS:
         raise MalformedMessage(f"op: got {str(node.get('op'))[:40]!r}, want one of {list(OPS)}")
-    reader = Reader(blobs, limits)
     obs, history = node.get("obs"), node.get("history") or []
     if not isinstance(history, list):
         raise MalformedMessage(f"history: got {type(history).__name__}, want a list of observations")

@@ -175,7 +175,10 @@ class _Reader:
     def _map(self, node: dict[Any, Any]) -> Any:
         self._count(len(node))
         if "__ndarray_class__" in node:
-            return npy.read_npy(node.get("as_npy"), self._limits)
+            value = npy.read_npy(node.get("as_npy"), self._limits)
+            if isinstance(value, list):  # texts
+                self._count(sum(len(row) if isinstance(row, list) else 1 for row in value))
+            return value
         if b"nd" in node or "nd" in node:
             self.packed = True
             return npy.read_packed(node)

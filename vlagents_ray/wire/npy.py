@@ -18,9 +18,11 @@ from vlagents_ray.wire.arrays import read_array
 from vlagents_ray.wire.messages import Limits
 
 _NPY = b"\x93NUMPY"
-# As numpy writes the header of every plain array; anything else (structures, objects) is refused.
+# As numpy writes the header of every plain array; anything else (structures, objects) is refused. There is one way to
+# match each text, so that none takes long.
 _HEADER = re.compile(
-    rb"\{'descr': '([<|]?[a-zA-Z]\d{1,5})', 'fortran_order': (True|False), 'shape': \(((?:\d{1,15}(?:, ?)?)*)\), \}\s*"
+    rb"\{'descr': '([<|]?[a-zA-Z]\d{1,5})', 'fortran_order': (True|False), "
+    rb"'shape': \(((?:\d{1,15}, ?)*(?:\d{1,15})?)\), \}\s*"
 )
 _TEXT_DTYPE = re.compile(r"<U\d{1,5}")
 

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import MalformedMessage
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge
 from vlagents_ray.wire.arrays import plain_dtype, read_array
 from vlagents_ray.wire.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.wire.packed import pack, unpack
@@ -21,7 +21,15 @@ def decode(data: bytes, limits: Limits = DEFAULT_LIMITS) -> dict[str, Any]:
 
     Raises `MalformedMessage` or `MessageTooLarge`.
     """
-    value = unpack(data, limits, _array)
+    texts = 0
+
+    def array(node: dict[Any, Any]) -> Any:
+        nonlocal texts
+        value = _array(node, limits.items - texts)
+        texts += len(value) if isinstance(value, list) else 0
+        return value
+
+    value = unpack(data, limits, array)
     if not isinstance(value, dict):
         raise MalformedMessage(f"message: got {type(value).__name__}, want a map")
     return value
@@ -32,11 +40,11 @@ def encode(value: Any) -> bytes:
     return pack(value, _node)
 
 
-def _array(node: dict[Any, Any]) -> Any:
+def _array(node: dict[Any, Any], most: int) -> Any:
     if b"__ndarray__" in node:
         data, dtype, shape = node.get(b"data"), node.get(b"dtype"), node.get(b"shape")
         if isinstance(dtype, str) and dtype.startswith("<U") and isinstance(data, bytes):
-            return _texts(data, dtype)
+            return _texts(data, dtype, most)
         return read_array(data, dtype, shape)  # type: ignore[arg-type]  # it checks
     if b"__npgeneric__" in node:
         value = node.get(b"data")
@@ -49,12 +57,14 @@ def _array(node: dict[Any, Any]) -> Any:
     return node
 
 
-def _texts(data: bytes, dtype: str) -> list[str]:
-    """An array of text, whatever its shape: as some clients send a prompt."""
+def _texts(data: bytes, dtype: str, most: int) -> list[str]:
+    """An array of text, of `most` at most, whatever its shape: as some clients send a prompt."""
     length = dtype.removeprefix("<U")
     size = 4 * int(length) if length.isascii() and length.isdigit() and len(length) < 9 else 0
     if not size or len(data) % size:
         raise MalformedMessage(f"array: got {len(data)} bytes, want texts of {dtype[:20]!r}")
+    if len(data) // size > most:
+        raise MessageTooLarge(f"array: got {len(data) // size} texts, want {most} more at most")
     try:
         return [data[at : at + size].decode("utf-32-le").rstrip("\0") for at in range(0, len(data), size)]
     except UnicodeDecodeError as error:

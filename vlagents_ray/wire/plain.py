@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, VLAgentsError
+from vlagents_ray.wire.container import require_few_values
 from vlagents_ray.wire.frames import check_request
 from vlagents_ray.wire.messages import Limits, Op, Reply, Request
 from vlagents_ray.wire.observations import read_obs
@@ -26,6 +27,7 @@ _KEYS = {"instruction", "gripper", "state", "info", "kwargs", "contract", "reque
 
 def request_from_parts(op: Op, text: str | bytes, images: Mapping[str, bytes], limits: Limits) -> Request:
     """A request from its JSON document and its images by camera name, each a JPEG or PNG file."""
+    require_few_values(text)
     try:
         document = json.loads(text)
     except (ValueError, RecursionError) as error:

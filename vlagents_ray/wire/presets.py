@@ -79,14 +79,15 @@ _JSON: dict[str, dict[str, Any]] = {
         "info": {"unnorm_key": "unnorm_key"},
         "action_gripper": {"index": 6, "open": 1.0, "closed": 0.0},
     },
-    # openvla-oft, experiments/robot/libero and its vla-scripts/deploy.py
+    # openvla-oft: observations as in experiments/robot/libero; vla-scripts/deploy.py answers what the model gives, 1 =
+    # open, which its clients turn into LIBERO's -1 themselves (normalize_gripper_action, invert_gripper_action)
     "openvla-oft": {
         "cameras": {"front": "full_image", "wrist": {"key": "wrist_image", "optional": True}},
         "state": _with_state(_LIBERO_STATE, "state"),
         "gripper": _with_state(_LIBERO_GRIPPER, "state"),
         "instruction": "instruction",
         "info": {"unnorm_key": "unnorm_key"},
-        "action_gripper": _LIBERO_ACTION,
+        "action_gripper": {"index": 6, "open": 1.0, "closed": 0.0},
     },
     # GR00T N1.6 and newer: {"video": {k: (1, T, H, W, 3)}, "state": {k: (1, T, D)}, "language": {"task": [[text]]}};
     # how an action's columns are named depends on the robot, so a deployment adds `action`

@@ -16,6 +16,8 @@ from vlagents_ray.wire.arrays import Buffer, is_plain, read_array
 from vlagents_ray.wire.codecs import decode_files
 from vlagents_ray.wire.messages import Limits
 
+_GROWTH = 16  # times the longest message: what its images and bytes may take; JPEG of a camera grows tenfold
+
 
 class Writer:
     """Turns values into JSON, collecting the blobs they refer to."""
@@ -62,11 +64,26 @@ class Writer:
         )
 
 
+class Budget:
+    """What images and bytes of one message may take: a small file that many places name is decoded for each."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._left = max(_GROWTH * limits.body_bytes, 3 * limits.pixels * limits.cameras)
+
+    def take(self, size: int) -> None:
+        """Count so many bytes; `MessageTooLarge` once there are too many."""
+        self._left -= size
+        if self._left < 0:
+            raise MessageTooLarge("message: its images and bytes are too much memory; send fewer at once")
+
+
 class Reader:
     """Turns the JSON back into values, which view the blobs instead of copying them."""
 
-    def __init__(self, blobs: Sequence[Buffer], limits: Limits) -> None:
+    def __init__(self, blobs: Sequence[Buffer], limits: Limits, budget: Budget | None = None) -> None:
+        """`budget` is the whole message's, if this reads a part of it."""
         self._blobs = blobs
+        self._budget = budget or Budget(limits)
         self._limits = limits
         self._items = 0
         self._images: dict[int, np.ndarray] = {}  # by blob, decoded ahead
@@ -79,7 +96,7 @@ class Reader:
         if not distinct:
             return
         files = [self._get(index) for index in distinct]
-        self._images = dict(zip(distinct, decode_files(files, self._limits.pixels), strict=True))
+        self._images = dict(zip(distinct, self._decode(files), strict=True))
 
     def value(self, node: Any, depth: int = 0) -> Any:
         """The value of a JSON node; `MalformedMessage` or `MessageTooLarge` if it is not one."""
@@ -107,13 +124,21 @@ class Reader:
         if kind == "img" and len(rest) == 1:
             return self._image(rest[0])
         if kind == "bin" and len(rest) == 1:
-            return bytes(self._get(rest[0]))
+            data = self._get(rest[0])
+            self._budget.take(len(data))
+            return bytes(data)
         raise MalformedMessage(f"reference: got {str(reference)[:80]}, want 'nd', 'img' or 'bin'")
 
     def _image(self, index: Any) -> np.ndarray:
         data = self._get(index)
         image = self._images.get(index)
-        return decode_files([data], self._limits.pixels)[0] if image is None else image
+        return self._decode([data])[0] if image is None else image
+
+    def _decode(self, files: Sequence[Buffer]) -> list[np.ndarray]:
+        self._budget.take(sum(map(len, files)))  # when it is used up, nothing more is decoded
+        found = decode_files(files, self._limits.pixels)
+        self._budget.take(sum(image.nbytes for image in found))
+        return found
 
     def _nest(self, depth: int) -> None:
         if depth >= self._limits.depth:

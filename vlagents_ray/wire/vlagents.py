@@ -126,6 +126,10 @@ def _read(document: Any, limits: Limits, segments: Segments) -> Seen:
         raise InvalidObservation("observation.obs: got no robot, want one or more")
     if len(robots) > limits.cameras:
         raise MessageTooLarge(f"observation.obs: got {len(robots)} robots, the limit is {limits.cameras}")
+    views = [part.get("cameras") for part in robots.values() if isinstance(part, dict)]
+    cameras = sum(len(view) for view in views if isinstance(view, dict))
+    if cameras > limits.cameras:  # all together, before any is decoded
+        raise MessageTooLarge(f"cameras: got {cameras}, the limit is {limits.cameras}")
     whole = Obs()
     for name, part in robots.items():
         robot = _mapping(part, f"observation.obs[{name[:40]!r}]")

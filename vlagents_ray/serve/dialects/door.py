@@ -47,9 +47,9 @@ class Door:
         self._mapping = dialect.keys()
         self._rank = dialect.rank
 
-    def sender(self, session_id: str = "") -> Sender:
-        """For a connection or, with a session of its own, for a request."""
-        return Sender(self.house.engine, self.name, session_id, connected=not session_id)
+    def sender(self, session_id: str = "", counted: bool | None = None) -> Sender:
+        """For a connection or, with a session of its own, for a request; `counted`: see `Sender`."""
+        return Sender(self.house.engine, self.name, session_id, connected=not session_id, counted=counted)
 
     def conversation(self, sender: Sender) -> Conversation:
         """A session of that sender's."""

@@ -113,7 +113,7 @@ class MapRoot:
             return
         finally:
             for talk in talks.values():
-                talk.sender.release()
+                talk.sender.release(for_good=True)
 
     async def _answer(self, socket: WebSocket, data: bytes | None, talks: dict[str, Talk]) -> bool:
         """Answer one message; False if that was the end."""

@@ -27,7 +27,7 @@ class OpenVLADoor(Door):
         super().__init__("openvla", dialect, house)
         self._chunk = dialect.chunk
         self._requests = Requests(house.limits)
-        self._kept: dict[str, Conversation] = {}  # by session
+        self._kept: dict[str, Conversation] = {}  # by session, as the engine calls it
 
     async def act(self, http: HttpRequest) -> Response:
         """One request."""
@@ -43,11 +43,11 @@ class OpenVLADoor(Door):
             if SESSION_HEADER in http.headers:
                 reply = await self._conversation(session_id(http)).act(obs, instruction, name)
             else:
-                sender = self.sender()
+                sender = self.sender(counted=True)
                 try:
                     reply = await self.conversation(sender).act(obs, instruction, name)
                 finally:
-                    sender.release()
+                    sender.release(for_good=True)
             return Response(visit.written(reply, lambda: self._answer(reply, twice)), media_type="application/json")
         except ClientDisconnect:
             visit.refused("disconnected")
@@ -66,6 +66,8 @@ class OpenVLADoor(Door):
         sessions = self.house.engine.sessions
         if len(self._kept) > 2 * len(sessions) + 16:
             self._kept = {kept: one for kept, one in self._kept.items() if kept in sessions}
-        if name not in self._kept or name not in sessions:
-            self._kept[name] = self.conversation(self.sender(name))
-        return self._kept[name]
+        sender = self.sender(name)
+        known = sender.session_id
+        if known not in self._kept or known not in sessions:
+            self._kept[known] = self.conversation(sender)
+        return self._kept[known]

@@ -50,7 +50,7 @@ class VlaEvalDoor(Door):
         except WebSocketDisconnect:
             return
         finally:
-            sender.release()
+            sender.release(for_good=True)
             reading.cancel()
             with contextlib.suppress(asyncio.CancelledError):
                 await reading
