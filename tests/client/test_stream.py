@@ -6,17 +6,20 @@ import logging
 import socket
 import threading
 from collections.abc import Iterator
+from http import HTTPStatus
 from urllib.parse import SplitResult, urlsplit
 
 import pytest
 from websockets.exceptions import ConnectionClosed
-from websockets.http11 import Request
+from websockets.http11 import Request, Response
 from websockets.server import ServerProtocol
 from websockets.sync.server import ServerConnection, serve
 
 from vlagents_ray.client.credentials import Credentials
+from vlagents_ray.client.link import CodecChoice
 from vlagents_ray.client.stream import Stream
-from vlagents_ray.client.websocket import _Proxied
+from vlagents_ray.client.websocket import WebSocketTransport, _Proxied
+from vlagents_ray.errors import PolicyUnavailable
 
 
 @pytest.fixture
@@ -91,3 +94,28 @@ def test_a_proxy_that_takes_nothing_does_not_hold_up_the_sender() -> None:
         thread.join()
         proxied.close()
     assert in_time  # not because the other side ended
+
+
+@pytest.mark.parametrize(("statuses", "accepted"), [([408, 503], True), ([404], False)])
+def test_a_proxy_that_waits_for_a_replica_is_asked_again_and_no_other_refusal_is(
+    statuses: list[int], accepted: bool
+) -> None:
+    left = list(statuses)
+
+    def refuse(connection: ServerConnection, request: Request) -> Response | None:
+        return connection.respond(HTTPStatus(left.pop(0)), "not now\n") if left else None
+
+    with serve(lambda connection: connection.close(), "127.0.0.1", 0, process_request=refuse) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        transport = WebSocketTransport(f"ws://127.0.0.1:{server.socket.getsockname()[1]}", CodecChoice("raw"))
+        try:
+            if accepted:
+                transport._proxied(10).close()
+            else:
+                with pytest.raises(PolicyUnavailable, match="404"):
+                    transport._proxied(10)
+        finally:
+            server.shutdown()
+            thread.join()
+    assert not left

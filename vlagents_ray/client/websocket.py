@@ -30,6 +30,8 @@ from vlagents_ray.wire.probe import is_answer as is_probe_answer
 
 logger = logging.getLogger(__name__)
 
+_PASSING = (408, 500, 502, 503, 504)  # statuses of a proxy; HAProxy says 500 for its own 502 to 504
+_PAUSE_S = 0.2
 _DIRECT_S = 1.0  # for a replica's own port to answer: a firewall may swallow the question
 
 
@@ -165,6 +167,19 @@ class WebSocketTransport:
         return None
 
     def _proxied(self, timeout_s: float) -> _Proxied:
+        """Through the proxy, which is asked again while it says that a replica is about to come or to go."""
+        deadline = time.monotonic() + timeout_s
+        while True:
+            try:
+                return self._accepted(max(0.1, deadline - time.monotonic()))
+            except PolicyUnavailable as error:
+                cause = error.__cause__
+                passing = isinstance(cause, InvalidStatus) and cause.response.status_code in _PASSING
+                if not passing or time.monotonic() + _PAUSE_S > deadline:
+                    raise
+            time.sleep(_PAUSE_S)
+
+    def _accepted(self, timeout_s: float) -> _Proxied:
         try:
             return _Proxied(self._url, self._credentials, timeout_s)
         except ssl.SSLError as error:
