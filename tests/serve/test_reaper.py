@@ -1,4 +1,4 @@
-"""What a killed driver leaves is cleaned up, and what an orderly one leaves is not touched."""
+"""What a killed driver leaves is cleaned up; of what an orderly one leaves, its HAProxy."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from eval_fakes import wait_for
 
-from vlagents_ray.serve.reaper import marked
+from vlagents_ray.serve.reaper import about, marked
 
 DRIVER = """
 import os, subprocess, sys, time
@@ -20,7 +20,12 @@ from vlagents_ray.serve.reaper import MARK, reaped
 folder = sys.argv[1]
 with reaped(Path(folder)):
     child = subprocess.Popen(["sleep", "100"], env=os.environ | {MARK: folder}, start_new_session=True)
-    print(child.pid, flush=True)
+    proxy = subprocess.Popen(
+        [sys.executable, "-c", "import time; time.sleep(100)", folder + "/haproxy.cfg"],
+        env=os.environ | {MARK: folder},
+        start_new_session=True,
+    )
+    print(child.pid, proxy.pid, flush=True)
     if sys.argv[2] == "killed":
         time.sleep(100)
 """
@@ -34,8 +39,9 @@ def test_only_a_killed_driver_takes_its_cluster_along(tmp_path: Path, end: str) 
         [sys.executable, "-c", DRIVER, str(folder), end], stdout=subprocess.PIPE, text=True
     ) as driver:
         assert driver.stdout is not None
-        child = int(driver.stdout.readline())
-        assert marked(str(folder)) == [child]
+        child, proxy = map(int, driver.stdout.readline().split())
+        wait_for(lambda: about(str(folder)) == [proxy])
+        assert set(marked(str(folder))) == {child, proxy}
         if end == "killed":
             driver.send_signal(signal.SIGKILL)
         driver.wait(30)

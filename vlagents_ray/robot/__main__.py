@@ -76,7 +76,8 @@ def _run(options: argparse.Namespace) -> LoopReport:
         )
         robot: Robot = _load(options.robot)() if options.robot else SimulatedRobot(contract)
         recorder = stack.enter_context(Recorder(options.record, options.hz)) if options.record else None
-        watchdog = Watchdog(lambda _: robot.stop(), {"server": options.silent_s, "loop": max(0.2, 5 / options.hz)})
+        hangs_s = max(0.2, 5 / options.hz) + options.deadline_ms / 1e3
+        watchdog = Watchdog(lambda _: robot.stop(), {"server": options.silent_s, "loop": hangs_s})
         if options.baseline > 0:
             say(_line(_HEADER))
             say(_row("empty loop", empty_loop(options.hz, options.baseline, real_time=options.real_time)))

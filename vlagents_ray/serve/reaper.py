@@ -2,7 +2,8 @@
 
 A local cluster normally goes down with its driver. After `kill -9` some of it can stay: an HAProxy whose
 manager was killed first, agents that take a minute to notice, the folder. This process hears of the
-driver's death by the end of the pipe; a driver that ends in order says so first.
+driver's death by the end of the pipe; a driver that ends in order says so first. Then only an HAProxy can
+be left, one that was to stop once its last connection has ended.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from pathlib import Path
 MARK = "VLAGENTS_RAY_CLUSTER"  # in the environment of every process of the cluster
 _GRACE_S = 3.0  # for Ray to end by itself
 _ORDERLY = b"."
+_SWEEPS = 20
 
 
 @contextmanager
@@ -52,16 +54,32 @@ def marked(folder: str) -> list[int]:
     return found
 
 
-def main() -> None:
-    """Wait for the end of the driver; kill what outlives it, unless it said that it ends in order."""
-    folder = sys.argv[1]
-    if os.read(0, 1) == _ORDERLY:
-        return
-    time.sleep(_GRACE_S)
+def about(folder: str) -> list[int]:
+    """Those of them whose command line names a file of the folder: an HAProxy, and none that a user started."""
+    found = []
     for pid in marked(folder):
-        with suppress(ProcessLookupError):
-            os.kill(pid, signal.SIGKILL)
-    shutil.rmtree(folder, ignore_errors=True)
+        with suppress(OSError):
+            if f"{folder}/".encode() in Path(f"/proc/{pid}/cmdline").read_bytes():
+                found.append(pid)
+    return found
+
+
+def main() -> None:
+    """Wait for the end of the driver, and kill what outlives it."""
+    folder = sys.argv[1]
+    orderly = os.read(0, 1) == _ORDERLY
+    if not orderly:
+        time.sleep(_GRACE_S)
+    for _ in range(_SWEEPS):  # what is killed may have been about to start another
+        left = about(folder) if orderly else marked(folder)
+        if not left:
+            break
+        for pid in left:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        time.sleep(0.05)
+    if not orderly:  # else the driver removes it
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 if __name__ == "__main__":
