@@ -143,7 +143,7 @@ def test_what_is_too_long_or_in_pieces_ends_the_connection_that_sent_it_alone(
 
 
 def test_a_client_that_takes_no_replies_holds_up_nobody(door: StreamDoor, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vlagents_ray.serve.stream._SLOW_S", 0.5)
+    monkeypatch.setattr("vlagents_ray.serve.stream_client._SLOW_S", 0.5)
     slow, other = stream(door), stream(door)
     for client in (slow, other):
         ask(client, "reset")
@@ -205,7 +205,7 @@ def test_what_nobody_foresaw_ends_the_connection_that_it_came_by_alone(
             raise RuntimeError
         return decode_requests(frame, limits)
 
-    monkeypatch.setattr("vlagents_ray.serve.stream.decode_requests", decode)
+    monkeypatch.setattr("vlagents_ray.serve.stream_client.decode_requests", decode)
     other, client = stream(door), stream(door)
     for each in (other, client):
         ask(each, "reset")
