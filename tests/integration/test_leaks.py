@@ -55,7 +55,8 @@ def test_sessions_opened_and_closed_leave_nothing(server: Server, transport: Tra
     assert grown["descriptors"] <= 2
     assert grown["threads"] <= 2
     assert grown["maps"] <= 1
-    assert grown["resident"] < 4 * MIB
+    # What Ray keeps of a request settles late; a session that stayed would keep its frame, of 12 kB, at least.
+    assert grown["resident"] < 4 * MIB + 1024 * number
     assert own[0] <= 2
     assert own[1] <= 2
     assert own[2] < 4 * MIB
