@@ -113,11 +113,8 @@ class _Door:
             return problem_response(error, request_id(http))
 
     async def _probed(self, message: bytes) -> bytes:
-        if (frame := probed_frame(message)) is not None:
-            for request in await self._requests.decode(frame):
-                if isinstance(request, Reply) and request.error is not None:
-                    raise request.error
-        return answer(message)
+        frame = probed_frame(message)
+        return answer(message, () if frame is None else await self._requests.decode(frame))
 
     def _when_ready(self, http: HttpRequest, answer: Callable[[], Response]) -> Response:
         try:

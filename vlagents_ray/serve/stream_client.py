@@ -153,11 +153,8 @@ class StreamClient:
             self._send(visit.frame([Reply(error=error)]))
 
     def _probed(self, message: bytes) -> bytes:
-        if (frame := probed_frame(message)) is not None:
-            for request in decode_requests(frame, self._door.limits):
-                if isinstance(request, Reply) and request.error is not None:
-                    raise request.error
-        return answer(message)
+        frame = probed_frame(message)
+        return answer(message, () if frame is None else decode_requests(frame, self._door.limits))
 
     def _answer(self, visit: Visit, replies: list[Reply], size: int) -> None:
         with self._sending:

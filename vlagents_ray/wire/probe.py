@@ -12,9 +12,11 @@ from __future__ import annotations
 
 import os
 import struct
+from collections.abc import Sequence
 
 from vlagents_ray.errors import MalformedMessage
 from vlagents_ray.wire.arrays import Buffer
+from vlagents_ray.wire.messages import Reply, Request
 
 _HEAD = struct.Struct("<4sI")
 _ASK, _TELL = b"VLA?", b"VLA!"
@@ -48,8 +50,11 @@ def probed_frame(message: bytes) -> bytes | None:
     return message[_HEAD.size :] if kind else None
 
 
-def answer(message: Buffer) -> bytes:
-    """The answer to a probe."""
+def answer(message: Buffer, requests: Sequence[Request | Reply] = ()) -> bytes:
+    """The answer to a probe, of whose frame `requests` were decoded; raises what kept one from being read."""
+    for request in requests:
+        if isinstance(request, Reply) and request.error is not None:
+            raise request.error
     return _ANSWER.pack(_TELL, len(message))
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 from in_process import Replicas
@@ -30,38 +31,39 @@ def one_replica() -> Iterator[Replicas]:
 @pytest.fixture(name="open_vlagents")
 def vlagents_doors(replicas: Replicas) -> Iterator[OpenDoor]:
     """Open a door; returns its port."""
-    doors: list[VlagentsDoor] = []
 
-    def make(sessions: int = 8, idle_s: float = 30.0, check: object = None, **args: object) -> int:
-        settings = VlagentsArgs(port=free_port(), **args)
-        house = House("noop", lambda _: replicas.agent(), LIMITS, sessions, idle_s, None, check)  # type: ignore[arg-type]
+    def make(house: House, settings: VlagentsArgs) -> VlagentsDoor:
         with contextlib.ExitStack() as stack:
             listener = stack.enter_context(reserve("vlagents", "127.0.0.1", settings.port))
-            doors.append(VlagentsDoor(house, settings, listener, "0"))
+            door = VlagentsDoor(house, settings, listener, "0")
             stack.pop_all()
-        doors[-1].open()
-        return settings.port
+        return door
 
-    yield make
-    for door in doors:
-        assert door.alive()
-        door.close()
-        assert not door.alive()
+    yield from _opened(replicas, VlagentsArgs, make)
 
 
 @pytest.fixture(name="open_gr00t")
 def gr00t_doors(replicas: Replicas) -> Iterator[OpenDoor]:
     """Open a door; returns its port."""
-    doors: list[GR00TDoor] = []
 
-    def make(sessions: int = 8, idle_s: float = 30.0, check: object = None, **args: object) -> int:
-        settings = GR00TArgs(port=free_port(), **args)
+    def make(house: House, settings: GR00TArgs) -> GR00TDoor:
+        return GR00TDoor(house, settings, reserve("gr00t", "127.0.0.1", settings.port))
+
+    yield from _opened(replicas, GR00TArgs, make)
+
+
+def _opened(replicas: Replicas, args: type, make: Callable[[House, Any], Any]) -> Iterator[OpenDoor]:
+    doors: list[Any] = []
+
+    def open_door(sessions: int = 8, idle_s: float = 30.0, check: object = None, **settings: object) -> int:
+        chosen = args(port=free_port(), **settings)
         house = House("noop", lambda _: replicas.agent(), LIMITS, sessions, idle_s, None, check)  # type: ignore[arg-type]
-        doors.append(GR00TDoor(house, settings, reserve("gr00t", "127.0.0.1", settings.port)))
+        doors.append(make(house, chosen))
         doors[-1].open()
-        return settings.port
+        port: int = chosen.port
+        return port
 
-    yield make
+    yield open_door
     for door in doors:
         assert door.alive()
         door.close()

@@ -9,6 +9,7 @@ An error is a text with a request id, and the end of the connection (1011); thei
 
 from __future__ import annotations
 
+import abc
 import time
 import uuid
 from collections.abc import Sequence
@@ -26,16 +27,16 @@ from vlagents_ray.wire import openpi as wire
 from vlagents_ray.wire.messages import Reply
 
 
-class MapDoor(Door):
+class MapDoor(Door, abc.ABC):
     """A dialect of maps, in openpi's encoding."""
 
+    @abc.abstractmethod
     def first(self) -> dict[str, Any]:
         """What a client is told when it connects."""
-        raise NotImplementedError
 
+    @abc.abstractmethod
     def speaks(self, message: dict[str, Any]) -> bool:
         """Is it one of its client's?"""
-        raise NotImplementedError
 
     def begins(self, message: dict[str, Any], talk: Talk) -> str | None:
         """Notice what begins an episode; the answer, if the message is no observation."""
