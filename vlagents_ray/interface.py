@@ -97,6 +97,10 @@ class Agent:
             raise ConfigError(f"policy {cls.__name__}: {error}") from error
         return cls(**config)
 
+    def shared_objects(self) -> list[Any]:
+        """What `shared` names; one that holds another agent adds that one's."""
+        return [getattr(self, name, None) for name in self.shared]
+
     @property
     def contract(self) -> Contract | None:
         """What the policy needs and gives; None states nothing, so nothing is checked."""

@@ -1,8 +1,8 @@
 """Names of policies and environments, and where their code lives.
 
 A name stands for `"module:Class"`, imported only when it is used. Third parties add names through
-the entry-point groups `vlagents_ray.policies` and `vlagents_ray.envs`; a `"module:Class"` written
-out in a deployment file works without registration.
+the entry-point groups `vlagents_ray.policies`, `vlagents_ray.wrappers` and `vlagents_ray.envs`;
+a `"module:Class"` written out in a deployment file works without registration.
 """
 
 from __future__ import annotations
@@ -21,6 +21,9 @@ POLICIES: dict[str, str] = {
     "replay": "vlagents_ray.policies.replay:Replay",
     "scripted": "vlagents_ray.policies.scripted:Scripted",
 }
+
+# What changes the observations of any policy: `wrappers` in a deployment file.
+WRAPPERS: dict[str, str] = {}
 
 # The part of an env's name before the first slash; the rest is the task within it.
 ENVS: dict[str, str] = {
@@ -67,8 +70,8 @@ def require(module: str) -> ModuleType:
 
 
 def names(kind: str) -> dict[str, str]:
-    """All registered names of `kind` ("policies" or "envs") with their "module:Class"."""
-    own = POLICIES if kind == "policies" else ENVS
+    """All registered names of `kind` ("policies", "wrappers" or "envs") with their "module:Class"."""
+    own = {"policies": POLICIES, "wrappers": WRAPPERS, "envs": ENVS}[kind]
     found = {point.name: point.value for point in entry_points(group=f"vlagents_ray.{kind}")}
     return found | own
 
@@ -76,6 +79,11 @@ def names(kind: str) -> dict[str, str]:
 def policy_class(name: str) -> type[Any]:
     """The Agent class registered as `name`, or written out as "module:Class"."""
     return _load(name, names("policies"), UnknownPolicy)
+
+
+def wrapper_class(name: str) -> type[Any]:
+    """The Wrapper class registered as `name`, or written out as "module:Class"."""
+    return _load(name, names("wrappers"), UnknownPolicy)
 
 
 def env_class(name: str) -> type[Any]:

@@ -168,6 +168,11 @@ class ServerArgs(_Closed):
 
     policy: str = Field(description="a registered name (`vlagents-ray policies`) or 'module:Class'")
     config: dict[str, Any] = Field(default_factory=dict, description="the policy's own settings")
+    wrappers: list[str | dict[str, dict[str, Any]]] = Field(
+        default=[],
+        description="what changes the policy's observations, the first being the nearest to the robot: names, or "
+        "{name: settings}",
+    )
     replicas: int | None = Field(default=None, ge=1, description="a fixed number; excludes `autoscaling`")
     autoscaling: AutoscalingArgs | None = None
     batch: BatchArgs = BatchArgs()

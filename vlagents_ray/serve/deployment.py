@@ -18,7 +18,7 @@ from ray.serve.config import HTTPOptions
 from starlette.types import ASGIApp
 
 from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
-from vlagents_ray.registry import policy_class
+from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.serve.auth import Caller, require_access
 from vlagents_ray.serve.autoscaling import SESSIONS, UTILISATION, WAITING
 from vlagents_ray.serve.balance import Balance
@@ -59,7 +59,7 @@ class PolicyReplica:
         self._app = serve.get_replica_context().app_name
         self._keys = self._args.access.keys()
         require_access(_http().host or EVERYWHERE, self._keys, self._args.access.insecure)
-        agent = policy_class(self._args.policy).from_config(self._args.config)
+        agent = build_agent(self._args.policy, self._args.config, self._args.wrappers)
         self._limits = self._args.limits.limits()
         self._engine = Engine(
             agent,
@@ -68,7 +68,7 @@ class PolicyReplica:
             batch_sizes=self._args.batch.sizes or (),
             session_limit=self._args.sessions.limit,
             session_idle_s=self._args.sessions.idle_s,
-            version=json.dumps([self._args.policy, self._args.config], sort_keys=True),
+            version=json.dumps([self._args.policy, self._args.config, self._args.wrappers], sort_keys=True),
             check=partial(require_fit, self._args.dialects),
         )
         self._load = LoadMeter(self._engine.queue)

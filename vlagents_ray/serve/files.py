@@ -12,6 +12,7 @@ from ray.serve.schema import ServeDeploySchema
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Agent
+from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.registry import names, policy_class, require
 from vlagents_ray.serve.config import ServerArgs
 from vlagents_ray.serve.dialects.routes import require_fit
@@ -86,9 +87,9 @@ def _checked(document: object, source: str) -> ServeDeploySchema:
         config = ServeDeploySchema.model_validate(document)
         for app in _ours(config):
             args = ServerArgs(**app.args)
-            cls = policy_class(args.policy)
+            agent = build_agent(args.policy, args.config, args.wrappers)
             if not (app.runtime_env or {}):
-                _require_fit(args, cls.from_config(args.config))
+                _require_fit(args, agent)
                 if args.dialects.gr00t is not None:
                     require("zmq")
     except ValidationError as error:

@@ -123,8 +123,7 @@ class AgentCopies:
 
     def __init__(self, agent: Agent) -> None:
         self._shared = _Shared()
-        for name in agent.shared:
-            item = getattr(agent, name, None)
+        for item in agent.shared_objects():
             if type(item) not in _PLAIN or item:
                 self._shared.add(item)
         self._pristine = self._dump(agent, find=True)

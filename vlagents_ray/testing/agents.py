@@ -103,9 +103,7 @@ class _Suite:
 
     def begin(self, i: int) -> Agent:
         """Session `i`: a copy of the agent that shares what the class says may be shared, reset."""
-        shared = {
-            id(value): value for name in self._agent.shared if (value := getattr(self._agent, name, None)) is not None
-        }
+        shared = {id(value): value for value in self._agent.shared_objects() if value is not None}
         try:
             session = copy.deepcopy(self._agent, dict(shared))
         except (TypeError, AttributeError, NotImplementedError, RuntimeError) as error:

@@ -1,0 +1,157 @@
+"""What every model family inherits: sessions, chunks, samples, batches, shown on a model of three lines."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vlagents_ray import Obs
+from vlagents_ray.contract import ActionSpec, Contract, StateSpec
+from vlagents_ray.errors import InvalidObservation, MissingState, NotReset
+from vlagents_ray.interface import DISTRIBUTION, LEFTOVER, SAMPLES, Act
+from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
+from vlagents_ray.policies.base.observing import state_vector
+from vlagents_ray.testing import check_agent
+
+HORIZON, DIM = 4, 2
+
+
+class Wobble(ModelPolicy):
+    """Row h of a chunk: the sum of the last two states, plus h, plus a little of the session's noise."""
+
+    Config = ModelConfig
+
+    @property
+    def history(self) -> int:
+        return 2
+
+    @property
+    def contract(self) -> Contract:
+        chunk = self.chunk(HORIZON)
+        return Contract(state={"joints": StateSpec(DIM)}, action=ActionSpec(dim=DIM), chunk=chunk, history=2)
+
+    def load(self) -> Any:
+        return {"batches": []}
+
+    def perceive(self, obs: Obs) -> np.ndarray:
+        return state_vector(obs, ["joints"], DIM)
+
+    def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
+        self.model["batches"].append(len(rows))
+        ramp = np.arange(HORIZON, dtype=np.float32)[:, None]
+        return [Prediction(sum(row.history(2)) + ramp + 0.01 * row.noise(HORIZON, DIM)) for row in rows]
+
+
+def made(**config: Any) -> Wobble:
+    return Wobble.from_config({"checkpoint": "none", **config})
+
+
+def at(x: float, **info: Any) -> Obs:
+    return Obs(state={"joints": np.full(DIM, x, np.float32)}, info=info)
+
+
+def begun(policy: Wobble, seed: int = 0) -> Wobble:
+    session = made(**policy.config.model_dump(exclude_unset=True, exclude={"checkpoint"}))
+    session.model = policy.model
+    session.reset(at(0.0), "go", seed=seed)
+    return session
+
+
+def loaded(**config: Any) -> Wobble:
+    policy = made(**config)
+    policy.initialize()
+    return policy
+
+
+@pytest.mark.parametrize(
+    "config",
+    [{}, {"execute": 2}, {"actions": "queue"}, {"actions": "ensemble"}, {"batch_sizes": [1, 2, 4]}, {"max_rows": 2}],
+)
+def test_keeps_the_contract(config: dict[str, Any]) -> None:
+    check_agent(made(**config), steps=2 * HORIZON)
+
+
+def test_a_session_gets_the_same_in_any_company() -> None:
+    policy = loaded()
+    alone = begun(policy, seed=3).act(at(1.0)).action
+    for size in (2, 3, 8):
+        company = [begun(policy, seed=3 + i) for i in range(size)]
+        acts = policy.act_batch([at(1.0 + i) for i in range(size)], company)
+        assert isinstance(acts[0], Act)
+        assert np.array_equal(acts[0].action, alone)
+
+
+def test_one_forward_pass_for_a_batch_and_padding_to_the_sizes_that_were_warmed_up() -> None:
+    policy = loaded(batch_sizes=[2, 4])
+    assert policy.model["batches"] == [2, 4]
+    policy.act_batch([at(0.0)] * 3, [begun(policy, seed) for seed in range(3)])
+    assert policy.model["batches"] == [2, 4, 4]
+
+
+def test_a_queue_asks_the_model_every_execute_acts_and_remembers_every_observation() -> None:
+    policy = loaded(actions="queue", execute=3)
+    session = begun(policy)
+    rows = [session.act(at(float(x))).action for x in range(4)]
+    assert len(policy.model["batches"]) == 2
+    assert [round(float(row[0])) for row in rows[:3]] == [0, 1, 2]  # the chunk of the first observation, seen twice
+    assert round(float(rows[3][0])) == 2 + 3  # the last two observations, although the model saw neither of them alone
+
+
+def test_an_ensemble_averages_what_the_chunks_say_of_a_tick() -> None:
+    session = begun(loaded(actions="ensemble", ensemble_m=0.0))
+    first, second = session.act(at(0.0)).action, session.act(at(10.0)).action
+    assert first[0] == pytest.approx(0, abs=0.1)
+    assert second[0] == pytest.approx((1 + 10) / 2, abs=0.1)
+
+
+def test_samples_come_with_their_mean_and_change_no_action() -> None:
+    policy = loaded()
+    plain, asked = begun(policy), begun(policy)
+    wanted = asked.act(at(1.0, **{SAMPLES: 500}))
+    assert np.array_equal(wanted.action, plain.act(at(1.0)).action)
+    found = wanted.info[DISTRIBUTION]
+    assert found["samples"].shape == (500, HORIZON, DIM)
+    assert np.allclose(found["mean"], 2.0 + np.arange(HORIZON)[:, None], atol=0.01)
+    assert found["std"].mean() == pytest.approx(0.01, rel=0.2)
+    assert np.array_equal(asked.act(at(1.0)).action, plain.act(at(1.0)).action)
+
+
+@pytest.mark.parametrize(
+    ("config", "obs", "error"),
+    [
+        ({}, Obs(), MissingState),
+        ({}, Obs(state={"joints": np.zeros(3, np.float32)}), InvalidObservation),
+        ({}, at(0.0, **{SAMPLES: -1}), InvalidObservation),
+        ({"actions": "queue"}, at(0.0, **{SAMPLES: 2}), InvalidObservation),
+        ({}, at(0.0, **{LEFTOVER: np.zeros(3)}), InvalidObservation),
+    ],
+)
+def test_a_bad_observation_fails_its_own_session_alone(
+    config: dict[str, Any], obs: Obs, error: type[Exception]
+) -> None:
+    policy = loaded(**config)
+    bad, good = policy.act_batch([obs, at(1.0)], [begun(policy), begun(policy)])
+    assert isinstance(bad, error)
+    assert isinstance(good, Act)
+
+
+def test_nothing_acts_before_its_reset() -> None:
+    with pytest.raises(NotReset):
+        loaded().act(at(0.0))
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        {"checkpoint": "run/{step}"},
+        {"checkpoint": "run", "checkpoint_step": 5},
+        {"checkpoint": "run", "batch_sizes": [4, 2]},
+        {"checkpoint": "run", "horizon": 4},
+    ],
+)
+def test_settings_that_contradict_are_refused(config: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match="policy Wobble"):
+        Wobble.from_config(config)

@@ -1,0 +1,128 @@
+"""Wrappers: a policy sees changed observations, in any session, through any of its calls."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import BaseModel
+
+from vlagents_ray import Act, Agent, Obs
+from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.errors import ConfigError, InvalidObservation
+from vlagents_ray.policies.wrapper import Wrapper, build_agent
+from vlagents_ray.serve.sessions import AgentCopies
+from vlagents_ray.testing import check_agent
+
+
+class Bright(Agent):
+    """Answers how bright its camera is, and how many of its session's observations it has seen."""
+
+    shared = ("weights",)
+
+    def initialize(self) -> None:
+        self.weights = [1.0]
+        self.seen = 0
+
+    @property
+    def contract(self) -> Contract:
+        return Contract(action=ActionSpec(dim=2))
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        return {"first": int(obs.cameras["front"].max())}
+
+    def observe(self, obs: Obs) -> None:
+        self.seen += 1
+
+    def act(self, obs: Obs) -> Act:
+        self.seen += 1
+        return Act(np.array([obs.cameras["front"].max(), self.seen], np.float32))
+
+
+class DimConfig(BaseModel, extra="forbid"):
+    by: int = 1
+
+
+class Dim(Wrapper):
+    """Takes `by` off each pixel, and one more with each observation of the session."""
+
+    Config = DimConfig
+
+    def __init__(self, agent: Agent, config: DimConfig) -> None:
+        super().__init__(agent, config)
+        self.count = 0
+
+    def begin(self, obs: Obs, instruction: str | None) -> Obs:
+        [first] = self.change_batch([obs], [self])
+        assert isinstance(first, Obs)
+        return first
+
+    def change_batch(self, obs: Sequence[Obs], sessions: Sequence[Wrapper]) -> list[Obs | Exception]:
+        return [self._dim(one, session) for one, session in zip(obs, sessions, strict=True)]  # type: ignore[arg-type]
+
+    def _dim(self, obs: Obs, session: Dim) -> Obs | Exception:
+        if "front" not in obs.cameras:
+            return InvalidObservation("no front camera")
+        session.count += 1
+        return Obs(cameras={"front": obs.cameras["front"] - np.uint8(self.config.by + session.count)})
+
+
+BRIGHT, DIM = f"{__name__}:Bright", f"{__name__}:Dim"
+
+
+def seen(value: int) -> Obs:
+    return Obs(cameras={"front": np.full((4, 4, 3), value, np.uint8)})
+
+
+def test_keeps_the_contract() -> None:
+    check_agent(Dim(Bright(), DimConfig()), obs=[seen(100), seen(150), seen(200)])
+
+
+def test_each_call_shows_the_policy_the_changed_observation() -> None:
+    agent = Dim(Bright(), DimConfig(by=10))
+    agent.initialize()
+    session = AgentCopies(agent).make()
+    assert session.reset(seen(100), None) == {"first": 89}
+    session.observe(seen(100))
+    assert session.act(seen(100)).action.tolist() == [87, 2]
+
+
+def test_what_the_policy_shares_is_shared_through_its_wrappers() -> None:
+    agent = Dim(Dim(Bright(), DimConfig()), DimConfig())
+    agent.initialize()
+    copies = AgentCopies(agent)
+    one, two = copies.make(), copies.make()
+    assert one.agent.agent.weights is two.agent.agent.weights  # type: ignore[attr-defined]
+    assert one.agent is not two.agent  # type: ignore[attr-defined]
+
+
+def test_an_observation_that_cannot_be_changed_fails_its_own_session_alone() -> None:
+    agent = Dim(Bright(), DimConfig())
+    agent.initialize()
+    copies = AgentCopies(agent)
+    bad, good = agent.act_batch([Obs(), seen(9)], [copies.make(), copies.make()])
+    assert isinstance(bad, InvalidObservation)
+    assert isinstance(good, Act)
+
+
+def test_the_first_wrapper_is_the_nearest_to_the_robot() -> None:
+    agent = build_agent(BRIGHT, {}, [{DIM: {"by": 1}}, {DIM: {"by": 2}}])
+    assert isinstance(agent, Dim)
+    assert isinstance(agent.agent, Dim)
+    assert (agent.config.by, agent.agent.config.by) == (1, 2)
+
+
+@pytest.mark.parametrize(
+    ("wrappers", "said"),
+    [
+        (["nothing"], "not registered"),
+        ([BRIGHT], "want a subclass"),
+        ([{DIM: {"off": 1}}], "wrapper Dim"),
+        ([{DIM: {}, BRIGHT: {}}], "one name each"),
+    ],
+)
+def test_wrong_entries_are_refused(wrappers: list[Any], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        build_agent(BRIGHT, {}, wrappers)

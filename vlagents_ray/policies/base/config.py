@@ -1,0 +1,70 @@
+"""Settings that every model family has; each family's own model adds its own and narrows these."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import BaseModel, Field, field_validator, model_validator
+from typing_extensions import Self
+
+from vlagents_ray.policies.base.checkpoint import STEP
+
+DType = Literal["auto", "float32", "bfloat16", "float16"]
+
+
+class ModelConfig(BaseModel, extra="forbid"):
+    """A checkpoint, where it runs, what it sees, and how its chunks become actions."""
+
+    checkpoint: str = Field(min_length=1, description="folder or file, or hub id; `{step}` stands for checkpoint_step")
+    checkpoint_step: int | None = Field(default=None, ge=0, description="the training step that replaces `{step}`")
+    device: str = Field(default="auto", description="'auto' (an accelerator if there is one), 'cpu', 'cuda', 'cuda:1'")
+    dtype: DType = Field(default="auto", description="of the weights; 'auto': the family's own choice")
+    compile: bool = Field(default=False, description="compile the forward pass; needs a warm-up of every batch size")
+    seed: int = Field(default=0, ge=0, description="mixed with the seed of each episode")
+
+    cameras: dict[str, str] | None = Field(
+        default=None, description="the model's name of each camera -> ours; unset: the family's convention"
+    )
+    state: list[str] | None = Field(
+        default=None,
+        description="parts of the proprioception that make up the model's state vector, in its order; "
+        "'gripper' stands for `Obs.gripper`; unset: the family's convention",
+    )
+
+    actions: Literal["chunk", "queue", "ensemble"] = Field(
+        default="chunk",
+        description="an `act` returns: a whole chunk; the next row of one that is kept here, where the model is asked "
+        "every `execute` acts; or one row, the model being asked at each act and the chunks averaged",
+    )
+    execute: int | None = Field(default=None, ge=1, description="rows of each chunk that are used; unset: all")
+    ensemble_m: float = Field(
+        default=0.01, description="weights exp(-m * i) of the average, oldest first (ACT, arXiv 2304.13705)"
+    )
+
+    max_rows: int = Field(default=64, ge=1, description="rows in one forward pass, at most; samples count as rows")
+    batch_sizes: list[int] | None = Field(
+        default=None,
+        description="for compiled models: the only numbers of rows to run, ascending; each is run once when the "
+        "model is loaded, smaller batches are padded",
+    )
+
+    @model_validator(mode="after")
+    def _step_has_a_place(self) -> Self:
+        if (STEP in self.checkpoint) != (self.checkpoint_step is not None):
+            raise ValueError(
+                f"checkpoint {self.checkpoint!r} and checkpoint_step {self.checkpoint_step}: give both the place "
+                f"{STEP} and the step that belongs there, or neither"
+            )
+        return self
+
+    @field_validator("batch_sizes")
+    @classmethod
+    def _ascending(cls, sizes: list[int] | None) -> list[int] | None:
+        if sizes is not None and (not sizes or sizes[0] < 1 or sizes != sorted(set(sizes))):
+            raise ValueError(f"got {sizes}, want ascending positive numbers, such as [1, 2, 4, 8, 16]")
+        return sizes
+
+    @property
+    def rows(self) -> int:
+        """The most rows of one forward pass."""
+        return self.batch_sizes[-1] if self.batch_sizes else self.max_rows

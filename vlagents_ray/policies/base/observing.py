@@ -1,0 +1,67 @@
+"""From our names to a model's: cameras one by one, proprioception as one vector."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from vlagents_ray.contract import CameraSpec, StateSpec
+from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, MissingState
+from vlagents_ray.interface import Obs
+
+GRIPPER = "gripper"  # as a part of the state: `Obs.gripper`
+
+
+def choose_cameras(chosen: Mapping[str, str] | None, usual: Mapping[str, str], known: Sequence[str]) -> dict[str, str]:
+    """The model's name of each camera -> ours: `chosen`, or the family's usual one.
+
+    `known` are the model's cameras: one that is unknown or left out raises `ConfigError`, never becomes zeros.
+    """
+    mapping = dict(usual if chosen is None else chosen)
+    if set(mapping) != set(known):
+        raise ConfigError(
+            f"cameras: got {sorted(mapping)}, want {sorted(known)}, the checkpoint's own names, each with the name of "
+            f"one of yours, as in cameras: {{{', '.join(f'{name}: …' for name in known)}}}"
+        )
+    return mapping
+
+
+def camera_images(obs: Obs, cameras: Mapping[str, str]) -> dict[str, np.ndarray]:
+    """The images by the model's names, (H, W, 3) uint8 RGB, not copied."""
+    for ours in cameras.values():
+        if ours not in obs.cameras:
+            raise MissingCamera(ours, have=obs.cameras)
+    return {name: obs.cameras[ours] for name, ours in cameras.items()}
+
+
+def state_vector(obs: Obs, parts: Sequence[str], dim: int | None = None) -> np.ndarray:
+    """The parts in their order as one (dim,) float32 vector of its own memory."""
+    found = []
+    for part in parts:
+        if part == GRIPPER:
+            if obs.gripper is None:
+                raise InvalidObservation("gripper: got none, want a number in [0, 1] where 1 = open")
+            found.append(np.array([obs.gripper], np.float32))
+        elif part in obs.state:
+            found.append(np.asarray(obs.state[part], np.float32))
+        else:
+            raise MissingState(part, have=obs.state)
+    vector = np.concatenate(found) if found else np.zeros(0, np.float32)
+    if dim is not None and vector.shape != (dim,):
+        raise InvalidObservation(
+            f"state: got {len(vector)} numbers from {list(parts)}, want {dim}, as the checkpoint was trained; "
+            f"set the policy's `state` to the parts that it was trained with"
+        )
+    return vector
+
+
+def camera_specs(cameras: Mapping[str, str]) -> dict[str, CameraSpec]:
+    """For a contract: images of any size, which the adapter resizes as its family does."""
+    return {ours: CameraSpec() for ours in cameras.values()}
+
+
+def state_specs(parts: Sequence[str], dim: int | None = None) -> dict[str, StateSpec]:
+    """For a contract: the parts, and how long one is where it alone makes the vector."""
+    own = [part for part in parts if part != GRIPPER]
+    return {part: StateSpec(dim=dim if list(parts) == own and len(own) == 1 else None) for part in own}
