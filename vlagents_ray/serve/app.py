@@ -12,6 +12,7 @@ from ray.serve import Application
 
 from vlagents_ray.serve.config import GATEWAY, POLICY, ServerArgs
 from vlagents_ray.serve.deployment import PolicyReplica
+from vlagents_ray.serve.environments.interpreter import place
 from vlagents_ray.serve.gateways.deployment import Gateway
 
 _HEAD = "node:__internal_head__"  # a resource that Ray gives to the head node of any cluster
@@ -21,6 +22,8 @@ _OUTSIDE: Any = {"replicas": True, "autoscaling": True, "resources": True, "dial
 
 def build(args: ServerArgs) -> Application:
     """One policy as a Serve application. Ray passes the file's `args`, checked against `ServerArgs`."""
+    process = place(args.environment)
+    args = args.model_copy(update={"environment": args.environment.model_copy(update={"process": process})})
     options: dict[str, Any] = {
         "name": POLICY,
         # A WebSocket session counts as a request as long as it lasts, so this must hold all sessions
@@ -33,6 +36,7 @@ def build(args: ServerArgs) -> Application:
             "num_gpus": args.resources.num_gpus,
             "resources": args.resources.custom,
             **({} if args.resources.memory is None else {"memory": args.resources.memory}),
+            "runtime_env": args.environment.runtime_env(),
         },
     }
     if args.autoscaling is not None:
