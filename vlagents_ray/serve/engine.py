@@ -90,7 +90,11 @@ class Engine:
     @property
     def ready(self) -> bool:
         """Can it act?"""
-        return self._unready is None and self.queue.alive()
+        try:
+            self.check_health()
+        except Exception:  # noqa: BLE001 - whatever a policy says is wrong with it
+            return False
+        return True
 
     def require_ready(self) -> None:
         """Raise `PolicyUnavailable` while the policy loads, `PolicyFailed` if it could not or has died."""

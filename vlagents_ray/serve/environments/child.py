@@ -30,6 +30,7 @@ from vlagents_ray.wire.messages import Reply, Request
 _FOREVER_S = 1e6  # a policy may think as long as it likes: whoever asked it has a deadline
 _CONNECT_S = 10.0
 _CLOSE_S = 10.0
+_EXIT_S = 2.0
 _LAST_WORDS = 20  # lines
 
 
@@ -38,6 +39,7 @@ class Child:
 
     def __init__(self, python: str, settings: Settings, env_vars: Mapping[str, str]) -> None:
         self.contract: Contract | None = None  # once it has started
+        self.sessions: set[str] = set()  # what it holds, by their names
         self._python = python
         self._settings = settings
         self._env_vars = env_vars
@@ -50,6 +52,7 @@ class Child:
         self._names = itertools.count(1)
         self._free: deque[str] = deque()
         self._left: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+        self._closed = False
 
     def start(self) -> None:
         """Start it, and return when the policy is loaded; `ConfigError`, `PolicyFailed` if that fails."""
@@ -88,9 +91,11 @@ class Child:
     def open_session(self) -> str:
         """A name for a new session. Names are few, and used again: each costs a connection a little for good."""
         try:
-            return self._free.popleft()
+            name = self._free.popleft()
         except IndexError:
-            return f"{next(self._names):x}"
+            name = f"{next(self._names):x}"
+        self.sessions.add(name)
+        return name
 
     def close_session(self, name: str) -> None:
         """Forget a session soon. Waits for nothing, as garbage collection may call it at any moment."""
@@ -103,10 +108,11 @@ class Child:
 
     def close(self) -> None:
         """Let the policy close itself, and end the process."""
-        self._left.put(None)
         process = self._process
-        if process is None:
+        if process is None or self._closed:
             return
+        self._closed = True
+        self._left.put(None)
         _write(process, b"\n")
         try:
             process.wait(_CLOSE_S)
@@ -126,7 +132,7 @@ class Child:
         _write(process, json.dumps(asdict(self._settings)).encode() + b"\n")
         line = b"" if process.stdout is None else process.stdout.readline()
         if not line:
-            keeper.join(_CLOSE_S)
+            keeper.join(_EXIT_S)
             raise PolicyFailed(f"{self._ended()}; it said:\n{''.join(self._last_words).strip()}")
         said: dict[str, Any] = json.loads(line)
         if "error" in said:
@@ -161,11 +167,17 @@ class Child:
                 self.call([Request("close", session=name)])
             except VLAgentsError:  # the process has ended, and its sessions with it
                 return
+            self.sessions.discard(name)
             self._free.append(name)
 
     def _ended(self) -> str:
-        status = None if self._process is None else self._process.poll()
-        return f"the policy's process ({self._python}) ended with exit status {status}"
+        """What became of it; its pipes and sockets close a moment before its exit status is known."""
+        if self._process is None:
+            return "the policy's process has not started"
+        try:
+            return f"the policy's process ({self._python}) ended with exit status {self._process.wait(_EXIT_S)}"
+        except subprocess.TimeoutExpired:
+            return f"the policy's process ({self._python}) hung up"
 
 
 def _write(process: subprocess.Popen[bytes], data: bytes) -> None:
