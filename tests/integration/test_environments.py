@@ -30,7 +30,10 @@ VERSIONS = {"old": ("1.26.4", "1.15.0"), "new": (np.__version__, "1.16.0")}  # o
 
 @dataclass(frozen=True, slots=True)
 class Served:
-    """A cluster with three applications: old and new in replicas, apart in a child process without Ray."""
+    """A cluster with four applications.
+
+    old and new run in replicas, apart in a child process without Ray, and what installed needs Ray installs.
+    """
 
     server: Server
     notes: dict[str, Path]  # what each policy said at its resets
@@ -51,6 +54,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
             "python": str(make_environment(requirements, home / "apart", light=True)),
             "env_vars": {"VARIABLE": "set"},
         },
+        "installed": {"requirements": ["six==1.16.0"], "env_vars": {"VARIABLE": "set"}},
     }
     notes = {name: home / f"{name}.jsonl" for name in environments}
     file = home / "deployment.yaml"
@@ -89,14 +93,14 @@ class EnvActor:
 
 
 def require_versions(app: str, told: dict[str, Any]) -> None:
-    numpy, six = VERSIONS["old" if app == "apart" else app]
+    numpy, six = VERSIONS["old" if app in ("old", "apart") else "new"]
     assert (told["numpy"], told["six"]) == (numpy, six)
     assert told["ray"] == (None if app == "apart" else ray.__version__)
-    assert Path(told["prefix"]).name == app
+    assert Path(told["prefix"]).name == ("virtualenv" if app == "installed" else app)
     assert told["variable"] == (None if app == "old" else "set")
 
 
-@pytest.mark.parametrize("app", ["old", "new", "apart"])
+@pytest.mark.parametrize("app", ["old", "new", "apart", "installed"])
 def test_each_policy_answers_with_its_own_versions_over_http(served: Served, app: str) -> None:
     with RemoteAgent(served.server.apps[app], transport="http") as agent:
         require_versions(app, agent.reset(observation(), "a task"))

@@ -15,7 +15,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, from_code
 from vlagents_ray.serve.environments.config import EnvironmentArgs
 
-__all__ = ["Probe", "check_policy", "place", "probe"]
+__all__ = ["Probe", "check_policy", "placed", "probe"]
 
 _PACKAGES = ("ray", "numpy", "vlagents-ray")
 _TIMEOUT_S = 120.0  # a cold network drive takes its time
@@ -85,12 +85,11 @@ def probe(python: str, policy: str | None = None, config: dict[str, Any] | None 
     return found
 
 
-def place(environment: EnvironmentArgs) -> Literal["replica", "child"]:
-    """Where the policy of a deployment with this environment runs; `ConfigError` if it cannot run where it is to."""
+def placed(environment: EnvironmentArgs) -> EnvironmentArgs:
+    """The same, with "auto" decided; `ConfigError` if the policy cannot run where it is to."""
     if environment.python is None:
-        return "replica"
-    found = probe(environment.python)
-    return _place(environment, found)
+        return environment
+    return environment.model_copy(update={"process": _process(environment, probe(environment.python))})
 
 
 def check_policy(environment: EnvironmentArgs, policy: str, config: dict[str, Any]) -> Contract | None:
@@ -101,7 +100,7 @@ def check_policy(environment: EnvironmentArgs, policy: str, config: dict[str, An
     if environment.python is None:
         raise ConfigError("environment: names no interpreter to ask")
     found = probe(environment.python, policy, config)
-    _place(environment, found)
+    _process(environment, found)
     said = found.policy or {}
     if "error" in said:
         raise from_code(said["code"], f"in {environment.python}: {said['error']}")
@@ -109,7 +108,7 @@ def check_policy(environment: EnvironmentArgs, policy: str, config: dict[str, An
     return None if contract is None else Contract.from_json(contract)
 
 
-def _place(environment: EnvironmentArgs, found: Probe) -> Literal["replica", "child"]:
+def _process(environment: EnvironmentArgs, found: Probe) -> Literal["replica", "child"]:
     if environment.process == "child":
         return "child"
     obstacle = found.hosts_replicas()

@@ -148,12 +148,17 @@ def _uv(arguments: Sequence[str]) -> str:
         if binary is None:
             raise MissingDependency("'uv' is not installed; pip install 'vlagents-ray[serve]'")
         command = [binary]
-    places = {uv: os.environ[pip].strip() for pip, uv in _PIP_VARIABLES.items() if pip in os.environ}
-    if "UV_FIND_LINKS" in places:
-        places["UV_FIND_LINKS"] = ",".join(places["UV_FIND_LINKS"].split())
     done = subprocess.run(  # noqa: S603 - uv, as installed with this package
-        [*command, *arguments], capture_output=True, text=True, check=False, env={**places, **os.environ}
+        [*command, *arguments], capture_output=True, text=True, check=False, env={**_places(), **os.environ}
     )
     if done.returncode != 0:
         raise ConfigError(f"uv {arguments[0]} failed:\n{done.stderr.strip()[-_SHOWN:]}")
     return done.stderr
+
+
+def _places() -> dict[str, str]:
+    """Where pip was told to look, as uv is told."""
+    places = {uv: os.environ[pip] for pip, uv in _PIP_VARIABLES.items() if pip in os.environ}
+    if "UV_FIND_LINKS" in places:
+        places["UV_FIND_LINKS"] = ",".join(places["UV_FIND_LINKS"].split())
+    return places
