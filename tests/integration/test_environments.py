@@ -54,7 +54,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
             "python": str(make_environment(requirements, home / "apart", light=True)),
             "env_vars": {"VARIABLE": "set"},
         },
-        "installed": {"requirements": ["six==1.16.0"], "env_vars": {"VARIABLE": "set"}},
+        "installed": {"requirements": ["six==1.16.0"], "installer": "uv", "env_vars": {"VARIABLE": "set"}},
     }
     notes = {name: home / f"{name}.jsonl" for name in environments}
     file = home / "deployment.yaml"
