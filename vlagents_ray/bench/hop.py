@@ -12,7 +12,8 @@ from vlagents_ray.bench.observing import observation
 from vlagents_ray.bench.rtt import RoundTripsOfAll, in_turns
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.noop import Noop
-from vlagents_ray.serve.environments.child import Child, ChildAgent
+from vlagents_ray.serve.environments.agent import ChildAgent
+from vlagents_ray.serve.environments.child import Child
 from vlagents_ray.serve.environments.host import Settings
 from vlagents_ray.serve.environments.interpreter import probe
 from vlagents_ray.serve.sessions import AgentCopies

@@ -10,12 +10,12 @@ import yaml
 from pydantic import ValidationError
 from ray.serve.schema import ServeDeploySchema
 
-from vlagents_ray.errors import ConfigError, MissingDependency
+from vlagents_ray.errors import ConfigError, MissingDependency, UnknownPolicy
 from vlagents_ray.registry import names, policy_class, require
 from vlagents_ray.serve.config import ServerArgs
 from vlagents_ray.serve.dialects.routes import require_fit
 from vlagents_ray.serve.environments.host import unloaded_contract
-from vlagents_ray.serve.environments.interpreter import check_policy
+from vlagents_ray.serve.environments.interpreter import check_policy, placed
 
 IMPORT_PATH = "vlagents_ray.serve.app:build"
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8000
@@ -103,7 +103,10 @@ def _require_policy(args: ServerArgs, *, installed: bool) -> None:
     """
     environment = args.environment
     if not installed:
-        policy_class(args.policy)
+        if environment.python is None:
+            policy_class(args.policy)
+        else:
+            placed(environment)
         return
     if args.dialects.gr00t is not None:
         require("zmq")
@@ -112,6 +115,6 @@ def _require_policy(args: ServerArgs, *, installed: bool) -> None:
         return
     try:
         require_fit(args.dialects, unloaded_contract(policy_class(args.policy).from_config(args.config)))
-    except MissingDependency:
-        if environment.requirements is None:
+    except (MissingDependency, UnknownPolicy):
+        if environment.requirements is None:  # else they may bring it
             raise

@@ -19,7 +19,8 @@ from eval_fakes import wait_for
 from vlagents_ray import Act, Obs
 from vlagents_ray.errors import ConnectionLost, NotReset, PolicyFailed, PolicyUnavailable, VLAgentsError
 from vlagents_ray.serve.engine import Engine
-from vlagents_ray.serve.environments.child import Child, ChildAgent
+from vlagents_ray.serve.environments.agent import ChildAgent
+from vlagents_ray.serve.environments.child import Child
 from vlagents_ray.serve.environments.host import Settings
 from vlagents_ray.serve.moving import export
 from vlagents_ray.wire.messages import Reply, Request

@@ -1,7 +1,7 @@
-"""A policy in a process of its own behind the replica, and the agent that stands for it there.
+"""The process behind a replica that runs its policy, as the replica sees it: see `host` for the other side.
 
-What the replica's engine asks of the agent travels through shared memory (`vlagents_ray.client.shm`) to an engine
-in the child (`vlagents_ray.serve.environments.host`): a batch as one message, a session as a session.
+What the replica's engine asks of the policy travels through shared memory (`vlagents_ray.client.shm`) to an engine in
+the child: a batch as one message, a session as a session.
 """
 
 from __future__ import annotations
@@ -17,12 +17,11 @@ import threading
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from typing import Any, ClassVar
+from typing import Any
 
 from vlagents_ray.client.shm import ShmTransport
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, ConnectionLost, PolicyFailed, PolicyUnavailable, VLAgentsError
-from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.serve.environments import host
 from vlagents_ray.serve.environments.host import Settings
 from vlagents_ray.wire.messages import Reply, Request
@@ -186,71 +185,3 @@ def _write(process: subprocess.Popen[bytes], data: bytes) -> None:
         with contextlib.suppress(BrokenPipeError):
             process.stdin.write(data)
             process.stdin.flush()
-
-
-class ChildAgent(Agent):
-    """The policy in the child. A copy of it is one of the child's sessions, and moves to another child by pickling."""
-
-    shared: ClassVar[tuple[str, ...]] = ("_child",)
-
-    def __init__(self, child: Child) -> None:
-        self._child = child
-        self._session: str | None = None  # until `reset`
-
-    @property
-    def contract(self) -> Contract | None:
-        return self._child.contract
-
-    def initialize(self) -> None:
-        self._child.start()
-
-    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        if self._session is None:
-            self._session = self._child.open_session()
-        return self._ask(Request("reset", obs, instruction, kwargs)).info or {}
-
-    def observe(self, obs: Obs) -> None:
-        self._ask(Request("observe", obs))
-
-    def act(self, obs: Obs) -> Act:
-        [act] = self.act_batch([obs], [self])
-        if isinstance(act, Exception):
-            raise act
-        return act
-
-    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        requests = [
-            Request("act", one, session=session._session or "")
-            for session, one in zip(sessions, obs, strict=True)
-            if isinstance(session, ChildAgent)
-        ]
-        none = PolicyFailed("act: the policy's process answered without an action")
-        return [reply.error or reply.act or none for reply in self._child.call(requests)]
-
-    def check_health(self) -> None:
-        self._child.require_alive()
-
-    def close(self) -> None:
-        self._child.close()
-
-    def _ask(self, request: Request) -> Reply:
-        request.session = self._session or ""
-        [reply] = self._child.call([request])
-        if reply.error is not None:
-            raise reply.error
-        return reply
-
-    def __getstate__(self) -> dict[str, Any]:
-        """A session's own state is the policy's in the child, which gives it up."""
-        moved = None if self._session is None else self._ask(Request("export")).info
-        return {"child": self._child, "moved": moved}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self._child, self._session = state["child"], None
-        if state["moved"] is not None:
-            self._session = self._child.open_session()
-            self._ask(Request("adopt", kwargs=state["moved"]))
-
-    def __del__(self) -> None:
-        if (session := getattr(self, "_session", None)) is not None:
-            self._child.close_session(session)
