@@ -71,8 +71,8 @@ class Contract:
     history: int | None = None  # policy: consecutive observations it keeps per session
 
     def to_json(self) -> dict[str, Any]:
-        """As plain JSON values, for metadata and results."""
-        return asdict(self)
+        """As plain JSON values, for metadata and results, which processes with another numpy read."""
+        return {key: _plain(value) for key, value in asdict(self).items()}
 
     @classmethod
     def from_json(cls, data: object) -> Contract:
@@ -86,6 +86,12 @@ class Contract:
         if "action" in top:
             top["action"] = ActionSpec(**_closed(ActionSpec, top["action"], "contract.action"))
         return cls(**top)
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    return value.item() if isinstance(value, np.generic) else value
 
 
 def differences(policy: Contract, env: Contract) -> list[str]:

@@ -144,6 +144,12 @@ class Agent:
                 acts.append(error)
         return acts
 
+    def check_health(self) -> None:
+        """Raise what keeps this agent from ever acting again, such as a lost device; a replica is then replaced.
+
+        A server calls it every few seconds on the initialized agent, beside a batch that runs.
+        """
+
     def close(self) -> None:
         """Give back what `initialize` took; a server calls it once, when the replica stops."""
 

@@ -14,6 +14,7 @@ from vlagents_ray.cli.main import app
         (["rtt", "--peers", "nobody"], "nobody"),
         (["rtt", "--transports", "smoke"], "smoke"),
         (["rtt", "--plot", "a.gif"], ".png"),
+        (["hop", "--python", "nowhere"], "nowhere"),
         (["throughput", "--clients", "few"], "few"),
         (["throughput", "--config", "{"], "JSON"),
         (["throughput", "--config", '{"base_ms": 1}'], "--policy"),

@@ -11,8 +11,9 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-from vlagents_ray.bench.environment import python_in, set_up
+from vlagents_ray.bench.environment import set_up
 from vlagents_ray.bench.ways import REQUIREMENTS
+from vlagents_ray.serve.environments.making import python_in
 
 FOLDER = Path(os.environ.get("VLAGENTS_PEERS", Path(__file__).parents[2] / ".venv-peers"))
 CLIENTS = Path(__file__).with_name("peer_clients.py")

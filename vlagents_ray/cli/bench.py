@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -76,6 +77,21 @@ def bench_link(
         _save(found, json_file)
         if plot is not None:
             plot_round_trips(found, plot, title)
+
+
+@bench.command("hop")
+def bench_hop(
+    calls: Annotated[int, typer.Option(min=1, help="Acts by each way.")] = 2000,
+    python: Annotated[str, typer.Option(help="The child's interpreter; default: this one.")] = sys.executable,
+    json_file: Json = None,
+) -> None:
+    """What a policy in a child process behind the replica costs, against one in the replica."""
+    from vlagents_ray.bench.hop import measure_hop
+
+    with errors():
+        found = measure_hop(calls, python, _tell).to_json()
+    show_round_trips(found, "one act, as the batch queue sees it")
+    _save(found, json_file)
 
 
 @bench.command("throughput")

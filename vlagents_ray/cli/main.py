@@ -15,6 +15,7 @@ from rich.table import Table
 from vlagents_ray.cli.bench import bench
 from vlagents_ray.cli.console import errors as _errors
 from vlagents_ray.cli.console import out
+from vlagents_ray.cli.environments import env
 from vlagents_ray.cli.keys import keys as keys_app
 from vlagents_ray.cli.settings import parse_settings
 from vlagents_ray.errors import ConfigError, VLAgentsError
@@ -178,6 +179,7 @@ def demo(
 
 
 app.add_typer(bench, name="bench")
+app.add_typer(env, name="env")
 app.add_typer(keys_app, name="keys")
 
 

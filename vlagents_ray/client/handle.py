@@ -11,8 +11,6 @@ import uuid
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from vlagents_ray.errors import ConfigError, ConnectionLost, DeadlineExceeded, PolicyUnavailable, VLAgentsError
 from vlagents_ray.wire.codecs import RAW
 from vlagents_ray.wire.frames import decode_replies, encode_requests
@@ -61,7 +59,8 @@ class HandleTransport:
         """One actor call; the frame lies in plasma and is freed with the reply."""
         import ray
 
-        frame = ray.put(np.frombuffer(encode_requests(requests, RAW), np.uint8))
+        # A bare buffer, which lies in plasma apart from its pickle: an array's pickle depends on the numpy.
+        frame = ray.put(pickle.PickleBuffer(encode_requests(requests, RAW)))
         pending = call_replica(self._replica, "call", self._session, frame, request_id=requests[0].request_id)
         try:
             return decode_replies(ray.get(pending, timeout=timeout_s))

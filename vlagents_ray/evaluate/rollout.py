@@ -43,6 +43,7 @@ from vlagents_ray.evaluate.jobs import Job
 from vlagents_ray.evaluate.video import VideoRecorder
 from vlagents_ray.interface import Agent
 from vlagents_ray.registry import env_class
+from vlagents_ray.wire.plain import plain_values
 
 log = logging.getLogger(__name__)
 
@@ -133,7 +134,8 @@ class Rollout:
                 policy = _metadata(self._agent)
             if self._env is None or self._env_name != job.key.env:
                 self._env = self._make_env(job.key.env)
-                made = Made(job.key.env, self._env.describe(), self._env.contract.to_json())
+                # The driver may have another numpy, which cannot read this one's pickles.
+                made = Made(job.key.env, plain_values(self._env.describe()), self._env.contract.to_json())
             agent, env = self._agent, self._env
             if made is not None or policy is not None:
                 require_match(agent.contract, env.contract)

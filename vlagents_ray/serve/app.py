@@ -12,6 +12,7 @@ from ray.serve import Application
 
 from vlagents_ray.serve.config import GATEWAY, POLICY, ServerArgs
 from vlagents_ray.serve.deployment import PolicyReplica
+from vlagents_ray.serve.environments.interpreter import placed
 from vlagents_ray.serve.gateways.deployment import Gateway
 
 _HEAD = "node:__internal_head__"  # a resource that Ray gives to the head node of any cluster
@@ -21,18 +22,20 @@ _OUTSIDE: Any = {"replicas": True, "autoscaling": True, "resources": True, "dial
 
 def build(args: ServerArgs) -> Application:
     """One policy as a Serve application. Ray passes the file's `args`, checked against `ServerArgs`."""
+    args = args.model_copy(update={"environment": placed(args.environment)})
     options: dict[str, Any] = {
         "name": POLICY,
         # A WebSocket session counts as a request as long as it lasts, so this must hold all sessions
         # besides two batches; it protects nothing, since the batch queue orders what waits.
         "max_ongoing_requests": args.sessions.limit + 2 * args.batch.max_size,
         "graceful_shutdown_timeout_s": 20,
-        "health_check_period_s": 5,
+        "health_check_period_s": 1 if args.environment.process == "child" else 5,  # Serve wants three failures
         "ray_actor_options": {
             "num_cpus": args.resources.num_cpus,
             "num_gpus": args.resources.num_gpus,
             "resources": args.resources.custom,
             **({} if args.resources.memory is None else {"memory": args.resources.memory}),
+            "runtime_env": args.environment.runtime_env(),
         },
     }
     if args.autoscaling is not None:

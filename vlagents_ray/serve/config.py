@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from vlagents_ray.serve.auth import Keys, load_keys
 from vlagents_ray.serve.dialects.config import DialectArgs
+from vlagents_ray.serve.environments.config import EnvironmentArgs
 from vlagents_ray.wire.messages import DEFAULT_LIMITS, Limits
 
 POLICY, GATEWAY = "Policy", "Gateway"  # the deployments of an application
@@ -181,6 +182,7 @@ class ServerArgs(_Closed):
     access: AccessArgs = AccessArgs()
     stream: StreamArgs = StreamArgs()
     resources: ResourceArgs = ResourceArgs()
+    environment: EnvironmentArgs = Field(default=EnvironmentArgs(), description="the Python that the policy runs in")
     dialects: DialectArgs = Field(default=DialectArgs(), description="other systems' clients that may connect")
 
     @model_validator(mode="after")

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import importlib.metadata
-import json
 import logging
 import os
 from dataclasses import asdict
 from functools import partial
 from typing import Any
 
-import numpy as np
 import ray
 from ray import serve
 from ray.serve.config import HTTPOptions
 from starlette.types import ASGIApp
 
 from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
-from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.serve.auth import Caller, require_access
 from vlagents_ray.serve.autoscaling import SESSIONS, UTILISATION, WAITING
 from vlagents_ray.serve.balance import Balance
@@ -27,6 +24,7 @@ from vlagents_ray.serve.config import ServerArgs
 from vlagents_ray.serve.dialects.door import House
 from vlagents_ray.serve.dialects.routes import describe, dialect_routes, require_fit
 from vlagents_ray.serve.engine import Engine
+from vlagents_ray.serve.environments.agent import make_agent, version_of
 from vlagents_ray.serve.guard import Guard
 from vlagents_ray.serve.ingress import build_ingress
 from vlagents_ray.serve.local import LocalDoor
@@ -59,16 +57,15 @@ class PolicyReplica:
         self._app = serve.get_replica_context().app_name
         self._keys = self._args.access.keys()
         require_access(_http().host or EVERYWHERE, self._keys, self._args.access.insecure)
-        agent = build_agent(self._args.policy, self._args.config, self._args.wrappers)
         self._limits = self._args.limits.limits()
         self._engine = Engine(
-            agent,
+            make_agent(self._args),
             max_batch_size=self._args.batch.max_size,
             patience=self._args.batch.patience,
             batch_sizes=self._args.batch.sizes or (),
             session_limit=self._args.sessions.limit,
             session_idle_s=self._args.sessions.idle_s,
-            version=json.dumps([self._args.policy, self._args.config, self._args.wrappers], sort_keys=True),
+            version=version_of(self._args),
             check=partial(require_fit, self._args.dialects),
         )
         self._load = LoadMeter(self._engine.queue)
@@ -183,12 +180,12 @@ class PolicyReplica:
             raise PolicyUnavailable("plasma: this replica has no such door; use transport 'handle'")
         return await asyncio.to_thread(self._plasma.pool.lease, length)
 
-    async def call(self, session_id: str, frame: np.ndarray) -> bytes:
-        """A frame of requests from inside the cluster, (N,) uint8, read in place from plasma."""
+    async def call(self, session_id: str, frame: Any) -> bytes:
+        """A frame of requests from inside the cluster, a buffer, read in place from plasma."""
         visit = Visit(self._engine.stats, "handle")
         sender = Sender(self._engine, "handle", session_id, connected=False)
         try:
-            requests = decode_requests(frame.data, self._limits)
+            requests = decode_requests(memoryview(frame), self._limits)
             visit.decoded(requests)
             replies = await sender.ask(requests)
         except VLAgentsError as error:
@@ -213,7 +210,7 @@ class PolicyReplica:
     def check_health(self) -> None:
         """Called by Serve; a replica whose policy did not load, or died, is replaced."""
         if self._loading.done():
-            self._engine.require_ready()
+            self._engine.check_health()
 
     def record_autoscaling_stats(self) -> dict[str, float]:
         """Called by Serve at regular times: the load since the last time, for `MeasuredLoad`."""

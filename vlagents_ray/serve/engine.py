@@ -90,7 +90,11 @@ class Engine:
     @property
     def ready(self) -> bool:
         """Can it act?"""
-        return self._unready is None and self.queue.alive()
+        try:
+            self.check_health()
+        except Exception:  # noqa: BLE001 - whatever a policy says is wrong with it
+            return False
+        return True
 
     def require_ready(self) -> None:
         """Raise `PolicyUnavailable` while the policy loads, `PolicyFailed` if it could not or has died."""
@@ -98,6 +102,11 @@ class Engine:
             raise self._unready
         if not self.queue.alive():
             raise PolicyFailed("the policy's thread has ended")
+
+    def check_health(self) -> None:
+        """As `require_ready`, and what the agent itself says; for a replica that may have to be replaced."""
+        self.require_ready()
+        self._agent.check_health()
 
     def close(self) -> None:
         """Answer what waits with 503, finish the batch under way, close the agent."""
@@ -150,7 +159,7 @@ class Engine:
     def adopt(self, session_id: str, state: dict[str, Any]) -> None:
         """Go on with a session that another replica gave up: the `info` of its answer to "export"."""
         self.require_ready()
-        if self._copies is None or state["version"] != self.version:
+        if self._copies is None or state["version"] != list(self.version):
             raise UnknownSession(f"session {session_id!r}: of another version of the policy; reset it")
         agent = self._copies.load(state["agent"])
         session = self.sessions.open(session_id)
@@ -176,6 +185,11 @@ class Engine:
                     self._reset(ticket)
                 elif ticket.request.op == "export":
                     self._export(ticket)
+                elif ticket.request.op == "observe":
+                    self._observe(ticket)
+                elif ticket.request.op == "adopt":
+                    self.adopt(ticket.session_id, ticket.request.kwargs)
+                    ticket.answer(Reply(ticket.request.request_id, info={}))
                 else:
                     self.sessions.close(ticket.session_id)
                     ticket.answer(Reply(ticket.request.request_id, info={}))
@@ -204,10 +218,17 @@ class Engine:
         state = {
             "agent": self._copies.dump(session.agent),
             "steps": session.steps,
-            "version": self.version,
+            "version": list(self.version),
         }
         self.sessions.close(ticket.session_id)
         ticket.answer(Reply(ticket.request.request_id, info=state))
+
+    def _observe(self, ticket: Ticket) -> None:
+        session = self._ready(ticket)
+        if session.agent is not None and ticket.request.obs is not None:  # `_ready` and the decoder have seen to both
+            session.agent.observe(ticket.request.obs)
+        ticket.request.obs = None
+        ticket.answer(Reply(ticket.request.request_id, info={}))
 
     def _reset(self, ticket: Ticket) -> None:
         session = self.sessions.open(ticket.session_id, ticket.connection, ticket.transport, ticket.owner)

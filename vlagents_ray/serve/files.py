@@ -10,12 +10,13 @@ import yaml
 from pydantic import ValidationError
 from ray.serve.schema import ServeDeploySchema
 
-from vlagents_ray.errors import ConfigError
-from vlagents_ray.interface import Agent
+from vlagents_ray.errors import ConfigError, MissingDependency, UnknownPolicy
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.registry import names, policy_class, require
 from vlagents_ray.serve.config import ServerArgs
 from vlagents_ray.serve.dialects.routes import require_fit
+from vlagents_ray.serve.environments.host import unloaded_contract
+from vlagents_ray.serve.environments.interpreter import check_policy, placed
 
 IMPORT_PATH = "vlagents_ray.serve.app:build"
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8000
@@ -87,21 +88,34 @@ def _checked(document: object, source: str) -> ServeDeploySchema:
         config = ServeDeploySchema.model_validate(document)
         for app in _ours(config):
             args = ServerArgs(**app.args)
-            agent = build_agent(args.policy, args.config, args.wrappers)
-            if not (app.runtime_env or {}):
-                _require_fit(args, agent)
-                if args.dialects.gr00t is not None:
-                    require("zmq")
+            if "environment" in app.args:  # paths in it are this process's; Ray is to see none that are relative
+                app.args["environment"] = args.environment.model_dump(exclude_unset=True)
+            _require_policy(args, installed=not (app.runtime_env or {}))
     except ValidationError as error:
         lines = [f"- {'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors()]
         raise ConfigError(f"{source}:\n" + "\n".join(lines)) from error
     return config
 
 
-def _require_fit(args: ServerArgs, agent: Agent) -> None:
-    """Compare dialects and policy, if it can state its contract before it is loaded; a replica compares again."""
-    try:
-        contract = agent.contract
-    except Exception:  # noqa: BLE001 - its own, for want of what `initialize` brings
+def _require_policy(args: ServerArgs, *, installed: bool) -> None:
+    """Build the policy where it will run, and compare it with the dialects; a replica compares again.
+
+    Not `installed`: all that it needs comes later, by the application's `runtime_env`.
+    """
+    environment = args.environment
+    if not installed:
+        if environment.python is None:
+            policy_class(args.policy)
+        else:
+            placed(environment)
         return
-    require_fit(args.dialects, contract)
+    if args.dialects.gr00t is not None:
+        require("zmq")
+    if environment.python is not None:
+        require_fit(args.dialects, check_policy(environment, args.policy, args.config, args.wrappers))
+        return
+    try:
+        require_fit(args.dialects, unloaded_contract(build_agent(args.policy, args.config, args.wrappers)))
+    except (MissingDependency, UnknownPolicy):
+        if environment.requirements is None:  # else they may bring it
+            raise

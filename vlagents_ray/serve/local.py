@@ -33,7 +33,7 @@ from vlagents_ray.serve.porter import Porter
 from vlagents_ray.serve.stats import Visit
 from vlagents_ray.wire import compact, cores
 from vlagents_ray.wire.frames import decode_requests, encode_replies
-from vlagents_ray.wire.messages import Limits, LocalAddress, Reply, Request, boot_id
+from vlagents_ray.wire.messages import OPS, Limits, LocalAddress, Op, Reply, Request, boot_id
 
 logger = logging.getLogger(__name__)
 
@@ -49,11 +49,12 @@ Admit = Callable[[str | None], "Caller | None"]  # who holds that key; `Unauthor
 class LocalDoor:
     """Listens from `open` on; everything else happens where the batch queue hears."""
 
-    def __init__(self, engine: Engine, limits: Limits, admit: Admit | None = None) -> None:
-        """`admit`, where there are keys, says whose a client's is, or raises that it is none."""
+    def __init__(self, engine: Engine, limits: Limits, admit: Admit | None = None, ops: Sequence[Op] = OPS) -> None:
+        """`admit`, where there are keys, says whose a client's is, or raises that it is none. `ops` are let in."""
         self._engine = engine
         self._limits = limits
         self._admit = admit
+        self._ops = ops
         self._clients: set[LocalClient] = set()
         self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET | socket.SOCK_NONBLOCK)
         self._porter = Porter(self._listener, self._welcome)
@@ -93,7 +94,7 @@ class LocalDoor:
 
     def client(self, connection: socket.socket) -> LocalClient:
         """What serves a connection that was let in."""
-        return LocalClient(connection, self._engine, self._limits, self._clients.discard, self._admit)
+        return LocalClient(connection, self._engine, self._limits, self._clients.discard, self._admit, self._ops)
 
 
 class LocalClient:
@@ -108,7 +109,9 @@ class LocalClient:
         limits: Limits,
         gone: Callable[[LocalClient], None],
         admit: Admit | None = None,
+        ops: Sequence[Op] = OPS,
     ) -> None:
+        self._ops = ops
         self._connection = connection
         self._engine = engine
         self._limits = limits
@@ -186,7 +189,7 @@ class LocalClient:
         memory = self._memory(number, length)
         if flags & LocalAddress.COMPACT:
             return self._acts.read(message[LocalAddress.REQUEST.size :], memory)
-        return decode_requests(memory.data, self._limits)
+        return decode_requests(memory.data, self._limits, self._ops)
 
     def forget(self) -> None:
         """Give the connection's memory back; what a policy keeps of it goes when the policy lets go."""

@@ -34,6 +34,7 @@ _OPTIONAL: dict[str, Any] = {
     "step": None,
     "deadline_ms": None,
 }  # and defaults
+_WITH_OBS = ("reset", "act", "observe")
 _REQUEST_KEYS = {"op", "obs", "instruction", "kwargs", "contract", "history", "blobs", *_OPTIONAL}
 
 
@@ -78,8 +79,8 @@ def decode_request(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> Request:
     return _read_request(header, Reader(blobs, limits), limits)
 
 
-def decode_requests(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> list[Request | Reply]:
-    """The requests in a frame; in place of one that is wrong, the reply that says so."""
+def decode_requests(data: Buffer, limits: Limits = DEFAULT_LIMITS, ops: Sequence[Op] = OPS) -> list[Request | Reply]:
+    """The requests in a frame, each one of `ops`; in place of one that is wrong, the reply that says so."""
     header, blobs = unpack(data, limits)
     nodes = header.get("requests", [header])
     if not isinstance(nodes, list) or not nodes or not all(isinstance(node, dict) for node in nodes):
@@ -90,19 +91,19 @@ def decode_requests(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> list[Reque
     budget = Budget(limits)
     for node in nodes:
         try:
-            read.append(_read_request(node, Reader(blobs, limits, budget), limits))
+            read.append(_read_request(node, Reader(blobs, limits, budget), limits, ops))
         except InvalidInput as error:
             name = node.get("request_id")
             read.append(Reply(name if isinstance(name, str) else "", error=error))
     return read
 
 
-def _read_request(node: dict[str, Any], reader: Reader, limits: Limits) -> Request:
+def _read_request(node: dict[str, Any], reader: Reader, limits: Limits, ops: Sequence[Op] = OPS) -> Request:
     unknown = node.keys() - _REQUEST_KEYS
     if unknown:
         raise MalformedMessage(f"request: unknown keys {sorted(unknown)}, want some of {sorted(_REQUEST_KEYS)}")
-    if node.get("op") not in OPS:
-        raise MalformedMessage(f"op: got {str(node.get('op'))[:40]!r}, want one of {list(OPS)}")
+    if node.get("op") not in ops:
+        raise MalformedMessage(f"op: got {str(node.get('op'))[:40]!r}, want one of {list(ops)}")
     obs, history = node.get("obs"), node.get("history") or []
     if not isinstance(history, list):
         raise MalformedMessage(f"history: got {type(history).__name__}, want a list of observations")
@@ -124,7 +125,7 @@ def _read_request(node: dict[str, Any], reader: Reader, limits: Limits) -> Reque
 
 def check_request(request: Request, limits: Limits) -> Request:
     """Types and sizes of the parts that JSON leaves open, whichever format they came in."""
-    if request.obs is None and request.op != "close":
+    if request.obs is None and request.op in _WITH_OBS:
         raise MalformedMessage(f"{request.op}: no 'obs'; send the observation")
     for name in ("instruction", "request_id", "session"):
         text = getattr(request, name)

@@ -21,20 +21,22 @@ NAME_CHARACTERS = 128  # of a session's or a request's id, at most
 STREAM_PATH = "/v1/stream/"  # on a replica's own port; something unguessable follows
 STREAM_BYTES = 16 * 2**20  # of one WebSocket message: what uvicorn takes, and Serve does not let us change
 
-Op = Literal["reset", "act", "close", "export"]
-OPS: tuple[Op, ...] = ("reset", "act", "close")  # "export" is for other replicas, and in no message
+Op = Literal["reset", "act", "close", "observe", "export", "adopt"]
+OPS: tuple[Op, ...] = ("reset", "act", "close")
+# What only a replica may ask of the process that runs its policy; "export" and "adopt" carry pickles.
+INNER_OPS: tuple[Op, ...] = (*OPS, "observe", "export", "adopt")
 RankName = Literal["robot", "simulation"]  # whose requests go first
 RANKS: tuple[RankName, ...] = ("robot", "simulation")
 
 
 @dataclass(slots=True)
 class Request:
-    """One call of `Agent.reset`, `Agent.act` or `Agent.close` on a remote policy."""
+    """One call of `Agent.reset`, `Agent.act` or `Agent.close` on a remote policy, or one of `INNER_OPS`."""
 
     op: Op
-    obs: Obs | None = None  # None only for close
+    obs: Obs | None = None  # of reset, act and observe
     instruction: str | None = None  # reset only
-    kwargs: dict[str, Any] = field(default_factory=dict)  # reset only: `seed`, ...
+    kwargs: dict[str, Any] = field(default_factory=dict)  # of reset: `seed`, ...; of adopt: what export answered
     contract: dict[str, Any] | None = None  # reset only: the robot's or env's side, compared by the server
     history: list[Obs] = field(default_factory=list)  # reset only: what the session saw since, oldest first
     session: str = ""  # which of its sessions the sender means; empty: the only one of its connection

@@ -59,9 +59,9 @@ def reply_to_json(reply: Reply) -> dict[str, Any]:
     """A reply without an error as plain JSON values."""
     document: dict[str, Any] = {"request_id": reply.request_id}
     if reply.act is not None:
-        document |= {"action": reply.act.action.tolist(), "done": reply.act.done, "info": _plain(reply.act.info)}
+        document |= {"action": reply.act.action.tolist(), "done": reply.act.done, "info": plain_values(reply.act.info)}
     else:
-        document["info"] = _plain(reply.info or {})
+        document["info"] = plain_values(reply.info or {})
     return document | {"timing": reply.timing}
 
 
@@ -77,11 +77,12 @@ def problem(error: VLAgentsError, request_id: str = "") -> dict[str, Any]:
     }
 
 
-def _plain(value: Any) -> Any:
+def plain_values(value: Any) -> Any:
+    """As JSON's values, in which no numpy is left: arrays become lists, bytes base64."""
     if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: plain_values(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [plain_values(item) for item in value]
     if isinstance(value, np.ndarray):
         return value.tolist()
     if isinstance(value, np.generic):

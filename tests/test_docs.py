@@ -1,0 +1,27 @@
+"""What the pages under docs/ tell people to write is accepted."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+import yaml
+
+from vlagents_ray.serve.environments.config import EnvironmentArgs
+
+DOCS = Path(__file__).parents[1] / "docs"
+BLOCKS = re.findall(r"```yaml\n(.*?)```", (DOCS / "environments.md").read_text(), re.DOTALL)
+
+
+@pytest.mark.parametrize("block", BLOCKS)
+def test_an_environment_as_it_is_documented_is_accepted(block: str) -> None:
+    document = yaml.safe_load(block)
+    if "applications" in document:
+        [application] = document["applications"]
+        document = application["args"]
+    assert EnvironmentArgs(**document["environment"]) != EnvironmentArgs()
+
+
+def test_there_are_such_blocks() -> None:
+    assert len(BLOCKS) == 2

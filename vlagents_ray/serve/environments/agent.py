@@ -1,0 +1,98 @@
+"""The agent of a replica: the policy itself, or what stands for one that runs in a process of its own."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+from vlagents_ray.contract import Contract
+from vlagents_ray.errors import PolicyFailed
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.policies.wrapper import build_agent
+from vlagents_ray.serve.config import ServerArgs
+from vlagents_ray.serve.environments.child import Child
+from vlagents_ray.serve.environments.host import Settings
+from vlagents_ray.wire.messages import Reply, Request
+
+
+def make_agent(args: ServerArgs) -> Agent:
+    """Built, not loaded. By now `environment.process` says which of the two it is."""
+    environment = args.environment
+    if environment.python is not None and environment.process == "child":
+        settings = Settings(args.policy, args.config, args.batch.max_size, version_of(args), args.wrappers)
+        return ChildAgent(Child(environment.python, settings, environment.env_vars))
+    return build_agent(args.policy, args.config, args.wrappers)
+
+
+def version_of(args: ServerArgs) -> str:
+    """Sessions move between replicas in which it is equal: pickles of one environment are for no other."""
+    return json.dumps([args.policy, args.config, args.wrappers, args.environment.model_dump()], sort_keys=True)
+
+
+class ChildAgent(Agent):
+    """The policy in the child. A copy of it is one of the child's sessions, and moves to another child by pickling."""
+
+    shared: ClassVar[tuple[str, ...]] = ("_child",)
+
+    def __init__(self, child: Child) -> None:
+        self._child = child
+        self._session: str | None = None  # until `reset`
+
+    @property
+    def contract(self) -> Contract | None:
+        return self._child.contract
+
+    def initialize(self) -> None:
+        self._child.start()
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        if self._session is None:
+            self._session = self._child.open_session()
+        return self._ask(Request("reset", obs, instruction, kwargs)).info or {}
+
+    def observe(self, obs: Obs) -> None:
+        self._ask(Request("observe", obs))
+
+    def act(self, obs: Obs) -> Act:
+        [act] = self.act_batch([obs], [self])
+        if isinstance(act, Exception):
+            raise act
+        return act
+
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        requests = [
+            Request("act", one, session=session._session or "")
+            for session, one in zip(sessions, obs, strict=True)
+            if isinstance(session, ChildAgent)
+        ]
+        none = PolicyFailed("act: the policy's process answered without an action")
+        return [reply.error or reply.act or none for reply in self._child.call(requests)]
+
+    def check_health(self) -> None:
+        self._child.require_alive()
+
+    def close(self) -> None:
+        self._child.close()
+
+    def _ask(self, request: Request) -> Reply:
+        request.session = self._session or ""
+        [reply] = self._child.call([request])
+        if reply.error is not None:
+            raise reply.error
+        return reply
+
+    def __getstate__(self) -> dict[str, Any]:
+        """A session's own state is the policy's in the child, which gives it up."""
+        moved = None if self._session is None else self._ask(Request("export")).info
+        return {"child": self._child, "moved": moved}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self._child, self._session = state["child"], None
+        if state["moved"] is not None:
+            self._session = self._child.open_session()
+            self._ask(Request("adopt", kwargs=state["moved"]))
+
+    def __del__(self) -> None:
+        if (session := getattr(self, "_session", None)) is not None:
+            self._child.close_session(session)

@@ -1,0 +1,145 @@
+"""What a virtual environment's interpreter can do: is it one, what is installed there, is the policy?"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from vlagents_ray.contract import Contract
+from vlagents_ray.errors import ConfigError, from_code
+from vlagents_ray.serve.environments.config import EnvironmentArgs
+
+__all__ = ["Probe", "check_policy", "placed", "probe"]
+
+_PACKAGES = ("ray", "numpy", "vlagents-ray")
+_TIMEOUT_S = 120.0  # a cold network drive takes its time
+OLDEST = (3, 10)
+# For whatever the path names, an old Python included; what imports print comes before the last line.
+_PROBE = """
+import json, sys
+found = {"python": "%d.%d.%d" % sys.version_info[:3]}
+if sys.version_info >= (3, 10):
+    from importlib.metadata import PackageNotFoundError, version
+    for name in sys.argv[2:]:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            pass
+    settings = json.loads(sys.argv[1])
+    if settings["policy"] is not None and found.get("vlagents-ray") == settings["version"]:
+        from vlagents_ray.serve.environments.host import examine
+        found["policy"] = examine(**settings["policy"])
+print()
+print("VLA" + json.dumps(found))
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Probe:
+    """What an interpreter said of itself."""
+
+    python: str  # its path
+    versions: dict[str, str]  # of "python", "ray", "numpy", "vlagents-ray"; what is not installed is not in it
+    policy: dict[str, Any] | None = None  # what `host.examine` says, if it was asked
+
+    def hosts_replicas(self) -> str | None:
+        """Why a replica of this process's cluster cannot run there; None if it can."""
+        ours, theirs = platform.python_version(), self.versions["python"]
+        if _minor(ours) != _minor(theirs):
+            return f"it is Python {theirs}, the cluster's is {ours}"
+        cluster, there = importlib.metadata.version("ray"), self.versions.get("ray")
+        return (
+            None if there == cluster else f"it has {f'Ray {there}' if there else 'no Ray'}, the cluster has {cluster}"
+        )
+
+
+def probe(python: str, policy: dict[str, Any] | None = None) -> Probe:
+    """Ask the interpreter, in one process, and have it build a policy: `policy` are the arguments of `host.examine`.
+
+    Raises `ConfigError` unless it is one in which a policy of this server can run.
+    """
+    if not Path(python).is_file():
+        inside = Path(python) / "bin" / "python"
+        cure = f"did you mean {inside}?" if inside.is_file() else "make one with `vlagents-ray env make REQUIREMENTS`"
+        raise ConfigError(f"environment.python: no such file, got {python!r}, want an interpreter; {cure}")
+    version = importlib.metadata.version("vlagents-ray")
+    settings = {"policy": policy, "version": version}
+    said = _asked(python, json.dumps(settings))
+    examined = said.pop("policy", None)
+    found = Probe(python, said, examined)
+    if _minor(said["python"]) < OLDEST:
+        oldest = ".".join(map(str, OLDEST))
+        raise ConfigError(f"environment.python: {python} is Python {said['python']}, want {oldest} or newer")
+    theirs = said.get("vlagents-ray")
+    if theirs != version:
+        raise ConfigError(
+            f"environment.python: {python} has {f'vlagents-ray {theirs}' if theirs else 'no vlagents-ray'}, want "
+            f"{version} as here; install it there, or make the environment with `vlagents-ray env make REQUIREMENTS`"
+        )
+    return found
+
+
+def placed(environment: EnvironmentArgs) -> EnvironmentArgs:
+    """The same, with "auto" decided; `ConfigError` if the policy cannot run where it is to."""
+    if environment.python is None:
+        return environment
+    return environment.model_copy(update={"process": _process(environment, probe(environment.python))})
+
+
+def check_policy(
+    environment: EnvironmentArgs, policy: str, config: dict[str, Any], wrappers: Sequence[Any] = ()
+) -> Contract | None:
+    """Have the environment of `python` build the policy, as a replica will; its contract, if it states one unloaded.
+
+    `ConfigError` if the policy cannot be built there, or the environment cannot be used.
+    """
+    if environment.python is None:
+        raise ConfigError("environment: names no interpreter to ask")
+    found = probe(environment.python, {"policy": policy, "config": config, "wrappers": list(wrappers)})
+    _process(environment, found)
+    said = found.policy or {}
+    if "error" in said:
+        raise from_code(said["code"], f"in {environment.python}: {said['error']}")
+    contract = said.get("contract")
+    return None if contract is None else Contract.from_json(contract)
+
+
+def _process(environment: EnvironmentArgs, found: Probe) -> Literal["replica", "child"]:
+    if environment.process == "child":
+        return "child"
+    obstacle = found.hosts_replicas()
+    if obstacle is not None and environment.process == "replica":
+        raise ConfigError(
+            f"environment.process: got 'replica', which cannot run in {environment.python}: {obstacle}; "
+            f"use process 'child' (or 'auto'), or make the environment anew with `vlagents-ray env make`"
+        )
+    return "child" if obstacle else "replica"
+
+
+def _minor(version: str) -> tuple[int, ...]:
+    return tuple(map(int, version.split(".")[:2]))
+
+
+def _asked(python: str, settings: str) -> dict[str, Any]:
+    command = [python, "-c", _PROBE, settings, *_PACKAGES]
+    try:
+        done = subprocess.run(  # noqa: S603 - the deployment's own interpreter
+            command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False, env={**os.environ}
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise ConfigError(
+            f"environment.python: {python!r} is no Python interpreter that runs here ({error})"
+        ) from error
+    last = done.stdout.strip().rpartition("\n")[2]
+    if not last.startswith("VLA{"):
+        words = (done.stderr or done.stdout).strip()[-500:] or "it said nothing"
+        raise ConfigError(f"environment.python: {python!r} is no Python interpreter, or a broken one: {words}")
+    answer: dict[str, Any] = json.loads(last[3:])
+    return answer
