@@ -46,6 +46,16 @@ class BatchArgs(_Closed):
         return self
 
 
+class CheckpointArgs(_Closed):
+    """Which checkpoints a session may choose for itself: `reset(..., checkpoint="late")`, `checkpoint_step=20000`."""
+
+    choices: dict[str, dict[str, Any]] = Field(
+        default_factory=dict, description="by name, the settings that take the place of those in `config`"
+    )
+    steps: bool = Field(default=False, description="any step of a checkpoint whose path holds {step}")
+    loaded: int = Field(default=2, ge=1, description="checkpoints in the memory of one replica at once, at most")
+
+
 class SessionArgs(_Closed):
     """Sessions of one replica."""
 
@@ -168,6 +178,7 @@ class ServerArgs(_Closed):
 
     policy: str = Field(description="a registered name (`vlagents-ray policies`) or 'module:Class'")
     config: dict[str, Any] = Field(default_factory=dict, description="the policy's own settings")
+    checkpoints: CheckpointArgs = CheckpointArgs()
     replicas: int | None = Field(default=None, ge=1, description="a fixed number; excludes `autoscaling`")
     autoscaling: AutoscalingArgs | None = None
     batch: BatchArgs = BatchArgs()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import importlib.metadata
-import json
 import logging
 import os
 from dataclasses import asdict
@@ -23,6 +22,7 @@ from vlagents_ray.serve.auth import Caller, require_access
 from vlagents_ray.serve.autoscaling import SESSIONS, UTILISATION, WAITING
 from vlagents_ray.serve.balance import Balance
 from vlagents_ray.serve.calls import Sender
+from vlagents_ray.serve.checkpoints import Checkpoints, resolved
 from vlagents_ray.serve.config import ServerArgs
 from vlagents_ray.serve.dialects.door import House
 from vlagents_ray.serve.dialects.routes import describe, dialect_routes, require_fit
@@ -59,19 +59,26 @@ class PolicyReplica:
         self._app = serve.get_replica_context().app_name
         self._keys = self._args.access.keys()
         require_access(_http().host or EVERYWHERE, self._keys, self._args.access.insecure)
-        agent = policy_class(self._args.policy).from_config(self._args.config)
+        offered = self._args.checkpoints
+        checkpoints = Checkpoints(
+            policy_class(self._args.policy).from_config,
+            self._args.config,
+            offered.choices,
+            steps=offered.steps,
+            loaded=offered.loaded,
+        )
         self._limits = self._args.limits.limits()
         self._engine = Engine(
-            agent,
+            checkpoints,
             max_batch_size=self._args.batch.max_size,
             patience=self._args.batch.patience,
             batch_sizes=self._args.batch.sizes or (),
             session_limit=self._args.sessions.limit,
             session_idle_s=self._args.sessions.idle_s,
-            version=json.dumps([self._args.policy, self._args.config], sort_keys=True),
+            version=self._args.policy,
             check=partial(require_fit, self._args.dialects),
         )
-        self._load = LoadMeter(self._engine.queue)
+        self._meter = LoadMeter(self._engine.queue)
         self._metrics = Exporter(self._engine, _tags(self._args.policy))
         self._metrics.start()
         self._peers = Peers()
@@ -85,6 +92,25 @@ class PolicyReplica:
         for door in (self._local, self._plasma, self._stream):
             if door is not None:
                 door.open()
+        self._loading: asyncio.Future[None] = asyncio.get_running_loop().create_future()  # until `reconfigure`
+        self._configured = False
+
+    async def reconfigure(self, settings: dict[str, Any] | None, rank: Any) -> None:
+        """Called by Serve with the file's `user_config`: before the replica is ready, and when that changes.
+
+        What it raises the first time keeps the replica from starting. Later ones return at once, and raise nothing,
+        as that would end the replica: what came of the swap is in the metadata and the log. `rank` is not used;
+        who asks for it is called without a `user_config`, too.
+        """
+        config = {**self._args.config, **(settings or {})}
+        if self._configured:
+            logger.info("new settings, to be loaded beside the present ones: %s", config)
+        self._engine.models.configure(config)
+        if not self._configured:
+            self._configured = True
+            await self._load()
+
+    async def _load(self) -> None:
         self._loading = asyncio.ensure_future(asyncio.to_thread(self._engine.start))
         if await asyncio.to_thread(_others_run):
             await self._loading
@@ -112,11 +138,12 @@ class PolicyReplica:
 
     def metadata(self) -> dict[str, Any]:
         """What `GET /v1/metadata` and `RemoteAgent.metadata` say."""
-        contract = self._engine.contract
+        contract, models = self._engine.contract, self._engine.models
         return {
             "policy": self._args.policy,
-            "checkpoint": self._args.config.get("checkpoint"),
-            "config": self._args.config,
+            "checkpoint": resolved(models.config),
+            "checkpoints": models.describe(),
+            "config": models.config,
             "contract": None if contract is None else contract.to_json(),
             "protocol": PROTOCOL_VERSION,
             "version": importlib.metadata.version("vlagents-ray"),
@@ -217,7 +244,7 @@ class PolicyReplica:
 
     def record_autoscaling_stats(self) -> dict[str, float]:
         """Called by Serve at regular times: the load since the last time, for `MeasuredLoad`."""
-        load = self._load.read()
+        load = self._meter.read()
         return {
             UTILISATION: load.utilisation,
             WAITING: load.waiting / self._args.batch.max_size,
