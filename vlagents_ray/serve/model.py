@@ -28,6 +28,7 @@ class Model:
 
     wish: Wish  # by which it was asked for first
     settings: dict[str, Any]
+    key: str  # `key_of` them
     agent: Agent
     contract: Contract | None
     copies: AgentCopies
@@ -36,11 +37,6 @@ class Model:
     since: float = field(default_factory=time.monotonic)
     sessions: int = 0  # that have an episode on it, or are about to
     busy: threading.Lock = field(default_factory=threading.Lock)  # held while its agent runs, or is closed
-
-    @property
-    def key(self) -> str:
-        """See `key_of`."""
-        return key_of(self.settings)
 
     @property
     def checkpoint(self) -> str | None:
@@ -90,7 +86,8 @@ class Loader:
             _give_back(agent)
             raise
         padding = Padding(self._batch_sizes, copies.make)
-        return Model(wish, settings, agent, contract, copies, padding, (self.version(settings), copies.fingerprint))
+        version = (self.version(settings), copies.fingerprint)
+        return Model(wish, settings, key_of(settings), agent, contract, copies, padding, version)
 
     def version(self, settings: Mapping[str, Any]) -> str:
         """Of the policy with these settings."""

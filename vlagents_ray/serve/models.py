@@ -64,7 +64,7 @@ class Models:
         self._failure: str | None = None  # of the last swap
         self._loaded: dict[str, Model] = {}  # by the settings' keys; the least recently used first
         self._waiting: list[_Waiter] = []  # in order of arrival
-        self._shut: Model | None = None  # begins no further episode, to make room
+        self._shut = ""  # the key of one that begins no further episode, to make room
         self._begun = self._closed = False
         self._changed = threading.Condition()
         self._thread = threading.Thread(target=self._loop, name="checkpoints", daemon=True)
@@ -133,7 +133,7 @@ class Models:
         with self._changed:
             self._let_go(session)
             model = self._loaded.get(self._key(wish))
-            if model is not None and model is not self._shut and not session.over:
+            if model is not None and model.key != self._shut and not session.over:
                 return self._give(session, model)
             self._waiting.append(_Waiter(session, wish, then, gone))
             self._changed.notify_all()
@@ -208,21 +208,26 @@ class Models:
     def _next_work(self) -> Callable[[], None] | None:
         with self._changed:
             while not self._closed:
-                work = self._plan()
-                if told := self._settle():
+                self._swap()
+                if told := self._settle():  # first, lest what was just loaded makes room for the next
                     return partial(_tell, told)
-                if work is not None:
+                shut = self._shut
+                if (work := self._plan()) is not None:
                     return work
-                self._changed.wait(_LOOK_S if self._waiting else None)
+                if self._shut == shut:
+                    self._changed.wait(_LOOK_S if self._waiting else None)
         return None
 
-    def _plan(self) -> Callable[[], None] | None:
-        """What is to be done next, if anything."""
-        self._shut = None
+    def _swap(self) -> None:
+        """To the settings wanted, once what they name is loaded."""
         if self._next is not None and (model := self._loaded.get(key_of(self._next))) is not None:
             self.config, self._next = self._next, None
             self._own(model)
             logger.info("new episodes begin with %s", model.checkpoint)
+
+    def _plan(self) -> Callable[[], None] | None:
+        """What is to be done next, if anything."""
+        self._shut = ""
         idle = [model for model in self._loaded.values() if not model.sessions]
         for model in idle:
             if not self._source.offers(model.wish, model.settings, self.config):
@@ -235,10 +240,11 @@ class Models:
             return partial(self._load, wish, settings)
         if idle:  # while a swap loads, new episodes still begin with the old one, so that one goes last
             last = None if self._next is None else self.config
-            return partial(self._unload, min(idle, key=lambda model: model.settings == last).key)
+            self._shut = min(idle, key=lambda model: model.settings == last).key
+            return partial(self._unload, self._shut)
         oldest = min(self._loaded.values(), key=lambda model: model.since)
         if time.monotonic() - since > PATIENCE_S:
-            self._shut = oldest
+            self._shut = oldest.key
         if self._next is not None and self._source.limit == 1:
             return partial(self._make_way, oldest.key)
         return None
@@ -263,7 +269,7 @@ class Models:
                 error = UnknownSession(f"session {waiter.session.id!r}: closed while it waited for {waiter.wish}")
             elif waiter.gone():
                 error = DeadlineExceeded(f"{waiter.wish} was not loaded in time; ask again, or allow more time")
-            elif model is None or model is self._shut:
+            elif model is None or model.key == self._shut:
                 continue
             else:
                 self._give(waiter.session, model)
