@@ -17,6 +17,7 @@ from ray.serve.schema import ServeDeploySchema
 from tests.integration.test_sessions import TRANSPORTS, url
 from vlagents_ray import ConfigError, Obs, PolicyFailed, RemoteAgent
 from vlagents_ray.errors import InvalidInput
+from vlagents_ray.evaluate import EvalConfig, evaluate
 from vlagents_ray.serve.cluster import Server, running_server
 from vlagents_ray.serve.files import deployment
 
@@ -32,15 +33,13 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def deployed(folder: Path, user_config: dict[str, Any] | None = None, replicas: int = 1) -> ServeDeploySchema:
-    """As a file says it, with what may change beside `args`."""
+def deployed(folder: Path, **beside: Any) -> ServeDeploySchema:
+    """As a file says it, with what may change while it runs beside `args`."""
     config = {"checkpoint": str(folder / "{step}"), "checkpoint_step": 1}
     checkpoints = {"choices": {"late": {"checkpoint": str(folder / "9")}}, "steps": True, "loaded": 2}
-    document = deployment(POLICY, config=config, checkpoints=checkpoints, replicas=replicas).model_dump(
-        exclude_unset=True
-    )
-    if user_config is not None:
-        document["applications"][0]["deployments"] = [{"name": "Policy", "user_config": user_config}]
+    document = deployment(POLICY, config=config, checkpoints=checkpoints).model_dump(exclude_unset=True)
+    if beside:
+        document["applications"][0]["deployments"] = [{"name": "Policy", **beside}]
     return ServeDeploySchema(**document)
 
 
@@ -56,7 +55,7 @@ def redeploy(folder: Path, replicas: int = 1, **user_config: Any) -> None:
 
     client = _get_global_client()
     assert client is not None
-    client.deploy_apps(deployed(folder, user_config, replicas))
+    client.deploy_apps(deployed(folder, num_replicas=replicas, user_config=user_config))
 
 
 def metadata(server: Server) -> dict[str, Any]:
@@ -79,11 +78,17 @@ def fresh(server: Server, folder: Path) -> Server:
     return server
 
 
+def told(agent: RemoteAgent) -> list[float]:
+    """The number that its checkpoint acts by, and of the act."""
+    act = agent.act(Obs())
+    return [float(act.action[0]), act.info["step"]]
+
+
 class Robot:
     """Plays episodes of its own on a thread, and keeps what it got: (checkpoint of the reset, act's number, step)."""
 
     def __init__(self, agent: RemoteAgent, episode: int = 20, **options: Any) -> None:
-        self.rows: list[tuple[str, float, float]] = []
+        self.rows: list[tuple[str, float, int]] = []
         self.resumed = 0
         self.failure: BaseException | None = None
         self._agent, self._episode, self._options = agent, episode, options
@@ -98,11 +103,11 @@ class Robot:
                 for _ in range(self._episode):
                     act = self._agent.act(Obs())
                     self.resumed += bool(act.info.get("resumed"))
-                    self.rows.append((name, float(act.action[0]), float(act.action[1])))
+                    self.rows.append((name, float(act.action[0]), act.info["step"]))
         except BaseException as failure:  # noqa: BLE001 - told by `end`
             self.failure = failure
 
-    def end(self) -> list[tuple[str, float, float]]:
+    def end(self) -> list[tuple[str, float, int]]:
         """Stop after the episode; raises what went wrong."""
         self._stop.set()
         self._thread.join(60)
@@ -122,18 +127,18 @@ def test_sessions_of_two_checkpoints_side_by_side(fresh: Server, folder: Path, t
         assert early.reset(Obs(), "x")["checkpoint"] == str(folder / "1")
         assert late.reset(Obs(), "x", checkpoint="late", seed=3)["options"] == {"seed": 3}
         for step in range(1, 50):
-            assert early.act(Obs()).action.tolist() == [1, step]
-            assert late.act(Obs()).action.tolist() == [9, step]
+            assert told(early) == [1, step]
+            assert told(late) == [9, step]
         assert early.reset(Obs(), "x", checkpoint_step=9)["checkpoint"] == str(folder / "9")
-        assert early.act(Obs()).action.tolist() == [9, 1]
+        assert told(early) == [9, 1]
 
 
 def test_metadata_says_what_may_be_chosen_and_what_is_loaded(fresh: Server, folder: Path) -> None:
     with RemoteAgent(fresh.url) as agent:
         agent.reset(Obs(), "x", checkpoint="late")
-        told = metadata(fresh)["checkpoints"]
-    assert (told["choices"], told["steps"], told["limit"]) == ({"late": str(folder / "9")}, True, 2)
-    assert str(folder / "9") in told["loaded"]
+        said = metadata(fresh)["checkpoints"]
+    assert (said["choices"], said["steps"], said["limit"]) == ({"late": str(folder / "9")}, True, 2)
+    assert str(folder / "9") in said["loaded"]
 
 
 def test_what_is_not_offered_is_a_400_and_what_does_not_load_says_why(fresh: Server) -> None:
@@ -149,7 +154,7 @@ def test_what_is_not_offered_is_a_400_and_what_does_not_load_says_why(fresh: Ser
         with pytest.raises(PolicyFailed, match="checkpoint step 77 did not load: FileNotFoundError"):
             agent.reset(Obs(), "x", checkpoint_step=77)
         agent.reset(Obs(), "x")
-        assert agent.act(Obs()).action.tolist() == [1, 1]
+        assert told(agent) == [1, 1]
 
 
 def test_a_slow_load_keeps_nobody_waiting_and_the_least_recently_used_goes(fresh: Server, folder: Path) -> None:
@@ -186,7 +191,7 @@ def test_a_redeploy_swaps_under_load_without_a_failed_step(fresh: Server, folder
     for robot in robots:
         rows = robot.end()
         assert {row[:2] for row in rows} == {("1", 1.0), ("2", 2.0)}
-        assert [row[2] for row in rows] == [float(i % 20 + 1) for i in range(len(rows))]
+        assert [row[2] for row in rows] == [i % 20 + 1 for i in range(len(rows))]
         assert robot.resumed == 0
     wait_for((folder / "1.closed").exists, 30)
     assert _pid(fresh) == pid
@@ -215,12 +220,35 @@ def test_any_other_setting_is_swapped_too(fresh: Server, folder: Path) -> None:
     wait_for(lambda: metadata(fresh)["config"].get("scale") == 10.0, 60)
     with RemoteAgent(fresh.url) as agent:
         agent.reset(Obs(), "x")
-        assert agent.act(Obs()).action.tolist() == [10, 1]
+        assert told(agent) == [10, 1]
 
 
-def test_new_replicas_begin_with_what_was_swapped_to(fresh: Server, folder: Path) -> None:
-    redeploy(folder, checkpoint_step=4)
-    wait_for(lambda: own(fresh, folder) == "4", 60)
+def test_every_replica_swaps_and_new_ones_begin_with_what_was_swapped_to(fresh: Server, folder: Path) -> None:
+    redeploy(folder, replicas=2, checkpoint_step=4)
+
+    def numbers() -> dict[int, set[float]]:
+        """What each replica's sessions act by."""
+        found: dict[int, set[float]] = {}
+        for _ in range(8):
+            with RemoteAgent("serve://Stored", transport="handle") as agent:
+                pid = agent.reset(Obs(), "x")["pid"]
+                found.setdefault(pid, set()).add(float(agent.act(Obs()).action[0]))
+        return found
+
+    wait_for(lambda: len(numbers()) == 2, 60)
+    wait_for(lambda: list(numbers().values()) == [{4.0}] * 2, 60)
+    redeploy(folder, replicas=2, checkpoint_step=5)
+    wait_for(lambda: list(numbers().values()) == [{5.0}] * 2, 60)
+
+
+def test_an_evaluation_says_by_which_checkpoint(fresh: Server, folder: Path, tmp_path: Path) -> None:
+    config = EvalConfig(
+        envs=["eval_fakes:Line"], policy_url=fresh.url, policy_options={"checkpoint_step": 3}, episodes=2,
+        out=tmp_path / "results", video="none",
+    )  # fmt: skip
+    summary = evaluate(config)
+    assert summary.checkpoint == str(folder / "3")
+    assert (summary.total.episodes, summary.total.policy_errors) == (2, 0)
 
 
 def test_a_file_that_cannot_be_is_refused_before_anything_starts(folder: Path) -> None:

@@ -180,7 +180,7 @@ class Mirror(Agent):
 
 
 class Stored(Agent):
-    """Its checkpoint is a file with a number, which its actions tell, beside the act's. Loads while there is no
+    """Its checkpoint is a file with a number, which its actions tell. Loads while there is no
     file "….held" beside it, and leaves "….begun" and "….closed"."""
 
     def __init__(self, checkpoint: str, checkpoint_step: int | None = None, scale: float = 1.0) -> None:
@@ -199,7 +199,7 @@ class Stored(Agent):
 
     def act(self, obs: Obs) -> Act:
         self.steps += 1
-        return Act(np.array([self.number, self.steps], np.float32), info={"pid": os.getpid()})
+        return Act(np.array([self.number], np.float32), info={"step": self.steps})
 
     def close(self) -> None:
         Path(f"{self.path}.closed").touch()

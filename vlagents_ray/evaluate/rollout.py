@@ -144,6 +144,7 @@ class Rollout:
                     job.key,
                     execute=self._config.execute,
                     reset_options=self._config.reset_options,
+                    policy_options=self._config.policy_options,
                     watch=self._watch,
                     record=recorder.add if self._config.video != "none" else lambda _obs: None,
                 )

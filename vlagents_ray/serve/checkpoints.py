@@ -70,6 +70,10 @@ class Checkpoints:
         chosen = {} if wish.choice is None else self._choices[wish.choice]
         return {**config, **chosen, **({} if wish.step is None else {STEP: wish.step})}
 
+    def examples(self) -> list[Wish]:
+        """The deployment's own, every choice, and a step if those can be chosen."""
+        return [OWN, *map(Wish, self._choices), *([Wish(step=0)] if self._steps else [])]
+
     def describe(self, config: Mapping[str, Any]) -> dict[str, Any]:
         """What there is to choose, for the metadata."""
         choices = {name: resolved(self.settings(Wish(name), config)) for name in self._choices}

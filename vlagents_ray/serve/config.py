@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from vlagents_ray.interface import Agent
 from vlagents_ray.serve.auth import Keys, load_keys
+from vlagents_ray.serve.checkpoints import Checkpoints
 from vlagents_ray.serve.dialects.config import DialectArgs
 from vlagents_ray.wire.messages import DEFAULT_LIMITS, Limits
 
@@ -54,6 +57,10 @@ class CheckpointArgs(_Closed):
     )
     steps: bool = Field(default=False, description="any step of a checkpoint whose path holds {step}")
     loaded: int = Field(default=2, ge=1, description="checkpoints in the memory of one replica at once, at most")
+
+    def of(self, make: Callable[[Mapping[str, Any]], Agent], config: Mapping[str, Any]) -> Checkpoints:
+        """Those of the policy that `make` makes, whose own settings are `config`."""
+        return Checkpoints(make, config, self.choices, steps=self.steps, loaded=self.loaded)
 
 
 class SessionArgs(_Closed):

@@ -22,7 +22,7 @@ from vlagents_ray.serve.auth import Caller, require_access
 from vlagents_ray.serve.autoscaling import SESSIONS, UTILISATION, WAITING
 from vlagents_ray.serve.balance import Balance
 from vlagents_ray.serve.calls import Sender
-from vlagents_ray.serve.checkpoints import Checkpoints, resolved
+from vlagents_ray.serve.checkpoints import resolved
 from vlagents_ray.serve.config import ServerArgs
 from vlagents_ray.serve.dialects.door import House
 from vlagents_ray.serve.dialects.routes import describe, dialect_routes, require_fit
@@ -59,17 +59,9 @@ class PolicyReplica:
         self._app = serve.get_replica_context().app_name
         self._keys = self._args.access.keys()
         require_access(_http().host or EVERYWHERE, self._keys, self._args.access.insecure)
-        offered = self._args.checkpoints
-        checkpoints = Checkpoints(
-            policy_class(self._args.policy).from_config,
-            self._args.config,
-            offered.choices,
-            steps=offered.steps,
-            loaded=offered.loaded,
-        )
         self._limits = self._args.limits.limits()
         self._engine = Engine(
-            checkpoints,
+            self._args.checkpoints.of(policy_class(self._args.policy).from_config, self._args.config),
             max_batch_size=self._args.batch.max_size,
             patience=self._args.batch.patience,
             batch_sizes=self._args.batch.sizes or (),

@@ -8,12 +8,12 @@ from typing import Any
 
 import yaml
 from pydantic import ValidationError
-from ray.serve.schema import ServeDeploySchema
+from ray.serve.schema import ServeApplicationSchema, ServeDeploySchema
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Agent
 from vlagents_ray.registry import names, policy_class, require
-from vlagents_ray.serve.config import ServerArgs
+from vlagents_ray.serve.config import POLICY, ServerArgs
 from vlagents_ray.serve.dialects.routes import require_fit
 
 IMPORT_PATH = "vlagents_ray.serve.app:build"
@@ -71,6 +71,12 @@ def listens_at(config: ServeDeploySchema) -> tuple[str, int]:
     return http.host if "host" in stated else DEFAULT_HOST, http.port if "port" in stated else DEFAULT_PORT
 
 
+def own_settings(app: ServeApplicationSchema) -> dict[str, Any]:
+    """The policy's settings: `config`, and what stands beside `args` because it may change while the policy runs."""
+    beside = [one.user_config for one in app.deployments if one.name == POLICY and isinstance(one.user_config, dict)]
+    return {**app.args.get("config", {}), **(beside[0] if beside else {})}
+
+
 def _ours(config: ServeDeploySchema) -> list[Any]:
     return [app for app in config.applications if app.import_path == IMPORT_PATH]
 
@@ -88,7 +94,10 @@ def _checked(document: object, source: str) -> ServeDeploySchema:
             args = ServerArgs(**app.args)
             cls = policy_class(args.policy)
             if not (app.runtime_env or {}):
-                _require_fit(args, cls.from_config(args.config))
+                own = own_settings(app)
+                offered = args.checkpoints.of(cls.from_config, own)
+                for wish in offered.examples():
+                    _require_fit(args, offered.make(offered.settings(wish, own)))
                 if args.dialects.gr00t is not None:
                     require("zmq")
     except ValidationError as error:
