@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from eval_fakes import wait_for
+from in_process import Replicas
 from numbered import Library, act, ask, begin, reset
 
 from vlagents_ray import Obs
@@ -21,7 +22,7 @@ from vlagents_ray.errors import (
     UnknownSession,
 )
 from vlagents_ray.serve import models
-from vlagents_ray.serve.checkpoints import Wish
+from vlagents_ray.serve.checkpoints import Checkpoints, Wish
 from vlagents_ray.serve.engine import Engine
 from vlagents_ray.serve.moving import export
 from vlagents_ray.wire.messages import Reply, Request
@@ -261,6 +262,19 @@ def test_a_session_that_moves_takes_its_checkpoint_along(serving: Callable[..., 
     assert act(there, "s") == [2, 2]
     assert library.loads["b/2"] == 2
     wait_for(lambda: not any(model.sessions for model in here.models._loaded.values()))
+
+
+def test_a_session_goes_on_by_its_checkpoint_where_its_replica_sends_it(library: Library) -> None:
+    offered = [Checkpoints(library.make, {"checkpoint": "a/1"}, {"b": {"checkpoint": "b/2"}}) for _ in range(2)]
+    replicas = Replicas(offered)
+    with replicas.agent() as agent:
+        agent.reset(Obs(), "x", checkpoint="b")
+        replicas.engines[0].draining = True
+        acts = [agent.act(Obs()) for _ in range(5)]
+        assert [act.action.tolist() for act in acts] == [[2, step] for step in range(1, 6)]
+        assert not any("resumed" in act.info for act in acts)
+        assert [len(engine.sessions) for engine in replicas.engines] == [0, 1]
+    replicas.close()
 
 
 def test_a_session_of_what_is_not_offered_here_does_not_move_here(serving: Callable[..., Engine]) -> None:

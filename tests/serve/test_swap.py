@@ -161,3 +161,25 @@ def test_replicas_with_different_settings_have_different_versions(library: Libra
     assert here.version == there.version
     here.close()
     there.close()
+
+
+def test_a_swap_without_room_takes_that_of_a_choice(library: Library) -> None:
+    engine = library.engine(choices=["c/3"])
+    try:
+        reset(engine, "own")
+        reset(engine, "chosen", checkpoint="c")
+        gate = library.hold("b/2")
+        swap(engine, "b/2")
+        wait_for(lambda: engine.models._shut != "")
+        again = begin(engine, "chosen", checkpoint="c")  # its last episode is over: the room goes to the swap
+        library.wait_for("b/2")
+        assert reset(engine, "another") == "a/1"
+        gate.set()
+        wait_for(lambda: state(engine) is None)
+        for session in ("own", "another"):  # the last that kept the old one in memory
+            ask(engine, session, "close").get(timeout=10)
+        assert reset(engine, "own") == "b/2"
+        assert again.get(timeout=10).error is None
+        assert act(engine, "chosen") == [3, 1]
+    finally:
+        engine.close()

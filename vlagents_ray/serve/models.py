@@ -238,11 +238,11 @@ class Models:
         wish, settings, since = wanted
         if len(self._loaded) < self._source.limit:
             return partial(self._load, wish, settings)
-        if idle:  # while a swap loads, new episodes still begin with the old one, so that one goes last
-            last = None if self._next is None else self.config
-            self._shut = min(idle, key=lambda model: model.settings == last).key
+        old = None if self._next is None else self.config  # with which episodes begin while a swap loads: it goes last
+        if idle:
+            self._shut = min(idle, key=lambda model: model.settings == old).key
             return partial(self._unload, self._shut)
-        oldest = min(self._loaded.values(), key=lambda model: model.since)
+        oldest = min(self._loaded.values(), key=lambda model: (model.settings == old, model.since))
         if time.monotonic() - since > PATIENCE_S:
             self._shut = oldest.key
         if self._next is not None and self._source.limit == 1:

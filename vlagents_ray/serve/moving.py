@@ -20,7 +20,7 @@ from vlagents_ray.wire.messages import Reply, Request
 
 logger = logging.getLogger(__name__)
 
-_THREADS = 4
+_THREADS = 16  # each for one search, and for as long as a checkpoint takes to load
 _PENDING = 256  # searches under way; whoever asks beyond that is told at once that the session is unknown
 _EXPORT_S = 10.0
 _ON_ITS_WAY_S = 0.1
