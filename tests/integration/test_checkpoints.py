@@ -15,8 +15,8 @@ from eval_fakes import wait_for
 from ray.serve.schema import ServeDeploySchema
 
 from tests.integration.test_sessions import TRANSPORTS, url
-from vlagents_ray import ConfigError, Obs, PolicyFailed, RemoteAgent
-from vlagents_ray.errors import InvalidInput
+from vlagents_ray import ConfigError, Obs, RemoteAgent
+from vlagents_ray.errors import CheckpointFailed, UnknownCheckpoint
 from vlagents_ray.evaluate import EvalConfig, evaluate
 from vlagents_ray.serve.cluster import Server, running_server
 from vlagents_ray.serve.files import deployment
@@ -146,12 +146,12 @@ def test_what_is_not_offered_is_a_400_and_what_does_not_load_says_why(fresh: Ser
     body = json.dumps({"instruction": "push", "kwargs": {"checkpoint": "/etc/passwd"}})
     connection.request("POST", "/v1/reset", body, {"x-session-id": "bare", "content-type": "application/json"})
     answer = connection.getresponse()
-    assert (answer.status, json.loads(answer.read())["code"]) == (400, "invalid_input")
+    assert (answer.status, json.loads(answer.read())["code"]) == (400, "unknown_checkpoint")
     connection.close()
     with RemoteAgent(fresh.url) as agent:
-        with pytest.raises(InvalidInput, match="late"):
+        with pytest.raises(UnknownCheckpoint, match="late"):
             agent.reset(Obs(), "x", checkpoint="early")
-        with pytest.raises(PolicyFailed, match="checkpoint step 77 did not load: FileNotFoundError"):
+        with pytest.raises(CheckpointFailed, match="checkpoint step 77 did not load: FileNotFoundError"):
             agent.reset(Obs(), "x", checkpoint_step=77)
         agent.reset(Obs(), "x")
         assert told(agent) == [1, 1]
@@ -249,6 +249,10 @@ def test_an_evaluation_says_by_which_checkpoint(fresh: Server, folder: Path, tmp
     summary = evaluate(config)
     assert summary.checkpoint == str(folder / "3")
     assert (summary.total.episodes, summary.total.policy_errors) == (2, 0)
+    for option, error in (({"checkpoint_step": 77}, CheckpointFailed), ({"checkpoint": "lat"}, UnknownCheckpoint)):
+        out = tmp_path / error.__name__
+        with pytest.raises(error):  # no episode is lost to it, and none counts as a failure of the policy
+            evaluate(config.model_copy(update={"policy_options": option, "out": out}))
 
 
 def test_a_file_that_cannot_be_is_refused_before_anything_starts(folder: Path) -> None:

@@ -14,11 +14,12 @@ from numbered import Library, act, ask, begin, reset
 
 from vlagents_ray import Obs
 from vlagents_ray.errors import (
+    CheckpointFailed,
     DeadlineExceeded,
-    InvalidInput,
     InvalidObservation,
     PolicyFailed,
     PolicyUnavailable,
+    UnknownCheckpoint,
     UnknownSession,
 )
 from vlagents_ray.serve import models
@@ -92,7 +93,7 @@ def test_what_is_not_offered_is_refused_with_what_is(
     serving: Callable[..., Engine], offer: dict[str, Any], options: dict[str, Any], says: str
 ) -> None:
     engine = serving(**offer)
-    with pytest.raises(InvalidInput, match=says):
+    with pytest.raises(UnknownCheckpoint, match=says):
         begin(engine, "s", **options)
     assert engine.sessions.ids() == []
 
@@ -129,7 +130,7 @@ def test_what_does_not_load_says_why_and_is_tried_again(serving: Callable[..., E
     engine = serving(choices=["broken"])
     reset(engine, "own")
     for tried in (1, 2):
-        with pytest.raises(PolicyFailed, match=r"checkpoint 'b' did not load: FileNotFoundError: no such checkpoint"):
+        with pytest.raises(CheckpointFailed, match="checkpoint 'b' did not load: FileNotFoundError: no such"):
             reset(engine, "chosen", checkpoint="b")
         assert library.loads["broken"] == tried
     assert act(engine, "own") == [1, 1]

@@ -12,7 +12,7 @@ import numpy as np
 
 from vlagents_ray.contract import check_action
 from vlagents_ray.envs import EvalEnv
-from vlagents_ray.errors import EnvFailed, PolicyFailed, VLAgentsError
+from vlagents_ray.errors import CheckpointFailed, EnvFailed, PolicyFailed, VLAgentsError
 from vlagents_ray.evaluate.jobs import EpisodeKey
 from vlagents_ray.interface import HIGH_RES, Act, Agent, Obs
 
@@ -79,7 +79,8 @@ def run_episode(
 
     A policy that raises or returns an unusable action ends its episode with status
     "policy_error". Whatever is not the policy's doing is raised: `EnvFailed` for the simulator,
-    `PolicyUnavailable`, `DeadlineExceeded` and the like for the way to the policy.
+    `PolicyUnavailable`, `DeadlineExceeded` and the like for the way to the policy, and
+    `CheckpointFailed`, as no episode was played by what did not load.
     """
     tally = _Tally()
     started = perf_counter()
@@ -96,6 +97,8 @@ def run_episode(
             watch=watch,
             record=record,
         )
+    except CheckpointFailed:
+        raise
     except PolicyFailed as failed:
         error = f"{failed.code}: {failed}"
         tally.ending = "error"

@@ -34,6 +34,7 @@ from vlagents_ray.errors import (
     PolicyFailed,
     PolicyUnavailable,
     UnknownApp,
+    UnknownCheckpoint,
     UnknownSession,
     VLAgentsError,
 )
@@ -223,6 +224,7 @@ _USER = (
     MissingState,
     PolicyFailed,
     UnknownApp,
+    UnknownCheckpoint,
 )
 _POLICY = (PolicyUnavailable, DeadlineExceeded, UnknownSession, NotReset)
 _WORKER = (EnvFailed, InvalidInput)  # InvalidInput left here: the env gave an observation nobody can use

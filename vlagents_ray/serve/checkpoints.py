@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from vlagents_ray.errors import InvalidInput
+from vlagents_ray.errors import UnknownCheckpoint
 from vlagents_ray.interface import Agent
 
 CHOICE, STEP = "checkpoint", "checkpoint_step"  # options of a reset, and settings of a policy
@@ -53,16 +53,16 @@ class Checkpoints:
         self._steps = steps
 
     def wish(self, options: Mapping[str, Any]) -> tuple[Wish, dict[str, Any]]:
-        """What a reset's options ask for, and those left for the policy; `InvalidInput` if there is no such."""
+        """What a reset's options ask for, and those left for the policy; `UnknownCheckpoint` if there is no such."""
         rest = dict(options)
         choice, step = rest.pop(CHOICE, None), rest.pop(STEP, None)
         if choice is not None and (not isinstance(choice, str) or choice not in self._choices):
-            raise InvalidInput(f"{CHOICE}: got {choice!r}, want {self._offered()}")
+            raise UnknownCheckpoint(f"{CHOICE}: got {choice!r}, want {self._offered()}")
         if step is not None:
             if not self._steps:
-                raise InvalidInput(f"{STEP}: got {step!r}; this deployment offers {self._offered()}")
+                raise UnknownCheckpoint(f"{STEP}: got {step!r}; this deployment offers {self._offered()}")
             if isinstance(step, bool) or not isinstance(step, int) or step < 0:
-                raise InvalidInput(f"{STEP}: got {step!r}, want a number of training steps, such as 20000")
+                raise UnknownCheckpoint(f"{STEP}: got {step!r}, want a number of training steps, such as 20000")
         return Wish(choice, step), rest
 
     def settings(self, wish: Wish, config: Mapping[str, Any]) -> dict[str, Any]:

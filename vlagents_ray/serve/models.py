@@ -23,7 +23,7 @@ from functools import partial
 from typing import Any
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import DeadlineExceeded, PolicyFailed, PolicyUnavailable, UnknownSession, VLAgentsError
+from vlagents_ray.errors import CheckpointFailed, DeadlineExceeded, PolicyUnavailable, UnknownSession, VLAgentsError
 from vlagents_ray.interface import Agent
 from vlagents_ray.serve.checkpoints import OWN, Checkpoints, Wish, resolved
 from vlagents_ray.serve.model import Loader, Model, free_memory, key_of
@@ -303,7 +303,7 @@ class Models:
             self._next, self._failure = None, failure  # the old one goes on
         failed = [w for w in self._waiting if self._source.settings(w.wish, self.config) == settings]
         self._waiting = [waiter for waiter in self._waiting if waiter not in failed]
-        return [(waiter.then, PolicyFailed(failure)) for waiter in failed]
+        return [(waiter.then, CheckpointFailed(failure)) for waiter in failed]
 
     def _unload(self, key: str) -> None:
         with self._changed:
