@@ -216,6 +216,7 @@ def test_a_session_that_is_closed_while_it_waits_is_not_opened_again(
     gate.set()
     assert isinstance(waiting.get(timeout=10).error, UnknownSession)
     assert engine.sessions.ids() == []
+    assert not any(model.sessions for model in engine.models._loaded.values())
 
 
 def test_an_episode_that_could_not_begin_keeps_no_checkpoint(serving: Callable[..., Engine]) -> None:

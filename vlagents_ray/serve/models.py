@@ -255,7 +255,7 @@ class Models:
             return OWN, self._next, float("-inf")
         for waiter in self._waiting:
             settings = self._source.settings(waiter.wish, self.config)
-            if key_of(settings) not in self._loaded and not (waiter.session.over or waiter.gone()):
+            if key_of(settings) not in self._loaded:
                 return waiter.wish, settings, waiter.since
         return None
 
