@@ -9,13 +9,15 @@
     │   │   └── MissingState     422
     │   ├── UnknownSession       404        expired, closed, or never reset
     │   ├── UnknownApp           404        no such application on this server
+    │   ├── UnknownCheckpoint    400        a reset asked for one that the deployment does not offer
     │   ├── NotReset             409        `act` before `reset`
     │   ├── ContractMismatch     409        robot or env and policy do not fit together
     │   ├── Unauthorized         401        no API key, or none that is valid (any more)
     │   └── Forbidden            403        a valid key, but not for this application
     ├── TooManyRequests          429        over the rate or the sessions of the API key
     ├── PolicyFailed             500        the policy raised, or returned an unusable action
-    │   └── InvalidAction        500
+    │   ├── InvalidAction        500
+    │   └── CheckpointFailed     500        the checkpoint that a reset asked for did not load
     ├── PolicyUnavailable        503        not ready yet, restarting, or full
     │   └── ConnectionLost       503        the connection broke; the request may have been executed
     ├── DeadlineExceeded         504        no answer in time (also TimeoutError)
@@ -101,6 +103,12 @@ class UnknownApp(InvalidInput):
     status = 404
 
 
+class UnknownCheckpoint(InvalidInput):
+    """A reset asked for a checkpoint that the deployment does not offer; the message lists what it does."""
+
+    code = "unknown_checkpoint"
+
+
 class NotReset(InvalidInput):
     """`act` was called before `reset` in this session."""
 
@@ -147,6 +155,12 @@ class InvalidAction(PolicyFailed):
     """The policy returned something that must not reach a robot: wrong shape, NaN, not an array."""
 
     code = "invalid_action"
+
+
+class CheckpointFailed(PolicyFailed):
+    """The checkpoint that a reset asked for did not load; others go on, and the next reset has it tried again."""
+
+    code = "checkpoint_failed"
 
 
 class PolicyUnavailable(VLAgentsError):

@@ -40,3 +40,8 @@ def test_a_fingerprint_ignores_order_and_nothing_else() -> None:
 def test_numbers_that_json_lacks_are_refused(value: Any) -> None:
     with pytest.raises(ValueError, match="Out of range"):
         canonical({"a": value})
+
+
+def test_what_is_set_episode_by_episode_is_no_option(config: Callable[..., EvalConfig]) -> None:
+    with pytest.raises(ValidationError, match=r"\['seed'\] are set episode by episode"):
+        config(policy_options={"seed": 3, "checkpoint_step": 20})

@@ -216,3 +216,16 @@ def test_two_runs_of_one_key_are_the_same_episode() -> None:
         return result.steps, result.episode_return, result.success_once, result.instruction
 
     assert outcome() == outcome()
+
+
+def test_the_policys_options_reach_its_reset_and_the_result_says_what_checkpoint_played() -> None:
+    class Named(Chunks):
+        def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+            super().reset(obs, instruction, **kwargs)
+            return {"checkpoint": f"runs/{kwargs['checkpoint_step']}"}
+
+    agent = Named(*[np.zeros(2)] * 6)
+    result = run_episode(Script(), agent, KEY, policy_options={"checkpoint_step": 20})
+    assert agent.began["checkpoint_step"] == 20
+    assert result.checkpoint == "runs/20"
+    assert run_episode(Script(), Chunks(*[np.zeros(2)] * 6), KEY).checkpoint is None

@@ -32,6 +32,7 @@ def test_a_plan_numbers_and_seeds_every_episode_of_every_env(config: Callable[..
     [
         {"policy": "other"},
         {"policy_config": {"speed": 2}},
+        {"policy_options": {"checkpoint_step": 2}},
         {"checkpoint": "step-100"},
         {"env_options": {"width": 128}},
         {"reset_options": {"layout": 1}},

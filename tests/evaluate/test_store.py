@@ -4,6 +4,7 @@ import sqlite3
 import sys
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from subprocess import PIPE, Popen
 
 import pytest
@@ -166,3 +167,14 @@ def test_a_killed_writer_loses_nothing_that_it_recorded(config: Config) -> None:
         finished = store.finished()
     assert set(told) <= finished
     assert len(finished) <= len(told) + 1
+
+
+def test_an_episode_of_another_checkpoint_is_not_added(config: Config) -> None:
+    first, second, third = plan(config(episodes=3))
+    with Store(config(episodes=3)) as store:
+        store.begin_run(config(episodes=3), {})
+        store.record(replace(done(first), checkpoint="runs/1"), attempts=1)
+        store.record(replace(done(second), checkpoint="runs/1"), attempts=1)
+        with pytest.raises(ConfigError, match=r"played by checkpoint 'runs/2'.* are of 'runs/1'"):
+            store.record(replace(done(third), checkpoint="runs/2"), attempts=1)
+        assert [row["checkpoint"] for row in store.rows("episodes")] == ["runs/1", "runs/1"]

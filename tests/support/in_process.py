@@ -12,6 +12,7 @@ from vlagents_ray.client.link import CodecChoice
 from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable, UnknownApp
 from vlagents_ray.interface import Agent
 from vlagents_ray.serve.calls import Sender
+from vlagents_ray.serve.checkpoints import Checkpoints
 from vlagents_ray.serve.engine import Engine
 from vlagents_ray.serve.moving import Strays, export
 from vlagents_ray.wire.frames import decode_replies, decode_requests, encode_replies, encode_requests
@@ -21,7 +22,7 @@ from vlagents_ray.wire.messages import PROTOCOL_VERSION, Reply, Request
 class Replicas:
     """Engines of one policy that know each other; requests go to the first that lives and does not stop."""
 
-    def __init__(self, agents: Sequence[Agent]) -> None:
+    def __init__(self, agents: Sequence[Agent | Checkpoints]) -> None:
         self.engines = [Engine(agent) for agent in agents]
         self.dead: set[int] = set()
         self.prefer = 0  # where new connections go, if that one lives and does not stop

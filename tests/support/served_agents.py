@@ -177,3 +177,29 @@ class Mirror(Agent):
         rows = np.tile(np.array(row, np.float32), (self.chunk, 1))
         rows[:, 4] = np.arange(self.chunk)
         return Act(rows)
+
+
+class Stored(Agent):
+    """Its checkpoint is a file with a number, which its actions tell. Loads while there is no
+    file "….held" beside it, and leaves "….begun" and "….closed"."""
+
+    def __init__(self, checkpoint: str, checkpoint_step: int | None = None, scale: float = 1.0) -> None:
+        self.path = checkpoint.replace("{step}", str(checkpoint_step))
+        self.scale = scale
+
+    def initialize(self) -> None:
+        Path(f"{self.path}.begun").touch()
+        while Path(f"{self.path}.held").exists():
+            time.sleep(0.02)
+        self.number = float(Path(self.path).read_text()) * self.scale
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
+        self.steps = 0
+        return {"pid": os.getpid(), "options": kwargs}
+
+    def act(self, obs: Obs) -> Act:
+        self.steps += 1
+        return Act(np.array([self.number], np.float32), info={"step": self.steps})
+
+    def close(self) -> None:
+        Path(f"{self.path}.closed").touch()

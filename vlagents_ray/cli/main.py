@@ -19,8 +19,9 @@ from vlagents_ray.cli.environments import env
 from vlagents_ray.cli.keys import keys as keys_app
 from vlagents_ray.cli.settings import parse_settings
 from vlagents_ray.errors import ConfigError, VLAgentsError
+from vlagents_ray.serve.checkpoints import resolved
 from vlagents_ray.serve.cluster import running_server
-from vlagents_ray.serve.files import listens_at, read_deployment, with_dialect
+from vlagents_ray.serve.files import listens_at, own_settings, read_deployment, with_dialect
 from vlagents_ray.serve.tls import Tls
 
 if TYPE_CHECKING:
@@ -101,6 +102,10 @@ def evaluate_command(
     env_set: Annotated[
         list[str], typer.Option("--env-set", metavar="KEY=VALUE", help="An option of the environments: width=256.")
     ] = [],  # noqa: B006
+    reset_set: Annotated[
+        list[str],
+        typer.Option("--reset-set", metavar="KEY=VALUE", help="An option of the policy's reset: checkpoint_step=9."),
+    ] = [],  # noqa: B006
     address: Address = None,
 ) -> None:
     """Evaluate a policy: episodes in parallel, success rates with confidence intervals, videos."""
@@ -109,6 +114,7 @@ def evaluate_command(
             "envs": envs, "episodes": episodes, "workers": workers, "seed": seed, "video": video, "out": out_dir,
             "resume": resume, "execute": execute, "retries": retries,
             "env_options": parse_settings(env_set, "--env-set"),
+            "policy_options": parse_settings(reset_set, "--reset-set"),
         }  # fmt: skip
         run_evaluation(policy, parse_settings(settings, "--set"), fields, address)
 
@@ -123,11 +129,11 @@ def run_evaluation(policy: str, settings: dict[str, Any], fields: dict[str, Any]
                 raise ConfigError(f"--set {sorted(settings)}: the server at {policy} has its settings already")
             config = EvalConfig(policy_url=policy, **_served(policy), **fields)
         else:
-            deployed, args = _single_application(policy, settings)
-            served = {"policy": args["policy"], "policy_config": args.get("config", {})}
-            checkpoint = served["policy_config"].get("checkpoint")
-            name = deployed.applications[0].name
-            config = EvalConfig(policy_url=f"serve://{name}", checkpoint=checkpoint, **served, **fields)
+            deployed = _single_application(policy, settings)
+            (app,) = deployed.applications
+            own = own_settings(app)
+            served = {"policy": app.args["policy"], "policy_config": own, "checkpoint": resolved(own)}
+            config = EvalConfig(policy_url=f"serve://{app.name}", **served, **fields)
             check(config)  # what is wrong is said before anything starts
             # Ray's CPUs are bookkeeping here: the number of workers that the user asked for must fit.
             cpus = max(os.cpu_count() or 1, math.ceil(config.workers * config.cpus_per_worker))
@@ -149,12 +155,12 @@ def _served(url: str) -> dict[str, Any]:
     return {"policy": said["policy"], "policy_config": said.get("config", {}), "checkpoint": said.get("checkpoint")}
 
 
-def _single_application(policy: str, settings: dict[str, Any]) -> tuple[ServeDeploySchema, dict[str, Any]]:
+def _single_application(policy: str, settings: dict[str, Any]) -> ServeDeploySchema:
     deployed = read_deployment(policy, {"config": settings} if settings else None)
     if len(deployed.applications) != 1:
         names = [one.name for one in deployed.applications]
         raise ConfigError(f"{policy}: holds {names}, want one application; serve it and give the URL of one of them")
-    return deployed, deployed.applications[0].args
+    return deployed
 
 
 @app.command()

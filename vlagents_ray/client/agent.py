@@ -141,6 +141,9 @@ class RemoteAgent(Agent):
     ) -> dict[str, Any]:
         """Begin an episode; `kwargs` reach the policy's `reset`.
 
+        `checkpoint` and `checkpoint_step` do not: they choose among what the server offers (`metadata["checkpoints"]`),
+        and the info that is returned says which it is.
+
         With `contract`, the robot's or env's side, the server compares it with the policy's first
         and raises `ContractMismatch` with every difference.
         """

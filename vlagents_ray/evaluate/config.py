@@ -38,7 +38,8 @@ class EvalConfig(BaseModel):
     reset_options: dict[str, JsonValue] = {}  # handed to every `reset` of every env
     policy: Name = "policy"  # its name, for the record
     policy_config: dict[str, JsonValue] = {}
-    checkpoint: str | None = None
+    policy_options: dict[str, JsonValue] = {}  # handed to every `reset` of the policy, e.g. {"checkpoint_step": 20000}
+    checkpoint: str | None = None  # the server's own; what each episode was played by stands in its result
     execute: PositiveInt | None = None  # rows executed of each action chunk; None = all
     seed: NonNegativeInt = 0  # episode i of an env uses seed + i
     # How images reach a policy over a network. JPEG changes them a little, so it has to be asked for; the others
@@ -77,6 +78,13 @@ class EvalConfig(BaseModel):
             raise ValueError(f"{repeated} named twice; name each env once and raise `episodes`")
         return envs
 
+    @field_validator("policy_options")
+    @classmethod
+    def _not_ours(cls, options: dict[str, JsonValue]) -> dict[str, JsonValue]:
+        if taken := sorted({"seed", "env", "contract"} & options.keys()):
+            raise ValueError(f"{taken} are set episode by episode; leave them out")
+        return options
+
     @model_validator(mode="after")
     def _options_are_mappings(self) -> Self:
         for env in self.envs:
@@ -100,6 +108,7 @@ def outcome_settings(config: EvalConfig, env: str) -> dict[str, Any]:
         "reset_options": config.reset_options,
         "policy": config.policy,
         "policy_config": config.policy_config,
+        "policy_options": config.policy_options,
         "checkpoint": config.checkpoint,
         "execute": config.execute,
         "codec": "jpeg" if config.codec == "jpeg" else "exact",

@@ -12,7 +12,7 @@ import numpy as np
 
 from vlagents_ray.contract import check_action
 from vlagents_ray.envs import EvalEnv
-from vlagents_ray.errors import EnvFailed, PolicyFailed, VLAgentsError
+from vlagents_ray.errors import CheckpointFailed, EnvFailed, PolicyFailed, VLAgentsError
 from vlagents_ray.evaluate.jobs import EpisodeKey
 from vlagents_ray.interface import HIGH_RES, Act, Agent, Obs
 
@@ -43,6 +43,7 @@ class EpisodeResult:
     policy_ms: float | None = None  # median of one act, transport included
     policy_p95_ms: float | None = None
     transport: str = "local"
+    checkpoint: str | None = None  # that the policy's reset named
 
 
 @dataclass(slots=True)
@@ -55,6 +56,7 @@ class _Tally:
     success_once: bool = False
     ending: Ending = "error"
     instruction: str = ""
+    checkpoint: str | None = None
     reset_ms: float | None = None
     step_ms: list[float] = field(default_factory=list)
     act_ms: list[float] = field(default_factory=list)
@@ -67,20 +69,36 @@ def run_episode(
     *,
     execute: int | None = None,
     reset_options: Mapping[str, Any] | None = None,
+    policy_options: Mapping[str, Any] | None = None,
     watch: Watch = lambda _phase, _steps: None,
     record: Record = lambda _obs: None,
 ) -> EpisodeResult:
     """Play the episode `key`; of each action chunk execute the first `execute` rows, open loop.
 
+    `reset_options` are the env's, `policy_options` the policy's.
+
     A policy that raises or returns an unusable action ends its episode with status
     "policy_error". Whatever is not the policy's doing is raised: `EnvFailed` for the simulator,
-    `PolicyUnavailable`, `DeadlineExceeded` and the like for the way to the policy.
+    `PolicyUnavailable`, `DeadlineExceeded` and the like for the way to the policy, and
+    `CheckpointFailed`, as no episode was played by what did not load.
     """
     tally = _Tally()
     started = perf_counter()
     error: str | None = None
     try:
-        _play(env, agent, key, tally, execute=execute, reset_options=reset_options, watch=watch, record=record)
+        _play(
+            env,
+            agent,
+            key,
+            tally,
+            execute=execute,
+            reset_options=reset_options,
+            policy_options=policy_options,
+            watch=watch,
+            record=record,
+        )
+    except CheckpointFailed:
+        raise
     except PolicyFailed as failed:
         error = f"{failed.code}: {failed}"
         tally.ending = "error"
@@ -101,6 +119,7 @@ def run_episode(
         policy_ms=_quantile(tally.act_ms, 0.5),
         policy_p95_ms=_quantile(tally.act_ms, 0.95),
         transport=str(getattr(agent, "transport", "local")),
+        checkpoint=tally.checkpoint,
     )
 
 
@@ -112,6 +131,7 @@ def _play(
     *,
     execute: int | None,
     reset_options: Mapping[str, Any] | None,
+    policy_options: Mapping[str, Any] | None,
     watch: Watch,
     record: Record,
 ) -> None:
@@ -124,7 +144,9 @@ def _play(
     record(obs)
     watch("policy reset", 0)
     with policy_side("reset"):
-        agent.reset(_for_policy(obs), tally.instruction, **_reset_arguments(env, agent, key))
+        info = agent.reset(_for_policy(obs), tally.instruction, **(policy_options or {}), **_given(env, agent, key))
+    named = info.get("checkpoint") if isinstance(info, dict) else None
+    tally.checkpoint = named if isinstance(named, str) else None
     contract = env.contract
     while True:
         watch("policy act", tally.steps)
@@ -179,7 +201,7 @@ def is_remote(agent: Agent) -> bool:
     return hasattr(agent, "metadata")
 
 
-def _reset_arguments(env: EvalEnv, agent: Agent, key: EpisodeKey) -> dict[str, Any]:
+def _given(env: EvalEnv, agent: Agent, key: EpisodeKey) -> dict[str, Any]:
     arguments: dict[str, Any] = {"seed": key.seed, "env": key.env}
     if is_remote(agent):
         arguments["contract"] = env.contract.to_json()  # the server compares it too, and answers 409

@@ -34,6 +34,7 @@ from vlagents_ray.errors import (
     PolicyFailed,
     PolicyUnavailable,
     UnknownApp,
+    UnknownCheckpoint,
     UnknownSession,
     VLAgentsError,
 )
@@ -146,6 +147,7 @@ class Rollout:
                     job.key,
                     execute=self._config.execute,
                     reset_options=self._config.reset_options,
+                    policy_options=self._config.policy_options,
                     watch=self._watch,
                     record=recorder.add if self._config.video != "none" else lambda _obs: None,
                 )
@@ -224,6 +226,7 @@ _USER = (
     MissingState,
     PolicyFailed,
     UnknownApp,
+    UnknownCheckpoint,
 )
 _POLICY = (PolicyUnavailable, DeadlineExceeded, UnknownSession, NotReset)
 _WORKER = (EnvFailed, InvalidInput)  # InvalidInput left here: the env gave an observation nobody can use

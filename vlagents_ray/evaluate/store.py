@@ -24,7 +24,7 @@ from vlagents_ray.evaluate.rollout import Failure, Made
 
 FILE = "results.db"
 LOCK = "results.lock"
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
 IDENTITY = ("policy", "checkpoint")  # of the policy's metadata: what must not change between runs
 
 _SCHEMA = """
@@ -39,7 +39,7 @@ CREATE TABLE episodes (
     settings TEXT NOT NULL, status TEXT NOT NULL, success_once INTEGER, success_at_end INTEGER,
     steps INTEGER NOT NULL, episode_return REAL NOT NULL, ending TEXT NOT NULL, instruction TEXT NOT NULL,
     error TEXT, seconds REAL NOT NULL, reset_ms REAL, env_step_ms REAL, acts INTEGER NOT NULL,
-    policy_ms REAL, policy_p95_ms REAL, transport TEXT NOT NULL, videos TEXT NOT NULL,
+    policy_ms REAL, policy_p95_ms REAL, transport TEXT NOT NULL, checkpoint TEXT, videos TEXT NOT NULL,
     attempts INTEGER NOT NULL, run INTEGER NOT NULL REFERENCES runs, finished REAL NOT NULL
 );
 CREATE TABLE attempts (
@@ -97,7 +97,11 @@ class Store:
         return {key for (key,) in self._db.execute("SELECT key FROM episodes WHERE status != 'infra_failed'")}
 
     def record(self, result: EpisodeResult, attempts: int, videos: Sequence[str] = ()) -> None:
-        """Add an episode. One that infrastructure failed gives way; any other is there once and for all."""
+        """Add an episode. One that infrastructure failed gives way; any other is there once and for all.
+
+        `ConfigError` for one that another checkpoint played, as after a swap: a rate is that of one.
+        """
+        self._require_same_checkpoint(result)
         row = asdict(result)
         key = row.pop("key")
         row |= {
@@ -112,6 +116,14 @@ class Store:
             self._db.execute("DELETE FROM episodes WHERE key = ? AND status = 'infra_failed'", (row["key"],))
             columns, marks = ", ".join(row), ", ".join("?" * len(row))
             self._db.execute(f"INSERT INTO episodes ({columns}) VALUES ({marks})", tuple(row.values()))  # noqa: S608 (our own column names)
+
+    def _require_same_checkpoint(self, result: EpisodeResult) -> None:
+        row = self._db.execute("SELECT checkpoint FROM episodes WHERE checkpoint IS NOT NULL LIMIT 1").fetchone()
+        if row is not None and result.checkpoint not in (None, row[0]):
+            raise ConfigError(
+                f"policy: {result.key} was played by checkpoint {result.checkpoint!r}, the results in {self._out} "
+                f"are of {row[0]!r}; serve that one again, or choose another out folder"
+            )
 
     def record_attempt(self, job: Job, failure: Failure, *, retried: bool) -> None:
         """Note an attempt that infrastructure failed."""

@@ -68,6 +68,7 @@ class Summary:
     rollout_seconds: float  # from the first reset to the last step, of all runs together
     config: dict[str, Any]
     policy: dict[str, Any]  # what its server said of itself
+    checkpoint: str | None  # that the episodes were played by; None if no reset named one
     transports: tuple[str, ...]
     described: dict[str, Any] = field(default_factory=dict)  # env -> `EvalEnv.describe()`
     versions: dict[str, Any] = field(default_factory=dict)
@@ -94,6 +95,7 @@ class Summary:
             "rollout_steps_per_second": self.rollout_steps_per_second,
             "transports": list(self.transports),
             "policy": self.policy,
+            "checkpoint": self.checkpoint,
             "env_descriptions": self.described,
             "versions": self.versions,
             "config": self.config,
@@ -119,6 +121,7 @@ def summarize(store: Store, config: EvalConfig, versions: dict[str, Any], state:
         rollout_seconds=sum(_rollout_seconds(run, episodes) for run in runs),
         config=config.model_dump(mode="json"),
         policy=store.policy() or {},
+        checkpoint=next((row["checkpoint"] for row in episodes if row["checkpoint"] is not None), None),
         transports=tuple(sorted({row["transport"] for row in episodes if row["status"] != "infra_failed"})),
         described={row["env"]: json.loads(row["described"]) for row in envs if row["described"] is not None},
         versions=versions,

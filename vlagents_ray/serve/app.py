@@ -30,6 +30,7 @@ def build(args: ServerArgs) -> Application:
         "max_ongoing_requests": args.sessions.limit + 2 * args.batch.max_size,
         "graceful_shutdown_timeout_s": 20,
         "health_check_period_s": 1 if args.environment.process == "child" else 5,  # Serve wants three failures
+        "user_config": {},  # of `config`, what a file states beside `args`: it changes without a restart
         "ray_actor_options": {
             "num_cpus": args.resources.num_cpus,
             "num_gpus": args.resources.num_gpus,

@@ -94,7 +94,7 @@ class BatchQueue:
             if self._closed:
                 raise PolicyUnavailable("the replica is stopping; connect again")
             for ticket in tickets:
-                self._tally.count(len(self._waiting), ticket.arrived)
+                self._tally.count(len(self._waiting), ticket.loaded or ticket.arrived)
                 if self._returning.slow:
                     self._returning.came(ticket)
                 self._waiting.add(ticket)

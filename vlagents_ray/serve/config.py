@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from vlagents_ray.interface import Agent
 from vlagents_ray.serve.auth import Keys, load_keys
+from vlagents_ray.serve.checkpoints import Checkpoints
 from vlagents_ray.serve.dialects.config import DialectArgs
 from vlagents_ray.serve.environments.config import EnvironmentArgs
 from vlagents_ray.wire.messages import DEFAULT_LIMITS, Limits
@@ -45,6 +48,20 @@ class BatchArgs(_Closed):
             raise ValueError(f"max_size {self.max_size} is not the largest of sizes {self.sizes}; leave it out")
         self.max_size = self.sizes[-1]
         return self
+
+
+class CheckpointArgs(_Closed):
+    """Which checkpoints a session may choose for itself: `reset(..., checkpoint="late")`, `checkpoint_step=20000`."""
+
+    choices: dict[str, dict[str, Any]] = Field(
+        default_factory=dict, description="by name, the settings that take the place of those in `config`"
+    )
+    steps: bool = Field(default=False, description="any step of a checkpoint whose path holds {step}")
+    loaded: int = Field(default=2, ge=1, description="checkpoints in the memory of one replica at once, at most")
+
+    def of(self, make: Callable[[Mapping[str, Any]], Agent], config: Mapping[str, Any]) -> Checkpoints:
+        """Those of the policy that `make` makes, whose own settings are `config`."""
+        return Checkpoints(make, config, self.choices, steps=self.steps, loaded=self.loaded)
 
 
 class SessionArgs(_Closed):
@@ -174,6 +191,7 @@ class ServerArgs(_Closed):
         description="what changes the policy's observations, the first being the nearest to the robot: names, or "
         "{name: settings}",
     )
+    checkpoints: CheckpointArgs = CheckpointArgs()
     replicas: int | None = Field(default=None, ge=1, description="a fixed number; excludes `autoscaling`")
     autoscaling: AutoscalingArgs | None = None
     batch: BatchArgs = BatchArgs()

@@ -20,6 +20,7 @@ from vlagents_ray.serve.auth import Caller, require_access
 from vlagents_ray.serve.autoscaling import SESSIONS, UTILISATION, WAITING
 from vlagents_ray.serve.balance import Balance
 from vlagents_ray.serve.calls import Sender
+from vlagents_ray.serve.checkpoints import resolved
 from vlagents_ray.serve.config import ServerArgs
 from vlagents_ray.serve.dialects.door import House
 from vlagents_ray.serve.dialects.routes import describe, dialect_routes, require_fit
@@ -59,7 +60,7 @@ class PolicyReplica:
         require_access(_http().host or EVERYWHERE, self._keys, self._args.access.insecure)
         self._limits = self._args.limits.limits()
         self._engine = Engine(
-            make_agent(self._args),
+            self._args.checkpoints.of(partial(make_agent, self._args), self._args.config),
             max_batch_size=self._args.batch.max_size,
             patience=self._args.batch.patience,
             batch_sizes=self._args.batch.sizes or (),
@@ -68,7 +69,7 @@ class PolicyReplica:
             version=version_of(self._args),
             check=partial(require_fit, self._args.dialects),
         )
-        self._load = LoadMeter(self._engine.queue)
+        self._meter = LoadMeter(self._engine.queue)
         self._metrics = Exporter(self._engine, _tags(self._args.policy))
         self._metrics.start()
         self._peers = Peers()
@@ -82,6 +83,25 @@ class PolicyReplica:
         for door in (self._local, self._plasma, self._stream):
             if door is not None:
                 door.open()
+        self._loading: asyncio.Future[None] = asyncio.get_running_loop().create_future()  # until `reconfigure`
+        self._configured = False
+
+    async def reconfigure(self, settings: dict[str, Any] | None, rank: Any) -> None:
+        """Called by Serve with the file's `user_config`: before the replica is ready, and when that changes.
+
+        What it raises the first time keeps the replica from starting. Later ones return at once, and raise nothing,
+        as that would end the replica: what came of the swap is in the metadata and the log. `rank` is not used;
+        who asks for it is called without a `user_config`, too.
+        """
+        config = {**self._args.config, **(settings or {})}
+        if self._configured:
+            logger.info("new settings, to be loaded beside the present ones: %s", config)
+        self._engine.models.configure(config)
+        if not self._configured:
+            self._configured = True
+            await self._load()
+
+    async def _load(self) -> None:
         self._loading = asyncio.ensure_future(asyncio.to_thread(self._engine.start))
         if await asyncio.to_thread(_others_run):
             await self._loading
@@ -109,11 +129,12 @@ class PolicyReplica:
 
     def metadata(self) -> dict[str, Any]:
         """What `GET /v1/metadata` and `RemoteAgent.metadata` say."""
-        contract = self._engine.contract
+        contract, models = self._engine.contract, self._engine.models
         return {
             "policy": self._args.policy,
-            "checkpoint": self._args.config.get("checkpoint"),
-            "config": self._args.config,
+            "checkpoint": resolved(models.config),
+            "checkpoints": models.describe(),
+            "config": models.config,
             "contract": None if contract is None else contract.to_json(),
             "protocol": PROTOCOL_VERSION,
             "version": importlib.metadata.version("vlagents-ray"),
@@ -214,7 +235,7 @@ class PolicyReplica:
 
     def record_autoscaling_stats(self) -> dict[str, float]:
         """Called by Serve at regular times: the load since the last time, for `MeasuredLoad`."""
-        load = self._load.read()
+        load = self._meter.read()
         return {
             UTILISATION: load.utilisation,
             WAITING: load.waiting / self._args.batch.max_size,

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import yaml
 from pydantic import ValidationError
-from ray.serve.schema import ServeDeploySchema
+from ray.serve.schema import ServeApplicationSchema, ServeDeploySchema
 
 from vlagents_ray.errors import ConfigError, MissingDependency, UnknownPolicy
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.registry import names, policy_class, require
-from vlagents_ray.serve.config import ServerArgs
+from vlagents_ray.serve.config import POLICY, ServerArgs
 from vlagents_ray.serve.dialects.routes import require_fit
 from vlagents_ray.serve.environments.host import unloaded_contract
 from vlagents_ray.serve.environments.interpreter import check_policy, placed
@@ -73,6 +74,12 @@ def listens_at(config: ServeDeploySchema) -> tuple[str, int]:
     return http.host if "host" in stated else DEFAULT_HOST, http.port if "port" in stated else DEFAULT_PORT
 
 
+def own_settings(app: ServeApplicationSchema) -> dict[str, Any]:
+    """The policy's settings: `config`, and what stands beside `args` because it may change while the policy runs."""
+    beside = [one.user_config for one in app.deployments if one.name == POLICY and isinstance(one.user_config, dict)]
+    return {**app.args.get("config", {}), **(beside[0] if beside else {})}
+
+
 def _ours(config: ServeDeploySchema) -> list[Any]:
     return [app for app in config.applications if app.import_path == IMPORT_PATH]
 
@@ -90,17 +97,18 @@ def _checked(document: object, source: str) -> ServeDeploySchema:
             args = ServerArgs(**app.args)
             if "environment" in app.args:  # paths in it are this process's; Ray is to see none that are relative
                 app.args["environment"] = args.environment.model_dump(exclude_unset=True)
-            _require_policy(args, installed=not (app.runtime_env or {}))
+            _require_policy(args, own_settings(app), installed=not (app.runtime_env or {}))
     except ValidationError as error:
         lines = [f"- {'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors()]
         raise ConfigError(f"{source}:\n" + "\n".join(lines)) from error
     return config
 
 
-def _require_policy(args: ServerArgs, *, installed: bool) -> None:
-    """Build the policy where it will run, and compare it with the dialects; a replica compares again.
+def _require_policy(args: ServerArgs, own: dict[str, Any], *, installed: bool) -> None:
+    """Build the policy where it will run, of each kind of settings that there may be, and compare it with the dialects.
 
-    Not `installed`: all that it needs comes later, by the application's `runtime_env`.
+    A replica compares again. `own` are the deployment's settings. Not `installed`: all that the policy needs comes
+    later, by the application's `runtime_env`.
     """
     environment = args.environment
     if not installed:
@@ -111,11 +119,14 @@ def _require_policy(args: ServerArgs, *, installed: bool) -> None:
         return
     if args.dialects.gr00t is not None:
         require("zmq")
-    if environment.python is not None:
-        require_fit(args.dialects, check_policy(environment, args.policy, args.config, args.wrappers))
-        return
-    try:
-        require_fit(args.dialects, unloaded_contract(build_agent(args.policy, args.config, args.wrappers)))
-    except (MissingDependency, UnknownPolicy):
-        if environment.requirements is None:  # else they may bring it
-            raise
+    offered = args.checkpoints.of(partial(build_agent, args.policy, wrappers=args.wrappers), own)
+    for wish in offered.examples():
+        settings = offered.settings(wish, own)
+        if environment.python is not None:
+            require_fit(args.dialects, check_policy(environment, args.policy, settings, args.wrappers))
+            continue
+        try:
+            require_fit(args.dialects, unloaded_contract(offered.make(settings)))
+        except (MissingDependency, UnknownPolicy):
+            if environment.requirements is None:  # else they may bring it
+                raise

@@ -20,10 +20,11 @@ from vlagents_ray.wire.messages import Reply, Request
 
 logger = logging.getLogger(__name__)
 
-_THREADS = 4
+_THREADS = 16  # each for one search, and for as long as a checkpoint takes to load
 _PENDING = 256  # searches under way; whoever asks beyond that is told at once that the session is unknown
 _EXPORT_S = 10.0
 _ON_ITS_WAY_S = 0.1
+_LOAD_S = 60.0  # that the checkpoint of a session which was fetched may take
 
 
 class Others(Protocol):
@@ -79,7 +80,7 @@ class Strays:
                 time.sleep(_ON_ITS_WAY_S)
                 state = self._others.take(session_id)
             if state is not None:
-                self._engine.adopt(session_id, state)
+                self._engine.adopt(session_id, state, _LOAD_S)
                 logger.info("session %s: fetched from another replica, after %d acts", session_id, state["steps"])
         except VLAgentsError as error:
             logger.warning("session %s: %s", session_id, error)

@@ -25,14 +25,17 @@ import threading
 import time
 import types
 from collections import Counter
-from collections.abc import Container, Iterable
+from collections.abc import Callable, Container, Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vlagents_ray.errors import PolicyUnavailable, TooManyRequests, UnknownSession
 from vlagents_ray.interface import Agent
+
+if TYPE_CHECKING:
+    from vlagents_ray.serve.model import Model
 
 logger = logging.getLogger(__name__)
 
@@ -166,6 +169,8 @@ class Session:
 
     id: str
     agent: Agent | None = None  # None until its first `reset` succeeded
+    model: Model | None = None  # what `agent` is a copy of; `vlagents_ray.serve.models` alone sets it
+    over: bool = False  # in no table any more
     owner: str = ""  # the connection that it ends with; empty: it ends when closed, or idle for long
     steps: int = 0  # acts since its last reset
     transport: str = ""  # the door that it came through
@@ -177,6 +182,7 @@ class SessionTable:
     """The sessions of a replica, by id. Thread-safe."""
 
     def __init__(self, limit: int, idle_s: float) -> None:
+        self.ended: Callable[[Session], None] = lambda _: None  # called with each that is forgotten, under the lock
         self._sessions: dict[str, Session] = {}
         self.limit = limit
         self.opened = 0  # so far
@@ -241,7 +247,7 @@ class SessionTable:
     def close(self, session_id: str) -> None:
         """Forget the session; unknown ids are none."""
         with self._lock:
-            self._sessions.pop(session_id, None)
+            self._forget(session_id)
 
     def close_owned(self, owner: str, session_ids: Iterable[str]) -> None:
         """Forget those of the sessions that are still `owner`'s."""
@@ -249,7 +255,13 @@ class SessionTable:
             for session_id in session_ids:
                 session = self._sessions.get(session_id)
                 if session is not None and session.owner == owner:
-                    del self._sessions[session_id]
+                    self._forget(session_id)
+
+    def close_those_of(self, model: Model) -> None:
+        """Forget all that act by that model."""
+        with self._lock:
+            for session in [session for session in self._sessions.values() if session.model is model]:
+                self._forget(session.id)
 
     def by_transport(self) -> dict[str, int]:
         """How many came through which door."""
@@ -276,4 +288,9 @@ class SessionTable:
     def _drop_idle(self) -> None:
         oldest = time.monotonic() - self._idle_s
         for session_id in [s.id for s in self._sessions.values() if s.used < oldest]:
-            del self._sessions[session_id]
+            self._forget(session_id)
+
+    def _forget(self, session_id: str) -> None:
+        session = self._sessions.pop(session_id, None)
+        if session is not None:
+            self.ended(session)

@@ -19,6 +19,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum
 
+from vlagents_ray.serve.checkpoints import OWN, Wish
 from vlagents_ray.wire.messages import Reply, Request
 
 logger = logging.getLogger(__name__)
@@ -46,6 +47,8 @@ class Ticket:
     owner: str = ""  # the connection that it came by; the session, unless one connection carries several
     connection: str = ""  # that its session ends with
     transport: str = ""  # for the metrics
+    wish: Wish = OWN  # of a reset: by which checkpoint its episode shall act
+    loaded: float | None = None  # s, when that was there, if it had to wait for it
     return_s: float | None = None  # how long its session lately took from an answer to the next request, if known
 
     def __post_init__(self) -> None:

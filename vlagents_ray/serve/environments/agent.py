@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 from vlagents_ray.contract import Contract
@@ -16,18 +16,19 @@ from vlagents_ray.serve.environments.host import Settings
 from vlagents_ray.wire.messages import Reply, Request
 
 
-def make_agent(args: ServerArgs) -> Agent:
-    """Built, not loaded. By now `environment.process` says which of the two it is."""
+def make_agent(args: ServerArgs, config: Mapping[str, Any]) -> Agent:
+    """The policy with these settings, built, not loaded. By now `environment.process` says which of the two it is."""
     environment = args.environment
     if environment.python is not None and environment.process == "child":
-        settings = Settings(args.policy, args.config, args.batch.max_size, version_of(args), args.wrappers)
+        settings = Settings(args.policy, dict(config), args.batch.max_size, version_of(args), args.wrappers)
         return ChildAgent(Child(environment.python, settings, environment.env_vars))
-    return build_agent(args.policy, args.config, args.wrappers)
+    return build_agent(args.policy, config, args.wrappers)
 
 
 def version_of(args: ServerArgs) -> str:
-    """Sessions move between replicas in which it is equal: pickles of one environment are for no other."""
-    return json.dumps([args.policy, args.config, args.wrappers, args.environment.model_dump()], sort_keys=True)
+    """Sessions move between replicas in which it is equal, as are the settings: pickles of one environment are for
+    no other."""
+    return json.dumps([args.policy, args.wrappers, args.environment.model_dump()], sort_keys=True)
 
 
 class ChildAgent(Agent):

@@ -1,0 +1,267 @@
+"""Many checkpoints in one deployment, and another one without a restart, on real servers."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+from eval_fakes import wait_for
+from ray.serve.schema import ServeDeploySchema
+
+from tests.integration.test_sessions import TRANSPORTS, url
+from vlagents_ray import ConfigError, Obs, RemoteAgent
+from vlagents_ray.errors import CheckpointFailed, UnknownCheckpoint
+from vlagents_ray.evaluate import EvalConfig, evaluate
+from vlagents_ray.serve.cluster import Server, running_server
+from vlagents_ray.serve.files import deployment
+
+POLICY = "served_agents:Stored"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Checkpoints 1 to 9, each a file with its number."""
+    folder = tmp_path_factory.mktemp("runs")
+    for number in range(1, 10):
+        (folder / f"{number}").write_text(str(number))
+    return folder
+
+
+def deployed(folder: Path, **beside: Any) -> ServeDeploySchema:
+    """As a file says it, with what may change while it runs beside `args`."""
+    config = {"checkpoint": str(folder / "{step}"), "checkpoint_step": 1}
+    checkpoints = {"choices": {"late": {"checkpoint": str(folder / "9")}}, "steps": True, "loaded": 2}
+    document = deployment(POLICY, config=config, checkpoints=checkpoints).model_dump(exclude_unset=True)
+    if beside:
+        document["applications"][0]["deployments"] = [{"name": "Policy", **beside}]
+    return ServeDeploySchema(**document)
+
+
+@pytest.fixture(scope="module")
+def server(folder: Path) -> Iterator[Server]:
+    with running_server(deployed(folder), num_cpus=4) as server:
+        yield server
+
+
+def redeploy(folder: Path, replicas: int = 1, **user_config: Any) -> None:
+    """What `serve deploy` does with the changed file."""
+    from ray.serve.context import _get_global_client
+
+    client = _get_global_client()
+    assert client is not None
+    client.deploy_apps(deployed(folder, num_replicas=replicas, user_config=user_config))
+
+
+def metadata(server: Server) -> dict[str, Any]:
+    with RemoteAgent(server.url, transport="http") as agent:
+        return agent.metadata
+
+
+def own(server: Server, folder: Path) -> str:
+    """The deployment's own checkpoint."""
+    return str(metadata(server)["checkpoint"]).removeprefix(f"{folder}/")
+
+
+@pytest.fixture
+def fresh(server: Server, folder: Path) -> Server:
+    """As the file says at first, whatever the test before left."""
+    for marker in folder.glob("*.*"):
+        marker.unlink()
+    redeploy(folder)
+    wait_for(lambda: own(server, folder) == "1", 60)
+    return server
+
+
+def told(agent: RemoteAgent) -> list[float]:
+    """The number that its checkpoint acts by, and of the act."""
+    act = agent.act(Obs())
+    return [float(act.action[0]), act.info["step"]]
+
+
+class Robot:
+    """Plays episodes of its own on a thread, and keeps what it got: (checkpoint of the reset, act's number, step)."""
+
+    def __init__(self, agent: RemoteAgent, episode: int = 20, **options: Any) -> None:
+        self.rows: list[tuple[str, float, int]] = []
+        self.resumed = 0
+        self.failure: BaseException | None = None
+        self._agent, self._episode, self._options = agent, episode, options
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            while not self._stop.is_set():
+                name = Path(self._agent.reset(Obs(), "x", **self._options)["checkpoint"]).name
+                for _ in range(self._episode):
+                    act = self._agent.act(Obs())
+                    self.resumed += bool(act.info.get("resumed"))
+                    self.rows.append((name, float(act.action[0]), act.info["step"]))
+        except BaseException as failure:  # noqa: BLE001 - told by `end`
+            self.failure = failure
+
+    def end(self) -> list[tuple[str, float, int]]:
+        """Stop after the episode; raises what went wrong."""
+        self._stop.set()
+        self._thread.join(60)
+        self._agent.close()
+        if self.failure is not None:
+            raise self.failure
+        return self.rows
+
+
+@pytest.mark.parametrize("transport", TRANSPORTS)
+def test_sessions_of_two_checkpoints_side_by_side(fresh: Server, folder: Path, transport: Any) -> None:
+    where = "serve://Stored" if transport in ("handle", "plasma") else fresh.url
+    with (
+        RemoteAgent(where, transport=transport) as early,
+        RemoteAgent(where, transport=transport) as late,
+    ):
+        assert early.reset(Obs(), "x")["checkpoint"] == str(folder / "1")
+        assert late.reset(Obs(), "x", checkpoint="late", seed=3)["options"] == {"seed": 3}
+        for step in range(1, 50):
+            assert told(early) == [1, step]
+            assert told(late) == [9, step]
+        assert early.reset(Obs(), "x", checkpoint_step=9)["checkpoint"] == str(folder / "9")
+        assert told(early) == [9, 1]
+
+
+def test_metadata_says_what_may_be_chosen_and_what_is_loaded(fresh: Server, folder: Path) -> None:
+    with RemoteAgent(fresh.url) as agent:
+        agent.reset(Obs(), "x", checkpoint="late")
+        said = metadata(fresh)["checkpoints"]
+    assert (said["choices"], said["steps"], said["limit"]) == ({"late": str(folder / "9")}, True, 2)
+    assert str(folder / "9") in said["loaded"]
+
+
+def test_what_is_not_offered_is_a_400_and_what_does_not_load_says_why(fresh: Server) -> None:
+    connection = http.client.HTTPConnection(urlsplit(fresh.url).netloc, timeout=30)
+    body = json.dumps({"instruction": "push", "kwargs": {"checkpoint": "/etc/passwd"}})
+    connection.request("POST", "/v1/reset", body, {"x-session-id": "bare", "content-type": "application/json"})
+    answer = connection.getresponse()
+    assert (answer.status, json.loads(answer.read())["code"]) == (400, "unknown_checkpoint")
+    connection.close()
+    with RemoteAgent(fresh.url) as agent:
+        with pytest.raises(UnknownCheckpoint, match="late"):
+            agent.reset(Obs(), "x", checkpoint="early")
+        with pytest.raises(CheckpointFailed, match="checkpoint step 77 did not load: FileNotFoundError"):
+            agent.reset(Obs(), "x", checkpoint_step=77)
+        agent.reset(Obs(), "x")
+        assert told(agent) == [1, 1]
+
+
+def test_a_slow_load_keeps_nobody_waiting_and_the_least_recently_used_goes(fresh: Server, folder: Path) -> None:
+    held = folder / "5.held"
+    held.touch()
+    robot = Robot(RemoteAgent(fresh.url, transport="websocket"))
+    slow = Robot(RemoteAgent(fresh.url, transport="http"), checkpoint_step=5)
+    wait_for((folder / "5.begun").exists, 30)
+    before = len(robot.rows)
+    wait_for(lambda: len(robot.rows) > before + 500 or robot.failure is not None, 30)
+    assert slow.rows == []
+    held.unlink()
+    wait_for(lambda: len(slow.rows) > 50, 30)
+    assert {row[:2] for row in robot.end()} == {("1", 1.0)}
+    assert {row[:2] for row in slow.end()} == {("5", 5.0)}
+    with RemoteAgent(fresh.url) as agent:
+        agent.reset(Obs(), "x", checkpoint_step=6)
+        wait_for(lambda: (folder / "1.closed").exists() or (folder / "5.closed").exists(), 30)
+
+
+def test_a_redeploy_swaps_under_load_without_a_failed_step(fresh: Server, folder: Path) -> None:
+    """Each step of each episode is answered by the checkpoint that its reset was told, and no replica restarts."""
+    robots = [Robot(RemoteAgent(url(fresh, t).replace("Reacher", "Stored"), transport=t)) for t in TRANSPORTS]
+    pid = _pid(fresh)
+    wait_for(lambda: all(len(robot.rows) > 100 for robot in robots), 30)
+    (folder / "2.held").touch()
+    redeploy(folder, checkpoint_step=2)
+    wait_for((folder / "2.begun").exists, 60)
+    counts = [len(robot.rows) for robot in robots]
+    wait_for(lambda: all(len(r.rows) > count + 100 for r, count in zip(robots, counts, strict=True)), 30)
+    assert metadata(fresh)["checkpoints"]["swap"] == {"state": "loading", "checkpoint": str(folder / "2")}
+    (folder / "2.held").unlink()
+    wait_for(lambda: all(r.failure is not None or (r.rows and r.rows[-1][0] == "2") for r in robots), 30)
+    for robot in robots:
+        rows = robot.end()
+        assert {row[:2] for row in rows} == {("1", 1.0), ("2", 2.0)}
+        assert [row[2] for row in rows] == [i % 20 + 1 for i in range(len(rows))]
+        assert robot.resumed == 0
+    wait_for((folder / "1.closed").exists, 30)
+    assert _pid(fresh) == pid
+
+
+def _pid(server: Server) -> int:
+    with RemoteAgent(server.url) as agent:
+        return int(agent.reset(Obs(), "x")["pid"])
+
+
+def test_a_redeploy_of_what_does_not_load_leaves_the_old_one_and_says_why(fresh: Server, folder: Path) -> None:
+    robot = Robot(RemoteAgent(fresh.url))
+    wait_for(lambda: len(robot.rows) > 50, 30)
+    redeploy(folder, checkpoint_step=77)
+    wait_for(lambda: (metadata(fresh)["checkpoints"]["swap"] or {}).get("state") == "failed", 60)
+    assert "No such file" in metadata(fresh)["checkpoints"]["swap"]["error"]
+    redeploy(folder, checkpoint_step=1, scales=3)  # an unknown setting
+    wait_for(lambda: "scales" in (metadata(fresh)["checkpoints"]["swap"] or {}).get("error", ""), 60)
+    count = len(robot.rows)
+    wait_for(lambda: len(robot.rows) > count + 50, 30)
+    assert {row[:2] for row in robot.end()} == {("1", 1.0)}
+
+
+def test_any_other_setting_is_swapped_too(fresh: Server, folder: Path) -> None:
+    redeploy(folder, scale=10.0)
+    wait_for(lambda: metadata(fresh)["config"].get("scale") == 10.0, 60)
+    with RemoteAgent(fresh.url) as agent:
+        agent.reset(Obs(), "x")
+        assert told(agent) == [10, 1]
+
+
+def test_every_replica_swaps_and_new_ones_begin_with_what_was_swapped_to(fresh: Server, folder: Path) -> None:
+    redeploy(folder, replicas=2, checkpoint_step=4)
+
+    def numbers() -> dict[int, set[float]]:
+        """What each replica's sessions act by."""
+        found: dict[int, set[float]] = {}
+        for _ in range(8):
+            with RemoteAgent("serve://Stored", transport="handle") as agent:
+                pid = agent.reset(Obs(), "x")["pid"]
+                found.setdefault(pid, set()).add(float(agent.act(Obs()).action[0]))
+        return found
+
+    wait_for(lambda: len(numbers()) == 2, 60)
+    wait_for(lambda: list(numbers().values()) == [{4.0}] * 2, 60)
+    redeploy(folder, replicas=2, checkpoint_step=5)
+    wait_for(lambda: list(numbers().values()) == [{5.0}] * 2, 60)
+
+
+def test_an_evaluation_says_by_which_checkpoint(fresh: Server, folder: Path, tmp_path: Path) -> None:
+    config = EvalConfig(
+        envs=["eval_fakes:Line"], policy_url=fresh.url, policy_options={"checkpoint_step": 3}, episodes=2,
+        out=tmp_path / "results", video="none",
+    )  # fmt: skip
+    summary = evaluate(config)
+    assert summary.checkpoint == str(folder / "3")
+    assert (summary.total.episodes, summary.total.policy_errors) == (2, 0)
+    for option, error in (({"checkpoint_step": 77}, CheckpointFailed), ({"checkpoint": "lat"}, UnknownCheckpoint)):
+        out = tmp_path / error.__name__
+        with pytest.raises(error):  # no episode is lost to it, and none counts as a failure of the policy
+            evaluate(config.model_copy(update={"policy_options": option, "out": out}))
+
+
+def test_a_file_that_cannot_be_is_refused_before_anything_starts(folder: Path) -> None:
+    config = {"checkpoint": "x"}
+    wrong: list[Callable[[], Any]] = [
+        lambda: deployment(POLICY, config=config, checkpoints={"choices": {"a": {"scales": 1}}}),
+        lambda: deployment("noop", checkpoints={"steps": True}),
+        lambda: deployment(POLICY, config=config, checkpoints={"loaded": 0}),
+    ]
+    for read in wrong:
+        with pytest.raises(ConfigError):
+            read()
