@@ -3,6 +3,7 @@
 #   make setup [PYTHON=...] [TORCH_INDEX_URL=...] [TORCH_CUDA=1]     the environment, in .venv
 #   make demo                                                       serve a policy, evaluate it, show the table
 #   make test                                                       lint, types, layers, tests
+#   make families [FAMILIES="lerobot hf openvla …"]                 tests of model families, in .venv-NAME each
 #   make bench                                                      measure, and write the README's figures anew
 #
 # Torch comes from wherever pip looks (its settings, PIP_INDEX_URL, PIP_FIND_LINKS). TORCH_INDEX_URL names
@@ -12,7 +13,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := setup
-.PHONY: setup demo bench test fmt lint type clean
+.PHONY: setup demo bench test families fmt lint type clean
 
 VENV ?= .venv
 TORCH ?= torch==2.13.0
@@ -25,6 +26,11 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 CONSTRAINTS := $(VENV)/constraints.txt
 STAMP := $(VENV)/.installed
+# Environments of model families: requirements/NAME.txt, in $(VENV)-NAME. What is tested in each is in tests/families,
+# in folders of the family's name. Those whose code is on no package index want its source, too: OPENPI_SRC, OPENVLA_SRC,
+# OPENVLA_OFT_SRC, OCTO_SRC, DIFFUSION_POLICY_SRC, VJEPA2_SRC.
+FAMILIES ?= lerobot hf
+TESTED_IN_hf := pi0 arro vjepa2_ac
 TORCH_FROM := $(if $(TORCH_INDEX_URL),--index-url $(TORCH_INDEX_URL))
 
 setup: $(STAMP)
@@ -37,9 +43,19 @@ bench: setup
 	$(BIN)/vlagents-ray bench peers-setup
 	$(BIN)/vlagents-ray bench report
 
-test: lint type
+test: lint type families
 	@echo '== tests'
-	$(BIN)/pytest
+	VLAGENTS_RAY_ENVIRONMENTS=$(abspath $(VENV)) $(BIN)/pytest
+
+families: $(FAMILIES:%=family-%)
+
+family-%: $(VENV)-%/.installed
+	@echo '== tests of $(or $(TESTED_IN_$*),$*), in $(VENV)-$*'
+	$(VENV)-$*/bin/python -m pytest $(addprefix tests/families/,$(or $(TESTED_IN_$*),$*))
+
+$(VENV)-%/.installed: requirements/%.txt requirements/testing.txt $(STAMP)
+	$(BIN)/vlagents-ray env make $< --with requirements/testing.txt --into $(VENV)-$*
+	@touch $@
 
 fmt: setup
 	$(BIN)/ruff check --fix .

@@ -21,6 +21,7 @@ def _group() -> None:
 def make(
     requirements: Annotated[Path, typer.Argument(help="A requirements file: requirements/lerobot.txt.")],
     into: Annotated[Path | None, typer.Option(help="Folder; default: .venv- and the file's name.")] = None,
+    more: Annotated[list[Path], typer.Option("--with", help="A further requirements file, repeatable.")] = [],  # noqa: B006
     python: Annotated[str | None, typer.Option(help="A version (3.12) or an interpreter; default: this one.")] = None,
     light: Annotated[bool, typer.Option("--light", help="Without Ray, for a child process.")] = False,
 ) -> None:
@@ -30,6 +31,11 @@ def make(
     folder = into or Path(f".venv-{requirements.stem}")
     with errors():
         made = make_environment(
-            requirements, folder, python=python, light=light, tell=lambda text: out.print(text, highlight=False)
+            requirements,
+            folder,
+            more=more,
+            python=python,
+            light=light,
+            tell=lambda text: out.print(text, highlight=False),
         )
     out.print(f"ready; in a deployment file, under args:\n\nenvironment:\n  python: {made}", highlight=False)

@@ -58,27 +58,37 @@ def install(python: Path, wanted: Sequence[str]) -> None:
 
 
 def make_environment(
-    requirements: Path, folder: Path, *, python: str | None = None, light: bool = False, tell: Tell = lambda _: None
+    requirements: Path,
+    folder: Path,
+    *,
+    more: Sequence[Path] = (),
+    python: str | None = None,
+    light: bool = False,
+    tell: Tell = lambda _: None,
 ) -> Path:
     """An environment for the policy that needs `requirements`, with this same package in it; returns its Python.
+
+    `more` are further requirements files.
 
     `light`: without Ray, for a child process; so is that of another Python minor, in which no replica can run.
     On a machine without an NVIDIA GPU it gets this environment's own torch, and what `NAME.cpu.txt`, beside
     `requirements`, puts in the place of other requirements. Raises `ConfigError` before a CUDA build would come there.
     """
-    if not requirements.is_file():
-        raise ConfigError(f"no such file: got {str(requirements)!r}, want a requirements file")
+    files = [requirements, *more]
+    for file in files:
+        if not file.is_file():
+            raise ConfigError(f"no such file: got {str(file)!r}, want a requirements file")
     made = create(folder, python, tell)
     if not light and _minor(made) != _minor(Path(sys.executable)):
         tell(
             f"Python {_minor(made)} is not this one's {_minor(Path(sys.executable))}: without Ray, for a child process"
         )
         light = True
-    wanted = [*_ourselves(light), "--requirement", str(requirements)]
+    wanted = [*_ourselves(light), *(word for file in files for word in ("--requirement", str(file)))]
     with tempfile.TemporaryDirectory() as scratch:
         if not _has_gpu():
-            for file in _overrides(requirements, Path(scratch)):
-                wanted += ["--override", str(file)]
+            for override in _overrides(requirements, Path(scratch)):
+                wanted += ["--override", str(override)]
             _require_no_cuda(made, wanted)
         tell(f"installing {_US} {importlib.metadata.version(_US)} and {requirements}")
         install(made, wanted)
