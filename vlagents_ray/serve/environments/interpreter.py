@@ -7,6 +7,7 @@ import json
 import os
 import platform
 import subprocess
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -59,7 +60,12 @@ class Probe:
         )
 
 
-def probe(python: str, policy: str | None = None, config: dict[str, Any] | None = None) -> Probe:
+def probe(
+    python: str,
+    policy: str | None = None,
+    config: Mapping[str, Any] | None = None,
+    env_vars: Mapping[str, str] | None = None,
+) -> Probe:
     """Ask the interpreter, in one process, and have it build the policy if one is named.
 
     Raises `ConfigError` unless it is one in which a policy of this server can run.
@@ -70,7 +76,7 @@ def probe(python: str, policy: str | None = None, config: dict[str, Any] | None 
         raise ConfigError(f"environment.python: no such file, got {python!r}, want an interpreter; {cure}")
     version = importlib.metadata.version("vlagents-ray")
     settings = {"policy": policy, "config": config or {}, "version": version}
-    said = _asked(python, json.dumps(settings))
+    said = _asked(python, json.dumps(settings), env_vars or {})
     examined = said.pop("policy", None)
     found = Probe(python, said, examined)
     if _minor(said["python"]) < OLDEST:
@@ -99,7 +105,7 @@ def check_policy(environment: EnvironmentArgs, policy: str, config: dict[str, An
     """
     if environment.python is None:
         raise ConfigError("environment: names no interpreter to ask")
-    found = probe(environment.python, policy, config)
+    found = probe(environment.python, policy, config, environment.env_vars)
     _process(environment, found)
     said = found.policy or {}
     if "error" in said:
@@ -124,11 +130,11 @@ def _minor(version: str) -> tuple[int, ...]:
     return tuple(map(int, version.split(".")[:2]))
 
 
-def _asked(python: str, settings: str) -> dict[str, Any]:
+def _asked(python: str, settings: str, env_vars: Mapping[str, str]) -> dict[str, Any]:
     command = [python, "-c", _PROBE, settings, *_PACKAGES]
     try:
         done = subprocess.run(  # noqa: S603 - the deployment's own interpreter
-            command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False, env={**os.environ}
+            command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False, env={**os.environ, **env_vars}
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise ConfigError(
