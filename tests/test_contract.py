@@ -138,3 +138,8 @@ def test_actions_become_float32(action: object) -> None:
 def test_an_unusable_action_never_gets_through(action: object) -> None:
     with pytest.raises(InvalidAction):
         check_action(action, POLICY)
+
+
+def test_no_numpy_is_left_in_the_json_of_a_contract() -> None:
+    told = Contract(action=ActionSpec(dim=1, low=np.float32(-1.0)), control_hz=np.float64(20.0)).to_json()  # type: ignore[arg-type]
+    assert (type(told["control_hz"]), type(told["action"]["low"])) == (float, float)

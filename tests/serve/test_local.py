@@ -26,6 +26,7 @@ from vlagents_ray.errors import (
     ConnectionLost,
     DeadlineExceeded,
     InvalidObservation,
+    MalformedMessage,
     PolicyUnavailable,
     UnknownSession,
 )
@@ -137,6 +138,16 @@ def test_vectors_of_sessions_and_odd_observations_come_as_they_are(served: tuple
     odd.gripper = 3.0
     [reply] = transport.call([Request("act", odd, session=names[0], request_id="odd")], 5)
     assert isinstance(reply.error, InvalidObservation)
+    transport.close()
+
+
+@pytest.mark.parametrize("op", ["observe", "export", "adopt"])
+def test_what_only_a_replica_may_ask_its_child_is_refused(served: tuple[Engine, LocalDoor], op: Any) -> None:
+    """Two of these carry pickles."""
+    transport = client(served[1])
+    call(transport, request("reset"), 5)
+    assert isinstance(call(transport, request(op), 5).error, MalformedMessage)
+    assert call(transport, request("act"), 5).error is None
     transport.close()
 
 

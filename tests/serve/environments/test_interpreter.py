@@ -159,14 +159,15 @@ def test_the_policy_is_built_where_it_will_run(tmp_path: Path, monkeypatch: pyte
     python = layered(tmp_path / "env", "six==1.15.0")
     [packages] = python.parents[1].glob("lib/python*/site-packages")
     (packages / "only_there.py").write_text(
-        "import six\n"
+        "import os, six\n"
         "from vlagents_ray import ActionSpec, Agent, Contract\n"
         "print('a greeting')\n"
         "class Policy(Agent):\n"
         "    contract = Contract(action=ActionSpec(dim=int(six.__version__.split('.')[1])))\n"
-        "    def __init__(self, gain=1.0): ...\n"
+        "    def __init__(self, gain=1.0):\n"
+        "        os.environ['SOURCE']\n"
     )
-    environment = args(python=str(python))
+    environment = args(python=str(python), env_vars={"SOURCE": "/src"})
     contract = check_policy(environment, "only_there:Policy", {"gain": 2.0})
     assert contract is not None
     assert contract.action.dim == 15
@@ -175,18 +176,14 @@ def test_the_policy_is_built_where_it_will_run(tmp_path: Path, monkeypatch: pyte
     with pytest.raises(ConfigError, match=rf"in {python}: .*no class 'Police'"):
         check_policy(environment, "only_there:Police", {})
     monkeypatch.chdir(tmp_path)
-    Path("deployment.yaml").write_text(
-        yaml.safe_dump(
-            {
-                "applications": [
-                    {
-                        "name": "there",
-                        "import_path": "vlagents_ray.serve.app:build",
-                        "args": {"policy": "only_there:Policy", "environment": {"python": "env/bin/python"}},
-                    }
-                ]
-            }
-        )
-    )
+    document = {
+        "name": "there",
+        "import_path": "vlagents_ray.serve.app:build",
+        "args": {
+            "policy": "only_there:Policy",
+            "environment": {"python": "env/bin/python", "env_vars": {"SOURCE": "/src"}},
+        },
+    }
+    Path("deployment.yaml").write_text(yaml.safe_dump({"applications": [document]}))
     [app] = read_deployment("deployment.yaml").applications
-    assert app.args["environment"] == {"python": str(python)}, "Ray is to see no relative path"
+    assert app.args["environment"]["python"] == str(python), "Ray is to see no relative path"

@@ -7,7 +7,7 @@ import json
 import os
 import platform
 import subprocess
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -60,7 +60,7 @@ class Probe:
         )
 
 
-def probe(python: str, policy: dict[str, Any] | None = None) -> Probe:
+def probe(python: str, policy: dict[str, Any] | None = None, env_vars: Mapping[str, str] | None = None) -> Probe:
     """Ask the interpreter, in one process, and have it build a policy: `policy` are the arguments of `host.examine`.
 
     Raises `ConfigError` unless it is one in which a policy of this server can run.
@@ -71,7 +71,7 @@ def probe(python: str, policy: dict[str, Any] | None = None) -> Probe:
         raise ConfigError(f"environment.python: no such file, got {python!r}, want an interpreter; {cure}")
     version = importlib.metadata.version("vlagents-ray")
     settings = {"policy": policy, "version": version}
-    said = _asked(python, json.dumps(settings))
+    said = _asked(python, json.dumps(settings), env_vars or {})
     examined = said.pop("policy", None)
     found = Probe(python, said, examined)
     if _minor(said["python"]) < OLDEST:
@@ -102,7 +102,8 @@ def check_policy(
     """
     if environment.python is None:
         raise ConfigError("environment: names no interpreter to ask")
-    found = probe(environment.python, {"policy": policy, "config": config, "wrappers": list(wrappers)})
+    asked = {"policy": policy, "config": dict(config), "wrappers": list(wrappers)}
+    found = probe(environment.python, asked, environment.env_vars)
     _process(environment, found)
     said = found.policy or {}
     if "error" in said:
@@ -127,11 +128,11 @@ def _minor(version: str) -> tuple[int, ...]:
     return tuple(map(int, version.split(".")[:2]))
 
 
-def _asked(python: str, settings: str) -> dict[str, Any]:
+def _asked(python: str, settings: str, env_vars: Mapping[str, str]) -> dict[str, Any]:
     command = [python, "-c", _PROBE, settings, *_PACKAGES]
     try:
         done = subprocess.run(  # noqa: S603 - the deployment's own interpreter
-            command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False, env={**os.environ}
+            command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False, env={**os.environ, **env_vars}
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise ConfigError(
