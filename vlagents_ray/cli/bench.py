@@ -10,7 +10,7 @@ import typer
 
 from vlagents_ray.cli.console import errors, out
 from vlagents_ray.cli.settings import parse_settings
-from vlagents_ray.cli.tables import show_overhead, show_round_trips, show_throughput
+from vlagents_ray.cli.tables import show_overhead, show_policy, show_round_trips, show_throughput
 from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -106,12 +106,7 @@ def bench_throughput(
 
     with errors():
         chosen = _policy(policy, config, model, device)
-        try:
-            counts = sorted({int(one) for one in _list(clients)})
-        except ValueError as error:
-            raise ConfigError(f"--clients: got {clients!r}, want numbers with commas between them") from error
-        if not counts or counts[0] < 1:
-            raise ConfigError(f"--clients: got {clients!r}, want numbers from 1 on")
+        counts = _counts(clients, "--clients")
         gpus = float(device.startswith("cuda")) if num_gpus is None else num_gpus
         plan: Plan = Plan(
             **chosen, num_gpus=gpus, batch=batch, clients=counts, seconds=seconds, rounds=rounds,
@@ -119,6 +114,33 @@ def bench_throughput(
         )  # fmt: skip
         found = measure_throughput(plan, _tell)
     show_throughput(found)
+    _save(found, json_file)
+
+
+@bench.command("policy")
+def bench_policy(
+    file: Annotated[str, typer.Argument(help="A deployment file, or a registered policy.")],
+    batch: Annotated[str, typer.Option(help="Batch sizes, with commas between them.")] = "1,8",
+    seconds: Annotated[float, typer.Option(min=0.1, help="Of each measurement.")] = 2.0,
+    rounds: Annotated[int, typer.Option(min=1)] = 3,
+    app: Annotated[str | None, typer.Option(help="Of the file, if it holds several.")] = None,
+    image: Annotated[int, typer.Option(min=1, help="Pixels a side, where the policy takes any image.")] = 224,
+    state: Annotated[
+        list[str], typer.Option(metavar="PART=N", help="Numbers in a part for which the policy does not say.")
+    ] = [],  # noqa: B006
+    json_file: Json = None,
+) -> None:
+    """Actions a second of one policy alone, by batch size: bare, and behind its batch queue; without Ray."""
+    from vlagents_ray.bench.policies import PolicyPlan, measure_policy
+    from vlagents_ray.serve.files import server_args
+
+    with errors():
+        dims = parse_settings(state, "--state")
+        if not all(isinstance(number, int) and number > 0 for number in dims.values()):
+            raise ConfigError(f"--state: got {dims}, want a number from 1 on for each part")
+        args, batches = server_args(file, app), _counts(batch, "--batch")
+        found = measure_policy(PolicyPlan(args, batches, seconds, rounds, image, dims), _tell)
+    show_policy(found)
     _save(found, json_file)
 
 
@@ -208,6 +230,17 @@ def _policy(policy: str | None, config: str, model: str | None, device: str) -> 
     if settings:
         raise ConfigError("--config: is for --policy or --model; name one")
     return {}
+
+
+def _counts(text: str, option: str) -> list[int]:
+    """Numbers from 1 on, ascending."""
+    try:
+        counts = sorted({int(one) for one in _list(text)})
+    except ValueError as error:
+        raise ConfigError(f"{option}: got {text!r}, want numbers with commas between them") from error
+    if not counts or counts[0] < 1:
+        raise ConfigError(f"{option}: got {text!r}, want numbers from 1 on")
+    return counts
 
 
 def _list(text: str) -> list[str]:
