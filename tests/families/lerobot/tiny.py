@@ -62,6 +62,13 @@ def ensemble(**settings: Any) -> Any:
     return act(temporal_ensemble_coeff=0.1, n_action_steps=1, **settings)
 
 
+def full_act(**settings: Any) -> Any:
+    """Not tiny: ACT of LeRobot's own sizes (52 million parameters), with two cameras of 224 pixels, to be measured."""
+    cameras = {f"observation.images.{name}": inputs(224)[f"observation.images.{CAMERA}"] for name in ("top", "wrist")}
+    features = {**cameras, "observation.state": inputs()["observation.state"]}
+    return _config("act", pretrained_backbone_weights=None, input_features=features, **settings)
+
+
 def diffusion(**settings: Any) -> Any:
     small = {"down_dims": (16, 32), "diffusion_step_embed_dim": 16, "spatial_softmax_num_keypoints": 8}
     steps = {"horizon": CHUNK, "n_obs_steps": 2, "n_action_steps": EXECUTED, "num_train_timesteps": 10}
@@ -163,13 +170,14 @@ KINDS: dict[str, Callable[..., Any]] = {
     "smolvla": smolvla,
     "xvla": xvla,
 }
+_MAKERS = {**KINDS, "full_act": full_act}
 _WITH_FILES = {"smolvla", "xvla"}  # of a tokenizer beside the checkpoint
 
 
 def make(folder: Path, kind: str = "act", **settings: Any) -> Path:
     """A checkpoint of that kind in `folder`, with `settings` of its LeRobot config; returns `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
-    config = KINDS[kind](folder, **settings) if kind in _WITH_FILES else KINDS[kind](**settings)
+    config = _MAKERS[kind](folder, **settings) if kind in _WITH_FILES else _MAKERS[kind](**settings)
     torch.manual_seed(0)
     with contextlib.redirect_stdout(io.StringIO()):
         policy = get_policy_class(config.type)(config)
@@ -177,7 +185,10 @@ def make(folder: Path, kind: str = "act", **settings: Any) -> Path:
     if kind == "vqbet":
         policy.vqbet.action_head.vqvae_model.discretized.fill_(True)
     policy.save_pretrained(folder)
-    for pipeline in make_pre_post_processors(config, dataset_stats=statistics()):
+    dataset = statistics()
+    for key in config.image_features:  # any camera sees what the first one does
+        dataset[key] = dataset[f"observation.images.{CAMERA}"]
+    for pipeline in make_pre_post_processors(config, dataset_stats=dataset):
         pipeline.save_pretrained(folder)
     return folder
 
