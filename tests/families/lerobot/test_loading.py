@@ -13,7 +13,7 @@ import pytest
 from safetensors.torch import load_file, save_file
 
 from tests.families.lerobot import tiny
-from tests.families.lerobot.conftest import FILTERS, Load, begun, view
+from tests.families.lerobot.conftest import FILTERS, PATCHED, Load, begun, view
 from vlagents_ray.contract import CameraSpec
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import LEFTOVER
@@ -21,6 +21,7 @@ from vlagents_ray.policies.lerobot import LeRobot
 
 pytestmark = FILTERS
 
+UNPATCHED = () if PATCHED else ("pi0", "pi05")
 Change = Callable[[Path], Any]
 PRE, POST = "policy_preprocessor", "policy_postprocessor"
 TOP = f"observation.images.{tiny.CAMERA}"

@@ -55,7 +55,7 @@ def statistics(state: int = STATE, action: int = ACTION) -> dict[str, dict[str, 
 def act(**settings: Any) -> Any:
     small = {"dim_model": 32, "n_heads": 2, "dim_feedforward": 64, "n_encoder_layers": 1, "n_vae_encoder_layers": 1}
     chunk = {"chunk_size": CHUNK, "n_action_steps": EXECUTED}
-    return _config("act", **{"pretrained_backbone_weights": None, "latent_dim": 8, **small, **chunk, **settings})
+    return config_of("act", **{"pretrained_backbone_weights": None, "latent_dim": 8, **small, **chunk, **settings})
 
 
 def ensemble(**settings: Any) -> Any:
@@ -66,29 +66,29 @@ def full_act(**settings: Any) -> Any:
     """Not tiny: ACT of LeRobot's own sizes (52 million parameters), with two cameras of 224 pixels, to be measured."""
     cameras = {f"observation.images.{name}": inputs(224)[f"observation.images.{CAMERA}"] for name in ("top", "wrist")}
     features = {**cameras, "observation.state": inputs()["observation.state"]}
-    return _config("act", pretrained_backbone_weights=None, input_features=features, **settings)
+    return config_of("act", pretrained_backbone_weights=None, input_features=features, **settings)
 
 
 def diffusion(**settings: Any) -> Any:
     small = {"down_dims": (16, 32), "diffusion_step_embed_dim": 16, "spatial_softmax_num_keypoints": 8}
     steps = {"horizon": CHUNK, "n_obs_steps": 2, "n_action_steps": EXECUTED, "num_train_timesteps": 10}
-    return _config("diffusion", crop_shape=(56, 56), num_inference_steps=3, **small, **steps, **settings)
+    return config_of("diffusion", crop_shape=(56, 56), num_inference_steps=3, **small, **steps, **settings)
 
 
 def vqbet(**settings: Any) -> Any:
     small = {"gpt_input_dim": 32, "gpt_output_dim": 32, "gpt_hidden_dim": 32, "gpt_n_layer": 1, "gpt_n_head": 2}
     codes = {"vqvae_n_embed": 8, "vqvae_embedding_dim": 16, "vqvae_enc_hidden_dim": 16, "bet_softmax_temperature": 5.0}
-    return _config("vqbet", crop_shape=(56, 56), n_obs_steps=3, **small, **codes, **settings)
+    return config_of("vqbet", crop_shape=(56, 56), n_obs_steps=3, **small, **codes, **settings)
 
 
 def tdmpc(**settings: Any) -> Any:
     small = {"latent_dim": 8, "mlp_dim": 16, "image_encoder_hidden_dim": 4, "state_encoder_hidden_dim": 8}
     plan = {"horizon": 3, "n_gaussian_samples": 16, "n_pi_samples": 4, "n_elites": 4, "cem_iterations": 2}
-    return _config("tdmpc", **small, **plan, **settings)
+    return config_of("tdmpc", **small, **plan, **settings)
 
 
 def sac(**settings: Any) -> Any:
-    return _config("sac", latent_dim=8, shared_encoder=False, use_torch_compile=False, **settings)
+    return config_of("sac", latent_dim=8, shared_encoder=False, use_torch_compile=False, **settings)
 
 
 def smolvla(folder: Path, **settings: Any) -> Any:
@@ -112,7 +112,7 @@ def smolvla(folder: Path, **settings: Any) -> Any:
     )
     names = ["<image>", "<fake_token_around_image>", "<global-img>", "<end_of_utterance>"]
     tokenizer = PreTrainedTokenizerFast(
-        tokenizer_object=_tokenizer(["<pad>", "<bos>", "<eos>", *names]),
+        tokenizer_object=tokenizer_of(["<pad>", "<bos>", "<eos>", *names]),
         **_named("<pad>", "<bos>", "<eos>"),
         extra_special_tokens=dict(
             zip(("image_token", "fake_image_token", "global_image_token", "end_of_utterance_token"), names, strict=True)
@@ -123,12 +123,12 @@ def smolvla(folder: Path, **settings: Any) -> Any:
     processor.save_pretrained(folder / "vlm")
     chunk = {"chunk_size": CHUNK, "n_action_steps": EXECUTED, "num_steps": 4}
     sizes = {"num_vlm_layers": 2, "resize_imgs_with_padding": (64, 64), "load_vlm_weights": False}
-    return _config("smolvla", vlm_model_name=str(folder / "vlm"), **{**sizes, **chunk, **settings})
+    return config_of("smolvla", vlm_model_name=str(folder / "vlm"), **{**sizes, **chunk, **settings})
 
 
 def xvla(folder: Path, **settings: Any) -> Any:
     tokenizer = PreTrainedTokenizerFast(
-        tokenizer_object=_tokenizer(["<s>", "<pad>", "</s>"]), **_named("<pad>", "<s>", "</s>")
+        tokenizer_object=tokenizer_of(["<s>", "<pad>", "</s>"]), **_named("<pad>", "<s>", "</s>")
     )
     tokenizer.save_pretrained(folder / "tokenizer")
     vision = {
@@ -157,7 +157,7 @@ def xvla(folder: Path, **settings: Any) -> Any:
     chunk = {"chunk_size": CHUNK, "n_action_steps": EXECUTED, "num_denoising_steps": 3}
     images = {"num_image_views": 1, "resize_imgs_with_padding": (64, 64)}
     own = {"florence_config": florence, "tokenizer_name": str(folder / "tokenizer"), "action_mode": "auto"}
-    return _config("xvla", **own, **sizes, **chunk, **images, **settings)
+    return config_of("xvla", **own, **sizes, **chunk, **images, **settings)
 
 
 KINDS: dict[str, Callable[..., Any]] = {
@@ -177,12 +177,16 @@ _WITH_FILES = {"smolvla", "xvla"}  # of a tokenizer beside the checkpoint
 def make(folder: Path, kind: str = "act", **settings: Any) -> Path:
     """A checkpoint of that kind in `folder`, with `settings` of its LeRobot config; returns `folder`."""
     folder.mkdir(parents=True, exist_ok=True)
-    config = _MAKERS[kind](folder, **settings) if kind in _WITH_FILES else _MAKERS[kind](**settings)
+    return write(folder, _MAKERS[kind](folder, **settings) if kind in _WITH_FILES else _MAKERS[kind](**settings))
+
+
+def write(folder: Path, config: Any) -> Path:
+    """The checkpoint of a random policy with that LeRobot config, in `folder`, which is there."""
     torch.manual_seed(0)
     with contextlib.redirect_stdout(io.StringIO()):
         policy = get_policy_class(config.type)(config)
     _unsettle(policy)
-    if kind == "vqbet":
+    if config.type == "vqbet":
         policy.vqbet.action_head.vqvae_model.discretized.fill_(True)
     policy.save_pretrained(folder)
     dataset = statistics()
@@ -193,7 +197,8 @@ def make(folder: Path, kind: str = "act", **settings: Any) -> Path:
     return folder
 
 
-def _config(name: str, **settings: Any) -> Any:
+def config_of(name: str, **settings: Any) -> Any:
+    """LeRobot's config of a policy that sees one camera."""
     features = {"input_features": inputs(), "output_features": {"action": PolicyFeature(FeatureType.ACTION, (ACTION,))}}
     return make_policy_config(name, device="cpu", push_to_hub=False, **{**features, **settings})
 
@@ -215,8 +220,8 @@ def _named(pad: str, begin: str, end: str) -> dict[str, str]:
     return {"pad_token": pad, "bos_token": begin, "eos_token": end}
 
 
-def _tokenizer(specials: list[str]) -> Tokenizer:
-    """Bytes, and a few words."""
+def tokenizer_of(specials: list[str]) -> Tokenizer:
+    """Of bytes and a few words."""
     tokenizer = Tokenizer(models.BPE())
     tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
     tokenizer.decoder = decoders.ByteLevel()

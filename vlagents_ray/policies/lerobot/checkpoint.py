@@ -47,6 +47,7 @@ def load(folder: Path, config: LeRobotConfig, device: Any) -> Any:
     _require_known(settings.type, folder)
     wants_bfloat16 = _prepare(settings, config, device)
     try:
+        saved = SavedTensors.of(folder / WEIGHTS)
         policy = factory.get_policy_class(settings.type).from_pretrained(str(folder), config=settings)
     except ConfigError:
         raise
@@ -56,7 +57,7 @@ def load(folder: Path, config: LeRobotConfig, device: Any) -> Any:
             f"it whole, and of this version of LeRobot? What it names on the hub has to be in the cache where there is "
             f"no network, or to be replaced by `overrides`"
         ) from error
-    require_loaded(policy, SavedTensors.of(folder / WEIGHTS).renamed(lambda name: _as_loaded(policy, name)))
+    require_loaded(policy, saved.renamed(lambda name: _as_loaded(policy, name)))
     if wants_bfloat16:
         for parameter in policy.model.vlm_with_expert.vlm.parameters():
             parameter.data = parameter.data.bfloat16()
