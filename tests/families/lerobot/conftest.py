@@ -10,24 +10,27 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from tests.families.lerobot import tiny
 from vlagents_ray import Obs
 from vlagents_ray.policies.lerobot import LeRobot
 from vlagents_ray.serve.sessions import AgentCopies
 
+torch.set_num_threads(1)  # the models are too small for more: threads would wait for one another
 # Only a transformers with openpi's changes has this module, and only it runs pi0 and pi0.5.
 PATCHED = importlib.util.find_spec("transformers.models.siglip.check") is not None
 collect_ignore = [] if PATCHED else ["test_pi.py"]
 
 Load = Callable[..., LeRobot]
+Made = Callable[[str], Path]
 # LeRobot 0.4.4's VQ-BeT decorates with an autocast that torch has another name for.
 FILTERS = [pytest.mark.filterwarnings("ignore:`torch.cuda.amp.autocast:FutureWarning")]
 TASKS = ("pick up the cube", "open the drawer, then close it again", "push")
 
 
 @pytest.fixture(scope="session")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
+def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
     """The checkpoint of a kind, written once."""
 
     @functools.cache
@@ -38,7 +41,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Path]:
 
 
 @pytest.fixture(scope="session")
-def loaded(made: Callable[..., Path]) -> Load:
+def loaded(made: Made) -> Load:
     """A policy on the checkpoint of a kind, loaded once for each setting."""
 
     @functools.cache

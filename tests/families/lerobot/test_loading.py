@@ -13,10 +13,9 @@ import pytest
 from safetensors.torch import load_file, save_file
 
 from tests.families.lerobot import tiny
-from tests.families.lerobot.conftest import FILTERS, PATCHED, Load, begun, view
+from tests.families.lerobot.conftest import FILTERS, PATCHED, Load, Made, begun, view
 from vlagents_ray.contract import CameraSpec
-from vlagents_ray.errors import ConfigError, InvalidObservation
-from vlagents_ray.interface import LEFTOVER
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.lerobot import LeRobot
 
 pytestmark = FILTERS
@@ -34,7 +33,7 @@ def opened(folder: Path, **config: Any) -> LeRobot:
 
 
 @pytest.fixture
-def copied(made: Callable[[str], Path], tmp_path: Path) -> Callable[[str], Path]:
+def copied(made: Made, tmp_path: Path) -> Callable[[str], Path]:
     """A copy of the checkpoint of a kind, to be spoilt."""
     return lambda kind: Path(shutil.copytree(made(kind), tmp_path / kind))
 
@@ -107,7 +106,7 @@ def test_a_spoilt_checkpoint_is_refused(spoil: Change, text: str, copied: Callab
         ({"temperature": 1}, "temperature"),
     ],
 )
-def test_a_wrong_setting_is_refused(config: dict[str, Any], text: str, made: Callable[[str], Path]) -> None:
+def test_a_wrong_setting_is_refused(config: dict[str, Any], text: str, made: Made) -> None:
     with pytest.raises(ConfigError, match=text):
         opened(made("act"), **config)
 
@@ -132,7 +131,7 @@ def test_a_type_that_cannot_be_served_says_why(name: str, text: str, copied: Cal
         opened(folder)
 
 
-def test_a_step_of_training_is_found_as_lerobot_writes_it(made: Callable[[str], Path], tmp_path: Path) -> None:
+def test_a_step_of_training_is_found_as_lerobot_writes_it(made: Made, tmp_path: Path) -> None:
     shutil.copytree(made("act"), tmp_path / "checkpoints" / "020000" / "pretrained_model")
     policy = opened(tmp_path / "checkpoints" / "{step}", checkpoint_step=20000)
     assert policy.contract is not None
@@ -140,7 +139,7 @@ def test_a_step_of_training_is_found_as_lerobot_writes_it(made: Callable[[str], 
         opened(tmp_path / "checkpoints" / "{step}", checkpoint_step=40000)
 
 
-def test_settings_of_the_checkpoint_can_be_overridden(loaded: Load, made: Callable[[str], Path]) -> None:
+def test_settings_of_the_checkpoint_can_be_overridden(loaded: Load, made: Made) -> None:
     policy = opened(made("diffusion"), overrides={"num_inference_steps": 10, "n_action_steps": 2})
     assert policy.contract is not None
     assert policy.contract.chunk == 2
@@ -157,30 +156,3 @@ def test_a_checkpoints_cameras_may_be_renamed_or_masked(tmp_path: Path) -> None:
     assert alone.contract is not None
     assert set(alone.contract.cameras or ()) == {tiny.CAMERA}
     assert np.isfinite(begun(alone).act(view()).action).all()
-
-
-def test_a_leftover_of_another_robot_fails_its_own_session_alone(loaded: Load) -> None:
-    policy = loaded("smolvla")
-    bad = view(**{LEFTOVER: np.zeros((3, tiny.ACTION + 1), np.float32)})
-    wrong, right = policy.act_batch([bad, view(1)], [begun(policy), begun(policy, 1)])
-    assert isinstance(wrong, InvalidObservation)
-    assert not isinstance(right, Exception)
-
-
-def test_leftovers_and_delays_of_neighbours_do_not_matter(loaded: Load) -> None:
-    policy = loaded("smolvla", execute=tiny.CHUNK)
-    plan = np.linspace(-1, 1, 5 * tiny.ACTION, dtype=np.float32).reshape(5, tiny.ACTION)
-    views = [view(0, leftover_actions=plan, delay_ticks=2), view(1), view(2, leftover_actions=plan[:3], delay_ticks=1)]
-    alone = [begun(policy, i).act(one).action for i, one in enumerate(views)]
-    acts = policy.act_batch(views, [begun(policy, i) for i in range(3)])
-    for act, wanted in zip(acts, alone, strict=True):
-        assert not isinstance(act, Exception)
-        np.testing.assert_allclose(act.action, wanted, atol=1e-5)
-
-
-def test_a_chunk_goes_on_from_what_the_robot_is_doing(loaded: Load) -> None:
-    policy = loaded("smolvla", execute=tiny.CHUNK)
-    plan = begun(policy, 5).act(view(5)).action[2:]
-    free = begun(policy).act(view()).action
-    guided = begun(policy).act(view(leftover_actions=plan, delay_ticks=3)).action
-    assert np.abs(guided[:3] - plan[:3]).max() < 0.2 * np.abs(free[:3] - plan[:3]).max()

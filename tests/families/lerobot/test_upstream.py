@@ -15,7 +15,7 @@ from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from lerobot.policies.utils import prepare_observation_for_inference
 
 from tests.families.lerobot import tiny
-from tests.families.lerobot.conftest import FILTERS, TASKS, Load, begun, view
+from tests.families.lerobot.conftest import FILTERS, TASKS, Load, Made, begun, view
 from vlagents_ray import Obs
 from vlagents_ray.interface import DELAY, LEFTOVER
 from vlagents_ray.policies.lerobot import LeRobot
@@ -53,7 +53,7 @@ def draws_of(policy: LeRobot) -> np.random.Generator:
 
 
 @pytest.fixture
-def upstream(made: Callable[..., Path]) -> Iterator[Callable[[str], Theirs]]:
+def upstream(made: Made) -> Iterator[Callable[[str], Theirs]]:
     state = torch.random.get_rng_state()
     yield lambda kind: Theirs(made(kind))
     torch.random.set_rng_state(state)
@@ -118,7 +118,7 @@ def test_diffusion_is_theirs_over_several_chunks(
         np.testing.assert_allclose(session.act(view(tick)).action, wanted, atol=ATOL)
 
 
-def test_tdmpc_plans_as_theirs_does_and_goes_on_from_its_last_plan(loaded: Load, upstream, monkeypatch) -> None:
+def test_tdmpc_plans_as_theirs_from_its_last_plan(loaded: Load, upstream: Callable[[str], Theirs]) -> None:
     theirs, policy = upstream("tdmpc"), loaded("tdmpc")
     draws, session = draws_of(policy), begun(policy)
     for tick in range(3):
@@ -129,8 +129,26 @@ def test_tdmpc_plans_as_theirs_does_and_goes_on_from_its_last_plan(loaded: Load,
         np.testing.assert_allclose(session.act(view(tick)).action[0], action, atol=ATOL)
 
 
+def test_smolvla_with_its_language_model_in_bfloat16_is_theirs(tmp_path: Path) -> None:
+    """LeRobot reads those weights from the hub first; here they come from the checkpoint alone, in the same types."""
+    folder = tiny.make(tmp_path / "smolvla", "smolvla", load_vlm_weights=True)
+    theirs, policy = Theirs(folder), LeRobot.from_config({"checkpoint": str(folder)})
+    for file in (folder / "vlm").glob("*.safetensors"):
+        file.unlink()
+    policy.initialize()
+    ours = {name: one.dtype for name, one in policy.model.kind.policy.named_parameters()}
+    assert ours == {name: one.dtype for name, one in theirs.policy.named_parameters()}
+    assert torch.bfloat16 in ours.values()
+    shape = (1, tiny.CHUNK, theirs.policy.config.max_action_dim)
+    noise = torch.from_numpy(draws_of(policy).standard_normal(shape, dtype=np.float32))
+    np.testing.assert_allclose(begun(policy).act(view()).action[0], theirs.select(view(), noise=noise), atol=ATOL)
+    exact = LeRobot.from_config({"checkpoint": str(folder), "dtype": "float32"})
+    exact.initialize()
+    assert {one.dtype for one in exact.model.kind.policy.parameters()} == {torch.float32}
+
+
 @pytest.mark.parametrize(("left", "delay"), [(6, 2), (3, 2), (8, 0), (2, 5)])
-def test_real_time_chunking_is_theirs(left: int, delay: int, loaded: Load, upstream) -> None:
+def test_real_time_chunking_is_theirs(left: int, delay: int, loaded: Load, upstream: Callable[[str], Theirs]) -> None:
     theirs, policy = upstream("smolvla"), loaded("smolvla", execute=tiny.CHUNK)
     plan = np.random.default_rng(5).uniform(-1, 1, (left, tiny.ACTION)).astype(np.float32)
     rows = begun(policy).act(view(1, **{LEFTOVER: plan, DELAY: delay})).action

@@ -25,7 +25,13 @@ import torch
 from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
 from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
-from transformers import PreTrainedTokenizerFast, SmolVLMConfig, SmolVLMImageProcessor, SmolVLMProcessor
+from transformers import (
+    PreTrainedTokenizerFast,
+    SmolVLMConfig,
+    SmolVLMForConditionalGeneration,
+    SmolVLMImageProcessor,
+    SmolVLMProcessor,
+)
 from transformers.models.smolvlm.video_processing_smolvlm import SmolVLMVideoProcessor
 
 STATE, ACTION, SIDE = 6, 6, 64
@@ -119,6 +125,8 @@ def smolvla(folder: Path, **settings: Any) -> Any:
         ),
     )
     model.save_pretrained(folder / "vlm")
+    if settings.get("load_vlm_weights"):  # the language model is then in bfloat16
+        SmolVLMForConditionalGeneration(model).save_pretrained(folder / "vlm")
     processor = SmolVLMProcessor(SmolVLMImageProcessor(), tokenizer, SmolVLMVideoProcessor(), chat_template=None)
     processor.save_pretrained(folder / "vlm")
     chunk = {"chunk_size": CHUNK, "n_action_steps": EXECUTED, "num_steps": 4}

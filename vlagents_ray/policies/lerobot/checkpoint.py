@@ -45,7 +45,7 @@ def load(folder: Path, config: LeRobotConfig, device: Any) -> Any:
     factory = require("lerobot.policies.factory")
     settings = _settings(folder, config)
     _require_known(settings.type, folder)
-    wants_bfloat16 = _prepare(settings, config, device)
+    as_saved = _prepare(settings, config, device)
     try:
         saved = SavedTensors.of(folder / WEIGHTS)
         policy = factory.get_policy_class(settings.type).from_pretrained(str(folder), config=settings)
@@ -58,9 +58,11 @@ def load(folder: Path, config: LeRobotConfig, device: Any) -> Any:
             f"no network, or to be replaced by `overrides`"
         ) from error
     require_loaded(policy, saved.renamed(lambda name: _as_loaded(policy, name)))
-    if wants_bfloat16:
-        for parameter in policy.model.vlm_with_expert.vlm.parameters():
-            parameter.data = parameter.data.bfloat16()
+    if config.dtype == "float32":
+        policy.float()
+    elif as_saved:
+        for name, parameter in policy.named_parameters():
+            parameter.data = parameter.data.to(saved[name].dtype if name in saved else parameter.dtype)
     return policy.to(device).eval()
 
 
@@ -101,7 +103,7 @@ def _require_known(name: str, folder: Path) -> None:
 
 
 def _prepare(settings: Any, config: LeRobotConfig, device: Any) -> bool:
-    """Where and how the policy runs; True if SmolVLA's language model is to be bfloat16."""
+    """Where and how the policy runs. True if its parameters are to be of the types that they were saved in."""
     if settings.use_peft:
         raise ConfigError(
             "checkpoint: is a PEFT adapter, want whole weights; merge it (merge_and_unload) and save that"
@@ -116,22 +118,15 @@ def _prepare(settings: Any, config: LeRobotConfig, device: Any) -> bool:
     if issubclass(KINDS.get(settings.type, object), Flow):
         rtc = settings.rtc_config or require("lerobot.policies.rtc.configuration_rtc").RTCConfig()
         settings.rtc_config = dataclasses.replace(rtc, enabled=True, debug=False)
-    return _choose_dtype(settings, config)
-
-
-def _choose_dtype(settings: Any, config: LeRobotConfig) -> bool:
-    if settings.type == "smolvla":
-        bfloat16 = settings.load_vlm_weights if config.dtype == "auto" else config.dtype == "bfloat16"
-        settings.load_vlm_weights = False  # else downloaded in bfloat16, only to be replaced by the checkpoint's
-        choices = ["auto", "float32", "bfloat16"]
-    else:
-        bfloat16 = False
-        choices = ["auto", "float32", *(["bfloat16"] if hasattr(settings, "dtype") else [])]
-        if hasattr(settings, "dtype") and config.dtype != "auto":
-            settings.dtype = config.dtype
+    choices = ["auto", "float32", *(["bfloat16"] if hasattr(settings, "dtype") else [])]
     if config.dtype not in choices:
         raise ConfigError(f"dtype: got {config.dtype!r}, LeRobot's {settings.type!r} takes one of {choices}")
-    return bool(bfloat16)
+    if hasattr(settings, "dtype") and config.dtype != "auto":
+        settings.dtype = config.dtype
+    as_saved = bool(getattr(settings, "load_vlm_weights", False))
+    if as_saved:
+        settings.load_vlm_weights = False  # else downloaded in bfloat16, only to be replaced by the checkpoint's
+    return as_saved
 
 
 def _as_loaded(policy: Any, name: str) -> str | None:

@@ -21,7 +21,7 @@ class Guidance:
     def weights(self, delay: int, leftover: int, chunk: int) -> Any:
         """How much each row of a chunk follows the leftover, (chunk,) float32 in [0, 1]."""
         horizon = min(self._processor.rtc_config.execution_horizon, leftover)
-        return self._processor.get_prefix_weights(delay, horizon, chunk)
+        return self._processor.get_prefix_weights(max(delay, 0), horizon, chunk)
 
     def denoise_step(
         self,

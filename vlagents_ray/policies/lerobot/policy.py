@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
-from vlagents_ray.errors import ConfigError, InvalidObservation
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import torch_device
@@ -94,12 +94,10 @@ class LeRobot(ModelPolicy):
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         """One forward pass for all rows whose images are of one size; types that cannot batch run row by row."""
-        results: list[Prediction | Exception] = [InvalidObservation("not predicted")] * len(rows)
+        chunks: dict[int, np.ndarray] = {}
         for members in self._groups(rows):
-            chunks = self._draw([rows[i] for i in members])
-            for i, chunk in zip(members, chunks, strict=True):
-                results[i] = Prediction(chunk)
-        return results
+            chunks |= zip(members, self._draw([rows[i] for i in members]), strict=True)
+        return [Prediction(chunks[i]) for i in range(len(rows))]
 
     def _groups(self, rows: Sequence[Row]) -> list[list[int]]:
         if not self.model.kind.batched:
