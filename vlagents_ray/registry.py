@@ -16,6 +16,7 @@ from typing import Any
 from vlagents_ray.errors import ConfigError, MissingDependency, UnknownEnv, UnknownPolicy
 
 POLICIES: dict[str, str] = {
+    "lerobot": "vlagents_ray.policies.lerobot:LeRobot",
     "noop": "vlagents_ray.policies.noop:Noop",
     "random": "vlagents_ray.policies.random:Random",
     "replay": "vlagents_ray.policies.replay:Replay",
@@ -55,6 +56,9 @@ _EXTRAS = {
     "gym_pusht": "pusht",
 }
 
+# import name -> its file in requirements/: what runs in a Python environment of its own
+_ENVIRONMENTS = {"lerobot": "lerobot.txt"}
+
 
 def require(module: str) -> ModuleType:
     """Import an optional module, or raise `MissingDependency` naming the extra that brings it."""
@@ -64,8 +68,11 @@ def require(module: str) -> ModuleType:
         top = module.partition(".")[0]
         if error.name is None or error.name.partition(".")[0] != top:
             raise  # the module is there, something it needs is not: say what
-        extra = _EXTRAS.get(top)
-        cure = f"pip install 'vlagents-ray[{extra}]'" if extra else f"install the package that provides {top!r}"
+        cure = f"install the package that provides {top!r}"
+        if top in _ENVIRONMENTS:
+            cure = f"name an environment with requirements/{_ENVIRONMENTS[top]} in the deployment's `environment`"
+        elif top in _EXTRAS:
+            cure = f"pip install 'vlagents-ray[{_EXTRAS[top]}]'"
         raise MissingDependency(f"{module!r} is not installed; {cure}") from error
 
 

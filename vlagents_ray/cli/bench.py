@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vlagents_ray.cli.console import errors, out
-from vlagents_ray.cli.settings import parse_settings
-from vlagents_ray.cli.tables import show_overhead, show_round_trips, show_throughput
+from vlagents_ray.cli.settings import parse_counts, parse_list, parse_settings
+from vlagents_ray.cli.tables import show_overhead, show_policy, show_round_trips, show_throughput
 from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def bench_rtt(
     with errors():
         check(plot)
         found = measure_rtt(
-            calls, transports=_list(transports), peers=_list(peers), peers_python=peers_python, tell=_tell
+            calls, transports=parse_list(transports), peers=parse_list(peers), peers_python=peers_python, tell=_tell
         ).to_json()
         show_round_trips(found, "round trip of one act on this machine")
         _save(found, json_file)
@@ -70,7 +70,7 @@ def bench_link(
     with errors():
         check(plot)
         found = measure_link(
-            calls, rate=rate, delay=delay, peers=_list(peers), peers_python=peers_python, tell=_tell
+            calls, rate=rate, delay=delay, peers=parse_list(peers), peers_python=peers_python, tell=_tell
         )  # fmt: skip
         title = f"round trip of one act over {found['link']['measured_mbit_per_s']:.0f} Mbit/s"
         show_round_trips(found, title)
@@ -122,19 +122,41 @@ def bench_throughput(
 
     with errors():
         chosen = _policy(policy, config, model, device)
-        try:
-            counts = sorted({int(one) for one in _list(clients)})
-        except ValueError as error:
-            raise ConfigError(f"--clients: got {clients!r}, want numbers with commas between them") from error
-        if not counts or counts[0] < 1:
-            raise ConfigError(f"--clients: got {clients!r}, want numbers from 1 on")
+        counts = parse_counts(clients, "--clients")
         gpus = float(device.startswith("cuda")) if num_gpus is None else num_gpus
         plan: Plan = Plan(
             **chosen, num_gpus=gpus, batch=batch, clients=counts, seconds=seconds, rounds=rounds,
-            robot_seconds=robot_seconds, transports=_list(transports),
+            robot_seconds=robot_seconds, transports=parse_list(transports),
         )  # fmt: skip
         found = measure_throughput(plan, _tell)
     show_throughput(found)
+    _save(found, json_file)
+
+
+@bench.command("policy")
+def bench_policy(
+    file: Annotated[str, typer.Argument(help="A deployment file, or a registered policy.")],
+    batch: Annotated[str, typer.Option(help="Batch sizes, with commas between them.")] = "1,8",
+    seconds: Annotated[float, typer.Option(min=0.1, help="Of each measurement.")] = 2.0,
+    rounds: Annotated[int, typer.Option(min=1)] = 3,
+    app: Annotated[str | None, typer.Option(help="Of the file, if it holds several.")] = None,
+    image: Annotated[int, typer.Option(min=1, help="Pixels a side, where the policy takes any image.")] = 224,
+    state: Annotated[
+        list[str], typer.Option(metavar="PART=N", help="Numbers in a part for which the policy does not say.")
+    ] = [],  # noqa: B006
+    json_file: Json = None,
+) -> None:
+    """Actions a second of one policy alone, by batch size: bare, and behind its batch queue; without Ray."""
+    from vlagents_ray.bench.policies import PolicyPlan, measure_policy
+    from vlagents_ray.serve.files import server_args
+
+    with errors():
+        dims = parse_settings(state, "--state")
+        if not all(isinstance(number, int) and number > 0 for number in dims.values()):
+            raise ConfigError(f"--state: got {dims}, want a number from 1 on for each part")
+        args, batches = server_args(file, app), parse_counts(batch, "--batch")
+        found = measure_policy(PolicyPlan(args, batches, seconds, rounds, image, dims), _tell)
+    show_policy(found)
     _save(found, json_file)
 
 
@@ -224,10 +246,6 @@ def _policy(policy: str | None, config: str, model: str | None, device: str) -> 
     if settings:
         raise ConfigError("--config: is for --policy or --model; name one")
     return {}
-
-
-def _list(text: str) -> list[str]:
-    return [one.strip() for one in text.split(",") if one.strip()]
 
 
 def _tell(text: str) -> None:

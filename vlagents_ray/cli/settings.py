@@ -1,4 +1,4 @@
-"""`--set key=value` on the command line."""
+"""`--set key=value` and lists on the command line."""
 
 from __future__ import annotations
 
@@ -28,3 +28,19 @@ def parse_settings(texts: Iterable[str], option: str) -> dict[str, Any]:
         except yaml.YAMLError as error:
             raise ConfigError(f"{option}: the value of {key!r} is not YAML ({error})") from error
     return settings
+
+
+def parse_list(text: str) -> list[str]:
+    """What stands between commas."""
+    return [one.strip() for one in text.split(",") if one.strip()]
+
+
+def parse_counts(text: str, option: str) -> list[int]:
+    """Numbers from 1 on with commas between them, ascending."""
+    try:
+        counts = sorted({int(one) for one in parse_list(text)})
+    except ValueError as error:
+        raise ConfigError(f"{option}: got {text!r}, want numbers with commas between them") from error
+    if not counts or counts[0] < 1:
+        raise ConfigError(f"{option}: got {text!r}, want numbers from 1 on")
+    return counts

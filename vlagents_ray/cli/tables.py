@@ -47,6 +47,23 @@ def show_round_trips(found: Mapping[str, Any], title: str) -> None:
         out.print(f"[yellow]skipped {escape(name)}[/]: {escape(reason)}", highlight=False, soft_wrap=True)
 
 
+def show_policy(found: Mapping[str, Any]) -> None:
+    """A row for each batch size."""
+    table = Table(
+        "batch", "bare actions/s", "ms a batch", "queued actions/s", "round trip ms", "mean batch", "peak MiB"
+    )
+    rows = f", {found['chunk']} rows an action" if (found["chunk"] or 1) > 1 else ""
+    table.title = f"{found['policy']} on {found['device']}{rows}"
+    for row in found["batches"]:
+        bare, queued = row["bare"], row["queued"]
+        table.add_row(
+            str(row["batch"]), f"{bare['actions_per_s']:.1f}", f"{bare['batch_ms']:.2f}",
+            f"{queued['actions_per_s']:.1f}", f"{queued['round_trip_ms']:.2f}", f"{queued['mean_batch']:.2f}",
+            f"{row['peak_mib']:.0f}",
+        )  # fmt: skip
+    out.print(table)
+
+
 def show_throughput(found: Mapping[str, Any]) -> None:
     """A row for each number of clients, and a sentence for each transport."""
     table = Table("transport", "clients", "actions/s", "of ideal", "mean batch", "p50 ms", "p99 ms")

@@ -46,6 +46,16 @@ def read_deployment(source: str, overrides: Mapping[str, Any] | None = None) -> 
     return deployment(source, **(overrides or {}))
 
 
+def server_args(source: str, app: str | None = None) -> ServerArgs:
+    """The settings of one policy of a deployment: the one called `app`, or the only one there is."""
+    ours = {one.name: one for one in _ours(read_deployment(source))}
+    if app is None and len(ours) == 1:
+        [app] = ours
+    if app not in ours:
+        raise ConfigError(f"{source}: holds the policies {sorted(ours)}, got {app!r}; name one of them as the app")
+    return ServerArgs(**ours[app].args)
+
+
 def with_gateways_at(config: ServeDeploySchema, host: str) -> ServeDeploySchema:
     """The deployment, in which a dialect with a port of its own that names no host listens where the server does."""
     changed = config.model_copy(deep=True)

@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.contract import CameraSpec, Contract, StateSpec, check_action
+from vlagents_ray.contract import Contract, check_action
 from vlagents_ray.errors import InvalidAction
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.testing.comparing import ContractViolation, require_same, require_wireable
+from vlagents_ray.testing.observations import random_observation
 
 _SESSIONS = 3
-_DEFAULT_SIDE = 64  # px, where the contract accepts any image
-_DEFAULT_DIM = 7  # where it accepts any state
 
 
 def check_agent(
@@ -44,7 +43,11 @@ def check_agent(
     contract = agent.contract
     if contract is not None and not isinstance(contract, Contract):
         raise ContractViolation(f"contract: got {type(contract).__name__}, want a Contract or None")
-    views = [obs] if isinstance(obs, Obs) else list(obs or [_random_obs(contract, seed) for seed in range(_SESSIONS)])
+    views = (
+        [obs]
+        if isinstance(obs, Obs)
+        else list(obs or [random_observation(contract, seed) for seed in range(_SESSIONS)])
+    )
     suite = _Suite(agent, contract, views, instructions, dict(reset_kwargs or {}))
 
     alone = [suite.play_alone(i, steps) for i in range(_SESSIONS)]
@@ -169,21 +172,3 @@ class _Suite:
             raise ContractViolation(f"{where}: done is {type(act.done).__name__}, want a bool")
         require_wireable(act.info, f"{where}: info")
         return act
-
-
-def _random_obs(contract: Contract | None, seed: int) -> Obs:
-    """Values that fit `contract`; where it states nothing, one camera and one state part."""
-    rng = np.random.default_rng(seed)
-    cameras: Mapping[str, CameraSpec] = {"front": CameraSpec()}
-    state: Mapping[str, StateSpec] = {"joints": StateSpec()}
-    if contract is not None:
-        cameras = cameras if contract.cameras is None else contract.cameras
-        state = state if contract.state is None else contract.state
-    return Obs(
-        cameras={
-            name: rng.integers(0, 256, (c.height or _DEFAULT_SIDE, c.width or _DEFAULT_SIDE, 3), dtype=np.uint8)
-            for name, c in cameras.items()
-        },
-        gripper=float(rng.uniform()),
-        state={name: rng.uniform(-1, 1, s.dim or _DEFAULT_DIM).astype(np.float32) for name, s in state.items()},
-    )

@@ -19,10 +19,12 @@ _LISTED = 8
 def find_checkpoint(name: str, step: int | None = None, needs: Iterable[str] = ()) -> Path:
     """The folder or file of a checkpoint: a path on this machine, or a hub id, downloaded if it is not cached.
 
-    `step` replaces `{step}` in `name`. `needs` are files (or glob patterns) that a folder must hold.
+    `step` replaces `{step}` in `name`, with leading zeros to six digits where only that exists. `needs` are files (or
+    glob patterns) that a folder must hold.
     Raises `ConfigError` when there is no such checkpoint, or a file is missing.
     """
-    name = name.replace(STEP, str(step))
+    names = [name.replace(STEP, digits) for digits in (str(step), f"{step or 0:06d}")]
+    name = next((one for one in names if Path(one).expanduser().exists()), names[0])
     path = Path(name).expanduser()
     if not path.exists():
         if name.startswith((".", "/", "~")) or name.count("/") != 1:

@@ -1,0 +1,70 @@
+"""Checkpoints and sessions for LeRobot's tests."""
+
+from __future__ import annotations
+
+import functools
+import importlib.util
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tests.families.lerobot import tiny
+from vlagents_ray import Obs
+from vlagents_ray.policies.lerobot import LeRobot
+from vlagents_ray.serve.sessions import AgentCopies
+
+torch.set_num_threads(1)  # the models are too small for more: threads would wait for one another
+# Only a transformers with openpi's changes has this module, and only it runs pi0 and pi0.5.
+PATCHED = importlib.util.find_spec("transformers.models.siglip.check") is not None
+collect_ignore = [] if PATCHED else ["test_pi.py"]
+
+Load = Callable[..., LeRobot]
+Made = Callable[[str], Path]
+# LeRobot 0.4.4's VQ-BeT decorates with an autocast that torch has another name for.
+FILTERS = [pytest.mark.filterwarnings("ignore:`torch.cuda.amp.autocast:FutureWarning")]
+TASKS = ("pick up the cube", "open the drawer, then close it again", "push")
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """The checkpoint of a kind, written once."""
+
+    @functools.cache
+    def make(kind: str) -> Path:
+        return tiny.make(tmp_path_factory.mktemp(kind), kind)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def loaded(made: Made) -> Load:
+    """A policy on the checkpoint of a kind, loaded once for each setting."""
+
+    @functools.cache
+    def load(kind: str, **config: Any) -> LeRobot:
+        policy = LeRobot.from_config({"checkpoint": str(made(kind)), **config})
+        policy.initialize()
+        return policy
+
+    return load
+
+
+def view(seed: int = 0, side: int = tiny.SIDE, **info: Any) -> Obs:
+    """What one robot sees."""
+    rng = np.random.default_rng(seed)
+    image = rng.integers(0, 256, (side, side, 3), dtype=np.uint8)
+    return Obs(
+        cameras={tiny.CAMERA: image}, state={"joints": rng.uniform(-1, 1, tiny.STATE).astype(np.float32)}, info=info
+    )
+
+
+def begun(policy: LeRobot, number: int = 0) -> LeRobot:
+    """The session of one robot, as a server makes it."""
+    session = AgentCopies(policy).make()
+    session.reset(view(number), TASKS[number % len(TASKS)], seed=number)
+    assert isinstance(session, LeRobot)
+    return session

@@ -1,0 +1,158 @@
+"""Whatever is missing, unknown or random in a checkpoint is an error before anything is served."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from safetensors.torch import load_file, save_file
+
+from tests.families.lerobot import tiny
+from tests.families.lerobot.conftest import FILTERS, PATCHED, Load, Made, begun, view
+from vlagents_ray.contract import CameraSpec
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.policies.lerobot import LeRobot
+
+pytestmark = FILTERS
+
+UNPATCHED = () if PATCHED else ("pi0", "pi05")
+Change = Callable[[Path], Any]
+PRE, POST = "policy_preprocessor", "policy_postprocessor"
+TOP = f"observation.images.{tiny.CAMERA}"
+
+
+def opened(folder: Path, **config: Any) -> LeRobot:
+    policy = LeRobot.from_config({"checkpoint": str(folder), **config})
+    policy.initialize()
+    return policy
+
+
+@pytest.fixture
+def copied(made: Made, tmp_path: Path) -> Callable[[str], Path]:
+    """A copy of the checkpoint of a kind, to be spoilt."""
+    return lambda kind: Path(shutil.copytree(made(kind), tmp_path / kind))
+
+
+def tensors(name: str, change: Callable[[dict[str, Any]], Any]) -> Change:
+    def spoil(folder: Path) -> None:
+        [file] = folder.glob(name)
+        saved = load_file(file)
+        change(saved)
+        save_file(saved, file)
+
+    return spoil
+
+
+def settings(**changed: Any) -> Change:
+    def spoil(folder: Path) -> None:
+        file = folder / "config.json"
+        file.write_text(json.dumps({**json.loads(file.read_text()), **changed}))
+
+    return spoil
+
+
+@pytest.mark.parametrize(
+    ("spoil", "text"),
+    [
+        (lambda folder: (folder / "config.json").unlink(), "config.json"),
+        (lambda folder: (folder / "model.safetensors").unlink(), "model.safetensors"),
+        (lambda folder: (folder / f"{PRE}.json").unlink(), "migrate_policy_normalization"),
+        (lambda folder: (folder / f"{POST}.json").unlink(), f"{POST}.json"),
+        (lambda folder: next(folder.glob(f"{POST}*.safetensors")).unlink(), "processors do not load"),
+        (
+            tensors(f"{PRE}*.safetensors", lambda saved: saved.pop("observation.state.mean")),
+            "'mean'.* of 'observation.state'",
+        ),
+        (tensors(f"{PRE}*.safetensors", lambda saved: saved.pop(f"{TOP}.std")), f"'std'.* of '{TOP}'"),
+        (tensors(f"{POST}*.safetensors", lambda saved: saved.pop("action.std")), "'std'.* of 'action'"),
+        (
+            tensors(f"{POST}*.safetensors", lambda saved: saved["action.mean"].fill_(float("nan"))),
+            "'mean'.* of 'action'",
+        ),
+        (tensors("model*", lambda saved: saved.pop("model.action_head.weight")), "model.action_head.weight"),
+        (settings(type="unheard_of"), "unheard_of"),
+        (settings(chunk_size="many"), "chunk_size"),
+        (settings(use_peft=True), "merge_and_unload"),
+        (settings(dim_model=64), "cannot load"),
+    ],
+)
+def test_a_spoilt_checkpoint_is_refused(spoil: Change, text: str, copied: Callable[[str], Path]) -> None:
+    folder = copied("act")
+    spoil(folder)
+    with pytest.raises(ConfigError, match=text):
+        opened(folder)
+
+
+@pytest.mark.parametrize(
+    ("config", "text"),
+    [
+        ({"cameras": {"side": "front"}}, r"want \['top'\]"),
+        ({"cameras": {}}, r"want \['top'\]"),
+        ({"masked_cameras": ["top"]}, "needs all its cameras"),
+        ({"masked_cameras": ["side"]}, "side"),
+        ({"execute": tiny.CHUNK + 1}, f"{tiny.CHUNK} rows"),
+        ({"overrides": {"num_inference_steps": 3}}, "num_inference_steps"),
+        ({"overrides": {"chunk_size": "many"}}, "many"),
+        ({"processors": {"tokenizer_processor": {}}}, "normalizer_processor"),
+        ({"processors": {"normalizer_processor": {"nonsense": 1}}}, "processors do not load"),
+        ({"dtype": "bfloat16"}, "'act' takes"),
+        ({"compile": True}, "compile_model"),
+        ({"device": "cuda:77"}, "cuda:77"),
+        ({"temperature": 1}, "temperature"),
+    ],
+)
+def test_a_wrong_setting_is_refused(config: dict[str, Any], text: str, made: Made) -> None:
+    with pytest.raises(ConfigError, match=text):
+        opened(made("act"), **config)
+
+
+def test_a_residual_vq_that_is_not_trained_is_refused(copied: Callable[[str], Path]) -> None:
+    folder = copied("vqbet")
+    tensors("model*", lambda saved: saved["vqbet.action_head.vqvae_model.discretized"].fill_(False))(folder)
+    with pytest.raises(ConfigError, match="not trained"):
+        opened(folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [("pi0", "openpi's changes"), ("pi05", "openpi's changes"), ("groot", "GR00T"), ("sarm", "rewards")],
+)
+def test_a_type_that_cannot_be_served_says_why(name: str, text: str, copied: Callable[[str], Path]) -> None:
+    folder = copied("act")
+    config = {**json.loads((folder / "config.json").read_text()), "type": name}
+    known = ("type", "input_features", "output_features", "device")
+    (folder / "config.json").write_text(json.dumps({key: config[key] for key in known}))
+    with pytest.raises(ConfigError, match=text):
+        opened(folder)
+
+
+def test_a_step_of_training_is_found_as_lerobot_writes_it(made: Made, tmp_path: Path) -> None:
+    shutil.copytree(made("act"), tmp_path / "checkpoints" / "020000" / "pretrained_model")
+    policy = opened(tmp_path / "checkpoints" / "{step}", checkpoint_step=20000)
+    assert policy.contract is not None
+    with pytest.raises(ConfigError, match="no such"):
+        opened(tmp_path / "checkpoints" / "{step}", checkpoint_step=40000)
+
+
+def test_settings_of_the_checkpoint_can_be_overridden(loaded: Load, made: Made) -> None:
+    policy = opened(made("diffusion"), overrides={"num_inference_steps": 10, "n_action_steps": 2})
+    assert policy.contract is not None
+    assert policy.contract.chunk == 2
+    assert not np.allclose(begun(policy).act(view()).action, begun(loaded("diffusion")).act(view()).action[:2])
+
+
+def test_a_checkpoints_cameras_may_be_renamed_or_masked(tmp_path: Path) -> None:
+    features = {**tiny.inputs(), "observation.images.wrist": tiny.inputs()[TOP]}
+    folder = tiny.make(tmp_path / "two", "smolvla", input_features=features, empty_cameras=1)
+    renamed = opened(folder, rename_map={"observation.images.front": TOP}).contract
+    assert renamed is not None
+    assert renamed.cameras == {"front": CameraSpec(), "wrist": CameraSpec()}
+    alone = opened(folder, masked_cameras=["wrist"])
+    assert alone.contract is not None
+    assert set(alone.contract.cameras or ()) == {tiny.CAMERA}
+    assert np.isfinite(begun(alone).act(view()).action).all()

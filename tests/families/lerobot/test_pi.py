@@ -1,0 +1,144 @@
+"""π0 and π0.5, where transformers has openpi's changes; conftest.py leaves this file out where it has not.
+
+LeRobot makes these models in two sizes only, so their sizes are changed under its hands.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.policies.rtc.configuration_rtc import RTCConfig
+from safetensors.torch import load_file, save_file
+from transformers import PreTrainedTokenizerFast
+
+from tests.families.lerobot import tiny
+from tests.families.lerobot.conftest import TASKS, begun, view
+from tests.families.lerobot.test_upstream import Theirs, draws_of
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.interface import DELAY, LEFTOVER, Act
+from vlagents_ray.policies.lerobot import LeRobot
+from vlagents_ray.testing import check_agent
+
+KINDS = ("pi0", "pi05")
+ATOL = 1e-5
+VOCABULARY = 400
+
+
+@pytest.fixture(scope="module")
+def shrunk() -> Iterator[pytest.MonkeyPatch]:
+    """LeRobot makes small models."""
+    with pytest.MonkeyPatch.context() as patch:
+        for kind in KINDS:
+            modeling = importlib.import_module(f"lerobot.policies.{kind}.modeling_{kind}")
+            size = modeling.GemmaConfig(width=32, depth=2, mlp_dim=64, num_heads=4, num_kv_heads=1, head_dim=16)
+            patch.setattr(modeling, "get_gemma_config", lambda _, size=size: size)
+            for name, change in (
+                ("PaliGemmaForConditionalGeneration", _small_vision),
+                ("GemmaForCausalLM", _few_words),
+            ):
+                made = getattr(modeling, name)
+                patch.setattr(modeling, name, lambda config, made=made, change=change: made(config=change(config)))
+        yield patch
+
+
+@pytest.fixture(scope="module")
+def made(shrunk: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
+    """The checkpoint of a kind, with a tokenizer beside it."""
+    folder = tmp_path_factory.mktemp("pi")
+    names = {"pad_token": "<pad>", "bos_token": "<bos>", "eos_token": "<eos>"}
+    words = tiny.tokenizer_of(list(names.values()))
+    PreTrainedTokenizerFast(tokenizer_object=words, **names).save_pretrained(folder / "tokenizer")
+    local = {"tokenizer_name": str(folder / "tokenizer")}
+    for kind in KINDS:
+        processor = importlib.import_module(f"lerobot.policies.{kind}.processor_{kind}")
+        step = processor.TokenizerProcessorStep
+        shrunk.setattr(processor, "TokenizerProcessorStep", lambda step=step, **given: step(**{**given, **local}))
+        chunk = {"chunk_size": tiny.CHUNK, "n_action_steps": tiny.EXECUTED, "num_inference_steps": 3}
+        (folder / kind).mkdir()
+        tiny.write(folder / kind, tiny.config_of(kind, dtype="float32", image_resolution=(56, 56), **chunk))
+    return lambda kind: folder / kind
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_keeps_the_contract(kind: str, made: Callable[[str], Path]) -> None:
+    check_agent(LeRobot.from_config({"checkpoint": str(made(kind))}), instructions=TASKS, atol=ATOL)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_session_gets_the_same_in_any_company(kind: str, made: Callable[[str], Path]) -> None:
+    policy = _loaded(made(kind))
+    alone = begun(policy, 1).act(view(1)).action
+    for size in (2, 3, 8):
+        numbers = range(1, size + 1)
+        acts = policy.act_batch([view(number) for number in numbers], [begun(policy, number) for number in numbers])
+        assert isinstance(acts[0], Act)
+        np.testing.assert_allclose(acts[0].action, alone, atol=ATOL)
+
+
+@pytest.mark.parametrize("delay", [None, 2])
+@pytest.mark.parametrize("kind", KINDS)
+def test_flow_matching_and_its_guidance_are_theirs(kind: str, delay: int | None, made: Callable[[str], Path]) -> None:
+    policy, theirs = _loaded(made(kind), execute=tiny.CHUNK), Theirs(made(kind))
+    shape = (1, tiny.CHUNK, theirs.policy.config.max_action_dim)
+    given: dict[str, Any] = {"noise": torch.from_numpy(draws_of(policy).standard_normal(shape, dtype=np.float32))}
+    info: dict[str, Any] = {}
+    if delay is not None:
+        plan = np.random.default_rng(5).uniform(-1, 1, (5, tiny.ACTION)).astype(np.float32)
+        info = {LEFTOVER: plan, DELAY: delay}
+        theirs.policy.config.rtc_config = RTCConfig(enabled=True)
+        theirs.policy.init_rtc_processor()
+        left = _normalised(plan, theirs.policy.config.normalization_mapping["ACTION"].name)
+        given |= {"prev_chunk_left_over": torch.from_numpy(left)[None], "inference_delay": delay}
+    chunk = theirs.policy.predict_action_chunk(theirs.see(view()), **given)
+    ours = begun(policy).act(view(**info)).action
+    np.testing.assert_allclose(ours, theirs.after(chunk)[0].detach().numpy(), atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_weights_that_lerobot_would_replace_by_random_ones_are_an_error(kind: str, made: Callable[[str], Path]) -> None:
+    file = made(kind) / "model.safetensors"
+    whole = load_file(file)
+    try:
+        save_file({name: tensor for name, tensor in whole.items() if "action_out_proj" not in name}, file)
+        with pytest.raises(ConfigError, match="action_out_proj"):
+            _loaded(made(kind))
+        file.write_bytes(b"not a checkpoint")
+        with pytest.raises(ConfigError, match="whole"):
+            _loaded(made(kind))
+        save_file({name.removeprefix("model."): tensor for name, tensor in whole.items()}, file)  # as openpi names them
+        _loaded(made(kind))
+    finally:
+        save_file(whole, file)
+
+
+def _loaded(folder: Path, **config: Any) -> LeRobot:
+    policy = LeRobot.from_config({"checkpoint": str(folder), **config})
+    policy.initialize()
+    return policy
+
+
+def _normalised(plan: np.ndarray, mode: str) -> np.ndarray:
+    of = tiny.statistics()["action"]
+    if mode == "MEAN_STD":
+        return (plan - of["mean"]) / of["std"]
+    return 2 * (plan - of["q01"]) / (of["q99"] - of["q01"]) - 1
+
+
+def _small_vision(config: Any) -> Any:
+    for key, value in {"num_hidden_layers": 1, "hidden_size": 32, "num_attention_heads": 2}.items():
+        setattr(config.vision_config, key, value)
+    config.vision_config.intermediate_size = 64
+    config.vision_config.projection_dim = config.text_config.hidden_size
+    _few_words(config.text_config)
+    return config
+
+
+def _few_words(config: Any) -> Any:
+    config.vocab_size = VOCABULARY
+    return config

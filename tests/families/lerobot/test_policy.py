@@ -1,0 +1,131 @@
+"""What every type of LeRobot policy keeps: the contract, and sessions that do not notice one another."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.families.lerobot import tiny
+from tests.families.lerobot.conftest import FILTERS, TASKS, Load, Made, begun, view
+from vlagents_ray import Obs
+from vlagents_ray.contract import CameraSpec, StateSpec
+from vlagents_ray.errors import InvalidObservation
+from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
+from vlagents_ray.policies.lerobot import LeRobot
+from vlagents_ray.testing import check_agent
+
+pytestmark = FILTERS
+
+ATOL = 1e-5
+DRAWING = sorted(set(tiny.KINDS) - {"act", "ensemble"})  # those whose actions depend on a session's random numbers
+
+
+@pytest.mark.parametrize("kind", sorted(tiny.KINDS))
+def test_keeps_the_contract(kind: str, made: Made) -> None:
+    check_agent(LeRobot.from_config({"checkpoint": str(made(kind))}), instructions=TASKS, atol=ATOL)
+
+
+@pytest.mark.parametrize("kind", sorted(tiny.KINDS))
+def test_a_session_gets_the_same_in_any_company(kind: str, loaded: Load) -> None:
+    policy = loaded(kind)
+    alone = begun(policy, 1)
+    first, second = alone.act(view(1)).action, alone.act(view(11)).action
+    for size in (2, 3, 8):
+        company = [begun(policy, number) for number in range(1, size + 1)]
+        for tick, wanted in enumerate((first, second)):
+            acts = policy.act_batch([view(10 * tick + number) for number in range(1, size + 1)], company)
+            assert isinstance(acts[0], Act)
+            np.testing.assert_allclose(acts[0].action, wanted, atol=ATOL)
+
+
+@pytest.mark.parametrize("kind", DRAWING)
+def test_what_is_drawn_depends_on_the_seed_alone(kind: str, loaded: Load) -> None:
+    policy = loaded(kind)
+
+    def played(seed: int) -> np.ndarray:
+        session = begun(policy)
+        session.reset(view(), TASKS[0], seed=seed)
+        return session.act(view()).action
+
+    assert np.array_equal(played(1), played(1))
+    assert not np.allclose(played(1), played(2), atol=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["smolvla", "xvla"])
+def test_the_instruction_decides(kind: str, loaded: Load) -> None:
+    policy = loaded(kind)
+    chunks = []
+    for task in TASKS[:2]:
+        session = begun(policy)
+        session.reset(view(), task, seed=0)
+        chunks.append(session.act(view()).action)
+    assert not np.allclose(*chunks, atol=1e-4)
+
+
+def test_a_policy_that_reads_no_instruction_does_without(loaded: Load) -> None:
+    assert loaded("act").contract.instruction is None
+    assert loaded("smolvla").contract.instruction
+    with pytest.raises(InvalidObservation, match="instruction"):
+        begun(loaded("smolvla")).reset(view(), None)
+
+
+def test_the_contract_is_what_the_checkpoint_was_trained_with(loaded: Load) -> None:
+    contract = loaded("diffusion").contract
+    assert contract.cameras == {tiny.CAMERA: CameraSpec(tiny.SIDE, tiny.SIDE)}
+    assert contract.state == {"joints": StateSpec(tiny.STATE)}
+    assert (contract.action.dim, contract.chunk, contract.history) == (tiny.ACTION, tiny.EXECUTED, 2)
+    assert loaded("smolvla").contract.cameras == {tiny.CAMERA: CameraSpec()}  # it resizes any image itself
+
+
+def test_images_of_any_size_meet_in_a_batch_of_a_policy_that_resizes(loaded: Load) -> None:
+    policy = loaded("smolvla")
+    sides = [64, 96, 64]
+    views = [view(number, side) for number, side in enumerate(sides)]
+    alone = [begun(policy, number).act(one).action for number, one in enumerate(views)]
+    acts = policy.act_batch(views, [begun(policy, number) for number in range(3)])
+    for act, wanted in zip(acts, alone, strict=True):
+        assert isinstance(act, Act)
+        np.testing.assert_allclose(act.action, wanted, atol=ATOL)
+
+
+def test_frames_between_chunks_are_remembered(loaded: Load) -> None:
+    """A chunk begins in the middle of an episode: its policy gets the last two observations, not one of them twice."""
+    policy = loaded("diffusion")
+    watched, fresh = begun(policy), begun(policy)
+    watched.observe(view(5))
+    assert not np.allclose(watched.act(view(6)).action, fresh.act(view(6)).action, atol=1e-4)
+
+
+def test_an_ensemble_and_its_coefficient_are_the_checkpoints_defaults(loaded: Load) -> None:
+    policy = loaded("ensemble")
+    assert (policy.config.actions, policy.config.ensemble_m, policy.contract.chunk) == ("ensemble", 0.1, 1)
+    assert loaded("ensemble", actions="chunk").contract.chunk == tiny.CHUNK
+
+
+def test_more_rows_than_usual_can_be_executed_and_are_the_same_at_first(loaded: Load) -> None:
+    longer = begun(loaded("diffusion", execute=7)).act(view()).action
+    assert longer.shape == (7, tiny.ACTION)
+    np.testing.assert_allclose(longer[: tiny.EXECUTED], begun(loaded("diffusion")).act(view()).action, atol=ATOL)
+
+
+@pytest.mark.parametrize("kind", ["diffusion", "tdmpc", "smolvla"])
+def test_samples_change_no_action_of_the_session(kind: str, loaded: Load) -> None:
+    plain, asked = begun(loaded(kind)), begun(loaded(kind))
+    for tick in range(2):
+        act = asked.act(view(tick, **{SAMPLES: 3}))
+        assert act.info[DISTRIBUTION]["samples"].shape == (3, *act.action.shape)
+        assert act.info[DISTRIBUTION]["std"].max() > 1e-3
+        np.testing.assert_allclose(act.action, plain.act(view(tick)).action, atol=ATOL)
+
+
+def test_other_names_for_cameras_and_state(loaded: Load, made: Made) -> None:
+    policy = LeRobot.from_config(
+        {"checkpoint": str(made("act")), "cameras": {tiny.CAMERA: "front"}, "state": ["left/joints", "gripper"]}
+    )
+    policy.initialize()
+    plain = view()
+    plain.state["joints"][-1] = 0.5
+    renamed = Obs({"front": plain.cameras[tiny.CAMERA]}, 0.5, {"left/joints": plain.state["joints"][:-1]})
+    session = begun(loaded("act"))
+    policy.reset(renamed, "go")
+    np.testing.assert_array_equal(policy.act(renamed).action, session.act(plain).action)

@@ -1,0 +1,216 @@
+"""What a policy alone gives on this machine, by batch size, without Ray: bare, and behind a replica's batch queue.
+
+Bare is `act_batch` on full batches, one after another. Behind the queue as many sessions as the batch has rows ask
+again as soon as they are answered. The policy is loaded once for both.
+"""
+
+from __future__ import annotations
+
+import queue
+import resource
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+from vlagents_ray.bench.throughput import rate_of
+from vlagents_ray.contract import Contract
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.interface import Agent, Obs
+from vlagents_ray.policies.wrapper import build_agent
+from vlagents_ray.serve.config import ServerArgs
+from vlagents_ray.serve.engine import Engine
+from vlagents_ray.serve.sessions import AgentCopies
+from vlagents_ray.testing.observations import random_observation
+from vlagents_ray.wire.messages import Reply, Request
+
+INSTRUCTION = "pick up the cube"
+_LATE_S = 600.0  # a first batch may be compiled
+_WARM = 2  # batches that do not count
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyPlan:
+    """What is measured of a policy."""
+
+    args: ServerArgs  # of a deployment file
+    batches: Sequence[int] = (1, 8)
+    seconds: float = 2.0  # of each measurement
+    rounds: int = 3  # in which all measurements take turns
+    side: int = 224  # px, of images of which the policy takes any size
+    dims: Mapping[str, int] = field(default_factory=dict)  # of parts of the state for which it does not say
+
+
+def measure_policy(plan: PolicyPlan, tell: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+    """All that the plan asks for, as plain JSON values: rates in actions a second, times in ms, memory in MiB."""
+    batch = plan.args.batch
+    if batch.sizes is not None and max(plan.batches) > batch.sizes[-1]:
+        raise ConfigError(f"--batch: got {max(plan.batches)}, the file's largest of batch.sizes is {batch.sizes[-1]}")
+    agent: Agent = build_agent(plan.args.policy, plan.args.config, plan.args.wrappers)
+    began = time.perf_counter()
+    with _serving(agent, plan) as engine:
+        load_s = time.perf_counter() - began
+        tell(f"{plan.args.policy}: loaded in {load_s:.1f} s")
+        copies, rows = AgentCopies(agent), {size: _Row(size) for size in plan.batches}
+        for number in range(plan.rounds):
+            for row in rows.values():
+                _forget_peak()
+                row.bare.append(_bare(agent, copies, plan, row.size))
+                row.queued.append(_queued(engine, plan, row.size))
+                row.memory.append(_peak_mib())
+            rates = ", ".join(f"{row.size}: {row.bare[-1]['actions_per_s']:.1f}/s" for row in rows.values())
+            tell(f"round {number + 1} of {plan.rounds}: {rates}")
+        contract = engine.contract
+    return {
+        "policy": plan.args.policy,
+        "device": _device(),
+        "load_s": load_s,
+        "chunk": None if contract is None else contract.chunk,
+        "batches": [row.to_json() for row in rows.values()],
+    }
+
+
+@dataclass(slots=True)
+class _Row:
+    """A batch size, measured in each round."""
+
+    size: int
+    bare: list[dict[str, float]] = field(default_factory=list)
+    queued: list[dict[str, float]] = field(default_factory=list)
+    memory: list[float] = field(default_factory=list)
+
+    def to_json(self) -> dict[str, Any]:
+        """The medians of the rounds, and the rounds."""
+        return {
+            "batch": self.size,
+            "bare": _medians(self.bare),
+            "queued": _medians(self.queued),
+            "peak_mib": max(self.memory),
+            "rounds": {"bare": self.bare, "queued": self.queued},
+        }
+
+
+def _medians(rounds: list[dict[str, float]]) -> dict[str, float]:
+    return {name: statistics.median(one[name] for one in rounds) for name in rounds[0]}
+
+
+@contextmanager
+def _serving(agent: Agent, plan: PolicyPlan) -> Iterator[Engine]:
+    engine = Engine(
+        agent,
+        max_batch_size=max(plan.batches),
+        patience=plan.args.batch.patience,
+        batch_sizes=plan.args.batch.sizes or (),
+    )
+    try:
+        engine.start()
+        yield engine
+    finally:
+        engine.close()
+
+
+def _views(contract: Contract | None, plan: PolicyPlan, size: int) -> list[Obs]:
+    return [random_observation(contract, seed, side=plan.side, dims=plan.dims) for seed in range(size)]
+
+
+def _bare(agent: Agent, copies: AgentCopies, plan: PolicyPlan, size: int) -> dict[str, float]:
+    views, sessions = _views(agent.contract, plan, size), [copies.make() for _ in range(size)]
+    for seed, (session, obs) in enumerate(zip(sessions, views, strict=True)):
+        session.reset(obs, INSTRUCTION, seed=seed)
+    times: list[float] = []
+    while len(times) < _WARM + 1 or sum(times[_WARM:]) < plan.seconds:
+        begun = time.perf_counter()
+        for act in agent.act_batch(views, sessions):
+            if isinstance(act, Exception):
+                raise act
+        _synchronise()
+        times.append(time.perf_counter() - begun)
+    times = times[_WARM:]
+    return {"actions_per_s": size * len(times) / sum(times), "batch_ms": statistics.median(times) * 1e3}
+
+
+def _queued(engine: Engine, plan: PolicyPlan, size: int) -> dict[str, float]:
+    """Sessions that ask again as soon as they are answered, as simulations do."""
+    views = _views(engine.contract, plan, size)
+    answers: queue.SimpleQueue[tuple[int, Reply]] = queue.SimpleQueue()
+    asked = [0.0] * size
+
+    def ask(i: int, op: Any, **given: Any) -> None:
+        asked[i] = time.perf_counter()
+        request = Request(op, views[i], rank="simulation", **given)
+        engine.submit(f"bench-{i}", request, lambda reply: answers.put((i, reply)))
+
+    def answer() -> tuple[int, Reply, float]:
+        i, reply = answers.get(timeout=_LATE_S)
+        if reply.error is not None:
+            raise reply.error
+        return i, reply, time.perf_counter()
+
+    for i in range(size):
+        ask(i, "reset", instruction=INSTRUCTION, kwargs={"seed": i})
+    for _ in range(size):
+        answer()
+    for i in range(size):
+        ask(i, "act")
+    calls: list[tuple[float, float, float]] = []
+    waiting, first = size, _WARM * size
+    while waiting:
+        i, reply, now = answer()
+        calls.append((now, now - asked[i], reply.timing["batch_size"]))
+        waiting -= 1
+        if len(calls) <= first or now - calls[first][0] < plan.seconds:
+            waiting += 1
+            ask(i, "act")
+    for i in range(size):
+        ask(i, "close")
+        answer()
+    calls = calls[first:]
+    return {
+        "actions_per_s": rate_of([calls]),  # type: ignore[list-item]
+        "round_trip_ms": statistics.median(call[1] for call in calls) * 1e3,
+        # Each call counts its batch once for each of the batch's members: the harmonic mean is the batches' own.
+        "mean_batch": len(calls) / sum(1 / call[2] for call in calls),
+    }
+
+
+def _cuda() -> Any:
+    """Torch's, if this process uses it."""
+    torch = sys.modules.get("torch")
+    return torch.cuda if torch is not None and torch.cuda.is_available() and torch.cuda.is_initialized() else None
+
+
+def _jax_device() -> Any:
+    """JAX's first device, if this process uses one that is no CPU."""
+    jax = sys.modules.get("jax")
+    device = None if jax is None else jax.local_devices()[0]
+    return None if device is None or device.platform == "cpu" else device
+
+
+def _synchronise() -> None:
+    if (cuda := _cuda()) is not None:
+        cuda.synchronize()
+
+
+def _forget_peak() -> None:
+    if (cuda := _cuda()) is not None:
+        cuda.reset_peak_memory_stats()
+
+
+def _peak_mib() -> float:
+    """Of the accelerator that the policy uses, by torch since `_forget_peak`; else resident, of this process so far."""
+    if (cuda := _cuda()) is not None:
+        return float(cuda.max_memory_allocated()) / 2**20
+    if (device := _jax_device()) is not None:
+        return float((device.memory_stats() or {}).get("peak_bytes_in_use", 0)) / 2**20
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**10
+
+
+def _device() -> str:
+    if (cuda := _cuda()) is not None:
+        return str(cuda.get_device_name())
+    if (device := _jax_device()) is not None:
+        return str(device.device_kind)
+    return "cpu"

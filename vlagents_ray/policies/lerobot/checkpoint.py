@@ -1,0 +1,138 @@
+"""A LeRobot checkpoint, read strictly: what is missing, unknown or random in it is an error before serving."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.policies.base.accelerator import ensure_torchvision
+from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
+from vlagents_ray.policies.lerobot.config import LeRobotConfig
+from vlagents_ray.policies.lerobot.kinds import KINDS, REFUSED, Flow
+from vlagents_ray.policies.lerobot.processors import PIPELINES
+from vlagents_ray.registry import require
+
+WEIGHTS = "model.safetensors"
+TRAINED = "pretrained_model"  # where LeRobot's training puts the checkpoint inside its step's folder
+_PATCHED = {"pi0", "pi05", "pi0_fast"}  # run with openpi's changes to transformers only
+_CHECK = "transformers.models.siglip.check"  # which these add
+
+
+def find(config: LeRobotConfig) -> Path:
+    """The folder with config, weights and processors. Raises `ConfigError`."""
+    folder = find_checkpoint(config.checkpoint, config.checkpoint_step)
+    if (folder / TRAINED).is_dir():
+        folder /= TRAINED
+    folder = find_checkpoint(str(folder.resolve()), needs=["config.json", WEIGHTS])
+    missing = [name for name in PIPELINES if not (folder / name).is_file()]
+    if missing:
+        raise ConfigError(
+            f"checkpoint {folder}: misses {missing}, with the normalisation; one that was made before LeRobot had "
+            f"processors is converted by: python -m lerobot.processor.migrate_policy_normalization "
+            f"--pretrained-path {folder}"
+        )
+    return folder
+
+
+def load(folder: Path, config: LeRobotConfig, device: Any) -> Any:
+    """LeRobot's policy on the device, in evaluation mode, every parameter of it from the checkpoint."""
+    ensure_torchvision()
+    factory = require("lerobot.policies.factory")
+    settings = _settings(folder, config)
+    _require_known(settings.type, folder)
+    as_saved = _prepare(settings, config, device)
+    try:
+        saved = SavedTensors.of(folder / WEIGHTS)
+        policy = factory.get_policy_class(settings.type).from_pretrained(str(folder), config=settings)
+    except ConfigError:
+        raise
+    except Exception as error:
+        raise ConfigError(
+            f"checkpoint {folder}: LeRobot cannot load it as {settings.type!r} ({type(error).__name__}: {error}); is "
+            f"it whole, and of this version of LeRobot? What it names on the hub has to be in the cache where there is "
+            f"no network, or to be replaced by `overrides`"
+        ) from error
+    require_loaded(policy, saved.renamed(lambda name: _as_loaded(policy, name)))
+    if config.dtype == "float32":
+        policy.float()
+    elif as_saved:
+        for name, parameter in policy.named_parameters():
+            parameter.data = parameter.data.to(saved[name].dtype if name in saved else parameter.dtype)
+    return policy.to(device).eval()
+
+
+def _settings(folder: Path, config: LeRobotConfig) -> Any:
+    """The checkpoint's config.json as LeRobot's object, `overrides` laid over it."""
+    base = require("lerobot.configs.policies").PreTrainedConfig
+    require("lerobot.utils.import_utils").register_third_party_plugins()
+    try:
+        settings = base.from_pretrained(folder)
+        known = {one.name for one in dataclasses.fields(settings)}
+        unknown = sorted(set(config.overrides) - known)
+        if unknown:
+            raise ConfigError(f"overrides: got {unknown}, want some of {sorted(known)}")
+        words = [f"--{name}={json.dumps(value)}" for name, value in config.overrides.items()]
+        return base.from_pretrained(folder, cli_overrides=words) if words else settings
+    except ConfigError:
+        raise
+    except Exception as error:
+        raise ConfigError(
+            f"checkpoint {folder}: config.json with overrides {config.overrides} is not LeRobot's "
+            f"({type(error).__name__}: {error}); the types it knows here: {sorted(base.get_known_choices())}"
+        ) from error
+
+
+def _require_known(name: str, folder: Path) -> None:
+    if name in REFUSED:
+        raise ConfigError(f"checkpoint {folder}: is a {name!r}, which is not served here: {REFUSED[name]}")
+    if name in _PATCHED:
+        found = None
+        with contextlib.suppress(ModuleNotFoundError):
+            found = importlib.util.find_spec(_CHECK)
+        if found is None:
+            raise ConfigError(
+                f"checkpoint {folder}: LeRobot's {name!r} needs transformers with openpi's changes, which no release "
+                f"has; install the branch that LeRobot's page on {name} names into this environment, or serve the "
+                f"policy by 'openpi' or, for π0, by 'pi0'"
+            )
+
+
+def _prepare(settings: Any, config: LeRobotConfig, device: Any) -> bool:
+    """Where and how the policy runs. True if its parameters are to be of the types that they were saved in."""
+    if settings.use_peft:
+        raise ConfigError(
+            "checkpoint: is a PEFT adapter, want whole weights; merge it (merge_and_unload) and save that"
+        )
+    settings.device = str(device)
+    if hasattr(settings, "pretrained_backbone_weights"):
+        settings.pretrained_backbone_weights = None  # else downloaded, only to be replaced by the checkpoint's
+    if config.compile and not hasattr(settings, "compile_model"):
+        raise ConfigError(f"compile: LeRobot's {settings.type!r} has no compile_model; leave it out")
+    if config.compile:
+        settings.compile_model = True
+    if issubclass(KINDS.get(settings.type, object), Flow):
+        rtc = settings.rtc_config or require("lerobot.policies.rtc.configuration_rtc").RTCConfig()
+        settings.rtc_config = dataclasses.replace(rtc, enabled=True, debug=False)
+    choices = ["auto", "float32", *(["bfloat16"] if hasattr(settings, "dtype") else [])]
+    if config.dtype not in choices:
+        raise ConfigError(f"dtype: got {config.dtype!r}, LeRobot's {settings.type!r} takes one of {choices}")
+    if hasattr(settings, "dtype") and config.dtype != "auto":
+        settings.dtype = config.dtype
+    as_saved = bool(getattr(settings, "load_vlm_weights", False))
+    if as_saved:
+        settings.load_vlm_weights = False  # else downloaded in bfloat16, only to be replaced by the checkpoint's
+    return as_saved
+
+
+def _as_loaded(policy: Any, name: str) -> str | None:
+    """What LeRobot calls a saved tensor when it has read it: checkpoints that openpi wrote have older names."""
+    fix = getattr(policy, "_fix_pytorch_state_dict_keys", None)
+    if fix is not None:
+        name = next(iter(fix({name: None}, policy.config)), "")
+        name = name if not name or name.startswith("model.") else f"model.{name}"
+    return name or None

@@ -1,0 +1,128 @@
+"""The checkpoint's own pipelines around its policy: observations in, actions out, leftovers back."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.policies.base import Row
+from vlagents_ray.policies.lerobot.config import LeRobotConfig
+from vlagents_ray.registry import require
+
+PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
+ACTION = "action"
+_DEVICE, _RENAME, _TOKENIZER = "device_processor", "rename_observations_processor", "tokenizer_processor"
+_STATISTICS = {
+    "MEAN_STD": ("mean", "std"),
+    "MIN_MAX": ("min", "max"),
+    "QUANTILES": ("q01", "q99"),
+    "QUANTILE10": ("q10", "q90"),
+}
+
+
+class Processors:
+    """Both pipelines, on the policy's device. Raises `ConfigError` if they are not whole."""
+
+    def __init__(self, folder: Path, settings: Any, config: LeRobotConfig) -> None:
+        """`settings` is the policy's own config."""
+        self._device = settings.device
+        saved = [_saved_steps(folder / name) for name in PIPELINES]
+        unknown = sorted(set(config.processors) - set().union(*saved))
+        if unknown:
+            raise ConfigError(f"processors: got {unknown}, the checkpoint has {[sorted(steps) for steps in saved]}")
+        own = {_DEVICE: {"device": settings.device}, _RENAME: {"rename_map": {}}}  # `perceive` uses the policy's names
+        overrides = {**own, **config.processors}
+        trained = saved[0].get(_RENAME, {}).get("rename_map") or {}
+        self.rename_map: dict[str, str] = dict(trained if config.rename_map is None else config.rename_map)
+        self.instructed = _TOKENIZER in saved[0]
+        try:
+            self._before, self._after = require("lerobot.policies.factory").make_pre_post_processors(
+                settings,
+                pretrained_path=str(folder),
+                preprocessor_overrides={name: value for name, value in overrides.items() if name in saved[0]},
+                postprocessor_overrides={name: value for name, value in config.processors.items() if name in saved[1]},
+            )
+        except Exception as error:
+            raise ConfigError(
+                f"checkpoint {folder}: its processors do not load ({type(error).__name__}: {error}); a tokenizer that "
+                f"is not here is replaced by processors: {{{_TOKENIZER}: {{tokenizer_name: …}}}}"
+            ) from error
+        self._back = self._inverse()
+
+    @property
+    def invertible(self) -> bool:
+        """Can actions be turned back into the policy's units?"""
+        return self._back is not None
+
+    def require_statistics(self, settings: Any, inputs: Sequence[str]) -> None:
+        """Raise `ConfigError` unless all `inputs`, and the actions, are normalised as the policy was trained.
+
+        LeRobot passes on unchanged what it has no statistics for.
+        """
+        features = {**settings.input_features, **settings.output_features}
+        for pipeline, keys, file in ((self._before, inputs, PIPELINES[0]), (self._after, [ACTION], PIPELINES[1])):
+            steps = [step for step in pipeline.steps if hasattr(step, "norm_map")]
+            for key in keys:
+                modes = steps[0].norm_map if steps else settings.normalization_mapping
+                wanted = _STATISTICS.get(getattr(modes.get(features[key].type), "name", ""), ())
+                have = {name: value for step in steps for name, value in step._tensor_stats.get(key, {}).items()}
+                missing = [name for name in wanted if name not in have or not have[name].isfinite().all()]
+                if missing:
+                    raise ConfigError(
+                        f"checkpoint: {file} has no usable {missing} of {key!r}, has {sorted(have)}; without them the "
+                        f"policy sees and does nonsense: save its processors with the statistics of its dataset"
+                    )
+
+    def observe(self, rows: Sequence[Row], steps: int) -> dict[str, Any]:
+        """What the policy takes, (rows * steps, …) on its device: the last `steps` frames of each row."""
+        torch = require("torch")
+        frames = [frame for row in rows for frame in row.history(steps)]
+        batch: dict[str, Any] = {}
+        for key, first in frames[0].items():
+            values = torch.from_numpy(np.stack([frame[key] for frame in frames])).to(self._device)
+            batch[key] = values.permute(0, 3, 1, 2).float() / 255 if first.ndim == 3 else values
+        batch["task"] = [row.instruction for row in rows for _ in range(steps)]
+        return {key: value for key, value in self._before(batch).items() if value is not None}
+
+    def actions(self, chunks: Any) -> np.ndarray:
+        """(B, T, D) of the policy as (B, T, D') float32, in the units that the robot takes."""
+        flat = self._after(chunks.float().flatten(0, 1))  # rows, as LeRobot's own loop hands them over
+        return np.asarray(flat.unflatten(0, chunks.shape[:2]).float().cpu())
+
+    def leftover(self, rows: np.ndarray) -> Any:
+        """(H, D') that `actions` gave, in the policy's units again."""
+        return None if self._back is None else self._back(require("torch").from_numpy(rows))
+
+    def width(self, dim: int) -> int:
+        """D' of the actions of a policy with `dim` of its own."""
+        return int(self._after(require("torch").zeros(1, dim)).shape[-1])
+
+    def _inverse(self) -> Any:
+        """A pipeline that undoes the post-processor, if that only unnormalises."""
+        processor, converters = require("lerobot.processor"), require("lerobot.processor.converters")
+        steps: list[Any] = []
+        for step in self._after.steps:
+            if isinstance(step, processor.UnnormalizerProcessorStep):
+                steps.append(
+                    processor.NormalizerProcessorStep(
+                        features=step.features, norm_map=step.norm_map, stats=step.stats, eps=step.eps
+                    )
+                )
+            elif not isinstance(step, processor.DeviceProcessorStep):
+                return None
+        return processor.PolicyProcessorPipeline(
+            steps=steps,
+            to_transition=converters.policy_action_to_transition,
+            to_output=converters.transition_to_policy_action,
+        )
+
+
+def _saved_steps(file: Path) -> dict[str, Mapping[str, Any]]:
+    """The registered name of each step of a pipeline -> its settings."""
+    steps = json.loads(file.read_text(encoding="utf-8")).get("steps", [])
+    return {step.get("registry_name", step.get("class", "")): step.get("config", {}) for step in steps}
