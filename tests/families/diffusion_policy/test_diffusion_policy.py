@@ -20,7 +20,13 @@ from vlagents_ray.policies.diffusion_policy import DiffusionPolicy
 from vlagents_ray.policies.diffusion_policy.noise import noise_of
 from vlagents_ray.testing import check_agent
 
-pytestmark = [pytest.mark.source("DIFFUSION_POLICY_SRC")]
+pytestmark = [
+    pytest.mark.source("DIFFUSION_POLICY_SRC"),
+    # The authors' save_checkpoint leaves its file open; robomimic 0.2.0 asks torchvision for a network as of old.
+    pytest.mark.filterwarnings("ignore:unclosed file .*latest.ckpt:ResourceWarning"),
+    pytest.mark.filterwarnings("ignore:The parameter 'pretrained' is deprecated:UserWarning"),
+    pytest.mark.filterwarnings("ignore:Arguments other than a weight enum:UserWarning"),
+]
 
 ATOL = 1e-5  # float32 on a CPU, actions between -3 and 5; measured: 1e-6
 KINDS = ["unet", "transformer", "image", "hybrid"]
@@ -103,7 +109,7 @@ def test_gives_what_the_authors_code_gives(kind: str, policies: Callable[[str], 
 
 @pytest.mark.parametrize("kind", ["unet", "image"])
 def test_keeps_the_contract(kind: str, checkpoint: Checkpoint) -> None:
-    check_agent(made(checkpoint(kind)), steps=6, atol=ATOL)
+    check_agent(made(checkpoint(kind)), steps=5, atol=ATOL)
 
 
 @pytest.mark.parametrize("kind", KINDS)

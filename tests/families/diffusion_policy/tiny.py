@@ -1,6 +1,7 @@
 """A small random Diffusion Policy, saved by its authors' own code: `python …/tiny.py OUT_FOLDER [KIND]`.
 
-KIND is `unet` or `transformer` (a state of 4 numbers), `image` or `hybrid` (one camera and a state of 2).
+KIND is `unet` or `transformer` (a state of 4 numbers), `image` or `hybrid` (one camera and a state of 2), or
+`random_crops`, a hybrid that crops at random while it acts.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from vlagents_ray.policies.base.source import use_source
 HORIZON, OBS_STEPS, ACTION_STEPS, OBS, ACTION, SIDE = 8, 2, 4, 4, 2, 48
 SCHEDULER = {
     "_target_": "diffusers.schedulers.scheduling_ddpm.DDPMScheduler",
-    "num_train_timesteps": 10,
+    "num_train_timesteps": 5,
     "beta_schedule": "squaredcos_cap_v2",
     "variance_type": "fixed_small",
     "clip_sample": True,
@@ -89,7 +90,6 @@ def _policy(kind: str) -> dict[str, Any]:
         encoder = {
             "_target_": "diffusion_policy.model.vision.multi_image_obs_encoder.MultiImageObsEncoder",
             "shape_meta": SHAPES,
-            # weights to begin with, as train_diffusion_unet_image_pretrained_workspace has them: never to be downloaded
             "rgb_model": {
                 "_target_": "diffusion_policy.model.vision.model_getter.get_resnet",
                 "name": "resnet18",

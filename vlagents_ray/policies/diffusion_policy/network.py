@@ -96,6 +96,13 @@ def _made(path: Path, settings: Any) -> Any:
             f"checkpoint {path}: {type(module).__name__} is no diffusion policy; want one of diffusion_policy.policy's "
             f"Diffusion…Policy"
         )
+    if any(
+        type(part).__name__ == "CropRandomizer" and "robomimic" in type(part).__module__ for part in module.modules()
+    ):
+        raise ConfigError(
+            f"checkpoint {path}: its encoder crops at random while it acts, so actions would depend on neighbours; "
+            f"want one trained with eval_fixed_crop: true"
+        )
     return module
 
 
