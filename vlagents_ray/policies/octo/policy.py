@@ -57,7 +57,7 @@ class Octo(ModelPolicy):
         config = self.config
         network = Network.load(config.checkpoint, config.checkpoint_step, config.device, config.source_dir)
         self._cameras(network)
-        wanted = ("mean", "std") if config.normalization == "normal" else ("p01", "p99")
+        wanted = ("mean", "std") if config.normalization == "normal" else ("mean", "p01", "p99")
         statistics = network.statistics(config.dataset, "action")
         if absent := [name for name in wanted if name not in statistics]:
             raise ConfigError(
