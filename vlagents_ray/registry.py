@@ -16,8 +16,10 @@ from typing import Any
 from vlagents_ray.errors import ConfigError, MissingDependency, UnknownEnv, UnknownPolicy
 
 POLICIES: dict[str, str] = {
+    "diffusion_policy": "vlagents_ray.policies.diffusion_policy:DiffusionPolicy",
     "lerobot": "vlagents_ray.policies.lerobot:LeRobot",
     "noop": "vlagents_ray.policies.noop:Noop",
+    "octo": "vlagents_ray.policies.octo:Octo",
     "random": "vlagents_ray.policies.random:Random",
     "replay": "vlagents_ray.policies.replay:Replay",
     "scripted": "vlagents_ray.policies.scripted:Scripted",

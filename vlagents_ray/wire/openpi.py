@@ -50,10 +50,13 @@ def _array(node: dict[Any, Any], most: int) -> Any:
         value = node.get(b"data")
         if not isinstance(value, (bool, int, float)):
             raise MalformedMessage(f"scalar: got {type(value).__name__}, want a number")
+        dtype = plain_dtype(node.get(b"dtype"))
         try:
-            return plain_dtype(node.get(b"dtype")).type(value)
+            if dtype.kind in "iu" and not np.iinfo(dtype).min <= value <= np.iinfo(dtype).max:
+                raise OverflowError
+            return dtype.type(value)
         except (OverflowError, ValueError) as error:
-            raise MalformedMessage(f"scalar: {str(value)[:40]} is no {node[b'dtype']}") from error
+            raise MalformedMessage(f"scalar: {str(value)[:40]} is no {dtype}") from error
     return node
 
 

@@ -1,0 +1,185 @@
+"""The authors' own code, asked through the policy: the same actions, in any company."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vlagents_ray import Obs
+from vlagents_ray.contract import StateSpec
+from vlagents_ray.errors import MissingCamera, PolicyFailed
+from vlagents_ray.interface import DISTRIBUTION, SAMPLES
+from vlagents_ray.policies.base import Row
+from vlagents_ray.policies.diffusion_policy import DiffusionPolicy
+from vlagents_ray.policies.diffusion_policy.noise import noise_of
+from vlagents_ray.testing import check_agent
+
+pytestmark = [
+    pytest.mark.source("DIFFUSION_POLICY_SRC"),
+    # The authors' save_checkpoint leaves its file open; robomimic 0.2.0 asks torchvision for a network as of old.
+    pytest.mark.filterwarnings("ignore:unclosed file .*latest.ckpt:ResourceWarning"),
+    pytest.mark.filterwarnings("ignore:The parameter 'pretrained' is deprecated:UserWarning"),
+    pytest.mark.filterwarnings("ignore:Arguments other than a weight enum:UserWarning"),
+]
+
+ATOL = 1e-5  # float32 on a CPU, actions between -3 and 5; measured: 1e-6
+KINDS = ["unet", "transformer", "image", "hybrid"]
+Checkpoint = Callable[[str], Path]
+
+
+def made(checkpoint: Path, **config: Any) -> DiffusionPolicy:
+    return DiffusionPolicy.from_config({"checkpoint": str(checkpoint), "trust_checkpoint": True, **config})
+
+
+def loaded(checkpoint: Path, **config: Any) -> DiffusionPolicy:
+    policy = made(checkpoint, **config)
+    policy.initialize()
+    return policy
+
+
+@pytest.fixture(scope="module")
+def policies(checkpoint: Checkpoint) -> Callable[[str], DiffusionPolicy]:
+    """The loaded policy of a kind, whole chunks."""
+    kept: dict[str, DiffusionPolicy] = {}
+
+    def of(kind: str) -> DiffusionPolicy:
+        if kind not in kept:
+            kept[kind] = loaded(checkpoint(kind), actions="chunk")
+        return kept[kind]
+
+    return of
+
+
+def seen(seed: int, size: tuple[int, int] = (48, 48), **info: Any) -> Obs:
+    rng = np.random.default_rng(seed)
+    return Obs(
+        cameras={"front": rng.integers(0, 256, (*size, 3), dtype=np.uint8)},
+        state={
+            "agent_pos": rng.uniform(-2, 1, 2).astype(np.float32),
+            "state": rng.uniform(-2, 1, 4).astype(np.float32),
+        },
+        info=info,
+    )
+
+
+def begun(policy: DiffusionPolicy, seed: int = 0) -> DiffusionPolicy:
+    session = copy.copy(policy)
+    session.reset(seen(0), None, seed=seed)
+    return session
+
+
+class TorchDraws:
+    """Stands for a session's generator: draws as torch does after `torch.manual_seed(0)`."""
+
+    def __init__(self) -> None:
+        import torch
+
+        self._torch, self._generator = torch, torch.Generator().manual_seed(0)
+
+    def standard_normal(self, shape: tuple[int, ...], dtype: Any) -> np.ndarray:
+        drawn: np.ndarray = self._torch.randn(shape, generator=self._generator).numpy()
+        return drawn.astype(dtype)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_gives_what_the_authors_code_gives(kind: str, policies: Callable[[str], DiffusionPolicy]) -> None:
+    import torch
+
+    policy = policies(kind)
+    views = [seen(1), seen(2)]
+    frames = tuple(policy.perceive(view) for view in views)
+    [found] = policy.predict([Row(frames, "", TorchDraws())])  # type: ignore[arg-type]
+
+    stacked: dict[str, np.ndarray] = {"obs": np.stack([view.state["state"] for view in views])[None]}
+    if kind in ("image", "hybrid"):
+        pictures = np.stack([view.cameras["front"] for view in views]).astype(np.float32) / 255
+        positions = np.stack([view.state["agent_pos"] for view in views])[None]
+        stacked = {"image": np.moveaxis(pictures, -1, 1)[None], "agent_pos": positions}
+    torch.manual_seed(0)
+    with torch.no_grad():
+        wanted = policy.model.module.predict_action({name: torch.from_numpy(x) for name, x in stacked.items()})
+    np.testing.assert_allclose(found.actions, wanted["action"][0].numpy(), atol=ATOL)
+
+
+@pytest.mark.parametrize("kind", ["unet", "image"])
+def test_keeps_the_contract(kind: str, checkpoint: Checkpoint) -> None:
+    check_agent(made(checkpoint(kind)), steps=5, atol=ATOL)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_session_gets_the_same_in_any_company(kind: str, policies: Callable[[str], DiffusionPolicy]) -> None:
+    policy = policies(kind)
+    views = [seen(i) for i in range(8)]
+    alone = [begun(policy, seed=i).act(view).action for i, view in enumerate(views)]
+    for size in (2, 3, 8):
+        company = [begun(policy, seed=i) for i in range(size)]
+        for i, act in enumerate(policy.act_batch(views[:size], company)):
+            np.testing.assert_allclose(act.action, alone[i], atol=ATOL)
+    assert np.ptp(np.stack(alone), axis=0).min() > 100 * ATOL  # eight answers, not one
+
+
+def test_a_queue_shows_the_model_the_frames_between_chunks(
+    checkpoint: Checkpoint, policies: Callable[[str], DiffusionPolicy], tiny: ModuleType
+) -> None:
+    queue = made(checkpoint("unet"))
+    queue.model = policies("unet").model
+    session, views = begun(queue), [seen(i) for i in range(tiny.ACTION_STEPS + 1)]
+    rows = [session.act(view).action for view in views]
+    assert rows[0].shape == (tiny.ACTION,)
+    assert session.episode is not None
+    last = [frame["obs"] for frame in session.episode.frames]
+    np.testing.assert_array_equal(last, [view.state["state"] for view in views[-2:]])
+
+
+def test_samples_are_draws_of_their_own(policies: Callable[[str], DiffusionPolicy]) -> None:
+    plain, asked = begun(policies("unet")), begun(policies("unet"))
+    act = asked.act(seen(1, **{SAMPLES: 20}))
+    np.testing.assert_allclose(act.action, plain.act(seen(1)).action, atol=ATOL)
+    found = act.info[DISTRIBUTION]
+    assert found["samples"].shape == (20, 4, 2)
+    assert found["std"].min() > 100 * ATOL
+
+
+def test_an_image_of_another_size_is_made_as_the_authors_make_it(policies: Callable[[str], DiffusionPolicy]) -> None:
+    policy, view = policies("image"), seen(1, (96, 200))
+    from diffusion_policy.real_world.real_inference_util import get_real_obs_dict
+
+    shapes = {"obs": {"image": {"shape": [3, 48, 48], "type": "rgb"}}}
+    wanted = get_real_obs_dict({"image": view.cameras["front"][None]}, shapes)["image"][0]
+    found = policy.perceive(view)["image"]
+    np.testing.assert_array_equal(np.moveaxis(found, -1, 0).astype(np.float32) / 255, wanted)
+
+
+def test_the_state_may_be_of_several_parts(checkpoint: Checkpoint) -> None:
+    policy = loaded(checkpoint("unet"), state=["joints", "gripper"], actions="chunk", execute=2)
+    obs = Obs(gripper=0.25, state={"joints": np.array([1, 2, 3], np.float32)})
+    np.testing.assert_array_equal(policy.perceive(obs)["obs"], [1, 2, 3, 0.25])
+    contract = policy.contract
+    assert (contract.state, contract.gripper, contract.chunk) == ({"joints": StateSpec()}, True, 2)
+
+
+def test_a_missing_camera_fails_its_own_session_alone(policies: Callable[[str], DiffusionPolicy]) -> None:
+    policy = policies("image")
+    blind = Obs(state=seen(0).state)
+    bad, good = policy.act_batch([blind, seen(1)], [begun(policy), begun(policy)])
+    assert isinstance(bad, MissingCamera)
+    assert not isinstance(good, Exception)
+
+
+def test_draws_that_are_no_rows_own_are_refused() -> None:
+    import torch
+
+    rows = [Row((), "", np.random.default_rng(i)) for i in range(2)]
+    with noise_of(rows):
+        drawn = torch.randn((2, 3))
+        for unfair in (lambda: torch.randn((3, 3)), lambda: torch.rand((2, 3)), lambda: torch.randint(0, 5, (2,))):
+            with pytest.raises(PolicyFailed):
+                unfair()
+    wanted = [np.random.default_rng(i).standard_normal(3, dtype=np.float32) for i in range(2)]
+    np.testing.assert_array_equal(drawn.numpy(), wanted)

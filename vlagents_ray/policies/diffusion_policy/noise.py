@@ -1,0 +1,37 @@
+"""The noise of a batch, each row's from its own session."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import PolicyFailed
+from vlagents_ray.policies.base import Row
+from vlagents_ray.registry import require
+
+
+def noise_of(rows: Sequence[Row]) -> Any:
+    """A context in which `torch.randn` draws row by row: the first axis of what it is asked for are the rows.
+
+    The policies draw their first trajectory so, and the scheduler what it adds at each step; neither takes one
+    generator a row. Other draws would come from the process's own generator, and are refused.
+    """
+    torch = require("torch")
+    uniform = (torch.rand, torch.randint, torch.rand_like, torch.randn_like)
+
+    class Noise(require("torch.overrides").TorchFunctionMode):  # type: ignore[misc]
+        def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+            options = kwargs or {}
+            if func in uniform:
+                raise PolicyFailed(f"the model drew from {func.__name__}: its actions would depend on its neighbours'")
+            if func is not torch.randn:
+                return func(*args, **options)
+            shape = options["size"] if "size" in options else args[0]
+            if len(shape) < 2 or shape[0] != len(rows):
+                raise PolicyFailed(f"the model asked for noise {tuple(shape)}, want one row for each of {len(rows)}")
+            drawn = np.stack([row.noise(*shape[1:]) for row in rows])
+            return torch.from_numpy(drawn).to(device=options.get("device"), dtype=options.get("dtype"))
+
+    return Noise()

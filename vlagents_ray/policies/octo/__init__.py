@@ -1,0 +1,5 @@
+"""Octo small and base 1.5, and what was fine-tuned from them, with Octo's own code (JAX)."""
+
+from vlagents_ray.policies.octo.policy import Octo
+
+__all__ = ["Octo"]
