@@ -20,6 +20,7 @@ POLICIES: dict[str, str] = {
     "random": "vlagents_ray.policies.random:Random",
     "replay": "vlagents_ray.policies.replay:Replay",
     "scripted": "vlagents_ray.policies.scripted:Scripted",
+    "vjepa2_ac": "vlagents_ray.policies.vjepa2_ac:VJepa2Ac",
 }
 
 # What changes the observations of any policy: `wrappers` in a deployment file.
