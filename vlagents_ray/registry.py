@@ -23,10 +23,13 @@ POLICIES: dict[str, str] = {
     "random": "vlagents_ray.policies.random:Random",
     "replay": "vlagents_ray.policies.replay:Replay",
     "scripted": "vlagents_ray.policies.scripted:Scripted",
+    "vjepa2_ac": "vlagents_ray.policies.vjepa2_ac:VJepa2Ac",
 }
 
 # What changes the observations of any policy: `wrappers` in a deployment file.
-WRAPPERS: dict[str, str] = {}
+WRAPPERS: dict[str, str] = {
+    "arro": "vlagents_ray.policies.arro:Arro",
+}
 
 # The part of an env's name before the first slash; the rest is the task within it.
 ENVS: dict[str, str] = {
@@ -87,17 +90,17 @@ def names(kind: str) -> dict[str, str]:
 
 def policy_class(name: str) -> type[Any]:
     """The Agent class registered as `name`, or written out as "module:Class"."""
-    return _load(name, names("policies"), UnknownPolicy)
+    return named_class(name, names("policies"), UnknownPolicy)
 
 
 def wrapper_class(name: str) -> type[Any]:
     """The Wrapper class registered as `name`, or written out as "module:Class"."""
-    return _load(name, names("wrappers"), UnknownPolicy)
+    return named_class(name, names("wrappers"), UnknownPolicy)
 
 
 def env_class(name: str) -> type[Any]:
     """The EvalEnv class for `name`, e.g. "tabletop" or "maniskill/PushCube-v1"."""
-    return _load(env_suite(name), names("envs"), UnknownEnv)
+    return named_class(env_suite(name), names("envs"), UnknownEnv)
 
 
 def env_suite(name: str) -> str:
@@ -110,7 +113,8 @@ def env_task(name: str) -> str | None:
     return None if ":" in name else name.partition("/")[2] or None
 
 
-def _load(name: str, known: dict[str, str], unknown: type[ConfigError]) -> type[Any]:
+def named_class(name: str, known: dict[str, str], unknown: type[ConfigError] = ConfigError) -> type[Any]:
+    """The class that `known` has under `name`, or written out as "module:Class"; raises `unknown` if there is none."""
     target = known.get(name, name)
     module, colon, attribute = target.partition(":")
     if not colon:

@@ -1,0 +1,244 @@
+"""ARRO around policies: what they see, what they are told, and what they never notice."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pytest
+from in_process import Replicas
+
+from vlagents_ray import Act, Agent, Obs
+from vlagents_ray.contract import CameraSpec, Contract
+from vlagents_ray.envs.tabletop import Tabletop
+from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, NotReset
+from vlagents_ray.policies.arro import Arro
+from vlagents_ray.policies.arro.parts import Found
+from vlagents_ray.policies.wrapper import build_agent
+from vlagents_ray.serve.sessions import AgentCopies
+from vlagents_ray.testing import check_agent
+
+BACKGROUND = (0, 0, 60)
+PARTS: dict[str, Any] = {
+    "detector": "colour",
+    "segmenter": "flat",
+    "selector": None,
+    "tracker": "iou",
+    "background": {"colour": BACKGROUND},
+}
+GREY, RED, BLUE = (200, 200, 200), (220, 40, 40), (40, 60, 220)
+
+
+class Watcher(Agent):
+    """Remembers the images that it is shown."""
+
+    contract = Contract(cameras={"front": CameraSpec()})
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self.seen = [obs.cameras["front"]]
+        return {"told": instruction}
+
+    def act(self, obs: Obs) -> Act:
+        self.seen.append(obs.cameras["front"])
+        return Act(np.zeros(1, np.float32), info={"own": 1})
+
+
+class OwnDetector:
+    """Stands in for a detector of somebody else's: boxes, no masks."""
+
+    Config = dict
+
+    def __init__(self, config: Mapping[str, Any]) -> None:
+        self._boxes = config["boxes"]
+
+    def load(self) -> None:
+        pass
+
+    def detect(self, images: Any, phrases: Any) -> list[list[Found]]:
+        return [[Found(asked[0], np.array(box, np.float32), 1.0) for box in self._boxes] for asked in phrases]
+
+
+def arro(agent: Agent | None = None, **settings: Any) -> Any:
+    wrapped = Arro.around(agent or Watcher(), {**PARTS, **settings})
+    wrapped.initialize()
+    return wrapped
+
+
+def view(*things: tuple[tuple[int, int, int], int, int], **cameras: np.ndarray) -> Obs:
+    """Squares of 10 px on grey, each of a colour at a row and a column."""
+    image = np.full((60, 80, 3), GREY, np.uint8)
+    for colour, row, column in things:
+        image[row : row + 10, column : column + 10] = colour
+    return Obs(cameras={"front": image, **cameras})
+
+
+def shown(image: np.ndarray) -> set[tuple[int, ...]]:
+    return {tuple(pixel) for pixel in image.reshape(-1, 3).tolist()}
+
+
+def test_a_policy_sees_the_things_that_are_named_and_nothing_else() -> None:
+    policy = arro()
+    info = policy.reset(view((RED, 10, 10), (BLUE, 40, 60)), "lift the red cube")
+    act = policy.act(view((RED, 12, 14), (BLUE, 40, 60)))
+    report = {"front": {"seen": ["lift the red cube"], "missing": [], "searched": False}}
+    assert info == {"told": "lift the red cube", "arro": {"front": {**report["front"], "searched": True}}}
+    assert act.info == {"own": 1, "arro": report}
+    first, second = policy.agent.seen
+    for image, row, column in ((first, 10, 10), (second, 12, 14)):
+        assert shown(image) == {BACKGROUND, RED}
+        assert (image[row : row + 10, column : column + 10] == RED).all()
+
+
+def test_objects_of_the_config_stand_in_for_those_of_the_instruction() -> None:
+    policy = arro(objects=["blue thing"])
+    policy.reset(view((RED, 10, 10), (BLUE, 40, 60)), None)
+    assert shown(policy.agent.seen[0]) == {BACKGROUND, BLUE}
+
+
+def test_segments_are_widened_by_grow() -> None:
+    policy = arro(grow=2)
+    policy.reset(view((RED, 10, 10)), "red")
+    assert (policy.agent.seen[0][8:22, 8:22] != BACKGROUND).any(-1).all()
+    assert shown(policy.agent.seen[0]) == {BACKGROUND, RED, GREY}
+
+
+def test_other_cameras_pass_as_they_are() -> None:
+    policy = arro()
+    wrist = np.full((8, 8, 3), 7, np.uint8)
+    obs = view((RED, 10, 10), wrist=wrist)
+    assert policy.begin(obs, "red").cameras["wrist"] is wrist
+
+
+def test_a_detector_of_ones_own_gives_boxes_and_the_segmenter_cuts_out() -> None:
+    policy = arro(detector={f"{__name__}:OwnDetector": {"boxes": [[5, 5, 25, 25]]}})
+    policy.reset(view((RED, 10, 10), (BLUE, 40, 60)), "it")
+    assert shown(policy.agent.seen[0]) == {BACKGROUND, RED}
+
+
+def test_a_lost_thing_is_shown_where_it_was_for_a_while_then_hidden_and_looked_for() -> None:
+    policy = arro(keep_lost=2)
+    policy.reset(view((RED, 10, 10)), "red")
+    policy.act(view((RED, 10, 10)))
+    reports = [policy.act(view()).info["arro"]["front"] for _ in range(4)]
+    assert [report["searched"] for report in reports] == [False, False, True, False]
+    assert all(report["missing"] == ["red"] and not report["seen"] for report in reports)
+    assert [shown(image) for image in policy.agent.seen[2:]] == 2 * [{BACKGROUND, GREY}] + 2 * [{BACKGROUND}]
+    for _ in range(2):  # it is back, far from where it was: found at the next search
+        found = policy.act(view((RED, 45, 65))).info["arro"]["front"]
+    assert found == {"seen": ["red"], "missing": [], "searched": True}
+    assert shown(policy.agent.seen[-1]) == {BACKGROUND, RED}
+
+
+def test_an_episode_without_what_is_named_is_refused() -> None:
+    policy = arro(objects=["red", "blue"])
+    with pytest.raises(InvalidObservation, match=r"'front' shows none of \['blue'\], found \['red'\].*missing: hide"):
+        policy.reset(view((RED, 10, 10)), None)
+
+
+def test_or_it_begins_without_and_looks_again() -> None:
+    policy = arro(objects=["red", "blue"], missing="hide", keep_lost=0)
+    policy.reset(view((RED, 10, 10)), None)
+    assert policy.act(view((RED, 10, 10))).info["arro"]["front"]["missing"] == ["blue"]
+    assert policy.act(view((RED, 10, 10), (BLUE, 40, 60))).info["arro"]["front"]["seen"] == ["red", "blue"]
+
+
+def test_without_an_instruction_or_objects_there_is_nothing_to_find() -> None:
+    with pytest.raises(InvalidObservation, match="or set `objects`"):
+        arro().reset(view(), "")
+
+
+def test_a_bad_observation_fails_its_own_session_alone() -> None:
+    policy = arro()
+    copies = AgentCopies(policy)
+    sessions: list[Any] = [copies.make() for _ in range(3)]
+    for session in sessions:
+        session.reset(view((RED, 10, 10)), "red")
+    small = Obs(cameras={"front": np.zeros((30, 40, 3), np.uint8)})
+    no_camera, good, resized = policy.act_batch([Obs(), view((RED, 10, 10)), small], sessions)
+    assert isinstance(no_camera, MissingCamera)
+    assert isinstance(good, Act)
+    assert isinstance(resized, InvalidObservation)
+    assert isinstance(sessions[0].act(view((RED, 10, 10))), Act)  # and its session goes on
+
+
+def test_the_contract_asks_for_what_it_is_to_change_and_an_instruction() -> None:
+    class Stateless(Watcher):
+        contract = Contract()
+
+    contract = arro(Stateless(), cameras=["wrist"]).contract
+    assert contract.cameras == {"wrist": CameraSpec()}
+    assert contract.instruction
+    assert not arro(objects=["red"]).contract.instruction
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"cameras": ["wirst"]}, r"cameras \['wirst'\] are none of the policy's, \['front'\]"),
+        ({"background": {"image": "no/such.png"}}, "no/such.png.*cannot be read"),
+        ({"background": {"image": "a.png", "grid": [1, 2, 3]}}, "image excludes"),
+        ({"background": {"colour": [0, 0, 256]}}, "from 0 to 255"),
+        ({"objects": []}, "objects"),
+        ({"colour": "red"}, "wrapper Arro.*colour"),
+        ({"tracker": "kalman"}, "not registered: want one of"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused_before_serving(settings: dict[str, Any], says: str) -> None:
+    with pytest.raises(ConfigError, match=f"(?s){says}"):
+        arro(**settings)
+
+
+def test_acting_before_a_reset_is_refused() -> None:
+    with pytest.raises(NotReset):
+        arro().act(view())
+
+
+def test_a_session_that_travels_goes_on_as_if_it_had_stayed() -> None:
+    here = AgentCopies(arro())
+    there = AgentCopies(arro())
+    staying: Any = here.make()
+    staying.reset(view((RED, 10, 10), (RED, 10, 60)), "red")
+    travelling: Any = there.load(here.dump(staying))
+    for x in range(10, 30, 4):
+        obs = view((RED, 10, x), (BLUE, 40, 60))
+        assert staying.act(obs).info == travelling.act(obs).info
+        assert np.array_equal(staying.agent.seen[-1], travelling.agent.seen[-1])
+
+
+SETTINGS = {**PARTS, "selector": "circle"}
+
+
+def test_keeps_the_promises_of_an_agent() -> None:
+    begun = []
+    for seed in range(3):
+        env = Tabletop()
+        begun.append((env.reset(seed=seed)[0], env.instruction))
+    check_agent(
+        build_agent("scripted", {}, [{"arro": SETTINGS}]),
+        obs=[obs for obs, _ in begun],
+        instructions=[instruction for _, instruction in begun],
+        reset_kwargs={"env": "tabletop"},
+    )
+
+
+def test_an_expert_that_sees_only_segments_still_solves_its_tasks() -> None:
+    replicas = Replicas([build_agent("scripted", {}, [{"arro": SETTINGS}])])
+
+    def solves(seed: int) -> bool:
+        env, agent = Tabletop(), replicas.agent()
+        obs, info = env.reset(seed=seed)
+        agent.initialize()
+        agent.reset(obs, env.instruction, env="tabletop")
+        truncated = False
+        while not truncated and not info["success"]:
+            obs, _, _, truncated, info = env.step(agent.act(obs))
+        agent.close()
+        return bool(info["success"])
+
+    try:
+        with ThreadPoolExecutor(4) as robots:
+            assert all(robots.map(solves, range(12)))
+    finally:
+        replicas.close()

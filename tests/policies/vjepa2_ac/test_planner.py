@@ -1,0 +1,109 @@
+"""The planner's mathematics, on a world where features are the pose that they belong to."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.policies.vjepa2_ac import VJepa2Ac, VJepa2AcConfig
+from vlagents_ray.policies.vjepa2_ac.planner import DRAWN, moved, plan
+
+
+def config(**settings: Any) -> VJepa2AcConfig:
+    return VJepa2AcConfig(checkpoint="none", **settings)
+
+
+def noise(settings: VJepa2AcConfig, *seeds: int) -> torch.Tensor:
+    shape = (settings.iterations, settings.rollout, settings.samples, DRAWN)
+    return torch.stack([torch.randn(shape, generator=torch.Generator().manual_seed(seed)) for seed in seeds])
+
+
+def world(features: torch.Tensor, actions: torch.Tensor, poses: torch.Tensor) -> torch.Tensor:
+    """One token: position and closedness after the last action."""
+    assert features.shape[1] == actions.shape[1] == poses.shape[1]
+    return seen(moved(poses[:, -1], actions[:, -1]))
+
+
+def seen(poses: torch.Tensor) -> torch.Tensor:
+    return poses[:, None, [0, 1, 2, 6]]
+
+
+def poses_at(*rows: list[float]) -> torch.Tensor:
+    return torch.tensor(rows)
+
+
+def test_poses_move_as_rotations_of_scipy_do() -> None:
+    rng = np.random.default_rng(0)
+    poses, actions = (rng.uniform(-3, 3, (200, 7)) for _ in range(2))
+    after = moved(torch.tensor(poses), torch.tensor(actions)).numpy()
+    turned = Rotation.from_euler("xyz", actions[:, 3:6]) * Rotation.from_euler("xyz", poses[:, 3:6])
+    assert np.allclose(after[:, 3:6], turned.as_euler("xyz"))
+    assert np.allclose(after[:, :3], (poses + actions)[:, :3])
+    assert np.allclose(after[:, 6], np.clip(poses[:, 6] + actions[:, 6], 0, 1))
+
+
+@pytest.mark.parametrize("pitch", [np.pi / 2, -np.pi / 2])
+def test_a_locked_gimbal_still_describes_the_same_rotation(pitch: float) -> None:
+    pose = torch.tensor([[0, 0, 0, 0.4, pitch, 0.1, 0]], dtype=torch.float64)
+    after = moved(pose, torch.zeros(1, 7, dtype=torch.float64))[0, 3:6]
+    same = Rotation.from_euler("xyz", after.numpy()).inv() * Rotation.from_euler("xyz", pose[0, 3:6].numpy())
+    assert same.magnitude() < 1e-6
+
+
+def test_a_plan_goes_where_the_goal_is() -> None:
+    settings = config(iterations=20, maxnorm=0.05)
+    start = poses_at([0.3, 0.0, 0.4, 3.1, 0.0, 0.0, 0.0], [0.3, 0.0, 0.4, 3.1, 0.0, 0.0, 1.0])
+    goal = poses_at([0.36, -0.03, 0.4, 3.1, 0.0, 0.0, 1.0], [0.25, 0.08, 0.42, 3.1, 0.0, 0.0, 1.0])
+    plans = plan(world, seen(start), start, seen(goal), noise(settings, 0, 1), settings)
+    assert plans.actions.shape == plans.std.shape == (2, settings.rollout, 7)
+    assert torch.allclose(plans.actions[..., :3].sum(1), (goal - start)[:, :3], atol=0.01)
+    assert plans.actions[0, :, 6].sum() >= 0.9  # closes
+    assert plans.actions[..., :3].abs().max() <= settings.maxnorm
+    assert not plans.actions[..., 3:6].any()
+    assert plans.energy.max() < 0.01
+
+
+def test_a_session_gets_the_same_plan_in_any_company_and_in_passes_of_any_size() -> None:
+    settings = config(samples=50)
+    start = poses_at(*([0.1 * i, 0.0, 0.4, 3.1, 0.2, 0.0, 0.5] for i in range(3)))
+    goal = start + 0.04
+    together = plan(world, seen(start), start, seen(goal), noise(settings, 0, 1, 2), settings)
+    small = config(samples=50, pass_size=7)
+    for i in range(3):
+        one = slice(i, i + 1)
+        alone = plan(world, seen(start[one]), start[one], seen(goal[one]), noise(settings, i), small)
+        assert torch.allclose(alone.actions[0], together.actions[i], atol=1e-6)
+        assert torch.allclose(alone.energy[0], together.energy[i], atol=1e-6)
+
+
+def test_small_changes_of_the_gripper_are_none() -> None:
+    settings = config(iterations=20, rollout=1)
+    start = poses_at([0.3, 0.0, 0.4, 3.1, 0.0, 0.0, 0.5])
+    plans = plan(world, seen(start), start, seen(start), noise(settings, 0), settings)
+    assert not plans.actions[..., 6].any()
+
+
+def test_a_plan_closes_from_the_step_that_the_config_says() -> None:
+    settings = config(rollout=3, close_gripper=1)
+    start = poses_at([0.3, 0.0, 0.4, 3.1, 0.0, 0.0, 0.0])
+    plans = plan(world, seen(start), start, seen(start), noise(settings, 0), settings)
+    assert torch.allclose(plans.actions[0, 1:, 6], torch.ones(2), atol=1e-4)
+    assert plans.actions[0, 0, 6] <= 0.75
+
+
+@pytest.mark.parametrize(
+    ("settings", "says"),
+    [
+        ({"topk": 500}, "topk 500 is over samples 400"),
+        ({"cameras": {"front": "front", "wrist": "wrist"}}, "cameras: got"),
+        ({"cem_steps": 5}, "cem_steps"),
+    ],
+)
+def test_settings_that_cannot_work_are_refused(settings: dict[str, Any], says: str) -> None:
+    with pytest.raises(ConfigError, match=f"(?s){says}"):
+        VJepa2Ac.from_config({"checkpoint": "none", **settings})

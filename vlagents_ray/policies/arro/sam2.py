@@ -1,0 +1,193 @@
+"""SAM 2 (arXiv 2408.00714) as ARRO's segmenter and tracker, through transformers."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from vlagents_ray.policies.arro.parts import Images
+from vlagents_ray.policies.arro.pretrained import PretrainedConfig, load_pretrained
+from vlagents_ray.policies.arro.regions import overlap
+from vlagents_ray.registry import require
+
+
+class Sam2Config(PretrainedConfig):
+    """Which SAM 2: those of the video model serve for images, too."""
+
+    checkpoint: str = Field(default="facebook/sam2.1-hiera-small", min_length=1)
+
+
+class Sam2SegmenterConfig(Sam2Config):
+    """How regions are proposed: a mask for each point of a grid, without the doubtful ones and repetitions."""
+
+    points: int = Field(default=16, ge=1, description="of the grid, along each side")
+    confidence: float = Field(default=0.8, ge=0, le=1, description="the least intersection over union it expects")
+    same: float = Field(default=0.7, ge=0, le=1, description="intersection over union of two masks of one region")
+
+
+class Sam2Segmenter:
+    """Masks for boxes and for a grid of points; all images in one forward pass of the image encoder."""
+
+    Config: ClassVar[type] = Sam2SegmenterConfig
+
+    def __init__(self, config: Sam2SegmenterConfig) -> None:
+        self._config = config
+        self._model: Any = None
+        self._processor: Any = None
+
+    def load(self) -> None:
+        """Read the weights; `ConfigError` if they are not all there."""
+        self._model, self._processor = load_pretrained("Sam2Model", "Sam2ImageProcessor", self._config)
+
+    def segment(self, images: Images, boxes: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """One mask a box."""
+        torch = require("torch")
+        made = []
+        for image, embedded, own in zip(images, self._embedded(images), boxes, strict=True):
+            scaled = torch.as_tensor(own * (self._side / _size(image)), dtype=self._model.dtype)
+            outputs = self._decoded(embedded, input_boxes=scaled[None], multimask_output=False)
+            made.append(_upscaled(outputs.pred_masks[0, :, 0], image))
+        return made
+
+    def propose(self, images: Images) -> list[np.ndarray]:
+        """What lies under the points of the grid, the surest first."""
+        torch = require("torch")
+        along = (np.arange(self._config.points, dtype=np.float32) + 0.5) * (self._side / self._config.points)
+        grid = torch.as_tensor(np.stack(np.meshgrid(along, along), -1).reshape(1, -1, 1, 2), dtype=self._model.dtype)
+        proposed = []
+        for image, embedded in zip(images, self._embedded(images), strict=True):
+            outputs = self._decoded(embedded, input_points=grid, multimask_output=True)
+            scores = outputs.iou_scores[0].flatten().float().cpu().numpy()
+            masks = (outputs.pred_masks[0].flatten(0, 1) > 0).cpu().numpy()
+            kept: list[int] = []
+            for i in np.argsort(-scores, kind="stable"):
+                if scores[i] < self._config.confidence:
+                    break
+                if masks[i].any() and all(overlap(masks[i], masks[k]) < self._config.same for k in kept):
+                    kept.append(int(i))
+            proposed.append(_upscaled(outputs.pred_masks[0].flatten(0, 1)[kept], image))
+        return proposed
+
+    @property
+    def _side(self) -> int:
+        """Of the square that images are resized to, px."""
+        return int(self._processor.size["height"])
+
+    def _embedded(self, images: Images) -> list[list[Any]]:
+        """The features of each image."""
+        with require("torch").inference_mode():
+            levels = self._model.get_image_embeddings(_pixels(self._processor, images, self._model))
+        return [[level[i : i + 1] for level in levels] for i in range(len(images))]
+
+    def _decoded(self, embedded: list[Any], **prompts: Any) -> Any:
+        prompts = {key: one.to(self._model.device) if hasattr(one, "to") else one for key, one in prompts.items()}
+        with require("torch").inference_mode():
+            return self._model(image_embeddings=embedded, **prompts)
+
+
+@dataclass(slots=True)
+class _Memory:
+    """What SAM 2 remembers of one camera of one session."""
+
+    session: Any  # transformers' own: features and pointers of the last frames, no more than the model looks at
+    frame: int = 0
+
+
+class Sam2Tracker:
+    """The video model with a memory for each session and camera.
+
+    The image encoder, which takes most of the time, runs once for all images; memory attention runs object by object.
+    """
+
+    Config: ClassVar[type] = Sam2Config
+
+    def __init__(self, config: Sam2Config) -> None:
+        self._config = config
+        self._model: Any = None
+        self._processor: Any = None
+
+    def load(self) -> None:
+        """Read the weights; `ConfigError` if they are not all there."""
+        self._model, self._processor = load_pretrained("Sam2VideoModel", "Sam2VideoProcessor", self._config)
+
+    def begin(self, images: Images, masks: Sequence[np.ndarray]) -> list[Any]:
+        """A memory of the masks."""
+        memories = []
+        for own in masks:
+            memory = _Memory(
+                self._processor.init_video_session(inference_device=self._model.device, dtype=self._model.dtype)
+            )
+            self._processor.add_inputs_to_inference_session(
+                memory.session, frame_idx=0, obj_ids=list(range(len(own))), input_masks=list(own)
+            )
+            memories.append(memory)
+        self._advance(images, memories)
+        return memories
+
+    def follow(self, images: Images, memories: Sequence[Any]) -> list[tuple[np.ndarray, np.ndarray]]:
+        """The masks on the next frame; one that the model thinks is out of sight is not seen."""
+        followed = []
+        for image, outputs in zip(images, self._advance(images, memories), strict=True):
+            seen = (outputs.object_score_logits.flatten() > 0).cpu().numpy()
+            masks = _upscaled(outputs.pred_masks[:, 0], image)
+            followed.append((masks, seen & masks.any((1, 2))))
+        return followed
+
+    def _advance(self, images: Images, memories: Sequence[_Memory]) -> list[Any]:
+        """Run the model on the next frame of each."""
+        pixels = _pixels(self._processor.image_processor, images, self._model)
+        with require("torch").inference_mode():
+            features = self._model.get_image_features(pixels, return_dict=True)
+        outputs = []
+        for i, memory in enumerate(memories):
+            own = {
+                "vision_feats": [level[:, i : i + 1] for level in features.fpn_hidden_states],
+                "vision_pos_embeds": [level[:, i : i + 1] for level in features.fpn_position_encoding],
+            }
+            memory.session.cache.cache_vision_features(memory.frame, own)
+            outputs.append(self._model(memory.session, frame_idx=memory.frame, frame=pixels[i]))
+            self._forget(memory)
+        return outputs
+
+    def _forget(self, memory: _Memory) -> None:
+        """Keep what the next frame needs: transformers' session would keep all frames with their masks."""
+        session = memory.session
+        session.cache.clear_all()
+        session.processed_frames.clear()
+        config = self._model.config
+        oldest = memory.frame + 1 - max(config.num_maskmem, config.max_object_pointers_in_encoder)
+        for outputs in session.output_dict_per_obj.values():
+            for kept in outputs.values():
+                for frame in [frame for frame in kept if kept is not outputs["cond_frame_outputs"] and frame < oldest]:
+                    del kept[frame]
+                for output in kept.values():
+                    output.pop("high_res_masks", None)
+                    output.pop("pred_masks", None)
+        for frames in session.frames_tracked_per_obj.values():
+            frames.clear()
+        memory.frame += 1
+
+
+def _pixels(processor: Any, images: Images, model: Any) -> Any:
+    """Images of any sizes as one (B, 3, side, side) tensor where the model is."""
+    return processor(list(images), return_tensors="pt")["pixel_values"].to(model.device, model.dtype)
+
+
+def _size(image: np.ndarray) -> np.ndarray:
+    """Width and height twice, as the corners of a box go."""
+    return np.array([image.shape[1], image.shape[0]] * 2, np.float32)
+
+
+def _upscaled(logits: Any, image: np.ndarray) -> np.ndarray:
+    """Masks (N, H, W) bool of the image's size, from (N, h, w) logits."""
+    if not len(logits):
+        return np.zeros((0, *image.shape[:2]), bool)
+    torch = require("torch")
+    scaled = torch.nn.functional.interpolate(
+        logits[None].float(), size=image.shape[:2], mode="bilinear", align_corners=False
+    )
+    return np.asarray((scaled[0] > 0).cpu().numpy())

@@ -1,0 +1,138 @@
+"""What is followed on the cameras: found on the first frame, tracked from then on, looked for again when lost."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.policies.arro.config import ArroConfig
+from vlagents_ray.policies.arro.parts import Detector, Found, Images, Segmenter, Selector, Tracker, make_part
+from vlagents_ray.policies.arro.regions import grown, overlap
+
+GRIPPER = "(gripper)"  # the label of what the selector chose; no phrase that a detector is asked for
+Segment = tuple[str, np.ndarray]  # its label and mask, (H, W) bool
+_SAME = 0.5  # intersection over union from which on a thing that is found is one that is followed
+
+
+@dataclass(slots=True)
+class Track:
+    """The segments of one session on one camera."""
+
+    wanted: tuple[str, ...]  # phrases, and GRIPPER
+    labels: list[str] = field(default_factory=list)  # what each segment was found as
+    masks: list[np.ndarray] = field(default_factory=list)  # (H, W) bool each, where it was seen last
+    lost: list[int] = field(default_factory=list)  # frames since then
+    memory: Any = None  # the tracker's
+    incomplete: int = 0  # frames for which something has been missing
+    searched: bool = True  # on this frame
+
+    @property
+    def seen(self) -> list[str]:
+        """Labels of the segments that are in sight."""
+        return [label for label, lost in zip(self.labels, self.lost, strict=True) if not lost]
+
+    @property
+    def missing(self) -> list[str]:
+        """Labels of segments that are lost, and what was never found."""
+        lost = [label for label, frames in zip(self.labels, self.lost, strict=True) if frames]
+        return list(dict.fromkeys([*lost, *(one for one in self.wanted if one not in self.labels)]))
+
+    def shown(self, shape: tuple[int, int], keep_lost: int, grow: int) -> np.ndarray:
+        """The segments together, (H, W) bool; one that is lost for `keep_lost` frames at most is where it was."""
+        together = np.zeros(shape, bool)
+        for mask, lost in zip(self.masks, self.lost, strict=True):
+            if lost <= keep_lost:
+                together |= mask
+        return grown(together, grow)
+
+    def move(self, masks: Iterable[np.ndarray], seen: np.ndarray) -> None:
+        """Take over what the tracker says."""
+        self.masks = [new if is_seen else old for new, old, is_seen in zip(masks, self.masks, seen, strict=True)]
+        self.lost = [0 if is_seen else frames + 1 for frames, is_seen in zip(self.lost, seen, strict=True)]
+
+
+class Tracking:
+    """The four parts at work, for any number of sessions and cameras at once."""
+
+    def __init__(self, config: ArroConfig) -> None:
+        self._detector: Detector = make_part("detector", config.detector)
+        self._segmenter: Segmenter = make_part("segmenter", config.segmenter)
+        self._selector: Selector | None = None if config.selector is None else make_part("selector", config.selector)
+        self._tracker: Tracker = make_part("tracker", config.tracker)
+        self._keep_lost = config.keep_lost
+
+    def load(self) -> None:
+        """Read the weights of all parts."""
+        for part in (self._detector, self._segmenter, self._selector, self._tracker):
+            if part is not None:
+                part.load()
+
+    def begin(self, images: Images, phrases: Sequence[str]) -> list[Track]:
+        """Find what is wanted on each image; what is not there is among its track's `missing`."""
+        wanted = tuple(phrases) if self._selector is None else (*phrases, GRIPPER)
+        tracks = [Track(wanted) for _ in images]
+        self._search(images, tracks)
+        return tracks
+
+    def follow(self, images: Images, tracks: Sequence[Track]) -> None:
+        """Go on with each track on its next image."""
+        moving = [i for i, track in enumerate(tracks) if track.labels]
+        moved = self._tracker.follow([images[i] for i in moving], [tracks[i].memory for i in moving])
+        for i, (masks, seen) in zip(moving, moved, strict=True):
+            tracks[i].move(masks, seen)
+        for track in tracks:
+            track.incomplete = track.incomplete + 1 if track.missing else 0
+            track.searched = track.incomplete > 0 and track.incomplete % (self._keep_lost + 1) == 0
+        due = [i for i, track in enumerate(tracks) if track.searched]
+        if due:
+            self._search([images[i] for i in due], [tracks[i] for i in due])
+
+    def _search(self, images: Images, tracks: Sequence[Track]) -> None:
+        """Look for what is missing; a track that gains something begins anew with that and what is in sight."""
+        cut = self._things(images, [[label for label in track.missing if label != GRIPPER] for track in tracks])
+        grippers = self._grippers(images, [GRIPPER in track.missing for track in tracks])
+        begun = []
+        for i, track in enumerate(tracks):
+            kept = [(label, track.masks[n]) for n, label in enumerate(track.labels) if not track.lost[n]]
+            new = [pair for pair in cut[i] + grippers[i] if all(overlap(pair[1], mask) < _SAME for _, mask in kept)]
+            if new:
+                track.labels = [label for label, _ in kept + new]
+                track.masks = [mask for _, mask in kept + new]
+                track.lost = [0] * len(track.labels)
+                begun.append(i)
+        if begun:
+            masks = [np.stack(tracks[i].masks) for i in begun]
+            for i, memory in zip(begun, self._tracker.begin([images[i] for i in begun], masks), strict=True):
+                tracks[i].memory = memory
+
+    def _things(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Segment]]:
+        """What the detector finds; the segmenter cuts it out where the detector does not itself."""
+        found: list[list[Found]] = [[] for _ in images]
+        asked = [i for i, wanted in enumerate(phrases) if wanted]
+        if asked:
+            detected = self._detector.detect([images[i] for i in asked], [phrases[i] for i in asked])
+            for i, things in zip(asked, detected, strict=True):
+                found[i] = things
+        boxed = [i for i, things in enumerate(found) if any(thing.mask is None for thing in things)]
+        boxes = [np.stack([thing.box for thing in found[i] if thing.mask is None]) for i in boxed]
+        made = self._segmenter.segment([images[i] for i in boxed], boxes) if boxed else []
+        cut = {i: iter(masks) for i, masks in zip(boxed, made, strict=True)}
+        segments = [
+            [(thing.phrase, next(cut[i]) if thing.mask is None else thing.mask) for thing in things]
+            for i, things in enumerate(found)
+        ]
+        return [[(label, mask) for label, mask in own if mask.any()] for own in segments]
+
+    def _grippers(self, images: Images, wanted: Sequence[bool]) -> list[list[Segment]]:
+        """The gripper's regions, on the images where it is wanted and to be seen."""
+        grippers: list[list[Segment]] = [[] for _ in images]
+        asked = [i for i, is_wanted in enumerate(wanted) if is_wanted]
+        if self._selector is not None and asked:
+            regions = self._segmenter.propose([images[i] for i in asked])
+            chosen = self._selector.select([images[i] for i in asked], regions)
+            for i, masks, numbers in zip(asked, regions, chosen, strict=True):
+                grippers[i] = [(GRIPPER, masks[number]) for number in numbers]
+        return grippers

@@ -1,0 +1,151 @@
+"""The wrapper that shows segments on a virtual background."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from vlagents_ray.contract import CameraSpec, Contract
+from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, NotReset, VLAgentsError
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.policies.arro.background import Background
+from vlagents_ray.policies.arro.config import ArroConfig
+from vlagents_ray.policies.arro.tracking import Track, Tracking
+from vlagents_ray.policies.wrapper import Wrapper
+
+INFO = "arro"  # in Act.info and what `reset` returns: {camera: {"seen": labels, "missing": labels, "searched": bool}}
+
+
+class Arro(Wrapper):
+    """Paints over all but the gripper and the things of the task, on the cameras of the config.
+
+    Each session tracks its own; detector, segmenter and tracker get the images of all sessions of a batch together.
+    `Obs.info` is not changed, so that an image in it, such as a goal, shows its own background.
+    """
+
+    Config: ClassVar[type] = ArroConfig
+    shared: ClassVar[tuple[str, ...]] = ("config", "tracking", "background")
+
+    def __init__(self, agent: Agent, config: ArroConfig) -> None:
+        super().__init__(agent, config)
+        self.tracking = Tracking(config)
+        self.background = Background(config.background)
+        self.tracks: dict[str, Track] | None = None
+
+    @property
+    def contract(self) -> Contract:
+        """The inner agent's, which also needs the cameras of the config, and an instruction to find things by."""
+        inner = self.agent.contract or Contract()
+        needed = {name: CameraSpec() for name in self.config.cameras or ()}
+        return replace(
+            inner,
+            cameras={**needed, **(inner.cameras or {})} or inner.cameras,
+            instruction=inner.instruction if self.config.objects else True,
+        )
+
+    def initialize(self) -> None:
+        """Load the parts, then the inner agent."""
+        self.background.load()
+        self.tracking.load()
+        super().initialize()
+        stated = self.agent.contract.cameras if self.agent.contract is not None else None
+        idle = sorted(set(self.config.cameras or ()) - set(stated or ())) if stated else []
+        if idle:
+            raise ConfigError(
+                f"arro: cameras {idle} are none of the policy's, {sorted(stated or ())}; name some of those"
+            )
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        """Begin an episode of both; raises `InvalidObservation` if something is missing that must not be."""
+        return {**super().reset(obs, instruction, **kwargs), INFO: self._report()}
+
+    def begin(self, obs: Obs, instruction: str | None) -> Obs:
+        names = self._names(obs)
+        phrases = self.config.objects or ([instruction] if instruction else [])
+        if not phrases:
+            raise InvalidObservation("instruction: got none, want one that names the things to show; or set `objects`")
+        tracks = self.tracking.begin([obs.cameras[name] for name in names], phrases)
+        for name, track in zip(names, tracks, strict=True):
+            if track.missing and self.config.missing == "refuse":
+                raise InvalidObservation(
+                    f"arro: camera {name!r} shows none of {track.missing}, found {track.seen}; is it in sight? Else "
+                    f"name it in `objects` in other words, leave the camera out of `cameras`, or set missing: hide"
+                )
+        self.tracks = dict(zip(names, tracks, strict=True))
+        return self._changed(obs)
+
+    def change_batch(self, obs: Sequence[Obs], sessions: Sequence[Wrapper]) -> list[Obs | Exception]:
+        results: list[Obs | Exception] = list(obs)
+        images: list[np.ndarray] = []
+        tracks: list[Track] = []
+        for i, (one, session) in enumerate(zip(obs, sessions, strict=True)):
+            try:
+                views = session._views(one)  # type: ignore[attr-defined]
+            except VLAgentsError as error:
+                results[i] = error
+                continue
+            images += [image for image, _ in views]
+            tracks += [track for _, track in views]
+        self.tracking.follow(images, tracks)
+        return [
+            one if isinstance(one, Exception) else session._changed(one)  # type: ignore[attr-defined]
+            for one, session in zip(results, sessions, strict=True)
+        ]
+
+    def act(self, obs: Obs) -> Act:
+        return self._told(super().act(obs))
+
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        acts = super().act_batch(obs, sessions)
+        return [
+            act if isinstance(act, Exception) else session._told(act)  # type: ignore[attr-defined]
+            for act, session in zip(acts, sessions, strict=True)
+        ]
+
+    def _names(self, obs: Obs) -> list[str]:
+        """The cameras that are changed."""
+        stated = self.agent.contract.cameras if self.agent.contract is not None else None
+        names = list(self.config.cameras or stated or obs.cameras)
+        for name in names:
+            if name not in obs.cameras:
+                raise MissingCamera(name, have=obs.cameras)
+        return names
+
+    def _views(self, obs: Obs) -> list[tuple[np.ndarray, Track]]:
+        """The images that are changed, with their tracks; raises before any of them is touched."""
+        views = []
+        for name, track in self._begun().items():
+            if name not in obs.cameras:
+                raise MissingCamera(name, have=obs.cameras)
+            image = obs.cameras[name]
+            if len(track.masks) and track.masks[0].shape != image.shape[:2]:
+                raise InvalidObservation(
+                    f"camera {name!r}: got {image.shape[:2]}, want {track.masks[0].shape} as at reset; keep its size"
+                )
+            views.append((image, track))
+        return views
+
+    def _changed(self, obs: Obs) -> Obs:
+        cameras = dict(obs.cameras)
+        for name, track in self._begun().items():
+            height, width = cameras[name].shape[:2]
+            mask = track.shown((height, width), self.config.keep_lost, self.config.grow)
+            cameras[name] = self.background.behind(cameras[name], mask)
+        return replace(obs, cameras=cameras)
+
+    def _told(self, act: Act) -> Act:
+        return replace(act, info={**act.info, INFO: self._report()})
+
+    def _report(self) -> Mapping[str, Any]:
+        return {
+            name: {"seen": track.seen, "missing": track.missing, "searched": track.searched}
+            for name, track in self._begun().items()
+        }
+
+    def _begun(self) -> dict[str, Track]:
+        if self.tracks is None:
+            raise NotReset("arro: act before reset; call reset(obs, instruction) first")
+        return self.tracks

@@ -1,0 +1,45 @@
+"""Settings of V-JEPA 2-AC; the planner's defaults are those of upstream's `WorldModel`."""
+
+from __future__ import annotations
+
+from pydantic import Field, model_validator
+from typing_extensions import Self
+
+from vlagents_ray.policies.base.config import ModelConfig
+
+
+class VJepa2AcConfig(ModelConfig):
+    """Upstream's .pt file with encoder and predictor, and how plans are searched for."""
+
+    encoder: str | None = Field(
+        default=None, description="folder or hub id of a `VJEPA2Model` instead of the encoder in the checkpoint"
+    )
+    source_dir: str | None = Field(
+        default=None,
+        description="checkout of vjepa2, for the predictor's code; unset: that of VJEPA2_SRC, or installed",
+    )
+    encoder_heads: int | None = Field(
+        default=None, ge=1, description="attention heads of the checkpoint's encoder; unset: those of ViT-L, -H or -g"
+    )
+    predictor_heads: int = Field(default=16, ge=1, description="attention heads of the predictor")
+    image_size: int = Field(default=256, ge=16, description="pixels of a side, as the model was trained")
+    normalize: bool = Field(default=True, description="normalise features, as the model was trained")
+
+    execute: int | None = Field(default=1, ge=1, description="steps of a plan that are used; the paper's: the first")
+    rollout: int = Field(default=2, ge=1, description="steps of a plan")
+    samples: int = Field(default=400, ge=2, description="plans that are tried in an iteration")
+    topk: int = Field(default=10, ge=2, description="of which so many, the nearest to the goal, say where to try next")
+    iterations: int = Field(default=10, ge=1)
+    momentum_mean: float = Field(default=0.15, ge=0, lt=1, description="share of the last iteration's mean position")
+    momentum_std: float = Field(default=0.15, ge=0, lt=1)
+    momentum_mean_gripper: float = Field(default=0.15, ge=0, lt=1)
+    momentum_std_gripper: float = Field(default=0.15, ge=0, lt=1)
+    maxnorm: float = Field(default=0.05, gt=0, description="the longest step along each axis, m")
+    close_gripper: int | None = Field(default=None, ge=0, description="steps of a plan from this one on close it")
+    pass_size: int = Field(default=400, ge=1, description="plans in one forward pass of the predictor, at most")
+
+    @model_validator(mode="after")
+    def _chosen_from_more(self) -> Self:
+        if self.topk > self.samples:
+            raise ValueError(f"topk {self.topk} is over samples {self.samples}; want it to be a small part of them")
+        return self

@@ -1,0 +1,177 @@
+"""V-JEPA 2-AC as a policy."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
+
+import numpy as np
+
+from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.errors import InvalidObservation
+from vlagents_ray.interface import GOAL_IMAGE, Obs
+from vlagents_ray.policies.base import ModelPolicy, Prediction, Row
+from vlagents_ray.policies.base.accelerator import torch_device, torch_dtype
+from vlagents_ray.policies.base.observing import (
+    GRIPPER,
+    camera_images,
+    camera_specs,
+    choose_cameras,
+    state_specs,
+    state_vector,
+)
+from vlagents_ray.policies.vjepa2_ac.config import VJepa2AcConfig
+from vlagents_ray.policies.vjepa2_ac.encoder import Encoder, load_encoder, to_pixels
+from vlagents_ray.policies.vjepa2_ac.planner import DRAWN, Tensor, plan
+from vlagents_ray.policies.vjepa2_ac.predictor import load_predictor, read_checkpoint
+from vlagents_ray.registry import require
+
+CAMERA = "front"  # the model has one camera, without a name
+_STATE = ["xyzrpy"]
+_GOAL, _GOAL_FEATURES = "goal", "goal_features"  # in a session's memory: pixels, and what the encoder made of them
+
+
+@dataclass(frozen=True, slots=True)
+class Frame:
+    """What is kept of an observation."""
+
+    pixels: np.ndarray  # (3, side, side) float32
+    pose: np.ndarray  # (7,) float32: x, y, z m, roll, pitch, yaw rad, closedness
+    goal: np.ndarray | None  # (3, side, side) float32, if the observation brings one
+
+
+class WorldModel:
+    """Encoder and predictor."""
+
+    def __init__(self, encoder: Any, predictor: Any, config: VJepa2AcConfig) -> None:
+        self.encode = Encoder(encoder, config.normalize)
+        self._predictor = predictor
+        self._normalize = config.normalize
+
+    def __call__(self, features: Tensor, actions: Tensor, poses: Tensor) -> Tensor:
+        """The next frame's features: see `planner.World`."""
+        torch = require("torch")
+        tokens = features.shape[2]
+        steps = (part.to(features.dtype) for part in (actions, poses))
+        following = self._predictor(features.flatten(1, 2), *steps)[:, -tokens:]
+        return torch.nn.functional.layer_norm(following, following.shape[-1:]) if self._normalize else following
+
+
+class VJepa2Ac(ModelPolicy):
+    """Moves the gripper so that the camera sees what `info["goal_image"]` shows.
+
+    The goal comes with the `reset` or with any later observation, and stays until there is another one.
+    """
+
+    Config: ClassVar[type] = VJepa2AcConfig
+    config: VJepa2AcConfig
+
+    def __init__(self, config: VJepa2AcConfig) -> None:
+        super().__init__(config)
+        self._cameras = choose_cameras(config.cameras, {CAMERA: "front"}, [CAMERA])
+        self._state = config.state or _STATE
+
+    @property
+    def contract(self) -> Contract:
+        return Contract(
+            cameras=camera_specs(self._cameras),
+            state=state_specs(self._state, 6),
+            gripper=True,
+            action=ActionSpec(
+                dim=7,
+                space="ee_pose",
+                delta=True,
+                rotation="euler_xyz",
+                frame="base",
+                gripper_open=1.0,
+                gripper_closed=0.0,
+            ),
+            chunk=self.chunk(self.config.rollout),
+        )
+
+    def load(self) -> WorldModel:
+        """Encoder and predictor, every parameter of which is the checkpoint's."""
+        saved = read_checkpoint(self.config)
+        device = torch_device(self.config.device)
+        dtype = torch_dtype(self.config.dtype, device, preferred="float32")  # in which upstream plans
+        encoder = load_encoder(self.config, saved.get("encoder"))
+        predictor = load_predictor(self.config, saved["predictor"], encoder.config.hidden_size)
+        return WorldModel(encoder.to(device, dtype).eval(), predictor.to(device, dtype).eval(), self.config)
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        """Begin an episode, to the goal in `obs` if there is one."""
+        told = super().reset(obs, instruction, **kwargs)
+        goal = self._goal(obs)
+        if goal is not None:
+            self._begun().memory[_GOAL] = goal
+        return told
+
+    def perceive(self, obs: Obs) -> Frame:
+        pose = state_vector(obs, [*self._state, GRIPPER], 7)
+        pose[6] = 1 - pose[6]
+        [image] = camera_images(obs, self._cameras).values()
+        return Frame(to_pixels(image, self.config.image_size), pose, self._goal(obs))
+
+    def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
+        for row in rows:
+            _remember(row)
+        ready = [row for row in rows if _GOAL in row.memory]
+        found = iter(self._plans(ready) if ready else [])
+        no_goal = InvalidObservation(
+            f"info[{GOAL_IMAGE!r}]: got none since the reset, want an image of what is to be reached, (H, W, 3) uint8"
+        )
+        return [next(found) if _GOAL in row.memory else no_goal for row in rows]
+
+    def _plans(self, rows: Sequence[Row]) -> list[Prediction]:
+        torch = require("torch")
+        config, world = self.config, self.model
+        new = [row for row in rows if _GOAL_FEATURES not in row.memory]
+        shape = (config.iterations, config.rollout, config.samples, DRAWN)
+        with torch.inference_mode():
+            pixels = [row.frames[-1].pixels for row in rows] + [row.memory[_GOAL] for row in new]
+            features = world.encode(np.stack(pixels))
+            for row, goal in zip(new, features[len(rows) :], strict=True):
+                row.memory[_GOAL_FEATURES] = goal.clone()
+            poses, noise = (
+                torch.as_tensor(np.stack(parts)).to(features.device, non_blocking=True)
+                for parts in ([row.frames[-1].pose for row in rows], [row.noise(*shape) for row in rows])
+            )
+            goals = torch.stack([row.memory[_GOAL_FEATURES] for row in rows])
+            plans = plan(world, features[: len(rows)], poses, goals, noise, config)
+        actions, std, energy = (part.float().cpu().numpy() for part in (plans.actions, plans.std, plans.energy))
+        predictions = []
+        for i, row in enumerate(rows):
+            steps = _openings(actions[i], row.frames[-1].pose[6])
+            predictions.append(Prediction(steps, mean=steps, std=std[i], info={"energy": float(energy[i])}))
+        return predictions
+
+    def _goal(self, obs: Obs) -> np.ndarray | None:
+        image = obs.info.get(GOAL_IMAGE)
+        if image is None:
+            return None
+        if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+            got = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
+            raise InvalidObservation(f"info[{GOAL_IMAGE!r}]: got {got}, want (H, W, 3) uint8 RGB")
+        return to_pixels(image, self.config.image_size)
+
+    def _example(self) -> Row:
+        example = super()._example()
+        return replace(example, memory={_GOAL: example.frames[-1].pixels})
+
+
+def _remember(row: Row) -> None:
+    """Take over the goal of the newest observation; features of the same image are kept."""
+    goal = row.frames[-1].goal
+    if goal is not None and (_GOAL not in row.memory or not np.array_equal(goal, row.memory[_GOAL])):
+        row.memory[_GOAL] = goal
+        row.memory.pop(_GOAL_FEATURES, None)
+
+
+def _openings(actions: np.ndarray, closedness: float) -> np.ndarray:
+    """Plans (H, 7) whose last column is how far the gripper shall be open after each step, instead of a change."""
+    opened = actions.copy()
+    for row in opened:
+        closedness = float(np.clip(closedness + row[6], 0, 1))
+        row[6] = 1 - closedness
+    return opened
