@@ -17,6 +17,8 @@ from vlagents_ray.errors import ConfigError, MissingDependency, UnknownEnv, Unkn
 
 POLICIES: dict[str, str] = {
     "noop": "vlagents_ray.policies.noop:Noop",
+    "openvla": "vlagents_ray.policies.openvla.policy:OpenVLA",
+    "openvla_oft": "vlagents_ray.policies.openvla.oft:OpenVLAOFT",
     "random": "vlagents_ray.policies.random:Random",
     "replay": "vlagents_ray.policies.replay:Replay",
     "scripted": "vlagents_ray.policies.scripted:Scripted",
