@@ -20,6 +20,8 @@ POLICIES: dict[str, str] = {
     "lerobot": "vlagents_ray.policies.lerobot:LeRobot",
     "noop": "vlagents_ray.policies.noop:Noop",
     "octo": "vlagents_ray.policies.octo:Octo",
+    "openvla": "vlagents_ray.policies.openvla.policy:OpenVLA",
+    "openvla_oft": "vlagents_ray.policies.openvla.oft:OpenVLAOFT",
     "random": "vlagents_ray.policies.random:Random",
     "replay": "vlagents_ray.policies.replay:Replay",
     "scripted": "vlagents_ray.policies.scripted:Scripted",

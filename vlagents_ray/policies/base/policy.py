@@ -6,7 +6,7 @@ import abc
 import copy
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -246,4 +246,4 @@ def _leftover(obs: Obs, contract: Contract | None) -> np.ndarray | None:
 
 def _sample(row: Row, draws: np.random.Generator) -> Row:
     """The same row, with noise and memory that are not the session's."""
-    return Row(row.frames, row.instruction, draws, row.leftover, row.delay, row.info, memory=copy.deepcopy(row.memory))
+    return replace(row, rng=draws, memory=copy.deepcopy(row.memory), sample=True)

@@ -20,6 +20,7 @@ class Row:
     delay: int = 0  # and DELAY: the chunk begins with so many rows of it
     info: Mapping[str, Any] = field(default_factory=dict)  # of the observation
     memory: dict[str, Any] = field(default_factory=dict)  # the session's, for families that keep more than frames
+    sample: bool = False  # a draw of the distribution, also where the session's own answer is the likeliest one
 
     def noise(self, *shape: int) -> np.ndarray:
         """Standard normal draws, float32: the same on every device."""

@@ -1,0 +1,51 @@
+"""OpenVLA's and OpenVLA-OFT's own code, out of the source trees that $OPENVLA_SRC and $OPENVLA_OFT_SRC name."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import os
+import sys
+import types
+from collections.abc import Iterator
+from functools import lru_cache
+from pathlib import Path
+
+from vlagents_ray.policies.base.accelerator import ensure_torchvision
+
+VARIABLES = ("OPENVLA_SRC", "OPENVLA_OFT_SRC")
+_PACKAGES = ("", ".extern", ".extern.hf", ".models", ".training", ".vla")  # their __init__ import TensorFlow and more
+
+
+def source(variable: str) -> Path | None:
+    """The source tree that a variable names, if there is one."""
+    root = Path(os.environ.get(variable) or "-")
+    return root if (root / "prismatic").is_dir() else None
+
+
+@lru_cache
+def module(variable: str, name: str) -> types.ModuleType:
+    """A module of that tree's package `prismatic`, by its name there; those of one tree share what they import."""
+    with _packages(variable):
+        return importlib.import_module(f"prismatic.{name}")
+
+
+_imported: dict[str, dict[str, types.ModuleType]] = {name: {} for name in VARIABLES}
+
+
+@contextlib.contextmanager
+def _packages(variable: str) -> Iterator[None]:
+    ensure_torchvision()
+    known = _imported[variable]
+    for suffix in _PACKAGES:
+        if f"prismatic{suffix}" not in known:
+            package = known[f"prismatic{suffix}"] = types.ModuleType(f"prismatic{suffix}")
+            package.__path__ = [str(Path(os.environ[variable], *f"prismatic{suffix}".split(".")))]
+    sys.modules.update(known)
+    try:
+        with contextlib.redirect_stdout(io.StringIO()):
+            yield
+    finally:
+        for name in [name for name in sys.modules if name.partition(".")[0] == "prismatic"]:
+            known[name] = sys.modules.pop(name)
