@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vlagents_ray.client.plan import ENSEMBLE, Chunk, Plan
+from vlagents_ray.contract import Contract
 from vlagents_ray.errors import InvalidObservation, NotReset, PolicyFailed
 from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, Act, Agent, Obs
 from vlagents_ray.policies.base.config import ModelConfig
@@ -146,7 +147,7 @@ class ModelPolicy(Agent, abc.ABC):
             frames=tuple(episode.frames),
             instruction=episode.instruction,
             rng=episode.rng,
-            leftover=_leftover(obs),
+            leftover=_leftover(obs, self.contract),
             delay=int(obs.info.get(DELAY) or 0),
             info=obs.info,
             memory=episode.memory,
@@ -232,13 +233,14 @@ def _samples(obs: Obs, config: ModelConfig) -> int:
     return samples
 
 
-def _leftover(obs: Obs) -> np.ndarray | None:
+def _leftover(obs: Obs, contract: Contract | None) -> np.ndarray | None:
     left = obs.info.get(LEFTOVER)
     if left is None:
         return None
     left = np.asarray(left, np.float32)
-    if left.ndim != 2 or not np.isfinite(left).all():
-        raise InvalidObservation(f"info[{LEFTOVER!r}]: got {left.shape}, want (H, D) finite float32")
+    dim = None if contract is None else contract.action.dim
+    if left.ndim != 2 or dim not in (None, left.shape[1]) or not np.isfinite(left).all():
+        raise InvalidObservation(f"info[{LEFTOVER!r}]: got {left.shape}, want (H, {dim or 'D'}) finite float32")
     return left.copy()
 
 
