@@ -17,6 +17,7 @@ from vlagents_ray.errors import ConfigError, MissingDependency, UnknownEnv, Unkn
 
 POLICIES: dict[str, str] = {
     "noop": "vlagents_ray.policies.noop:Noop",
+    "openpi": "vlagents_ray.policies.openpi:OpenPi",
     "pi0": "vlagents_ray.policies.pi0:Pi0",
     "random": "vlagents_ray.policies.random:Random",
     "replay": "vlagents_ray.policies.replay:Replay",

@@ -20,7 +20,14 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
-from vlagents_ray.policies.base.observing import camera_images, camera_specs, choose_cameras, state_specs, state_vector
+from vlagents_ray.policies.base.observing import (
+    camera_images,
+    camera_specs,
+    choose_cameras,
+    needs_gripper,
+    state_specs,
+    state_vector,
+)
 from vlagents_ray.policies.base.realtime import Guide
 from vlagents_ray.policies.base.resizing import resize_with_pad
 from vlagents_ray.registry import require
@@ -88,7 +95,7 @@ class Pi0(ModelPolicy):
         return Contract(
             cameras=camera_specs(self.cameras),
             state=state_specs(self.state, state_dim),
-            gripper="gripper" in self.state,
+            gripper=needs_gripper(self.state),
             instruction=True,
             action=ActionSpec(dim=None if loaded is None else len(loaded.processor.actions_mean)),
             chunk=None if loaded is None else self.chunk(loaded.network.config.chunk_size),
@@ -138,7 +145,7 @@ class Pi0(ModelPolicy):
             return torch.from_numpy(array).to(model.device, non_blocking=True)
 
         noise = convert(np.stack([row.noise(*shape) for row in rows]))
-        guide = Guide.of(rows, *shape, model.normalised)
+        guide = Guide.of(rows, *shape, lambda _, plan: model.normalised(plan))
         with torch.inference_mode():
             flow = self._follow(self._inputs(rows), noise, None if guide is None else guide.to(convert))
         return [Prediction(model.actions(one)) for one in flow.cpu().numpy()]
@@ -181,13 +188,11 @@ class Pi0(ModelPolicy):
         actions = noise
         for step in range(steps):
             time = 1.0 - step / steps
-            if guide is not None:
-                actions = guide.hold(actions, noise, time)
             change = velocity(actions, time)
             if guide is not None:
-                change = guide.pull(actions, change, time, steps, self.config.guidance)
+                change = guide.steer(change, actions, noise, time, steps=steps, limit=self.config.guidance)
             actions = actions - change / steps
-        return actions if guide is None else guide.hold(actions, noise, 0.0)
+        return actions
 
 
 def _cameras(chosen: Mapping[str, str] | None) -> dict[str, str]:

@@ -19,15 +19,15 @@ def row(leftover: np.ndarray | None = None, delay: int = 0) -> Row:
 def flow(*rows: Row, steps: int = STEPS, limit: float = 5.0) -> np.ndarray:
     """(B, H, D) actions, as a policy makes them."""
     noise = np.random.default_rng(0).standard_normal((len(rows), HORIZON, DIM)).astype(np.float32)
-    guide = Guide.of(rows, HORIZON, DIM, lambda plan: plan)
+    guide = Guide.of(rows, HORIZON, DIM, lambda _, plan: plan)
     actions = noise
     for step in range(steps):
         time = 1.0 - step / steps
-        actions = actions if guide is None else guide.hold(actions, noise, time)
         velocity = (actions - TARGET) / time
-        velocity = velocity if guide is None else guide.pull(actions, velocity, time, steps, limit)
+        if guide is not None:
+            velocity = guide.steer(velocity, actions, noise, time, steps=steps, limit=limit)
         actions = actions - velocity / steps
-    return actions if guide is None else guide.hold(actions, noise, 0.0)
+    return actions
 
 
 def plan(length: int = 6) -> np.ndarray:
@@ -35,12 +35,12 @@ def plan(length: int = 6) -> np.ndarray:
 
 
 def test_without_a_plan_there_is_nothing_to_follow() -> None:
-    assert Guide.of([row(), row()], HORIZON, DIM, lambda plan: plan) is None
+    assert Guide.of([row(), row()], HORIZON, DIM, lambda _, plan: plan) is None
 
 
 @pytest.mark.parametrize("delay", [1, 3, 6])
-def test_rows_within_the_delay_are_the_plan_exactly(delay: int) -> None:
-    np.testing.assert_array_equal(flow(row(plan(), delay))[0, :delay], plan()[:delay])
+def test_rows_within_the_delay_are_the_plan(delay: int) -> None:
+    np.testing.assert_allclose(flow(row(plan(), delay))[0, :delay], plan()[:delay], atol=1e-6)
 
 
 def test_later_rows_follow_less_and_less_and_not_at_all_after_the_plan() -> None:
@@ -63,5 +63,5 @@ def test_few_steps_do_not_overshoot(steps: int) -> None:
 
 
 def test_a_delay_beyond_the_plan_and_a_plan_beyond_the_horizon_are_cut_to_it() -> None:
-    np.testing.assert_array_equal(flow(row(plan(2), 5))[0, :2], plan(2))
-    np.testing.assert_array_equal(flow(row(plan(20), 20))[0], plan(20)[:HORIZON])
+    np.testing.assert_allclose(flow(row(plan(2), 5))[0, :2], plan(2), atol=1e-6)
+    np.testing.assert_allclose(flow(row(plan(20), 20))[0], plan(20)[:HORIZON], atol=1e-6)

@@ -1,4 +1,4 @@
-"""Torch on whatever there is: devices, dtypes, and a torchvision that does not match."""
+"""Torch and JAX on whatever there is: devices, dtypes, and a torchvision that does not match."""
 
 from __future__ import annotations
 
@@ -34,6 +34,21 @@ def torch_dtype(name: DType, device: Any, preferred: str = "bfloat16") -> Any:
     torch = require("torch")
     usual = "float32" if device.type == "cpu" else preferred
     return getattr(torch, usual if name == "auto" else name)
+
+
+def jax_device(name: str = "auto") -> Any:
+    """The JAX device of that name; "auto" takes the first there is. `ConfigError` if it is not there."""
+    jax = require("jax")
+    if name == "auto":
+        return jax.devices()[0]
+    kind, _, index = name.partition(":")
+    try:
+        return jax.devices(kind)[int(index or 0)]
+    except (RuntimeError, IndexError, ValueError) as error:
+        raise ConfigError(
+            f"device {name!r}: not here, JAX sees {jax.devices()}; use 'auto' or 'cpu', or install the jaxlib of your "
+            f"accelerator and give the replica a GPU with resources: {{num_gpus: 1}}"
+        ) from error
 
 
 def ensure_torchvision() -> None:

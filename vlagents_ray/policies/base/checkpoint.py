@@ -131,6 +131,31 @@ def require_loaded(model: Any, saved: SavedTensors | Mapping[str, Any]) -> None:
         )
 
 
+def require_filled(params: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """Raise `ConfigError` unless the nested `params` are arrays of just the names and shapes that are `wanted`.
+
+    For JAX, whose loaders hand out what they read: what is an array there came from the checkpoint.
+    """
+    have, want = dict(_leaves(params)), dict(_leaves(wanted))
+    absent = sorted(name for name in want if not hasattr(have.get(name), "__array__"))
+    unknown = sorted(set(have) - set(want))
+    different = sorted(name for name in want if name not in absent and have[name].shape != want[name].shape)
+    if absent or unknown or different:
+        raise ConfigError(
+            f"the checkpoint does not fill the model: {len(absent)} parameters are not in it {absent[:_LISTED]}, "
+            f"{len(different)} have another shape {different[:_LISTED]}, {len(unknown)} are not the model's "
+            f"{unknown[:_LISTED]}: is it a checkpoint of this model and this version of its library?"
+        )
+
+
+def _leaves(tree: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{name}/")
+        else:
+            yield f"{prefix}{name}", value
+
+
 def _same(torch: Any, have: Any, want: Any) -> bool:
     if have.shape != want.shape:
         return False

@@ -1,9 +1,9 @@
 """Real-time chunking of flow-matching policies: a chunk that goes on from what the robot is doing meanwhile.
 
 After Black, Galliker & Levine 2025 (https://arxiv.org/abs/2506.07339), with two differences. Rows that will have been
-executed when the answer comes are not guided but set, at each step, to the plan with as much noise as is left, so that
-they come out as they were planned, exactly. And the later rows' correction takes the model's Jacobian for the identity,
-as LeRobot 0.4.4 does: it costs no backward pass.
+executed when the answer comes are not guided but moved straight from the noise to the plan, so that they come out as
+they were planned. And the later rows' correction takes the model's Jacobian for the identity, as LeRobot 0.4.4 does: it
+costs no backward pass.
 
 Flow time is openpi's: 1 is noise, 0 is the actions, and the velocity is noise minus actions.
 """
@@ -29,9 +29,12 @@ class Guide:
 
     @classmethod
     def of(
-        cls, rows: Sequence[Row], horizon: int, dim: int, normalise: Callable[[np.ndarray], np.ndarray]
+        cls, rows: Sequence[Row], horizon: int, dim: int, planned: Callable[[Row, np.ndarray], np.ndarray]
     ) -> Guide | None:
-        """That of the rows' `leftover` and `delay`, in numpy; None if no row has any."""
+        """That of the rows' `leftover` and `delay`, in numpy; None if no row has any.
+
+        `planned` turns a row's leftover actions into what the model sees.
+        """
         if all(row.leftover is None for row in rows):
             return None
         plan = np.zeros((len(rows), horizon, dim), np.float32)
@@ -39,7 +42,7 @@ class Guide:
         weight = np.zeros((len(rows), horizon, 1), np.float32)
         for i, row in enumerate(rows):
             if row.leftover is not None:
-                left = normalise(row.leftover[:horizon])
+                left = planned(row, row.leftover[:horizon])
                 delay = min(max(row.delay, 0), len(left))
                 plan[i, : len(left), : left.shape[1]] = left
                 frozen[i, :delay] = 1.0
@@ -50,19 +53,26 @@ class Guide:
         """The same in another library, or on another device."""
         return Guide(convert(self.plan), convert(self.frozen), convert(self.weight))
 
-    def hold(self, actions: Any, noise: Any, time: float) -> Any:
-        """The noisy actions (B, H, D) with the frozen rows as the plan has them at that flow time."""
-        known = time * noise + (1.0 - time) * self.plan
-        return self.frozen * known + (1.0 - self.frozen) * actions
+    def steer(
+        self,
+        velocity: Any,
+        actions: Any,
+        noise: Any,
+        time: Any,
+        *,
+        steps: int,
+        limit: float,
+        lower: Callable[[Any, float], Any] = min,
+    ) -> Any:
+        """The velocity (B, H, D) at the noisy actions of that flow time, as the plan changes it.
 
-    def pull(self, actions: Any, velocity: Any, time: float, steps: int, limit: float) -> Any:
-        """The velocity (B, H, D), corrected toward the plan with a gain of at most `limit`.
-
-        Nor is it more than the number of steps: at that, one step goes all the way.
+        A later row is pulled with a gain of at most `limit`, and of the number of steps at most: with that, one step
+        goes all the way. `lower` is the smaller of two numbers, for libraries whose `time` is no plain number.
         """
         spread = (1.0 - time) ** 2 + time**2
-        gain = min(limit, float(steps), spread / max(time * (1.0 - time), 1e-6))
-        return velocity - gain * self.weight * (self.plan - (actions - time * velocity))
+        gain = lower(spread / (time * (1.0 - time) + 1e-6), min(limit, float(steps)))
+        pulled = velocity - gain * self.weight * (self.plan - (actions - time * velocity))
+        return self.frozen * (noise - self.plan) + (1.0 - self.frozen) * pulled
 
 
 def _weights(delay: int, length: int, horizon: int) -> np.ndarray:
