@@ -127,6 +127,7 @@ def test_samples_come_with_their_mean_and_change_no_action() -> None:
         ({}, at(0.0, **{SAMPLES: -1}), InvalidObservation),
         ({"actions": "queue"}, at(0.0, **{SAMPLES: 2}), InvalidObservation),
         ({}, at(0.0, **{LEFTOVER: np.zeros(3)}), InvalidObservation),
+        ({}, at(0.0, **{LEFTOVER: np.zeros((2, DIM + 1))}), InvalidObservation),
     ],
 )
 def test_a_bad_observation_fails_its_own_session_alone(

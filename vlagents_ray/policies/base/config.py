@@ -28,7 +28,7 @@ class ModelConfig(BaseModel, extra="forbid"):
     state: list[str] | None = Field(
         default=None,
         description="parts of the proprioception that make up the model's state vector, in its order; "
-        "'gripper' stands for `Obs.gripper`; unset: the family's convention",
+        "'gripper' stands for `Obs.gripper`, 'gripper_closed' for 1 minus that; unset: the family's convention",
     )
 
     actions: Literal["chunk", "queue", "ensemble"] = Field(

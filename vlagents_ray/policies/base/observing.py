@@ -11,6 +11,7 @@ from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, 
 from vlagents_ray.interface import Obs
 
 GRIPPER = "gripper"  # as a part of the state: `Obs.gripper`
+CLOSED = "gripper_closed"  # how far it is closed: 1 - `Obs.gripper`
 
 
 def choose_cameras(chosen: Mapping[str, str] | None, usual: Mapping[str, str], known: Sequence[str]) -> dict[str, str]:
@@ -39,10 +40,10 @@ def state_vector(obs: Obs, parts: Sequence[str], dim: int | None = None) -> np.n
     """The parts in their order as one (dim,) float32 vector of its own memory."""
     found = []
     for part in parts:
-        if part == GRIPPER:
+        if part in (GRIPPER, CLOSED):
             if obs.gripper is None:
                 raise InvalidObservation("gripper: got none, want a number in [0, 1] where 1 = open")
-            found.append(np.array([obs.gripper], np.float32))
+            found.append(np.array([obs.gripper if part == GRIPPER else 1.0 - obs.gripper], np.float32))
         elif part in obs.state:
             found.append(np.asarray(obs.state[part], np.float32))
         else:
@@ -61,7 +62,12 @@ def camera_specs(cameras: Mapping[str, str]) -> dict[str, CameraSpec]:
     return {ours: CameraSpec() for ours in cameras.values()}
 
 
+def needs_gripper(parts: Sequence[str]) -> bool:
+    """For a contract: is `Obs.gripper` among the parts?"""
+    return GRIPPER in parts or CLOSED in parts
+
+
 def state_specs(parts: Sequence[str], dim: int | None = None) -> dict[str, StateSpec]:
     """For a contract: the parts, and how long one is where it alone makes the vector."""
-    own = [part for part in parts if part != GRIPPER]
+    own = [part for part in parts if part not in (GRIPPER, CLOSED)]
     return {part: StateSpec(dim=dim if list(parts) == own and len(own) == 1 else None) for part in own}

@@ -75,7 +75,9 @@ class ModelPolicy(Agent, abc.ABC):
         """Load the checkpoint; with `batch_sizes`, run each of them once."""
         self.model = self.load()
         for size in self.config.batch_sizes or ():
-            self._forward([self._example() for _ in range(size)])
+            for prediction in self._forward([self._example() for _ in range(size)]):
+                if isinstance(prediction, Exception):
+                    raise prediction
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin the episode of `kwargs["seed"]` (an int, 0 if not given)."""

@@ -1,0 +1,126 @@
+"""openpi's π0 and π0.5, on small random checkpoints made with openpi itself."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.families.openpi.marks import MARKS
+from vlagents_ray import Obs
+from vlagents_ray.errors import InvalidObservation, MissingCamera
+from vlagents_ray.interface import DELAY, LEFTOVER
+from vlagents_ray.testing import check_agent
+from vlagents_ray.wire.presets import PRESETS
+
+pytestmark = MARKS
+
+WORDS = ("pick up the cube", "push", "open the upper drawer")
+BATCHED = 1e-5  # how far a batch's actions may be off those of a lone row, in float32 on a CPU
+KINDS = ("pi0", "pi05", "aloha")
+# openpi's observation -> ours, as a client of each would send it
+MAPPINGS = {"pi0": "openpi-libero", "pi05": "openpi-droid", "aloha": "openpi-aloha"}
+
+
+def theirs(kind: str, seed: int) -> dict[str, Any]:
+    """What openpi's own client would send."""
+    rng = np.random.default_rng(seed)
+
+    def picture() -> np.ndarray:
+        return rng.integers(0, 256, (96, 128, 3), dtype=np.uint8)
+
+    def numbers(dim: int) -> np.ndarray:
+        return rng.uniform(0, 1, dim).astype(np.float32)
+
+    if kind == "pi0":
+        state = np.concatenate([numbers(6), 0.04 * numbers(2)])
+        return {"observation/image": picture(), "observation/wrist_image": picture(), "observation/state": state}
+    if kind == "pi05":
+        return {
+            "observation/exterior_image_1_left": picture(),
+            "observation/wrist_image_left": picture(),
+            "observation/joint_position": numbers(7),
+            "observation/gripper_position": numbers(1),
+        }
+    cameras = ("cam_high", "cam_left_wrist", "cam_right_wrist")
+    return {"images": {name: picture().transpose(2, 0, 1) for name in cameras}, "state": numbers(14)}
+
+
+def seen(kind: str, seed: int, **info: Any) -> Obs:
+    """The same, as it reaches the policy: through the mapping of that client."""
+    obs, _ = PRESETS[MAPPINGS[kind]].obs({**theirs(kind, seed), "prompt": "as reset says"})
+    obs.info.update(info)
+    return obs
+
+
+def begun(policy: Any, kind: str, i: int) -> Any:
+    session = copy.copy(policy)
+    session.reset(seen(kind, i), WORDS[i % len(WORDS)], seed=i)
+    return session
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_actions_are_those_of_openpis_own_policy(kind: str, loaded: Any, upstream: Any, checkpoint: Any) -> None:
+    policy = loaded(kind)
+    theirs_policy = upstream(kind, checkpoint(kind))
+    for i in range(2):
+        noise = np.random.default_rng([0, i]).standard_normal(policy.model.model.noise_shape, dtype=np.float32)
+        want = theirs_policy.infer({**theirs(kind, i), "prompt": WORDS[i]}, noise=noise)["actions"]
+        np.testing.assert_allclose(begun(policy, kind, i).act(seen(kind, i)).action, want, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_neighbours_change_nothing(kind: str, loaded: Any) -> None:
+    policy = loaded(kind)
+    alone = [begun(policy, kind, i).act(seen(kind, i)).action for i in range(6)]
+    for size in (2, 3, 6):  # of batches of 1 and 4
+        acts = policy.act_batch([seen(kind, i) for i in range(size)], [begun(policy, kind, i) for i in range(size)])
+        for one, act in zip(alone, acts, strict=False):
+            np.testing.assert_allclose(act.action, one, atol=BATCHED, rtol=1e-5)
+
+
+def test_it_keeps_what_an_agent_promises(loaded: Any, checkpoint: Any) -> None:
+    policy = type(loaded("pi0"))(loaded("pi0").config)
+    check_agent(policy, obs=[seen("pi0", i) for i in range(3)], instructions=WORDS, steps=2, atol=BATCHED)
+
+
+def test_contracts_fit_the_mappings_of_their_clients(loaded: Any) -> None:
+    for kind, mapping in MAPPINGS.items():
+        assert PRESETS[mapping].lacks(loaded(kind).contract) == []
+
+
+def test_a_session_that_fails_leaves_its_neighbours_alone(loaded: Any) -> None:
+    policy = loaded("pi0")
+    bad = seen("pi0", 0)
+    del bad.cameras["wrist"]
+    long = copy.copy(policy)
+    long.reset(seen("pi0", 1), "pick up the cube " * 50, seed=1)
+    acts = policy.act_batch(
+        [bad, seen("pi0", 1), seen("pi0", 2)], [begun(policy, "pi0", 0), long, begun(policy, "pi0", 2)]
+    )
+    assert isinstance(acts[0], MissingCamera)
+    assert isinstance(acts[1], InvalidObservation)
+    assert "shorten it" in str(acts[1])
+    np.testing.assert_allclose(acts[2].action, begun(policy, "pi0", 2).act(seen("pi0", 2)).action, atol=BATCHED)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_frozen_rows_come_back_as_planned_also_where_actions_are_relative(kind: str, loaded: Any) -> None:
+    policy = loaded(kind)
+    plan = begun(policy, kind, 1).act(seen(kind, 1)).action[1:]
+    free = begun(policy, kind, 0).act(seen(kind, 0)).action
+    guided = begun(policy, kind, 0).act(seen(kind, 0, **{LEFTOVER: plan, DELAY: 2})).action
+    np.testing.assert_allclose(guided[:2], plan[:2], atol=1e-4)
+    assert np.abs(guided[2] - plan[2]).mean() < np.abs(free[2] - plan[2]).mean()
+
+
+def test_a_config_with_its_own_prompt_needs_no_instruction(loaded: Any) -> None:
+    policy = loaded("aloha")
+    assert policy.contract.instruction is False
+    session = copy.copy(policy)
+    session.reset(seen("aloha", 0), None, seed=0)
+    told = copy.copy(policy)
+    told.reset(seen("aloha", 0), "uncap", seed=0)
+    np.testing.assert_array_equal(session.act(seen("aloha", 0)).action, told.act(seen("aloha", 0)).action)

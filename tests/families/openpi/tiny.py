@@ -1,0 +1,115 @@
+"""Small random checkpoints of openpi, made with its own code: weights, statistics, tokenizer.
+
+    OPENPI_SRC=… python tests/families/openpi/tiny.py OUT_FOLDER [pi0|pi05|aloha]
+
+Serve one with `config: tests.families.openpi.tiny:PI0` and OPENPI_DATA_HOME=OUT_FOLDER/cache, where openpi finds the
+tokenizer that it would download. Importing this module makes openpi's vision tower and vocabulary small.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.policies.base.source import use_source
+from vlagents_ray.policies.openpi.training import FOLDERS, SOURCE
+
+use_source("openpi", SOURCE, within=FOLDERS)
+import jax  # noqa: E402
+import orbax.checkpoint  # noqa: E402
+import sentencepiece  # noqa: E402
+from flax import nnx  # noqa: E402
+from openpi import transforms  # noqa: E402
+from openpi.models import gemma, pi0_config, siglip  # noqa: E402
+from openpi.policies import droid_policy  # noqa: E402
+from openpi.shared import normalize  # noqa: E402
+from openpi.training import config as training  # noqa: E402
+
+_SMALL = {"paligemma_variant": "dummy", "action_expert_variant": "dummy"}
+_WORDS = 600
+
+_whole_module = siglip.Module
+siglip.Module = lambda *args, **kwargs: _whole_module(*args, **{**kwargs, "variant": "mu/14"})
+gemma.PALIGEMMA_VOCAB_SIZE = _WORDS
+
+
+def _droid(model: Any) -> transforms.Group:
+    return transforms.Group(
+        inputs=[droid_policy.DroidInputs(model_type=model.model_type)], outputs=[droid_policy.DroidOutputs()]
+    )
+
+
+# As openpi's own pi0_libero, pi05_droid and pi0_aloha, but for the sizes.
+PI0 = training.TrainConfig(
+    name="tiny_pi0_libero",
+    model=pi0_config.Pi0Config(**_SMALL, action_horizon=8),
+    data=training.LeRobotLiberoDataConfig(repo_id="tiny/libero", extra_delta_transform=True),
+)
+PI05 = training.TrainConfig(
+    name="tiny_pi05_droid",
+    model=pi0_config.Pi0Config(**_SMALL, action_horizon=6, pi05=True),
+    data=training.SimpleDataConfig(assets=training.AssetsConfig(asset_id="droid"), data_transforms=_droid),
+)
+ALOHA = training.TrainConfig(
+    name="tiny_pi0_aloha",
+    model=pi0_config.Pi0Config(**_SMALL, action_horizon=5),
+    data=training.LeRobotAlohaDataConfig(assets=training.AssetsConfig(asset_id="trossen"), default_prompt="uncap"),
+)
+CONFIGS = {"pi0": PI0, "pi05": PI05, "aloha": ALOHA}
+_DIMS = {"pi0": (8, 7), "pi05": (8, 8), "aloha": (14, 14)}  # of states and actions
+
+
+def save(folder: str | Path, kind: str = "pi0", seed: int = 0) -> Path:
+    """Write the checkpoint into `folder`, with openpi's cache beside it."""
+    folder = Path(folder).resolve()
+    params = nnx.state(CONFIGS[kind].model.create(jax.random.key(seed))).to_pure_dict()
+    rng = np.random.default_rng(seed)
+
+    def shaken(leaf: Any) -> np.ndarray:  # much is made zeros: were it lost on the way, nobody would notice
+        return np.asarray(leaf, np.float32) + 0.05 * rng.standard_normal(leaf.shape, np.float32)
+
+    with orbax.checkpoint.PyTreeCheckpointer() as saver:
+        saver.save(folder / "params", {"params": jax.tree.map(shaken, params)})
+    save_statistics(folder, kind)
+    save_tokenizer(folder / "cache")
+    return folder
+
+
+def save_statistics(folder: Path, kind: str) -> None:
+    """Of states and actions, at the config's asset."""
+    data = CONFIGS[kind].data
+    rng = np.random.default_rng(1)
+
+    def some(dim: int) -> normalize.NormStats:
+        middle, width = rng.normal(0, 0.2, dim), rng.uniform(0.5, 1.5, dim)
+        return normalize.NormStats(mean=middle, std=width, q01=middle - 2 * width, q99=middle + 2 * width)
+
+    states, actions = _DIMS[kind]
+    asset = data.assets.asset_id or data.repo_id
+    normalize.save(folder / "assets" / asset, {"state": some(states), "actions": some(actions)})
+
+
+def save_tokenizer(cache: Path) -> None:
+    """In the place of PaliGemma's, with its special tokens' numbers, made of bytes and a few words."""
+    model = cache / "big_vision" / "paligemma_tokenizer.model"
+    model.parent.mkdir(parents=True, exist_ok=True)
+    with model.open("wb") as file:
+        sentencepiece.SentencePieceTrainer.train(
+            sentence_iterator=iter(["pick up the cube", "Task: open the drawer, State: 12 34 56;", "Action: "] * 20),
+            model_writer=file,
+            vocab_size=400,
+            hard_vocab_limit=False,
+            byte_fallback=True,
+            pad_id=0,
+            eos_id=1,
+            bos_id=2,
+            unk_id=3,
+            minloglevel=2,
+        )
+
+
+if __name__ == "__main__":
+    print(save(*sys.argv[1:3]))

@@ -1,0 +1,82 @@
+"""Real-time chunking of flow-matching policies: a chunk that goes on from what the robot is doing meanwhile.
+
+After Black, Galliker & Levine 2025 (https://arxiv.org/abs/2506.07339), with two differences. Rows that will have been
+executed when the answer comes are not guided but moved straight from the noise to the plan, so that they come out as
+they were planned. And the later rows' correction takes the model's Jacobian for the identity, as LeRobot 0.4.4 does: it
+costs no backward pass.
+
+Flow time is openpi's: 1 is noise, 0 is the actions, and the velocity is noise minus actions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.policies.base.row import Row
+
+
+@dataclass(frozen=True, slots=True)
+class Guide:
+    """What each row of a batch of chunks is to follow, as arrays of whichever library the model is written in."""
+
+    plan: Any  # (B, H, D) as the model sees actions, i.e. normalised; zeros where there is none
+    frozen: Any  # (B, H, 1): 1.0 where a row will have been executed, else 0.0
+    weight: Any  # (B, H, 1) in [0, 1]: how closely a later row is to follow
+
+    @classmethod
+    def of(
+        cls, rows: Sequence[Row], horizon: int, dim: int, planned: Callable[[Row, np.ndarray], np.ndarray]
+    ) -> Guide | None:
+        """That of the rows' `leftover` and `delay`, in numpy; None if no row has any.
+
+        `planned` turns a row's leftover actions into what the model sees.
+        """
+        if all(row.leftover is None for row in rows):
+            return None
+        plan = np.zeros((len(rows), horizon, dim), np.float32)
+        frozen = np.zeros((len(rows), horizon, 1), np.float32)
+        weight = np.zeros((len(rows), horizon, 1), np.float32)
+        for i, row in enumerate(rows):
+            if row.leftover is not None:
+                left = planned(row, row.leftover[:horizon])
+                delay = min(max(row.delay, 0), len(left))
+                plan[i, : len(left), : left.shape[1]] = left
+                frozen[i, :delay] = 1.0
+                weight[i, delay:, 0] = _weights(delay, len(left), horizon)[delay:]
+        return cls(plan, frozen, weight)
+
+    def to(self, convert: Callable[[np.ndarray], Any]) -> Guide:
+        """The same in another library, or on another device."""
+        return Guide(convert(self.plan), convert(self.frozen), convert(self.weight))
+
+    def steer(
+        self,
+        velocity: Any,
+        actions: Any,
+        noise: Any,
+        time: Any,
+        *,
+        steps: int,
+        limit: float,
+        lower: Callable[[Any, float], Any] = min,
+    ) -> Any:
+        """The velocity (B, H, D) at the noisy actions of that flow time, as the plan changes it.
+
+        A later row is pulled with a gain of at most `limit`, and of the number of steps at most: with that, one step
+        goes all the way. `lower` is the smaller of two numbers, for libraries whose `time` is no plain number.
+        """
+        spread = (1.0 - time) ** 2 + time**2
+        gain = lower(spread / (time * (1.0 - time) + 1e-6), min(limit, float(steps)))
+        pulled = velocity - gain * self.weight * (self.plan - (actions - time * velocity))
+        return self.frozen * (noise - self.plan) + (1.0 - self.frozen) * pulled
+
+
+def _weights(delay: int, length: int, horizon: int) -> np.ndarray:
+    """(horizon,): the paper's soft mask, from about 1 after the frozen rows down to 0 where the plan ends."""
+    behind = np.arange(horizon, dtype=np.float32)
+    share = np.clip((length - behind) / (length - delay + 1), 0.0, 1.0)
+    return np.asarray(share * np.expm1(share) / np.expm1(1.0), np.float32)

@@ -1,0 +1,202 @@
+"""openpi's models, loaded whole and asked for many rows at once: JAX, with or without a flow, and PyTorch."""
+
+from __future__ import annotations
+
+import abc
+import dataclasses
+import logging
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.policies.base.accelerator import jax_device, torch_device
+from vlagents_ray.policies.base.checkpoint import SavedTensors, require_loaded
+from vlagents_ray.policies.base.realtime import Guide
+from vlagents_ray.policies.openpi.config import OpenPiConfig
+from vlagents_ray.registry import require
+
+logger = logging.getLogger(__name__)
+
+_STEPS = 10  # openpi's own default
+_END = 1  # PaliGemma's end of sequence
+_LISTED = 5
+
+
+class Model(abc.ABC):
+    """What the policy asks."""
+
+    noise_shape: tuple[int, int] | None = None  # (H, action_dim) of a row's noise; None for a model that takes none
+
+    @abc.abstractmethod
+    def sample(self, batch: dict[str, Any], noise: np.ndarray, guide: Guide | None) -> np.ndarray:
+        """What the model says for a batch of inputs: (B, H, action_dim), or (B, T) tokens."""
+
+
+class JaxFlow(Model):
+    """π0 and π0.5. Compiled once for each number of rows."""
+
+    def __init__(self, network: Any, device: Any, config: OpenPiConfig) -> None:
+        jax, nnx = require("jax"), require("flax.nnx")
+        graph, self._state = nnx.split(network)
+        self._device = device
+        steps, limit = config.steps or _STEPS, config.guidance
+
+        def sample(state: Any, batch: Any, noise: Any, guide: Any) -> Any:
+            model = nnx.merge(graph, state)
+            _steer_jax(model, noise, Guide(*guide), steps, limit)
+            return model.sample_actions(jax.random.key(0), _observation(batch), num_steps=steps, noise=noise)
+
+        self._sample = jax.jit(sample)
+        self.noise_shape = (network.action_horizon, network.action_dim)
+
+    def sample(self, batch: dict[str, Any], noise: np.ndarray, guide: Guide | None) -> np.ndarray:
+        """(B, H, action_dim) float32. A batch without plans runs the same program, with nothing to follow."""
+        jax = require("jax")
+        if guide is None:
+            none = np.zeros((*noise.shape[:2], 1), np.float32)
+            guide = Guide(np.zeros_like(noise), none, none)
+        arrays = jax.device_put((batch, noise, (guide.plan, guide.frozen, guide.weight)), self._device)
+        return np.asarray(self._sample(self._state, *arrays), np.float32)  # waits for the device
+
+
+class JaxTokens(Model):
+    """π0-FAST: greedy decoding, so that no noise is involved."""
+
+    def __init__(self, network: Any, device: Any, config: OpenPiConfig) -> None:
+        jax, nnx = require("jax"), require("flax.nnx")
+        graph, self._state = nnx.split(network)
+        self._device = device
+        most = config.max_decoding_steps
+
+        def sample(state: Any, batch: Any) -> Any:
+            model = nnx.merge(graph, state)
+            return model.sample_actions(jax.random.key(0), _observation(batch), max_decoding_steps=most)
+
+        self._sample = jax.jit(sample)
+
+    def sample(self, batch: dict[str, Any], noise: np.ndarray, guide: Guide | None) -> np.ndarray:
+        """(B, T) int32, zeros after the end of each row.
+
+        openpi decodes until all rows end in the same step: a row of a batch goes on after its end, into what it would
+        not have said alone.
+        """
+        jax = require("jax")
+        tokens = np.asarray(self._sample(self._state, jax.device_put(batch, self._device)), np.int32)
+        ended = np.cumsum(tokens == _END, axis=1) - (tokens == _END) > 0
+        return np.where(ended, 0, tokens)
+
+
+class TorchFlow(Model):
+    """openpi's PyTorch port of π0 and π0.5."""
+
+    def __init__(self, network: Any, device: Any, config: OpenPiConfig) -> None:
+        self._network, self._device = network, device
+        self._steps, self._limit = config.steps or _STEPS, config.guidance
+        self.noise_shape = (network.config.action_horizon, network.config.action_dim)
+
+    def sample(self, batch: dict[str, Any], noise: np.ndarray, guide: Guide | None) -> np.ndarray:
+        """(B, H, action_dim) float32."""
+        jax, torch = require("jax"), require("torch")
+
+        def convert(array: np.ndarray) -> Any:
+            return torch.from_numpy(np.array(array)).to(self._device, non_blocking=True)
+
+        observation = _observation(jax.tree.map(convert, batch))
+        start = convert(noise)
+        plain = self._network.denoise_step
+        if guide is not None:
+            self._network.denoise_step = self._steered(plain, start, guide.to(convert))
+        try:
+            with torch.inference_mode():
+                flow = self._network.sample_actions(self._device, observation, noise=start, num_steps=self._steps)
+        finally:
+            self._network.denoise_step = plain
+        return np.asarray(flow.float().cpu().numpy())
+
+    def _steered(self, plain: Any, noise: Any, guide: Guide) -> Any:
+        def step(state: Any, masks: Any, cache: Any, actions: Any, time: Any) -> Any:
+            velocity = plain(state, masks, cache, actions, time)
+            return guide.steer(velocity, actions, noise, float(time[0]), steps=self._steps, limit=self._limit)
+
+        return step
+
+
+def load_jax(config: Any, folder: Path, settings: OpenPiConfig) -> Model:
+    """`ConfigError` unless every parameter of the model, and of its fine-tuning, is in the checkpoint."""
+    jax, models = require("jax"), require("openpi.models.model")
+    device = jax_device({"cuda": "gpu"}.get(settings.device, settings.device))
+    dtype = ("float32" if device.platform == "cpu" else "bfloat16") if settings.dtype == "auto" else settings.dtype
+    params = models.restore_params(
+        folder / "params",
+        dtype=getattr(jax.numpy, dtype),
+        sharding=jax.sharding.SingleDeviceSharding(device),
+    )
+    model = dataclasses.replace(config.model, dtype=dtype)
+    try:
+        network = model.load(params)
+    except ValueError as error:
+        raise ConfigError(
+            f"checkpoint {folder}: does not fill the model of config {config.name!r} ({str(error)[:400]}); "
+            f"choose the config that it was trained with"
+        ) from error
+    _require_used(params, network, folder, config.name)
+    network.eval()
+    kind = JaxTokens if config.model.model_type is models.ModelType.PI0_FAST else JaxFlow
+    return kind(network, device, settings)
+
+
+def load_torch(config: Any, folder: Path, settings: OpenPiConfig) -> Model:
+    """`ConfigError` where transformers is not patched as openpi wants it, or the weights do not fill the model."""
+    device = torch_device(settings.device)
+    file = folder / "model.safetensors"
+    mode = config.model.pytorch_compile_mode if settings.compile else None
+    config = dataclasses.replace(config, model=dataclasses.replace(config.model, pytorch_compile_mode=mode))
+    try:
+        network = config.model.load_pytorch(config, str(file))
+    except (ValueError, RuntimeError) as error:
+        raise ConfigError(f"checkpoint {file}: {str(error)[:600]}") from error
+    chosen = settings.dtype if settings.dtype != "auto" else ("float32" if device.type == "cpu" else "bfloat16")
+    network.paligemma_with_expert.to_bfloat16_for_selected_params(chosen)
+    require_loaded(network, SavedTensors.of(file))
+    return TorchFlow(network.eval().requires_grad_(False).to(device), device, settings)
+
+
+def _observation(batch: dict[str, Any]) -> Any:
+    data = {**batch, "image": dict(batch["image"])}  # openpi writes into it
+    return require("openpi.models.model").Observation.from_dict(data)
+
+
+def _steer_jax(model: Any, noise: Any, guide: Guide, steps: int, limit: float) -> None:
+    """Change this copy of π0 so that its velocity follows the guide.
+
+    openpi's sampling loop is one function, but takes each step's actions and time through `embed_suffix`, and its
+    velocity through `action_out_proj`.
+    """
+    minimum = require("jax.numpy").minimum
+    embed, project = model.embed_suffix, model.action_out_proj
+    now: dict[str, Any] = {}
+
+    def embed_suffix(observation: Any, actions: Any, time: Any) -> Any:
+        now.update(actions=actions, time=time[:, None, None])
+        return embed(observation, actions, time)
+
+    def action_out_proj(hidden: Any) -> Any:
+        return guide.steer(project(hidden), now["actions"], noise, now["time"], steps=steps, limit=limit, lower=minimum)
+
+    model.embed_suffix, model.action_out_proj = embed_suffix, action_out_proj
+
+
+def _require_used(params: Any, network: Any, folder: Path, name: str) -> None:
+    """openpi drops what its model has no place for. Some base checkpoints have such; LoRA's must not be lost."""
+    flatten = require("flax.traverse_util").flatten_dict
+    own = set(flatten(require("flax.nnx").state(network).to_pure_dict(), sep="/"))
+    extra = sorted(set(flatten(params, sep="/")) - own)
+    if any("lora" in key for key in extra):
+        raise ConfigError(
+            f"checkpoint {folder}: was fine-tuned by LoRA, of which config {name!r} knows nothing: {extra[:_LISTED]}; "
+            f"choose the config that it was trained with, such as pi0_libero_low_mem_finetune"
+        )
+    if extra:
+        logger.warning("checkpoint %s: %d tensors have no place in the model: %s", folder, len(extra), extra[:_LISTED])

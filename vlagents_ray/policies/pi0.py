@@ -1,0 +1,258 @@
+"""π0 as Hugging Face transformers has it: PaliGemma and an action expert, flow matching.
+
+A checkpoint is what `PI0ForConditionalGeneration.save_pretrained` and `PI0Processor.save_pretrained` leave in a folder.
+Physical Intelligence's own code and checkpoints are `vlagents_ray.policies.openpi`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+from pydantic import Field
+
+from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.errors import ConfigError, InvalidObservation, PolicyFailed
+from vlagents_ray.interface import Obs
+from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
+from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
+from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
+from vlagents_ray.policies.base.observing import (
+    camera_images,
+    camera_specs,
+    choose_cameras,
+    needs_gripper,
+    state_specs,
+    state_vector,
+)
+from vlagents_ray.policies.base.realtime import Guide
+from vlagents_ray.policies.base.resizing import resize_with_pad
+from vlagents_ray.registry import require
+
+CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")  # openpi's names, in the order of the image tokens
+USUAL_CAMERAS = {"base_0_rgb": "front", "left_wrist_0_rgb": "wrist"}
+USUAL_STATE = ("xyz_axis_angle", "gripper_qpos")  # LIBERO
+_EPSILON = 1e-8  # what PI0Processor adds to a standard deviation
+_STATISTICS = ("state_mean", "state_std", "actions_mean", "actions_std")
+
+
+class Pi0Config(ModelConfig):
+    """Beside what all models have: how the flow is followed, and how long an instruction may be."""
+
+    cameras: dict[str, str] | None = Field(
+        default=None,
+        description=f"those of {', '.join(CAMERAS)} that it was trained with -> ours; unset: {USUAL_CAMERAS}",
+    )
+    steps: int | None = Field(default=None, ge=1, description="of the flow; unset: the checkpoint's, usually 10")
+    max_tokens: int = Field(default=48, ge=1, description="of an instruction, as in training; a longer one is refused")
+    guidance: float = Field(default=5.0, gt=0, description="real-time chunking: the most that the old plan pulls")
+
+
+@dataclass(frozen=True)
+class Loaded:
+    """The model, and what turns observations into its inputs."""
+
+    network: Any
+    processor: Any
+    device: Any
+    dtype: Any
+
+    def normalised(self, actions: np.ndarray) -> np.ndarray:
+        """Actions (H, D) in their own units -> as the model sees them."""
+        mean, std = self._statistics()
+        return np.asarray((actions - mean) / std)
+
+    def actions(self, flow: np.ndarray) -> np.ndarray:
+        """What the model says, (H, max_action_dim) -> actions (H, D) in their own units."""
+        mean, std = self._statistics()
+        return np.asarray(flow[:, : len(mean)] * std + mean)
+
+    def _statistics(self) -> tuple[np.ndarray, np.ndarray]:
+        mean, std = self.processor.actions_mean, self.processor.actions_std
+        return np.asarray(mean, np.float32), np.asarray(std, np.float32) + np.float32(_EPSILON)
+
+
+class Pi0(ModelPolicy):
+    """Chunks by flow matching, all sessions' in one pass through the vision-language model and the action expert."""
+
+    Config: ClassVar[type] = Pi0Config
+    config: Pi0Config
+    model: Loaded | None
+
+    def __init__(self, config: Pi0Config) -> None:
+        super().__init__(config)
+        self.cameras = _cameras(config.cameras)
+        self.state = tuple(config.state or USUAL_STATE)
+
+    @property
+    def contract(self) -> Contract:
+        """Dimensions and the chunk's length are known once the checkpoint is loaded."""
+        loaded = self.model
+        state_dim = None if loaded is None else len(loaded.processor.state_mean)
+        return Contract(
+            cameras=camera_specs(self.cameras),
+            state=state_specs(self.state, state_dim),
+            gripper=needs_gripper(self.state),
+            instruction=True,
+            action=ActionSpec(dim=None if loaded is None else len(loaded.processor.actions_mean)),
+            chunk=None if loaded is None else self.chunk(loaded.network.config.chunk_size),
+            history=1,
+        )
+
+    def load(self) -> Loaded:
+        """The model with every parameter of the checkpoint, and its processor with all statistics."""
+        if self.config.compile:
+            raise ConfigError("compile: not done for pi0, whose cache changes its length at each step; leave it out")
+        path = find_checkpoint(
+            self.config.checkpoint,
+            self.config.checkpoint_step,
+            needs=["config.json", "processor_config.json", "*.safetensors"],
+        )
+        device = torch_device(self.config.device)
+        dtype = torch_dtype(self.config.dtype, device)
+        ensure_torchvision()
+        return Loaded(_network(path, device, dtype), _processor(path), device, dtype)
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        """Begin an episode. An instruction that is longer than in training is refused, not cut off."""
+        info = super().reset(obs, instruction, **kwargs)
+        if self.model is not None:
+            tokens = len(self.model.processor.tokenizer(f"{instruction}\n")["input_ids"]) + 1  # and the first one
+            if tokens > self.config.max_tokens:
+                raise InvalidObservation(
+                    f"instruction: got {tokens} tokens, want at most {self.config.max_tokens}, as in training; "
+                    f"shorten it, or set the policy's max_tokens"
+                )
+        return info
+
+    def perceive(self, obs: Obs) -> tuple[list[np.ndarray], np.ndarray]:
+        """Images in the model's order, each (height, width, 3) as its vision tower takes them, and the state."""
+        model = self._loaded()
+        side = model.processor.image_processor.pad_size
+        found = camera_images(obs, self.cameras)
+        images = [resize_with_pad(found[name], side["height"], side["width"]) for name in self.cameras]
+        return images, state_vector(obs, self.state, len(model.processor.state_mean))
+
+    def predict(self, rows: Sequence[Row]) -> list[Prediction]:
+        """One flow for all rows."""
+        model, torch = self._loaded(), require("torch")
+        shape = (model.network.config.chunk_size, model.network.config.max_action_dim)
+
+        def convert(array: np.ndarray) -> Any:
+            return torch.from_numpy(array).to(model.device, non_blocking=True)
+
+        noise = convert(np.stack([row.noise(*shape) for row in rows]))
+        guide = Guide.of(rows, *shape, lambda _, plan: model.normalised(plan))
+        with torch.inference_mode():
+            flow = self._follow(self._inputs(rows), noise, None if guide is None else guide.to(convert))
+        return [Prediction(model.actions(one)) for one in flow.cpu().numpy()]
+
+    def _loaded(self) -> Loaded:
+        if self.model is None:
+            raise PolicyFailed("pi0: act before initialize; the checkpoint is not loaded")
+        return self.model
+
+    def _inputs(self, rows: Sequence[Row]) -> Mapping[str, Any]:
+        """Tokens, images and states, on the device. Every batch is as long as the longest instruction may be."""
+        model = self._loaded()
+        frames = [row.frames[-1] for row in rows]
+        length = self.config.max_tokens + len(self.cameras) * model.processor.image_seq_length
+        batch = model.processor(
+            images=[images for images, _ in frames],
+            text=[row.instruction for row in rows],
+            state=np.stack([state for _, state in frames]),
+            text_kwargs={
+                "padding": "max_length",
+                "max_length": length,
+                "padding_side": "right",
+                "return_tensors": "pt",
+            },
+        )
+        floating = {key for key, value in batch.items() if value.is_floating_point()}
+        return {
+            key: value.to(model.device, model.dtype if key in floating else None, non_blocking=True)
+            for key, value in batch.items()
+        }
+
+    def _follow(self, inputs: Mapping[str, Any], noise: Any, guide: Guide | None) -> Any:
+        """From noise (B, H, D) to actions, in Euler steps as `PI0ForConditionalGeneration.sample_actions` takes them.
+
+        The actions are kept in float32 between the steps, whatever the model computes in, as openpi does.
+        """
+        model = self._loaded()
+        velocity = _velocity(model.network, inputs, model.dtype)
+        steps = self.config.steps or model.network.config.num_inference_steps
+        actions = noise
+        for step in range(steps):
+            time = 1.0 - step / steps
+            change = velocity(actions, time)
+            if guide is not None:
+                change = guide.steer(change, actions, noise, time, steps=steps, limit=self.config.guidance)
+            actions = actions - change / steps
+        return actions
+
+
+def _cameras(chosen: Mapping[str, str] | None) -> dict[str, str]:
+    """In the order of the model's image tokens. A checkpoint may have been trained without some of them."""
+    asked = USUAL_CAMERAS if chosen is None else chosen
+    known = [name for name in CAMERAS if name in asked] if asked and set(asked) <= set(CAMERAS) else CAMERAS
+    mapping = choose_cameras(chosen, USUAL_CAMERAS, known)
+    return {name: mapping[name] for name in known}
+
+
+def _velocity(network: Any, inputs: Mapping[str, Any], dtype: Any) -> Callable[[Any, float], Any]:
+    """The flow's velocity at noisy actions (B, H, D) and a time; images and words are read once, here."""
+    torch = require("torch")
+    mask, state = inputs["attention_mask"], inputs["state"]
+    prefix = network.model.embed_prefix(inputs["input_ids"], inputs["pixel_values"], inputs["pixel_attention_mask"])
+    cache = network.model.vlm(
+        inputs_embeds=prefix,
+        attention_mask=mask,
+        position_ids=mask.cumsum(-1) - 1,
+        token_type_ids=torch.zeros_like(mask),
+        use_cache=True,
+    ).past_key_values
+    length = cache.get_seq_length()
+
+    def velocity(actions: Any, time: float) -> Any:
+        times = torch.full((len(actions),), time, dtype=torch.float32, device=actions.device)
+        output = network(
+            state=state, noise=actions.to(dtype), timestep=times, attention_mask=mask, past_key_values=cache
+        )
+        cache.crop(length - cache.get_seq_length())  # later steps must not attend to this one
+        return output.logits.float()
+
+    return velocity
+
+
+def _network(path: Path, device: Any, dtype: Any) -> Any:
+    transformers = require("transformers")
+    network = transformers.PI0ForConditionalGeneration.from_pretrained(path, dtype=dtype, local_files_only=True)
+    require_loaded(network, SavedTensors.of(path).renamed(_names(network)))
+    return network.eval().requires_grad_(False).to(device)
+
+
+def _names(network: Any) -> Callable[[str], str]:
+    """A tensor's name in the file -> in the model: transformers saves π0 under the names of LeRobot's checkpoints."""
+    renamings = require("transformers.conversion_mapping").get_model_conversion_mapping(network)
+    rename = require("transformers.core_model_loading").rename_source_key
+    known = network.state_dict()
+
+    def name(key: str) -> str:
+        return str(rename(key, renamings, [], network.base_model_prefix, known)[0])
+
+    return name
+
+
+def _processor(path: Path) -> Any:
+    processor = require("transformers").PI0Processor.from_pretrained(path, local_files_only=True)
+    absent = [name for name in _STATISTICS if getattr(processor, name) is None]
+    if absent:
+        raise ConfigError(
+            f"checkpoint {path}: processor_config.json has no {absent}; want those of the dataset it was trained on: "
+            f"PI0Processor(…, {absent[0]}=[…]).save_pretrained(folder) writes them"
+        )
+    return processor
