@@ -1,0 +1,131 @@
+"""Model families served from their deployment files, each in its own environment, all on one cluster.
+
+The environments are those of `make families`, the checkpoints tiny random ones of each family's own code. Families
+whose code is on no package index want their source (`OPENPI_SRC`, …) and their environment (`make families
+FAMILIES=openpi`) besides.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import ray
+import yaml
+from desk import DESK, DeskActor, play
+
+from vlagents_ray.evaluate import EvalConfig, evaluate
+from vlagents_ray.serve.cluster import Server, running_server
+from vlagents_ray.serve.files import read_deployment
+
+ROOT = Path(__file__).parents[2]
+ENVIRONMENTS = os.environ.get("VLAGENTS_RAY_ENVIRONMENTS") or sys.prefix  # with -NAME after it
+
+
+@dataclass(frozen=True, slots=True)
+class Family:
+    """A deployment file, and what of it has to change for a tiny checkpoint."""
+
+    file: str  # in deployments/
+    environment: str
+    tests: str  # the folder in tests/families whose tiny.py makes the checkpoint
+    kind: tuple[str, ...] = ()
+    within: str = ""  # where in what tiny.py wrote
+    config: dict[str, Any] = field(default_factory=dict)
+    source: str | None = None  # the variable with its checkout
+    atol: float = 1e-4
+
+
+FAMILIES = {
+    "lerobot": Family("lerobot", "lerobot", "lerobot", ("act",)),
+    "smolvla": Family("lerobot", "lerobot", "lerobot", ("smolvla",)),
+    "pi0": Family("pi0", "hf", "pi0"),
+}
+
+
+def python_of(family: Family) -> Path:
+    return Path(f"{ENVIRONMENTS}-{family.environment}") / "bin" / "python"
+
+
+def present() -> dict[str, Family]:
+    return {name: f for name, f in FAMILIES.items() if f.source is None or os.environ.get(f.source)}
+
+
+def application(name: str, family: Family, home: Path) -> dict[str, Any]:
+    """The file's one application, with a tiny checkpoint and this run's environment in it."""
+    python = python_of(family)
+    assert python.is_file(), f"{python} is missing: make families FAMILIES={family.environment}"
+    script = ROOT / "tests" / "families" / family.tests / "tiny.py"
+    subprocess.run(
+        [python, script, home / name, *family.kind],
+        check=True,
+        capture_output=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )
+    [app] = yaml.safe_load((ROOT / "deployments" / f"{family.file}.yaml").read_text())["applications"]
+    app["name"], app["route_prefix"] = name, f"/{name}"
+    args = app["args"]
+    args["environment"]["python"] = str(python)
+    args["config"] |= {"checkpoint": str(home / name / family.within), **family.config}
+    args.pop("dialects", None)
+    args["resources"]["num_gpus"] = 0
+    return app
+
+
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    home = tmp_path_factory.mktemp("families")
+    file = home / "all.yaml"
+    file.write_text(yaml.safe_dump({"applications": [application(n, f, home) for n, f in present().items()]}))
+    with running_server(read_deployment(str(file)), num_cpus=4) as server:
+        yield server
+
+
+def each() -> list[Any]:
+    marks = {name: [pytest.mark.source(f.source)] if f.source else [] for name, f in FAMILIES.items()}
+    return [pytest.param(name, marks=marks[name]) for name in FAMILIES]
+
+
+@pytest.mark.parametrize("name", each())
+def test_it_acts_the_same_through_http_and_for_an_env_actor_on_its_node(server: Server, name: str) -> None:
+    transport, by_http = play(server.apps[name], "http", 3)
+    assert transport == "http"
+    actor = DeskActor.remote()  # type: ignore[attr-defined]
+    transport, by_plasma = ray.get(actor.play.remote(f"serve://{name}", "plasma", 3))
+    assert transport == "plasma"
+    for one, other in zip(by_http, by_plasma, strict=True):
+        assert np.isfinite(one).all()
+        assert one.std() > 0
+        np.testing.assert_allclose(one, other, atol=FAMILIES[name].atol)
+    _, another = play(server.apps[name], "http", 4)
+    assert not np.allclose(by_http[0], another[0], atol=1e-3)
+
+
+def test_families_whose_packages_contradict_are_evaluated_side_by_side(server: Server, tmp_path: Path) -> None:
+    told = {name: versions(family) for name, family in present().items()}
+    assert len({versions["transformers"] for versions in told.values()}) > 1
+    for name in present():
+        config = EvalConfig(
+            envs=[DESK],
+            episodes=2,
+            workers=2,
+            execute=1,
+            out=tmp_path / name,
+            video="none",
+            policy_url=server.apps[name],
+        )
+        summary = evaluate(config)
+        assert (summary.state, summary.total.episodes, summary.total.successes) == ("complete", 2, 2)
+
+
+def versions(family: Family) -> dict[str, str]:
+    code = "from importlib.metadata import version; print(*(version(p) for p in ('numpy', 'transformers')))"
+    found = subprocess.run([python_of(family), "-c", code], check=True, capture_output=True, text=True)
+    return dict(zip(("numpy", "transformers"), found.stdout.split(), strict=True))
