@@ -120,7 +120,7 @@ def test_a_residual_vq_that_is_not_trained_is_refused(copied: Callable[[str], Pa
 
 @pytest.mark.parametrize(
     ("name", "text"),
-    [("pi0", "openpi's changes"), ("pi05", "openpi's changes"), ("groot", "GR00T"), ("sarm", "rewards")],
+    [("groot", "GR00T"), ("sarm", "rewards"), *((name, "openpi's changes") for name in UNPATCHED)],
 )
 def test_a_type_that_cannot_be_served_says_why(name: str, text: str, copied: Callable[[str], Path]) -> None:
     folder = copied("act")

@@ -100,6 +100,7 @@ def test_an_ensemble_and_its_coefficient_are_the_checkpoints_defaults(loaded: Lo
     policy = loaded("ensemble")
     assert (policy.config.actions, policy.config.ensemble_m, policy.contract.chunk) == ("ensemble", 0.1, 1)
     assert loaded("ensemble", actions="chunk").contract.chunk == tiny.CHUNK
+    assert loaded("act", actions="ensemble").config.execute is None
 
 
 def test_more_rows_than_usual_can_be_executed_and_are_the_same_at_first(loaded: Load) -> None:

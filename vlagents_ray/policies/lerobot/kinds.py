@@ -117,6 +117,14 @@ class Flow(Kind):
         return self.policy._pi_aloha_encode_actions_inv(left[None].clone())[0]
 
 
+class Fast(Kind):
+    """π0-FAST decodes tokens for the rows that are executed, and no more."""
+
+    @property
+    def horizon(self) -> int:
+        return int(self.config.n_action_steps)
+
+
 class XVla(Kind):
     """X-VLA draws its noise itself, and masks no padding of instructions: they must all be as long."""
 
@@ -220,6 +228,7 @@ KINDS: Mapping[str, type[Kind]] = {
     "diffusion": Diffusion,
     "pi0": Flow,
     "pi05": Flow,
+    "pi0_fast": Fast,
     "sac": Single,
     "smolvla": Flow,
     "tdmpc": Tdmpc,

@@ -54,11 +54,6 @@ class Processors:
             ) from error
         self._back = self._inverse()
 
-    @property
-    def invertible(self) -> bool:
-        """Can actions be turned back into the policy's units?"""
-        return self._back is not None
-
     def require_statistics(self, settings: Any, inputs: Sequence[str]) -> None:
         """Raise `ConfigError` unless all `inputs`, and the actions, are normalised as the policy was trained.
 
@@ -95,7 +90,7 @@ class Processors:
         return np.asarray(flat.unflatten(0, chunks.shape[:2]).float().cpu())
 
     def leftover(self, rows: np.ndarray) -> Any:
-        """(H, D') that `actions` gave, in the policy's units again."""
+        """(H, D') that `actions` gave, in the policy's units again; None if they cannot be turned back."""
         return None if self._back is None else self._back(require("torch").from_numpy(rows))
 
     def width(self, dim: int) -> int:
