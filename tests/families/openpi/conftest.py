@@ -48,15 +48,16 @@ def loaded(checkpoint: Callable[[str], Path]) -> Made:
 
     def get(kind: str) -> OpenPi:
         if kind not in made:
-            made[kind] = OpenPi.from_config(
-                {
-                    "checkpoint": str(checkpoint(kind)),
-                    "config": f"tests.families.openpi.tiny:{kind.upper()}",
-                    "batch_sizes": [1, 4],
-                    "steps": 4,
-                }
-            )
-            made[kind].initialize()
+            settings = {
+                "checkpoint": str(checkpoint(kind)),
+                "config": f"tests.families.openpi.tiny:{kind.upper()}",
+                "batch_sizes": [1, 4],
+                "steps": 4,
+                "max_decoding_steps": 32,
+            }
+            policy = OpenPi.from_config(settings)
+            policy.initialize()
+            made[kind] = policy
         return made[kind]
 
     return get
@@ -77,6 +78,7 @@ def upstream(tiny: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Made:
     def make(kind: str, folder: Path) -> Any:
         config = tiny.CONFIGS[kind]
         config = dataclasses.replace(config, model=dataclasses.replace(config.model, dtype="float32"))
-        return policy_config.create_trained_policy(config, folder, sample_kwargs={"num_steps": 4})
+        settings = {"max_decoding_steps": 32} if kind == "fast" else {"num_steps": 4}
+        return policy_config.create_trained_policy(config, folder, sample_kwargs=settings)
 
     return make

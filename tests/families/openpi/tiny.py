@@ -1,6 +1,6 @@
 """Small random checkpoints of openpi, made with its own code: weights, statistics, tokenizer.
 
-    OPENPI_SRC=… python tests/families/openpi/tiny.py OUT_FOLDER [pi0|pi05|aloha]
+    OPENPI_SRC=… python tests/families/openpi/tiny.py OUT_FOLDER [pi0|pi05|aloha|fast]
 
 Serve one with `config: tests.families.openpi.tiny:PI0` and OPENPI_DATA_HOME=OUT_FOLDER/cache, where openpi finds the
 tokenizer that it would download. Importing this module makes openpi's vision tower and vocabulary small.
@@ -23,7 +23,7 @@ import orbax.checkpoint  # noqa: E402
 import sentencepiece  # noqa: E402
 from flax import nnx  # noqa: E402
 from openpi import transforms  # noqa: E402
-from openpi.models import gemma, pi0_config, siglip  # noqa: E402
+from openpi.models import gemma, gemma_fast, pi0_config, pi0_fast, siglip, tokenizer  # noqa: E402
 from openpi.policies import droid_policy  # noqa: E402
 from openpi.shared import normalize  # noqa: E402
 from openpi.training import config as training  # noqa: E402
@@ -34,6 +34,28 @@ _WORDS = 600
 _whole_module = siglip.Module
 siglip.Module = lambda *args, **kwargs: _whole_module(*args, **{**kwargs, "variant": "mu/14"})
 gemma.PALIGEMMA_VOCAB_SIZE = _WORDS
+_whole_config = gemma_fast.get_config
+
+
+def _small_config(variant: str) -> Any:
+    config = _whole_config(variant)
+    config.update(width=64, depth=2, mlp_dim=128, num_heads=4, head_dim=16, vocab_size=_WORDS)
+    return config
+
+
+gemma_fast.get_config = _small_config
+
+
+class Words(tokenizer.FASTTokenizer):
+    """Of pi0-FAST, without its half that the hub has: a token stands for a number, and any tokens can be decoded."""
+
+    def __init__(self, max_len: int = 256) -> None:
+        self._max_len = max_len
+        self._paligemma_tokenizer = tokenizer.PaligemmaTokenizer()._tokenizer
+
+    def extract_actions(self, tokens: np.ndarray, action_horizon: int, action_dim: int) -> np.ndarray:
+        numbers = np.resize(tokens.astype(np.float32), (action_horizon, action_dim))
+        return numbers / _WORDS
 
 
 def _droid(model: Any) -> transforms.Group:
@@ -58,8 +80,13 @@ ALOHA = training.TrainConfig(
     model=pi0_config.Pi0Config(**_SMALL, action_horizon=5),
     data=training.LeRobotAlohaDataConfig(assets=training.AssetsConfig(asset_id="trossen"), default_prompt="uncap"),
 )
-CONFIGS = {"pi0": PI0, "pi05": PI05, "aloha": ALOHA}
-_DIMS = {"pi0": (8, 7), "pi05": (8, 8), "aloha": (14, 14)}  # of states and actions
+FAST = training.TrainConfig(
+    name="tiny_pi0_fast_droid",
+    model=pi0_fast.Pi0FASTConfig(action_dim=8, action_horizon=4, max_token_len=60, fast_model_tokenizer=Words),
+    data=training.SimpleDataConfig(assets=training.AssetsConfig(asset_id="droid"), data_transforms=_droid),
+)
+CONFIGS = {"pi0": PI0, "pi05": PI05, "aloha": ALOHA, "fast": FAST}
+_DIMS = {"pi0": (8, 7), "pi05": (8, 8), "aloha": (14, 14), "fast": (8, 8)}  # of states and actions
 
 
 def save(folder: str | Path, kind: str = "pi0", seed: int = 0) -> Path:
