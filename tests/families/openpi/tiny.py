@@ -8,6 +8,7 @@ tokenizer that it would download. Importing this module makes openpi's vision to
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from pathlib import Path
 from typing import Any
@@ -102,6 +103,35 @@ def save(folder: str | Path, kind: str = "pi0", seed: int = 0) -> Path:
         saver.save(folder / "params", {"params": jax.tree.map(shaken, params)})
     save_statistics(folder, kind)
     save_tokenizer(folder / "cache")
+    return folder
+
+
+def save_torch(folder: Path) -> Path:
+    """The PyTorch port of PI0, random; openpi's sizes of the vision tower and of its output become small."""
+    import safetensors.torch
+    import torch
+    from openpi.models_pytorch import gemma_pytorch, pi0_pytorch
+    from transformers.models.siglip import SiglipVisionConfig
+
+    class Vision(SiglipVisionConfig):
+        projection_dim = property(lambda self: 64, lambda self, value: None)  # noqa: ARG005
+
+    whole = gemma_pytorch.CONFIG_MAPPING["paligemma"]
+
+    def small() -> Any:
+        config = whole()
+        config.vision_config = Vision(
+            hidden_size=32, patch_size=14, image_size=224, num_hidden_layers=1, num_attention_heads=2
+        )
+        config.vision_config.vision_use_head = False
+        config.projection_dim = 64
+        return config
+
+    gemma_pytorch.CONFIG_MAPPING = {"paligemma": small, "gemma": gemma_pytorch.CONFIG_MAPPING["gemma"]}
+    torch.manual_seed(0)
+    model = dataclasses.replace(PI0.model, pytorch_compile_mode=None, dtype="float32")
+    safetensors.torch.save_model(pi0_pytorch.PI0Pytorch(model), str(folder / "model.safetensors"))
+    save_statistics(folder, "pi0")
     return folder
 
 
