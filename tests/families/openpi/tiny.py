@@ -83,7 +83,7 @@ ALOHA = training.TrainConfig(
 )
 FAST = training.TrainConfig(
     name="tiny_pi0_fast_droid",
-    model=pi0_fast.Pi0FASTConfig(action_dim=8, action_horizon=4, max_token_len=60, fast_model_tokenizer=Words),
+    model=pi0_fast.Pi0FASTConfig(action_dim=8, action_horizon=4, max_token_len=100, fast_model_tokenizer=Words),
     data=training.SimpleDataConfig(assets=training.AssetsConfig(asset_id="droid"), data_transforms=_droid),
 )
 CONFIGS = {"pi0": PI0, "pi05": PI05, "aloha": ALOHA, "fast": FAST}
