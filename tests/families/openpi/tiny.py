@@ -113,14 +113,13 @@ def save_torch(folder: Path) -> Path:
     from openpi.models_pytorch import gemma_pytorch, pi0_pytorch
     from transformers.models.siglip import SiglipVisionConfig
 
-    class Vision(SiglipVisionConfig):
-        projection_dim = property(lambda self: 64, lambda self, value: None)  # noqa: ARG005
-
+    # openpi sets it to the width of the whole model's words
+    SiglipVisionConfig.projection_dim = property(lambda self: 64, lambda self, value: None)  # noqa: ARG005
     whole = gemma_pytorch.CONFIG_MAPPING["paligemma"]
 
     def small() -> Any:
         config = whole()
-        config.vision_config = Vision(
+        config.vision_config = SiglipVisionConfig(
             hidden_size=32, patch_size=14, image_size=224, num_hidden_layers=1, num_attention_heads=2
         )
         config.vision_config.vision_use_head = False
