@@ -7,7 +7,7 @@ Physical Intelligence's own code and checkpoints are `vlagents_ray.policies.open
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -60,10 +60,12 @@ class Loaded:
     device: Any
     dtype: Any
 
-    def normalised(self, actions: np.ndarray) -> np.ndarray:
-        """Actions (H, D) in their own units -> as the model sees them."""
+    def planned(self, row: Row) -> Row:
+        """The row with its leftover actions as the model sees them."""
+        if row.leftover is None:
+            return row
         mean, std = self._statistics()
-        return np.asarray((actions - mean) / std)
+        return replace(row, leftover=(row.leftover - mean) / std)
 
     def actions(self, flow: np.ndarray) -> np.ndarray:
         """What the model says, (H, max_action_dim) -> actions (H, D) in their own units."""
@@ -145,7 +147,7 @@ class Pi0(ModelPolicy):
             return torch.from_numpy(array).to(model.device, non_blocking=True)
 
         noise = convert(np.stack([row.noise(*shape) for row in rows]))
-        guide = Guide.of(rows, *shape, lambda _, plan: model.normalised(plan))
+        guide = Guide.of([model.planned(row) for row in rows], *shape)
         with torch.inference_mode():
             flow = self._follow(self._inputs(rows), noise, None if guide is None else guide.to(convert))
         return [Prediction(model.actions(one)) for one in flow.cpu().numpy()]

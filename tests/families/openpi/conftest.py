@@ -14,6 +14,9 @@ import pytest
 
 Made = Callable[..., Any]
 
+# The models are small: what takes time is to compile them, and that shall be done once, and fast.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+
 
 @pytest.fixture(scope="session")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> ModuleType:
@@ -48,15 +51,15 @@ def loaded(checkpoint: Callable[[str], Path]) -> Made:
 
     def get(kind: str) -> OpenPi:
         if kind not in made:
-            made[kind] = OpenPi.from_config(
-                {
-                    "checkpoint": str(checkpoint(kind)),
-                    "config": f"tests.families.openpi.tiny:{kind.upper()}",
-                    "batch_sizes": [1, 4],
-                    "steps": 4,
-                }
-            )
-            made[kind].initialize()
+            settings = {
+                "checkpoint": str(checkpoint(kind)),
+                "config": f"tests.families.openpi.tiny:{kind.upper()}",
+                "batch_sizes": [1] if kind == "aloha" else [1, 4],
+                "steps": 4,
+            }
+            policy = OpenPi.from_config(settings)
+            policy.initialize()
+            made[kind] = policy
         return made[kind]
 
     return get
@@ -72,11 +75,12 @@ def upstream(tiny: ModuleType, monkeypatch: pytest.MonkeyPatch) -> Made:
 
     models = policy_config._model
     restore = models.restore_params
-    monkeypatch.setattr(models, "restore_params", lambda path, dtype: restore(path, dtype="float32"))  # noqa: ARG005
+    monkeypatch.setattr(models, "restore_params", lambda path, **kwargs: restore(path, **kwargs | {"dtype": "float32"}))
 
     def make(kind: str, folder: Path) -> Any:
         config = tiny.CONFIGS[kind]
         config = dataclasses.replace(config, model=dataclasses.replace(config.model, dtype="float32"))
-        return policy_config.create_trained_policy(config, folder, sample_kwargs={"num_steps": 4})
+        settings = {} if kind == "fast" else {"num_steps": 4}
+        return policy_config.create_trained_policy(config, folder, sample_kwargs=settings)
 
     return make

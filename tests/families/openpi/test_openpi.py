@@ -21,7 +21,7 @@ WORDS = ("pick up the cube", "push", "open the upper drawer")
 BATCHED = 1e-5  # how far a batch's actions may be off those of a lone row, in float32 on a CPU
 KINDS = ("pi0", "pi05", "aloha")
 # openpi's observation -> ours, as a client of each would send it
-MAPPINGS = {"pi0": "openpi-libero", "pi05": "openpi-droid", "aloha": "openpi-aloha"}
+MAPPINGS = {"pi0": "openpi-libero", "pi05": "openpi-droid", "aloha": "openpi-aloha", "fast": "openpi-droid"}
 
 
 def theirs(kind: str, seed: int) -> dict[str, Any]:
@@ -37,7 +37,7 @@ def theirs(kind: str, seed: int) -> dict[str, Any]:
     if kind == "pi0":
         state = np.concatenate([numbers(6), 0.04 * numbers(2)])
         return {"observation/image": picture(), "observation/wrist_image": picture(), "observation/state": state}
-    if kind == "pi05":
+    if kind in ("pi05", "fast"):
         return {
             "observation/exterior_image_1_left": picture(),
             "observation/wrist_image_left": picture(),
@@ -71,7 +71,7 @@ def test_actions_are_those_of_openpis_own_policy(kind: str, loaded: Any, upstrea
         np.testing.assert_allclose(begun(policy, kind, i).act(seen(kind, i)).action, want, atol=1e-4, rtol=1e-4)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["pi0", "pi05"])
 def test_neighbours_change_nothing(kind: str, loaded: Any) -> None:
     policy = loaded(kind)
     alone = [begun(policy, kind, i).act(seen(kind, i)).action for i in range(6)]
@@ -124,3 +124,22 @@ def test_a_config_with_its_own_prompt_needs_no_instruction(loaded: Any) -> None:
     told = copy.copy(policy)
     told.reset(seen("aloha", 0), "uncap", seed=0)
     np.testing.assert_array_equal(session.act(seen("aloha", 0)).action, told.act(seen("aloha", 0)).action)
+
+
+def test_fast_says_what_openpis_own_policy_says_alone_and_in_company(
+    loaded: Any, upstream: Any, checkpoint: Any
+) -> None:
+    policy, theirs_policy = loaded("fast"), upstream("fast", checkpoint("fast"))
+    want = [theirs_policy.infer({**theirs("fast", i), "prompt": WORDS[i]})["actions"] for i in range(3)]
+    alone = [begun(policy, "fast", i).act(seen("fast", i)).action for i in range(3)]
+    acts = policy.act_batch([seen("fast", i) for i in range(3)], [begun(policy, "fast", i) for i in range(3)])
+    for i in range(3):
+        np.testing.assert_allclose(alone[i], want[i], rtol=1e-5)
+        np.testing.assert_array_equal(acts[i].action, alone[i])
+
+
+def test_what_a_row_says_after_its_end_is_dropped() -> None:
+    from vlagents_ray.policies.openpi.models import JaxTokens
+
+    tokens = np.array([[5, 1, 7, 1], [5, 6, 7, 8]])
+    np.testing.assert_array_equal(JaxTokens.ended(tokens), [[5, 1, 0, 0], [5, 6, 7, 8]])

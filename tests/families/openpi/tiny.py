@@ -1,6 +1,6 @@
 """Small random checkpoints of openpi, made with its own code: weights, statistics, tokenizer.
 
-    OPENPI_SRC=… python tests/families/openpi/tiny.py OUT_FOLDER [pi0|pi05|aloha]
+    OPENPI_SRC=… python tests/families/openpi/tiny.py OUT_FOLDER [pi0|pi05|aloha|fast]
 
 Serve one with `config: tests.families.openpi.tiny:PI0` and OPENPI_DATA_HOME=OUT_FOLDER/cache, where openpi finds the
 tokenizer that it would download. Importing this module makes openpi's vision tower and vocabulary small.
@@ -8,6 +8,7 @@ tokenizer that it would download. Importing this module makes openpi's vision to
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ import orbax.checkpoint  # noqa: E402
 import sentencepiece  # noqa: E402
 from flax import nnx  # noqa: E402
 from openpi import transforms  # noqa: E402
-from openpi.models import gemma, pi0_config, siglip  # noqa: E402
+from openpi.models import gemma, gemma_fast, pi0_config, pi0_fast, siglip, tokenizer  # noqa: E402
 from openpi.policies import droid_policy  # noqa: E402
 from openpi.shared import normalize  # noqa: E402
 from openpi.training import config as training  # noqa: E402
@@ -34,6 +35,28 @@ _WORDS = 600
 _whole_module = siglip.Module
 siglip.Module = lambda *args, **kwargs: _whole_module(*args, **{**kwargs, "variant": "mu/14"})
 gemma.PALIGEMMA_VOCAB_SIZE = _WORDS
+_whole_config = gemma_fast.get_config
+
+
+def _small_config(variant: str) -> Any:
+    config = _whole_config(variant)
+    config.update(width=64, depth=2, mlp_dim=128, num_heads=4, head_dim=16, vocab_size=_WORDS)
+    return config
+
+
+gemma_fast.get_config = _small_config
+
+
+class Words(tokenizer.FASTTokenizer):
+    """Of pi0-FAST, without its half that the hub has: a token stands for a number, and any tokens can be decoded."""
+
+    def __init__(self, max_len: int = 256) -> None:
+        self._max_len = max_len
+        self._paligemma_tokenizer = tokenizer.PaligemmaTokenizer()._tokenizer
+
+    def extract_actions(self, tokens: np.ndarray, action_horizon: int, action_dim: int) -> np.ndarray:
+        numbers = np.resize(tokens.astype(np.float32), (action_horizon, action_dim))
+        return numbers / _WORDS
 
 
 def _droid(model: Any) -> transforms.Group:
@@ -58,8 +81,13 @@ ALOHA = training.TrainConfig(
     model=pi0_config.Pi0Config(**_SMALL, action_horizon=5),
     data=training.LeRobotAlohaDataConfig(assets=training.AssetsConfig(asset_id="trossen"), default_prompt="uncap"),
 )
-CONFIGS = {"pi0": PI0, "pi05": PI05, "aloha": ALOHA}
-_DIMS = {"pi0": (8, 7), "pi05": (8, 8), "aloha": (14, 14)}  # of states and actions
+FAST = training.TrainConfig(
+    name="tiny_pi0_fast_droid",
+    model=pi0_fast.Pi0FASTConfig(action_dim=8, action_horizon=4, max_token_len=100, fast_model_tokenizer=Words),
+    data=training.SimpleDataConfig(assets=training.AssetsConfig(asset_id="droid"), data_transforms=_droid),
+)
+CONFIGS = {"pi0": PI0, "pi05": PI05, "aloha": ALOHA, "fast": FAST}
+_DIMS = {"pi0": (8, 7), "pi05": (8, 8), "aloha": (14, 14), "fast": (8, 8)}  # of states and actions
 
 
 def save(folder: str | Path, kind: str = "pi0", seed: int = 0) -> Path:
@@ -75,6 +103,34 @@ def save(folder: str | Path, kind: str = "pi0", seed: int = 0) -> Path:
         saver.save(folder / "params", {"params": jax.tree.map(shaken, params)})
     save_statistics(folder, kind)
     save_tokenizer(folder / "cache")
+    return folder
+
+
+def save_torch(folder: Path) -> Path:
+    """The PyTorch port of PI0, random; openpi's sizes of the vision tower and of its output become small."""
+    import safetensors.torch
+    import torch
+    from openpi.models_pytorch import gemma_pytorch, pi0_pytorch
+    from transformers.models.siglip import SiglipVisionConfig
+
+    # openpi sets it to the width of the whole model's words
+    SiglipVisionConfig.projection_dim = property(lambda self: 64, lambda self, value: None)  # noqa: ARG005
+    whole = gemma_pytorch.CONFIG_MAPPING["paligemma"]
+
+    def small() -> Any:
+        config = whole()
+        config.vision_config = SiglipVisionConfig(
+            hidden_size=32, patch_size=14, image_size=224, num_hidden_layers=1, num_attention_heads=2
+        )
+        config.vision_config.vision_use_head = False
+        config.projection_dim = 64
+        return config
+
+    gemma_pytorch.CONFIG_MAPPING = {"paligemma": small, "gemma": gemma_pytorch.CONFIG_MAPPING["gemma"]}
+    torch.manual_seed(0)
+    model = dataclasses.replace(PI0.model, pytorch_compile_mode=None, dtype="float32")
+    safetensors.torch.save_model(pi0_pytorch.PI0Pytorch(model), str(folder / "model.safetensors"))
+    save_statistics(folder, "pi0")
     return folder
 
 

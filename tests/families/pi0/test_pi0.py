@@ -19,6 +19,8 @@ from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER, SAMPLES
 from vlagents_ray.policies.pi0 import Pi0
 from vlagents_ray.testing import check_agent
 
+torch.set_num_threads(1)  # the model is too small for more: threads would wait for one another
+
 WORDS = ("pick up the cube", "push", "open the upper drawer of the white cabinet")
 BATCHED = 1e-5  # how far a batch's actions may be off those of a lone row, in float32 on a CPU
 

@@ -19,7 +19,7 @@ def row(leftover: np.ndarray | None = None, delay: int = 0) -> Row:
 def flow(*rows: Row, steps: int = STEPS, limit: float = 5.0) -> np.ndarray:
     """(B, H, D) actions, as a policy makes them."""
     noise = np.random.default_rng(0).standard_normal((len(rows), HORIZON, DIM)).astype(np.float32)
-    guide = Guide.of(rows, HORIZON, DIM, lambda _, plan: plan)
+    guide = Guide.of(rows, HORIZON, DIM)
     actions = noise
     for step in range(steps):
         time = 1.0 - step / steps
@@ -35,7 +35,7 @@ def plan(length: int = 6) -> np.ndarray:
 
 
 def test_without_a_plan_there_is_nothing_to_follow() -> None:
-    assert Guide.of([row(), row()], HORIZON, DIM, lambda _, plan: plan) is None
+    assert Guide.of([row(), row()], HORIZON, DIM) is None
 
 
 @pytest.mark.parametrize("delay", [1, 3, 6])

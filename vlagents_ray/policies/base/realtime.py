@@ -28,13 +28,8 @@ class Guide:
     weight: Any  # (B, H, 1) in [0, 1]: how closely a later row is to follow
 
     @classmethod
-    def of(
-        cls, rows: Sequence[Row], horizon: int, dim: int, planned: Callable[[Row, np.ndarray], np.ndarray]
-    ) -> Guide | None:
-        """That of the rows' `leftover` and `delay`, in numpy; None if no row has any.
-
-        `planned` turns a row's leftover actions into what the model sees.
-        """
+    def of(cls, rows: Sequence[Row], horizon: int, dim: int) -> Guide | None:
+        """That of the rows' `delay` and `leftover`, made what the model sees already; None if no row has any."""
         if all(row.leftover is None for row in rows):
             return None
         plan = np.zeros((len(rows), horizon, dim), np.float32)
@@ -42,7 +37,7 @@ class Guide:
         weight = np.zeros((len(rows), horizon, 1), np.float32)
         for i, row in enumerate(rows):
             if row.leftover is not None:
-                left = planned(row, row.leftover[:horizon])
+                left = row.leftover[:horizon]
                 delay = min(max(row.delay, 0), len(left))
                 plan[i, : len(left), : left.shape[1]] = left
                 frozen[i, :delay] = 1.0

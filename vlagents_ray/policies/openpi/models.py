@@ -77,15 +77,18 @@ class JaxTokens(Model):
         self._sample = jax.jit(sample)
 
     def sample(self, batch: dict[str, Any], noise: np.ndarray, guide: Guide | None) -> np.ndarray:
-        """(B, T) int32, zeros after the end of each row.
-
-        openpi decodes until all rows end in the same step: a row of a batch goes on after its end, into what it would
-        not have said alone.
-        """
+        """(B, T) int32."""
         jax = require("jax")
-        tokens = np.asarray(self._sample(self._state, jax.device_put(batch, self._device)), np.int32)
-        ended = np.cumsum(tokens == _END, axis=1) - (tokens == _END) > 0
-        return np.where(ended, 0, tokens)
+        return self.ended(np.asarray(self._sample(self._state, jax.device_put(batch, self._device)), np.int32))
+
+    @staticmethod
+    def ended(tokens: np.ndarray) -> np.ndarray:
+        """The tokens (B, T) with zeros after the end of each row, as it would be alone.
+
+        openpi decodes until all rows end in the same step: a row of a batch goes on after its own end.
+        """
+        ends = tokens == _END
+        return np.where(np.cumsum(ends, axis=1) - ends > 0, 0, tokens)
 
 
 class TorchFlow(Model):
@@ -151,13 +154,14 @@ def load_torch(config: Any, folder: Path, settings: OpenPiConfig) -> Model:
     """`ConfigError` where transformers is not patched as openpi wants it, or the weights do not fill the model."""
     device = torch_device(settings.device)
     file = folder / "model.safetensors"
+    chosen = settings.dtype if settings.dtype != "auto" else ("float32" if device.type == "cpu" else "bfloat16")
     mode = config.model.pytorch_compile_mode if settings.compile else None
-    config = dataclasses.replace(config, model=dataclasses.replace(config.model, pytorch_compile_mode=mode))
+    model = dataclasses.replace(config.model, pytorch_compile_mode=mode, dtype=chosen)
+    config = dataclasses.replace(config, model=model)
     try:
         network = config.model.load_pytorch(config, str(file))
     except (ValueError, RuntimeError) as error:
         raise ConfigError(f"checkpoint {file}: {str(error)[:600]}") from error
-    chosen = settings.dtype if settings.dtype != "auto" else ("float32" if device.type == "cpu" else "bfloat16")
     network.paligemma_with_expert.to_bfloat16_for_selected_params(chosen)
     require_loaded(network, SavedTensors.of(file))
     return TorchFlow(network.eval().requires_grad_(False).to(device), device, settings)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -36,6 +36,15 @@ class Loaded:
     transforms: Transforms
     robot: Robot
     horizon: int
+
+
+@dataclass(frozen=True)
+class Ready:
+    """A row as the model takes it."""
+
+    inputs: dict[str, Any]
+    row: Row  # its leftover actions as the model sees them
+    noise: np.ndarray
 
 
 class OpenPi(ModelPolicy):
@@ -91,36 +100,36 @@ class OpenPi(ModelPolicy):
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         """One call of the model for all rows that openpi's transforms take."""
-        loaded = self._loaded()
-        inputs: list[dict[str, Any]] = []
-        found: list[Prediction | Exception] = []
-        for row in rows:
-            try:
-                inputs.append(loaded.transforms.read(row.frames[-1], row.instruction))
-            except Exception as error:  # noqa: BLE001 - handed to the session whose observation it is
-                found.append(error)
-            else:
-                found.append(Prediction(np.empty(0)))
-        good = [i for i, one in enumerate(found) if not isinstance(one, Exception)]
-        if not good:
-            return found
-        # All rows go in, so that the number of rows is one that is compiled: in the place of a bad one, a good one.
-        spare = inputs[0]
-        chosen = dict(zip(good, inputs, strict=True))
-        said = self._sample(rows, [chosen.get(i, spare) for i in range(len(rows))])
-        for i in good:
-            found[i] = Prediction(loaded.transforms.actions(chosen[i]["state"], said[i]))
-        return found
+        read = [self._read(row) for row in rows]
+        spare = next((one for one in read if not isinstance(one, Exception)), None)
+        if spare is None:
+            return read  # type: ignore[return-value]  # errors all
+        # The number of rows stays one that is compiled: in the place of a bad one goes a good one.
+        said = self._sample([spare if isinstance(one, Exception) else one for one in read])
+        actions = self._loaded().transforms.actions
+        return [
+            one if isinstance(one, Exception) else Prediction(actions(one.inputs["state"], flow))
+            for one, flow in zip(read, said, strict=True)
+        ]
 
-    def _sample(self, rows: Sequence[Row], inputs: list[dict[str, Any]]) -> np.ndarray:
-        loaded, jax = self._loaded(), require("jax")
-        batch = jax.tree.map(lambda *leaves: np.stack(leaves), *inputs)
+    def _read(self, row: Row) -> Ready | Exception:
+        """A row as the model takes it, or what is wrong with it, which its own session is told."""
+        loaded, observation = self._loaded(), row.frames[-1]
         shape = loaded.model.noise_shape
-        if shape is None:
-            return loaded.model.sample(batch, np.empty(0), None)
-        noise = np.stack([row.noise(*shape) for row in rows])
-        guide = Guide.of(rows, *shape, lambda row, plan: loaded.transforms.plan(row.frames[-1], row.instruction, plan))
-        return loaded.model.sample(batch, noise, guide)
+        try:
+            inputs = loaded.transforms.read(observation, row.instruction)
+            if row.leftover is not None:
+                row = replace(row, leftover=loaded.transforms.plan(observation, row.instruction, row.leftover))
+        except Exception as error:  # noqa: BLE001 - handed to the session whose observation it is
+            return error
+        return Ready(inputs, row, row.noise(*shape or ()))
+
+    def _sample(self, ready: Sequence[Ready]) -> np.ndarray:
+        model = self._loaded().model
+        batch = require("jax").tree.map(lambda *leaves: np.stack(leaves), *(one.inputs for one in ready))
+        shape = model.noise_shape
+        guide = None if shape is None else Guide.of([one.row for one in ready], *shape)
+        return model.sample(batch, np.stack([one.noise for one in ready]), guide)
 
     def _folder(self) -> Path:
         name, step = self.config.checkpoint, self.config.checkpoint_step
