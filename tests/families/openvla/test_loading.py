@@ -85,7 +85,7 @@ def test_statistics_are_in_the_checkpoint_or_nothing_is_served(copied: Callable[
     folder = copied("openvla")
     found = (folder / "dataset_statistics.json").read_text()
     (folder / "dataset_statistics.json").unlink()
-    with pytest.raises(ConfigError, match="got no normalisation statistics, want dataset_statistics.json"):
+    with pytest.raises(ConfigError, match=r"got no normalisation statistics, want dataset_statistics.json"):
         load("openvla", folder)
     config = json.loads((folder / "config.json").read_text())
     (folder / "config.json").write_text(json.dumps(config | {"norm_stats": json.loads(found)}))
@@ -107,7 +107,7 @@ def test_no_source_and_no_leave_to_run_remote_code(
 ) -> None:
     for name in VARIABLES:
         monkeypatch.delenv(name)
-    with pytest.raises(ConfigError, match="got no source tree, want .*OPENVLA_SRC.*trust_remote_code: true"):
+    with pytest.raises(ConfigError, match=r"got no source tree, want .*OPENVLA_SRC.*trust_remote_code: true"):
         load("openvla", copied("remote"))
 
 
@@ -123,7 +123,7 @@ def test_either_source_serves_either_policy(checkpoint: Callable[[str], Path], m
 def test_components_of_two_steps_are_not_guessed_between(copied: Callable[[str], Path]) -> None:
     folder = copied("oft")
     shutil.copy(folder / "action_head--100_checkpoint.pt", folder / "action_head--200_checkpoint.pt")
-    with pytest.raises(ConfigError, match="got .*100.*200.* for 'action_head', want one file"):
+    with pytest.raises(ConfigError, match=r"got .*100.*200.* for 'action_head', want one file"):
         load("openvla_oft", folder)
 
 
