@@ -203,3 +203,15 @@ def test_a_bad_request_fails_alone(
     bad, good = policy.act_batch([obs, seen(1)], [begun(policy, 0), begun(policy, 1)])
     assert isinstance(bad, error)
     assert isinstance(good, Act)
+
+
+def test_a_dataset_whose_actions_are_longer_than_the_heads_is_refused_alone(
+    loaded: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = loaded("oft")
+    longer = {"q01": [0.0] * 14, "q99": [1.0] * 14}
+    monkeypatch.setitem(policy.model.base.statistics._datasets, "aloha", {"action": longer})
+    bad, good = policy.act_batch([seen(0, unnorm_key="aloha"), seen(1)], [begun(policy, 0), begun(policy, 1)])
+    assert isinstance(bad, InvalidObservation)
+    assert "'aloha' of 14 numbers, want one of 7" in str(bad)
+    assert isinstance(good, Act)
