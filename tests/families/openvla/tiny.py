@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from tokenizers import Tokenizer, models, pre_tokenizers, processors, trainers
+from tokenizers import Tokenizer, decoders, models, pre_tokenizers, processors, trainers
 from transformers import PreTrainedTokenizerFast
 
 from tests.families.openvla.upstream import module
@@ -36,7 +36,7 @@ def make(folder: Path, kind: str = "openvla", datasets: tuple[str, ...] = DATASE
     """A checkpoint of that kind in `folder`."""
     torch.manual_seed(0)
     variable = "OPENVLA_OFT_SRC" if kind.startswith("oft") else "OPENVLA_SRC"
-    network = _network(variable)
+    network = _network(variable, small=kind != "openvla")
     network.save_pretrained(folder)
     processor = module(variable, "extern.hf.processing_prismatic").PrismaticImageProcessor(
         use_fused_vision_backbone=True,
@@ -56,8 +56,11 @@ def make(folder: Path, kind: str = "openvla", datasets: tuple[str, ...] = DATASE
     return folder
 
 
-def _network(variable: str) -> Any:
-    """The model, whose two backbones give 16 patches each; the first has the layer scales that transformers renames."""
+def _network(variable: str, *, small: bool) -> Any:
+    """The model, whose two backbones give 16 patches each.
+
+    The first one of the larger has layer scales, whose name transformers would change if OpenVLA did not.
+    """
     modeling = module(variable, "extern.hf.modeling_prismatic")
     config = modeling.OpenVLAConfig(
         vision_backbone_id="dinosiglip-vit-so-224px",
@@ -74,7 +77,7 @@ def _network(variable: str) -> Any:
             "initializer_range": 0.3,
         },
         # in the JSON these go before what the id stands for
-        timm_model_ids=["deit3_small_patch16_224", "vit_tiny_patch16_224"],
+        timm_model_ids=["vit_tiny_patch16_224" if small else "deit3_small_patch16_224", "vit_tiny_patch16_224"],
         image_sizes=[64, 64],
         initializer_range=0.1,  # far from nothing, so that different inputs have different answers
         n_action_bins=256,
@@ -93,7 +96,8 @@ def _network(variable: str) -> Any:
 def _tokenizer() -> PreTrainedTokenizerFast:
     special = {"unk_token": "<unk>", "bos_token": "<s>", "eos_token": "</s>"}  # with Llama's numbers, 0, 1, 2
     tokenizer = Tokenizer(models.BPE())
-    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel()
+    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
+    tokenizer.decoder = decoders.ByteLevel()
     trainer = trainers.BpeTrainer(
         vocab_size=400,
         special_tokens=list(special.values()),
@@ -160,11 +164,16 @@ def _add_components(folder: Path, kind: str, network: Any) -> None:
         torch.save(state, folder / f"{name}--100_checkpoint.pt")
 
 
-def filmed(network: Any) -> torch.nn.Module:
-    """The network's vision backbone with LoRA and FiLM, as OFT+ trains it."""
+def filmed(network: Any, *, trained: bool = True) -> torch.nn.Module:
+    """The network's vision backbone with LoRA and FiLM, as OFT+ trains it; untrained adapters change nothing."""
     from peft import LoraConfig, get_peft_model
 
-    config = LoraConfig(r=LORA_RANK, lora_alpha=LORA_RANK, target_modules="all-linear", init_lora_weights=False)
+    config = LoraConfig(
+        r=LORA_RANK,
+        lora_alpha=LORA_RANK,
+        target_modules="all-linear",
+        init_lora_weights=False if trained else "gaussian",
+    )
     adapted = get_peft_model(network, config).model
     film = module("OPENVLA_OFT_SRC", "models.film_vit_wrapper")
     return film.FiLMedPrismaticVisionBackbone(vision_backbone=adapted.vision_backbone, llm_dim=LLM_DIM)

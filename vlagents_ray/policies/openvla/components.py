@@ -149,15 +149,15 @@ class Film:
 
 
 def _merged(saved: Weights) -> dict[str, Any]:
-    """With the low-rank adapters added to the layers that they adapt: OFT+ saves them apart."""
+    """With the low-rank adapters added to the layers that they adapt, convolutions too: OFT+ saves them apart."""
     merged = {key.replace(".base_layer.", "."): tensor for key, tensor in saved.items() if ".lora_" not in key}
     for key, down in saved.items():
         if ".lora_A." in key:
             up = saved[key.replace(".lora_A.", ".lora_B.")]
             rank = len(down)
             name = key.partition(".lora_A.")[0] + ".weight"
-            added = (up.float() @ down.float()) * (min(rank, _LORA_ALPHA) / rank)
-            merged[name] = (merged[name].float() + added).to(merged[name].dtype)
+            added = up.flatten(1).float() @ down.flatten(1).float() * (min(rank, _LORA_ALPHA) / rank)
+            merged[name] = (merged[name].float() + added.view_as(merged[name])).to(merged[name].dtype)
     return merged
 
 

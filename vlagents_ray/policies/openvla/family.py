@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from typing_extensions import Self
 
 from vlagents_ray.contract import ActionSpec
-from vlagents_ray.errors import InvalidObservation, NotReset, VLAgentsError
+from vlagents_ray.errors import InvalidObservation, NotReset
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.openvla.prismatic import Prismatic
@@ -110,7 +110,7 @@ class PrismaticPolicy(ModelPolicy):
             try:
                 key = self._key(row)
                 asked[i] = Asked(row, self._statistics.scale(key), self._question(row, key))
-            except VLAgentsError as error:
+            except Exception as error:  # noqa: BLE001 - handed to the session whose request failed
                 results[i] = error
         answers = self._answer(list(asked.values())) if asked else []
         for (i, ask), answer in zip(asked.items(), answers, strict=True):

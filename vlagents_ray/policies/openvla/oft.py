@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from typing_extensions import Self
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import ConfigError
+from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base.observing import (
@@ -132,6 +132,10 @@ class OpenVLAOFT(PrismaticPolicy):
     def _question(self, row: Row, key: str) -> Question:
         seen, state = row.frames[-1]
         base = self.model.base
+        if (dim := base.statistics.scale(key).dim) != self.model.dim:
+            raise InvalidObservation(
+                f"unnorm_key: got {key!r} of {dim} numbers, want one of {self.model.dim}, the head's"
+            )
         proprio = None if state is None else base.statistics.scale(key, "proprio").normalise(state)
         return Question(seen, base.tokens(row.instruction), proprio)
 

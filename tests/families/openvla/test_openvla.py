@@ -1,0 +1,162 @@
+"""OpenVLA on a tiny random checkpoint made with OpenVLA's own code."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from transformers import AutoTokenizer
+
+from tests.families.openvla.conftest import LIBRARIES, WORDS, begun, seen
+from tests.families.openvla.upstream import module
+from vlagents_ray.errors import InvalidObservation, MissingCamera
+from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
+from vlagents_ray.policies.openvla import pictures
+from vlagents_ray.policies.openvla.policy import OpenVLA
+from vlagents_ray.testing import check_agent
+
+pytestmark = [pytest.mark.source("OPENVLA_SRC"), *LIBRARIES]
+
+
+@pytest.fixture
+def policy(loaded: Callable[..., Any]) -> OpenVLA:
+    return loaded("openvla")
+
+
+def upstream(folder: Path, image: np.ndarray, words: str, unnorm_key: str) -> np.ndarray:
+    """What OpenVLA's own `predict_action` answers, (7,)."""
+    hf = "extern.hf."
+    network = module("OPENVLA_SRC", hf + "modeling_prismatic").OpenVLAForActionPrediction.from_pretrained(folder).eval()
+    network.norm_stats = json.loads((folder / "dataset_statistics.json").read_text())
+    processing = module("OPENVLA_SRC", hf + "processing_prismatic")
+    processor = processing.PrismaticProcessor(
+        processing.PrismaticImageProcessor.from_pretrained(folder), AutoTokenizer.from_pretrained(folder)
+    )
+    inputs = processor(f"In: What action should the robot take to {words.lower()}?\nOut:", Image.fromarray(image))
+    return network.predict_action(**inputs, unnorm_key=unnorm_key, do_sample=False)
+
+
+def test_keeps_the_contract(checkpoint: Callable[[str], Path]) -> None:
+    agent = OpenVLA.from_config({"checkpoint": str(checkpoint("openvla")), "unnorm_key": "bridge_orig"})
+    check_agent(agent, instructions=WORDS, steps=2, atol=0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_answers_what_upstream_answers(policy: OpenVLA, checkpoint: Callable[[str], Path], seed: int) -> None:
+    [row] = begun(policy, seed).act(seen(seed)).action
+    want = upstream(checkpoint("openvla"), seen(seed).cameras["front"], WORDS[seed], "bridge_orig")
+    assert np.array_equal(row, want.astype(np.float32))
+
+
+@pytest.mark.parametrize("size", [2, 3, 8])
+def test_a_session_gets_the_same_in_any_company(policy: OpenVLA, size: int) -> None:
+    alone = [begun(policy, seed).act(seen(seed)).action for seed in range(size)]
+    together = policy.act_batch([seen(seed) for seed in range(size)], [begun(policy, seed) for seed in range(size)])
+    for one, act in zip(alone, together, strict=True):
+        assert isinstance(act, Act)
+        assert np.array_equal(one, act.action)
+    assert len({one.tobytes() for one in alone}) == size  # they differ by what they see and are told
+
+
+def test_a_session_may_have_another_datasets_units(policy: OpenVLA, checkpoint: Callable[[str], Path]) -> None:
+    here, told = begun(policy, 0), begun(policy, 0, unnorm_key="libero_spatial")
+    asked = seen(0, unnorm_key="libero_spatial_no_noops")
+    plain, reset, observed = policy.act_batch([seen(0), seen(0), asked], [here, told, begun(policy, 0)])
+    want = upstream(checkpoint("openvla"), seen(0).cameras["front"], WORDS[0], "libero_spatial_no_noops")
+    assert np.array_equal(reset.action[0], want.astype(np.float32))
+    assert np.array_equal(observed.action, reset.action)
+    assert not np.array_equal(plain.action, reset.action)
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        (lambda obs: obs.info.update(unnorm_key="bridge"), InvalidObservation),
+        (lambda obs: obs.info.update(unnorm_key=3), InvalidObservation),
+        (lambda obs: obs.cameras.pop("front"), MissingCamera),
+    ],
+)
+def test_a_bad_request_fails_alone(policy: OpenVLA, change: Callable[[Any], Any], error: type[Exception]) -> None:
+    obs = seen(0)
+    change(obs)
+    bad, good = policy.act_batch([obs, seen(1)], [begun(policy, 0), begun(policy, 1)])
+    assert isinstance(bad, error)
+    assert np.array_equal(good.action, begun(policy, 1).act(seen(1)).action)
+
+
+def test_an_instruction_longer_than_the_model_was_trained_for_is_refused(policy: OpenVLA) -> None:
+    session = begun(policy, 0)
+    session.reset(seen(0), "go " * 2048)
+    with pytest.raises(InvalidObservation, match="tokens with the prompt, want 2048"):
+        session.act(seen(0))
+
+
+def test_an_unknown_dataset_is_refused_when_an_episode_begins(policy: OpenVLA) -> None:
+    with pytest.raises(InvalidObservation, match=r"got 'aloha', want one of .*bridge_orig.*libero_spatial_no_noops"):
+        begun(policy, 0, unnorm_key="aloha")
+
+
+def test_samples_are_drawn_from_the_distribution_whose_moments_are_stated(policy: OpenVLA) -> None:
+    act = begun(policy, 0).act(seen(0, **{SAMPLES: 2000}))
+    assert np.array_equal(act.action, begun(policy, 0).act(seen(0)).action)
+    found = act.info[DISTRIBUTION]
+    assert found["samples"].shape == (2000, 1, 7)
+    # the first number does not depend on those before it, so that its draws have just the stated moments
+    first = found["samples"][:, 0, 0]
+    assert first.mean() == pytest.approx(found["mean"][0, 0], abs=4 * found["std"][0, 0] / 2000**0.5)
+    assert first.std() == pytest.approx(found["std"][0, 0], rel=0.1)
+
+
+def test_samples_belong_to_their_session(policy: OpenVLA) -> None:
+    def draws(act: Act) -> np.ndarray:
+        return act.info[DISTRIBUTION]["samples"]
+
+    asked = {SAMPLES: 5}
+    alone = draws(begun(policy, 1).act(seen(1, **asked)))
+    _, together = policy.act_batch([seen(0, **asked), seen(1, **asked)], [begun(policy, 0), begun(policy, 1)])
+    assert np.array_equal(draws(together), alone)
+    assert len({sample.tobytes() for sample in alone}) > 1
+
+
+def test_samples_share_their_sessions_prompt(policy: OpenVLA, monkeypatch: pytest.MonkeyPatch) -> None:
+    read = []
+    backbone = policy.model.network.vision_backbone
+    forward = backbone.forward
+    monkeypatch.setattr(backbone, "forward", lambda pixels: read.append(len(pixels)) or forward(pixels))
+    policy.act_batch([seen(0, **{SAMPLES: 5}), seen(1)], [begun(policy, 0), begun(policy, 1)])
+    assert read == [2]
+
+
+def test_pictures_may_be_those_of_libero(loaded: Callable[..., Any]) -> None:
+    cropping = loaded("openvla", center_crop=True)
+    obs = seen(0)
+    want = cropping.model.pixels(pictures.middle(pictures.resized(obs.cameras["front"])))
+    assert torch.equal(cropping.perceive(obs), want)
+    assert not torch.equal(cropping.perceive(obs), loaded("openvla").perceive(obs))
+
+
+@pytest.mark.filterwarnings("ignore:the load_module:DeprecationWarning")  # transformers 4.40 imports such code with it
+def test_a_checkpoints_own_code_runs_where_that_is_allowed(
+    loaded: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("transformers.dynamic_module_utils.HF_MODULES_CACHE", str(tmp_path))
+    monkeypatch.syspath_prepend(tmp_path)
+    policy = loaded("remote", trust_remote_code=True)
+    assert type(policy.model.network).__module__.startswith("transformers_modules.")
+    same = loaded("remote")
+    assert np.array_equal(begun(policy, 0).act(seen(0)).action, begun(same, 0).act(seen(0)).action)
+
+
+def test_the_first_version_has_its_own_prompt(checkpoint: Callable[[str], Path], tmp_path: Path) -> None:
+    (tmp_path / "openvla-v01-7b").symlink_to(checkpoint("openvla"))
+    policy = OpenVLA.from_config({"checkpoint": str(tmp_path / "openvla-v01-7b"), "unnorm_key": "bridge_orig"})
+    policy.initialize()
+    prompt = policy.model.tokenizer.decode(policy.model.tokens("Push")[1:-1])
+    assert prompt.startswith("A chat between a curious user")
+    assert prompt.endswith("USER: What action should the robot take to push? ASSISTANT:")

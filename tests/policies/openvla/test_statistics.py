@@ -1,0 +1,49 @@
+"""Between [-1, 1] and physical units, as a checkpoint's statistics say."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vlagents_ray.errors import ConfigError, InvalidObservation
+from vlagents_ray.policies.openvla.statistics import Statistics
+
+ACTION = {"q01": [-1.0, 0.0], "q99": [3.0, 1.0], "min": [-2.0, 0.0], "max": [4.0, 1.0], "mask": [True, False]}
+ONE = {"libero_goal_no_noops": {"action": ACTION, "proprio": {"q01": [0.0, 5.0], "q99": [2.0, 5.0]}}}
+
+
+def test_masked_numbers_stay_as_they_are() -> None:
+    scale = Statistics(ONE).scale("libero_goal_no_noops")
+    assert scale.restore(np.array([[-1.0, 0.25], [0.0, 1.0], [1.0, 0.0]])).tolist() == [[-1, 0.25], [1, 1], [3, 0]]
+    assert scale.restore_spread(np.array([0.5, 0.5])).tolist() == [1.0, 0.5]
+
+
+def test_bounds_may_be_the_smallest_and_largest() -> None:
+    assert Statistics(ONE, "min_max").scale("libero_goal_no_noops").restore(np.ones(2)).tolist() == [4.0, 1.0]
+
+
+def test_states_beyond_their_range_are_at_its_end_and_those_that_never_moved_do_no_harm() -> None:
+    scale = Statistics(ONE).scale("libero_goal_no_noops", "proprio")
+    assert scale.normalise(np.array([9.0, 5.0])).tolist() == [1.0, -1.0]
+
+
+def test_a_name_may_lack_its_ending_and_the_only_dataset_needs_none() -> None:
+    statistics = Statistics(ONE)
+    assert statistics.key("libero_goal") == statistics.key(None) == "libero_goal_no_noops"
+
+
+def test_an_unknown_name_is_told_what_there_is() -> None:
+    with pytest.raises(InvalidObservation, match=r"got None, want one of .*\['a', 'b'\]"):
+        Statistics({"a": {}, "b": {}}).key(None)
+    with pytest.raises(ConfigError, match=r"action has \[\], want 'q01' and 'q99'"):
+        Statistics({"a": {}}).scale("a")
+
+
+def test_fine_tunings_statistics_go_before_the_base_models(tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text(json.dumps({"norm_stats": {"base": {}}}))
+    assert Statistics.of(tmp_path).key(None) == "base"
+    (tmp_path / "dataset_statistics.json").write_text(json.dumps(ONE))
+    assert Statistics.of(tmp_path).key(None) == "libero_goal_no_noops"
