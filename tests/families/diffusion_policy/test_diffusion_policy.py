@@ -5,12 +5,12 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 
+from tests.families.diffusion_policy import tiny
 from vlagents_ray import Obs
 from vlagents_ray.contract import StateSpec
 from vlagents_ray.errors import MissingCamera, PolicyFailed
@@ -125,7 +125,7 @@ def test_a_session_gets_the_same_in_any_company(kind: str, policies: Callable[[s
 
 
 def test_a_queue_shows_the_model_the_frames_between_chunks(
-    checkpoint: Checkpoint, policies: Callable[[str], DiffusionPolicy], tiny: ModuleType
+    checkpoint: Checkpoint, policies: Callable[[str], DiffusionPolicy]
 ) -> None:
     queue = made(checkpoint("unet"))
     queue.model = policies("unet").model
