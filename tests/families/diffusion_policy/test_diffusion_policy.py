@@ -28,7 +28,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore:Arguments other than a weight enum:UserWarning"),
 ]
 
-ATOL = 1e-5  # float32 on a CPU, actions between -3 and 5; measured: 1e-6
+ATOL = 1e-5  # float32 on a CPU, actions between -3 and 5; measured: 2e-6
 KINDS = ["unet", "transformer", "image", "hybrid"]
 Checkpoint = Callable[[str], Path]
 
