@@ -159,17 +159,21 @@ class Sam2Tracker:
         session.cache.clear_all()
         session.processed_frames.clear()
         config = self._model.config
-        oldest = memory.frame + 1 - max(config.num_maskmem, config.max_object_pointers_in_encoder)
+        following = memory.frame + 1
         for outputs in session.output_dict_per_obj.values():
-            for kept in outputs.values():
-                for frame in [frame for frame in kept if kept is not outputs["cond_frame_outputs"] and frame < oldest]:
-                    del kept[frame]
-                for output in kept.values():
-                    output.pop("high_res_masks", None)
-                    output.pop("pred_masks", None)
+            tracked = outputs["non_cond_frame_outputs"]
+            for frame in list(tracked):
+                if frame <= following - config.num_maskmem:  # only its pointer to the object is still looked at
+                    tracked[frame].pop("maskmem_features", None)
+                    tracked[frame].pop("maskmem_pos_enc", None)
+                if frame <= following - max(config.num_maskmem, config.max_object_pointers_in_encoder):
+                    del tracked[frame]
+            for output in (*tracked.values(), *outputs["cond_frame_outputs"].values()):
+                output.pop("high_res_masks", None)
+                output.pop("pred_masks", None)
         for frames in session.frames_tracked_per_obj.values():
             frames.clear()
-        memory.frame += 1
+        memory.frame = following
 
 
 def _pixels(processor: Any, images: Images, model: Any) -> Any:
