@@ -30,6 +30,7 @@ from vlagents_ray.serve.files import deployment, listens_at, read_deployment
 
 COMMAND = [str(Path(sys.executable).parent / "vlagents-ray")]
 ROOT = Path(__file__).parent.parent.parent
+INTERRUPTED = 130  # before it serves; 0 from then on
 
 
 def health(url: str) -> int | None:
@@ -56,7 +57,9 @@ def command(*words: str) -> Iterator[subprocess.Popen[str]]:
         if process.poll() is None:
             family = set(psutil.Process(process.pid).children(recursive=True))
             process.send_signal(signal.SIGTERM)
-        process.communicate(timeout=60)
+        said, _ = process.communicate(timeout=60)
+        if family:
+            assert process.returncode in (0, INTERRUPTED), f"ended with {process.returncode}:\n{said[-4000:]}"
         _, alive = psutil.wait_procs(list(family), timeout=15)
         names = [p.name() for p in alive]
         for p in alive:

@@ -27,6 +27,7 @@ from vlagents_ray.evaluate.store import Store
 from vlagents_ray.evaluate.summary import State, Summary, summarize, versions, write_summary
 from vlagents_ray.evaluate.video import save_videos
 from vlagents_ray.registry import env_class
+from vlagents_ray.signals import own_sigterm
 
 POLL_S = 0.25  # how soon a signal is noticed
 
@@ -173,7 +174,8 @@ def ray_cluster(config: EvalConfig) -> Iterator[None]:
         # Its CPUs are bookkeeping: the user's number of workers must fit.
         needed = ceil(config.workers * config.cpus_per_worker)
         options |= {"num_cpus": max(os.cpu_count() or 1, needed), "include_dashboard": False}
-    ray.init(**options)
+    with own_sigterm():
+        ray.init(**options)
     try:
         yield
     finally:

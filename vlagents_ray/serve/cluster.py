@@ -27,6 +27,7 @@ from vlagents_ray.serve.haproxy import Front, wait_for_haproxy
 from vlagents_ray.serve.own_ray import own_ray
 from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK, free_port
 from vlagents_ray.serve.tls import Tls
+from vlagents_ray.signals import own_sigterm
 
 __all__ = ["Server", "free_port", "running_server"]
 
@@ -145,7 +146,8 @@ def _ray(
         )
     with contextlib.ExitStack() as stack:
         if not ray.is_initialized():
-            ray.init(address=address, log_to_driver=show_logs, logging_level="WARNING")
+            with own_sigterm():
+                ray.init(address=address, log_to_driver=show_logs, logging_level="WARNING")
             stack.callback(ray.shutdown)
         yield {"host": host, "port": port}
 
