@@ -37,8 +37,12 @@ def part(kind: str, name: str, checkpoint: Path, **settings: Any) -> Any:
 
 
 def images(seed: int = 0) -> list[np.ndarray]:
+    """Read-only, as a server's are."""
     rng = np.random.default_rng(seed)
-    return [rng.integers(0, 256, (*size, 3), dtype=np.uint8) for size in SIZES]
+    views = [rng.integers(0, 256, (*size, 3), dtype=np.uint8) for size in SIZES]
+    for view in views:
+        view.flags.writeable = False
+    return views
 
 
 def squares(count: int) -> list[np.ndarray]:
@@ -68,7 +72,7 @@ def test_boxes_are_those_that_transformers_finds_itself(grounding_dino: Path) ->
 
     detector = part("detector", "grounding_dino", grounding_dino, threshold=0.3, overlap=1.0, most=100)
     [image], [asked] = images()[:1], PHRASES[:1]
-    inputs = detector._processor(images=image, text=[asked], return_tensors="pt")
+    inputs = detector._processor(images=image.copy(), text=[asked], return_tensors="pt")
     with torch.no_grad():
         outputs = detector._model(**inputs)
     [theirs] = detector._processor.post_process_grounded_object_detection(
@@ -124,11 +128,15 @@ def test_segments_are_followed_as_transformers_does_with_all_frames_kept(sam2: P
     whole = [processor.init_video_session() for _ in SIZES]
     for i, session in enumerate(whole):
         processor.add_inputs_to_inference_session(session, 0, [0, 1], input_masks=list(squares(2)[i]))
-        model(session, frame_idx=0, frame=processor.image_processor(images()[i], return_tensors="pt").pixel_values[0])
+        model(
+            session,
+            frame_idx=0,
+            frame=processor.image_processor(images()[i].copy(), return_tensors="pt").pixel_values[0],
+        )
     for frame in range(1, 10):
         views = images(frame)
         for i, (masks, seen) in enumerate(tracker.follow(views, memories)):
-            pixels = processor.image_processor(views[i], return_tensors="pt").pixel_values[0]
+            pixels = processor.image_processor(views[i].copy(), return_tensors="pt").pixel_values[0]
             theirs = model(whole[i], frame_idx=frame, frame=pixels)
             logits = torch.nn.functional.interpolate(theirs.pred_masks[:, 0][None], size=SIZES[i], mode="bilinear")[0]
             unsure = logits.abs().numpy() < 1e-3  # on the very edge of a mask

@@ -41,8 +41,10 @@ def policy(checkpoint: Path) -> VJepa2Ac:
 
 def obs(seed: int, goal: int | None = None) -> Obs:
     rng = np.random.default_rng(seed)
+    image = rng.integers(0, 256, (40, 60, 3), dtype=np.uint8)
+    image.flags.writeable = False  # as a server's are
     return Obs(
-        cameras={"front": rng.integers(0, 256, (40, 60, 3), dtype=np.uint8)},
+        cameras={"front": image},
         gripper=float(rng.uniform()),
         state={"xyzrpy": rng.uniform(-1, 1, 6).astype(np.float32)},
         info={} if goal is None else {GOAL_IMAGE: goal_image(goal)},

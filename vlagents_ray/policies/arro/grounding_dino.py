@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from vlagents_ray.policies.arro.parts import Found, Images
-from vlagents_ray.policies.arro.pretrained import PretrainedConfig, load_pretrained
+from vlagents_ray.policies.arro.pretrained import PretrainedConfig, load_pretrained, writable
 from vlagents_ray.registry import require
 
 
@@ -51,7 +51,7 @@ class GroundingDinoDetector:
         """Images of one size."""
         torch = require("torch")
         texts = [_text(asked) for asked in phrases]
-        inputs = self._processor(images=list(images), text=texts, padding=True, return_tensors="pt")
+        inputs = self._processor(images=writable(images), text=texts, padding=True, return_tensors="pt")
         with torch.inference_mode():
             outputs = self._model(**inputs.to(self._model.device, self._model.dtype))
         words = outputs.logits.float().sigmoid().cpu().numpy()  # (B, queries, tokens)

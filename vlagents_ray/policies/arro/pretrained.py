@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from pydantic import BaseModel, Field
 
+from vlagents_ray.policies.arro.parts import Images
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import find_checkpoint
 from vlagents_ray.policies.base.config import DType
@@ -29,3 +31,8 @@ def load_pretrained(model: str, processor: str, config: PretrainedConfig) -> tup
     device = torch_device(config.device)
     loaded = from_pretrained(getattr(transformers, model), path, dtype=torch_dtype(config.dtype, device))
     return loaded.to(device).eval(), getattr(transformers, processor).from_pretrained(path)
+
+
+def writable(images: Images) -> list[np.ndarray]:
+    """Copies: a server's images are read-only, which torch warns of."""
+    return [image.copy() for image in images]

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from vlagents_ray.policies.arro.parts import Images
-from vlagents_ray.policies.arro.pretrained import PretrainedConfig, load_pretrained
+from vlagents_ray.policies.arro.pretrained import PretrainedConfig, load_pretrained, writable
 from vlagents_ray.policies.arro.regions import overlap
 from vlagents_ray.registry import require
 
@@ -178,7 +178,7 @@ class Sam2Tracker:
 
 def _pixels(processor: Any, images: Images, model: Any) -> Any:
     """Images of any sizes as one (B, 3, side, side) tensor where the model is."""
-    return processor(list(images), return_tensors="pt")["pixel_values"].to(model.device, model.dtype)
+    return processor(writable(images), return_tensors="pt")["pixel_values"].to(model.device, model.dtype)
 
 
 def _size(image: np.ndarray) -> np.ndarray:
