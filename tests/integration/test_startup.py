@@ -247,7 +247,7 @@ def test_a_file_says_where_to_listen_and_nobody_is_let_in_by_default(tmp_path: P
 
 @pytest.mark.parametrize("file", sorted((ROOT / "deployments").glob("*.yaml")), ids=lambda file: file.stem)
 def test_every_shipped_deployment_file_is_valid(file: Path, tmp_path: Path) -> None:
-    """In this environment in the place of the policy's own, which builds it as well: what is heavy comes with loading."""
+    """In this environment in the place of the policy's own: what is heavy comes with loading."""
     text = file.read_text()
     [app] = yaml.safe_load(text)["applications"]
     if (own := app["args"].get("environment", {}).get("python")) is not None:
