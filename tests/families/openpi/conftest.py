@@ -14,9 +14,6 @@ import pytest
 
 Made = Callable[..., Any]
 
-# The models are small: what takes time is to compile them, and that shall be done once, and fast.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
-
 
 @pytest.fixture(scope="session")
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> ModuleType:
