@@ -54,7 +54,8 @@ family-%: $(VENV)-%/.installed
 	$(VENV)-$*/bin/python -m pytest $(addprefix tests/families/,$(or $(TESTED_IN_$*),$*))
 
 $(VENV)-%/.installed: requirements/%.txt requirements/testing.txt $(STAMP)
-	$(BIN)/vlagents-ray env make $< --with requirements/testing.txt --into $(VENV)-$*
+	$(BIN)/vlagents-ray env make $< $(addprefix --with ,requirements/testing.txt $(wildcard requirements/$*.testing.txt)) \
+	  --into $(VENV)-$*
 	@touch $@
 
 fmt: setup

@@ -16,7 +16,7 @@ from vlagents_ray.interface import GOAL_IMAGE, Act
 
 DESK = "desk:Desk"
 SIDE = 64  # px; some checkpoints take no other size than theirs
-STATES = {"xyz_axis_angle": 6, "gripper_qpos": 2, "joints": 6, "xyzrpy": 6, "agent_pos": 2}
+STATES = {"xyz_axis_angle": 6, "gripper_qpos": 2, "joints": 7, "xyzrpy": 6, "agent_pos": 2}
 
 
 class Desk(EvalEnv):
