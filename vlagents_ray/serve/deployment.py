@@ -120,11 +120,12 @@ class PolicyReplica:
         return None if self._keys is None else self._keys.check(token, self._app)
 
     async def refusal(self) -> str | None:
-        """Why the policy cannot act yet; None when it can. For whoever started the server."""
+        """Why the policy cannot act yet; None when it can. For whoever started the server, who is told all of it."""
         try:
             self._engine.require_ready()
         except VLAgentsError as error:
-            return str(error)
+            failure = self._loading.exception() if self._loading.done() else None
+            return str(failure or error)
         return None
 
     def metadata(self) -> dict[str, Any]:

@@ -81,9 +81,9 @@ class Engine:
         try:
             self.queue.start()
         except Exception as error:
-            text = f"the policy did not load: {type(error).__name__}: {error}"
-            self._unready = PolicyFailed(text)
-            raise self._unready from error
+            failed = f"the policy did not load: {type(error).__name__}"
+            self._unready = PolicyFailed(f"{failed}; the server's log says why")  # clients are told no more
+            raise PolicyFailed(f"{failed}: {error}") from error
         self._unready = None
 
     @property

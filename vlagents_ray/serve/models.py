@@ -289,8 +289,8 @@ class Models:
         try:
             model = self._loader.load(wish, settings)
         except BaseException as error:
-            failure = f"{wish} did not load: {type(error).__name__}: {error}"
-            logger.exception("%s", failure)
+            logger.exception("%s did not load", wish)
+            failure = f"{wish} did not load: {type(error).__name__}; the server's log says why"
             with self._changed:
                 told = self._failed(settings, failure)
         else:
