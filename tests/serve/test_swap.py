@@ -123,6 +123,32 @@ def test_with_room_for_one_sessions_end_so_that_the_new_one_can_load(library: Li
         engine.close()
 
 
+@pytest.mark.parametrize("op", ["act", "reset"])
+def test_what_a_swap_overtakes_is_told_that_its_session_has_ended(library: Library, op: str) -> None:
+    """Clients begin such an episode again by themselves; a closed policy must not be asked."""
+    engine = library.engine()
+    try:
+        reset(engine, "s")
+        [model] = engine.models._loaded.values()
+
+        class Overtaken:
+            """The lock, which the swap gets first."""
+
+            def __enter__(self) -> None:
+                model.busy = threading.Lock()
+                engine.sessions.close_those_of(model)
+                model.close()
+
+            def __exit__(self, *_: object) -> None: ...
+
+        model.busy = Overtaken()  # type: ignore[assignment]
+        before = len(library.batches)
+        assert isinstance(ask(engine, "s", op).get(timeout=10).error, UnknownSession)
+        assert len(library.batches) == before
+    finally:
+        engine.close()
+
+
 def test_with_room_for_one_the_old_one_is_loaded_again_if_the_new_one_cannot_be(library: Library) -> None:
     engine = library.engine(loaded=1)
     try:

@@ -21,7 +21,7 @@ from vlagents_ray.serve.batching import BatchQueue, Rank, Ticket
 from vlagents_ray.serve.checkpoints import Checkpoints, Wish
 from vlagents_ray.serve.leavers import Leavers
 from vlagents_ray.serve.model import Loader, Model
-from vlagents_ray.serve.models import Models
+from vlagents_ray.serve.models import Models, too_late
 from vlagents_ray.serve.sessions import Session, SessionTable
 from vlagents_ray.serve.stats import Stats
 from vlagents_ray.wire.messages import Reply, Request
@@ -146,8 +146,8 @@ class Engine:
             if session.agent is None:
                 raise NotReset(f"session {session_id!r}: act before a successful reset; reset first")
             session.owner, session.transport, session.connection = owner, transport, turn
-            if session.model is not None:
-                session.model.check(request)
+            if (model := session.model) is not None:  # which another thread may take away
+                model.check(request)
         elif request.op == "reset":
             ticket.wish, request.kwargs = self._source.wish(request.kwargs)
             if (model := self.models.loaded(ticket.wish)) is not None:  # else when it is
@@ -246,11 +246,18 @@ class Engine:
     def _reset(self, ticket: Ticket) -> None:
         if ticket.loaded is None:
             session = self.sessions.open(ticket.session_id, ticket.connection, ticket.transport, ticket.owner)
-            session.agent, session.steps = None, 0
-            if self.models.hold(session, ticket.wish, partial(self._go_on, ticket), partial(_given_up, ticket)) is None:
+            session.agent, session.steps, session.resetting = None, 0, ticket
+            given_up = partial(_given_up, ticket, session)
+            if self.models.hold(session, ticket.wish, partial(self._go_on, ticket), given_up) is None:
                 return  # it comes back by `_go_on`
         else:
             session = self.sessions.get(ticket.session_id)
+            if session.resetting is not ticket:
+                raise UnknownSession(f"session {ticket.session_id!r}: reset anew, or closed, while this reset waited")
+            if _given_up(ticket, session):
+                self.models.let_go(session)
+                raise too_late(ticket.wish)
+        session.resetting = None
         try:
             self._begin(ticket, session)
         except BaseException:
@@ -288,6 +295,7 @@ class Engine:
                 raise error
             self.queue.put(ticket)
         except VLAgentsError as reason:
+            ticket.request.obs, ticket.request.history = None, []  # its session may remember the ticket
             ticket.answer(Reply(ticket.request.request_id, error=reason))
 
     def _act(self, model: Model, acting: list[tuple[Ticket, Session]]) -> None:
@@ -328,9 +336,9 @@ class Engine:
             self.queue.answer_later(unsent)
 
 
-def _given_up(ticket: Ticket) -> bool:
-    """Does nobody wait for the answer any more?"""
-    return ticket.cancelled or ticket.expired(time.perf_counter())
+def _given_up(ticket: Ticket, session: Session) -> bool:
+    """Does nobody wait for that reset any more, or was the session reset again?"""
+    return ticket.cancelled or ticket.expired(time.perf_counter()) or session.resetting is not ticket
 
 
 def _synchronize() -> None:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from vlagents_ray.contract import Contract, check_observation, require_match
+from vlagents_ray.errors import UnknownSession
 from vlagents_ray.interface import Agent
 from vlagents_ray.serve.checkpoints import Checkpoints, Wish, resolved
 from vlagents_ray.serve.padding import Padding
@@ -50,6 +51,11 @@ class Model:
         for obs in (*request.history, request.obs):
             if obs is not None:
                 check_observation(obs, self.contract)
+
+    def require_open(self) -> None:
+        """`UnknownSession` if it was closed while somebody waited for `busy`: its sessions had ended by then."""
+        if self.closed:
+            raise UnknownSession(f"{self.wish} has just been unloaded for another; reset the session")
 
     def close(self) -> None:
         """Give back what it took, after the batch under way. The memory is free when nobody refers to it any more."""

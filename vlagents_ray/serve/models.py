@@ -100,7 +100,7 @@ class Models:
             waiting, self._waiting = self._waiting, []
             loaded, self._loaded = self._loaded, {}
         for waiter in waiting:
-            waiter.then(PolicyUnavailable("the replica is stopping; connect again"))
+            waiter.then(_stopping())
         for model in loaded.values():
             model.close()
 
@@ -138,6 +138,7 @@ class Models:
         or with why it will not. `gone` says whether nobody waits for that any more.
         """
         with self._changed:
+            self._require_open()
             self._let_go(session)
             model = self._loaded.get(self._key(wish))
             if model is not None and model.key != self._shut and not session.over:
@@ -152,6 +153,7 @@ class Models:
         One that is offered here is loaded, if that takes no longer than `timeout_s`.
         """
         with self._changed:
+            self._require_open()
             model = self._loaded.get(key_of(settings))
             if model is not None:
                 return self._give(session, model)
@@ -171,10 +173,11 @@ class Models:
         return session.model
 
     def pass_on(self, session: Session, to: Session) -> None:
-        """What one session holds is the other's from now on."""
+        """What one session holds is the other's from now on, unless that is over."""
         with self._changed:
             self._let_go(to)
-            to.model, session.model = session.model, None
+            if not to.over:
+                to.model, session.model = session.model, None
 
     def let_go(self, session: Session) -> None:
         """The session has no episode."""
@@ -187,6 +190,10 @@ class Models:
             session.over = True
             self._let_go(session)
 
+    def _require_open(self) -> None:
+        if self._closed:
+            raise _stopping()
+
     def _key(self, wish: Wish) -> str:
         return key_of(self._source.settings(wish, self.config))
 
@@ -197,6 +204,7 @@ class Models:
             self._changed.notify_all()
 
     def _give(self, session: Session, model: Model) -> Model:
+        self._let_go(session)
         self._loaded[model.key] = self._loaded.pop(model.key)  # the most recently used is the last
         session.model = model
         model.sessions += 1
@@ -275,7 +283,7 @@ class Models:
             if waiter.session.over:
                 error = UnknownSession(f"session {waiter.session.id!r}: closed while it waited for {waiter.wish}")
             elif waiter.gone():
-                error = DeadlineExceeded(f"{waiter.wish} was not loaded in time; ask again, or allow more time")
+                error = too_late(waiter.wish)
             elif model is None or model.key == self._shut:
                 continue
             else:
@@ -322,9 +330,20 @@ class Models:
         del model
         free_memory()
 
-    def _make_way(self, key: str) -> None:
+    def _make_way(self, model: Model) -> None:
         logger.info("there is room for one checkpoint: its sessions end, for the next")
-        self._sessions.close_those_of(self._loaded[key])
+        self._sessions.close_those_of(model)
+        with self._changed:  # one that arrives from another replica is in no table yet
+            self._changed.wait_for(lambda: self._closed or not model.sessions, _LOOK_S)
+
+
+def too_late(wish: Wish) -> DeadlineExceeded:
+    """For a reset that nobody waits for any more."""
+    return DeadlineExceeded(f"{wish} was not loaded in time; ask again, or allow more time")
+
+
+def _stopping() -> PolicyUnavailable:
+    return PolicyUnavailable("the replica is stopping; connect again")
 
 
 def _tell(told: list[tuple[Then, VLAgentsError | None]]) -> None:
