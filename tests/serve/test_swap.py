@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
 from typing import Any
 
@@ -74,6 +75,17 @@ def test_a_checkpoint_that_does_not_load_leaves_the_old_one_in_place(library: Li
         assert reset(engine, "new") == "a/1"
         swapped(engine, "b/2")
         assert reset(engine, "new") == "b/2"
+    finally:
+        engine.close()
+
+
+def test_a_swap_that_failed_is_forgotten_with_the_old_settings(library: Library) -> None:
+    engine = library.engine()
+    try:
+        swap(engine, "broken")
+        wait_for(lambda: state(engine) is not None and state(engine)["state"] == "failed")
+        engine.models.configure({"checkpoint": "a/{step}", "checkpoint_step": 1})
+        assert state(engine) is None
     finally:
         engine.close()
 

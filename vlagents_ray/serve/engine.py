@@ -239,6 +239,7 @@ class Engine:
         session, model = self._ready(ticket)
         if session.agent is not None and ticket.request.obs is not None:  # `_ready` and the decoder have seen to both
             with model.busy:
+                model.require_open()
                 session.agent.observe(ticket.request.obs)
         ticket.request.obs = None
         ticket.answer(Reply(ticket.request.request_id, info={}))
@@ -272,6 +273,7 @@ class Engine:
         model.check(request)
         begun = time.perf_counter()
         with model.busy:
+            model.require_open()
             agent = model.copies.make()
             info = agent.reset(request.obs, request.instruction, **request.kwargs)
             if not isinstance(info, dict):
@@ -309,6 +311,7 @@ class Engine:
         results: Sequence[Act | Exception]
         try:
             with model.busy:
+                model.require_open()
                 results = model.agent.act_batch(observations, agents + padding)  # type: ignore[arg-type]
                 _synchronize()
             if len(results) != rows:

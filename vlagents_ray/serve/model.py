@@ -37,6 +37,7 @@ class Model:
     version: tuple[str, str]  # equal in replicas that can take each other's sessions of it over
     since: float = field(default_factory=time.monotonic)
     sessions: int = 0  # that have an episode on it, or are about to
+    closed: bool = False
     busy: threading.Lock = field(default_factory=threading.Lock)  # held while its agent runs, or is closed
 
     @property
@@ -60,6 +61,7 @@ class Model:
     def close(self) -> None:
         """Give back what it took, after the batch under way. The memory is free when nobody refers to it any more."""
         with self.busy:
+            self.closed = True
             _give_back(self.agent)
 
 

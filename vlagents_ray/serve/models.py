@@ -74,7 +74,7 @@ class Models:
         with self._changed:
             if not self._begun:
                 self._begun, self.config, self._first = True, dict(config), self._source.make(config)
-            elif config != (self.config if self._next is None else self._next):
+            else:
                 self._next = None if config == self.config else dict(config)
                 self._failure = None
                 self._changed.notify_all()
@@ -261,7 +261,7 @@ class Models:
         if time.monotonic() - since > PATIENCE_S:
             self._shut = oldest.key
         if self._next is not None and self._source.limit == 1:
-            return partial(self._make_way, oldest.key)
+            return partial(self._make_way, oldest)
         return None
 
     def _most_wanted(self) -> tuple[Wish, dict[str, Any], float] | None:
