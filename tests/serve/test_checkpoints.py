@@ -22,7 +22,7 @@ from vlagents_ray.errors import (
     UnknownCheckpoint,
     UnknownSession,
 )
-from vlagents_ray.serve import models
+from vlagents_ray.serve import room
 from vlagents_ray.serve.batching import Ticket
 from vlagents_ray.serve.checkpoints import Checkpoints, Wish
 from vlagents_ray.serve.engine import Engine
@@ -53,7 +53,7 @@ def serving(library: Library) -> Iterator[Callable[..., Engine]]:
 
 def holders(engine: Engine) -> dict[str | None, int]:
     """How many sessions keep which checkpoint."""
-    return {model.checkpoint: model.sessions for model in engine.models._loaded.values()}
+    return {model.checkpoint: model.sessions for model in engine.models._room.loaded.values()}
 
 
 def test_sessions_act_by_the_checkpoint_that_they_chose(serving: Callable[..., Engine]) -> None:
@@ -180,7 +180,7 @@ def test_ten_checkpoints_have_their_turns_with_room_for_two(
     serving: Callable[..., Engine], library: Library, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Ten clients, each with a checkpoint of its own, that begin one episode after the other for ever."""
-    monkeypatch.setattr(models, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(room, "PATIENCE_S", 0.0)
     engine = serving(steps=True)
     replies: queue.SimpleQueue[tuple[int, Reply]] = queue.SimpleQueue()
 
@@ -223,7 +223,7 @@ def test_a_session_that_is_closed_while_it_waits_is_not_opened_again(
     gate.set()
     assert isinstance(waiting.get(timeout=10).error, UnknownSession)
     assert engine.sessions.ids() == []
-    assert not any(model.sessions for model in engine.models._loaded.values())
+    assert not any(model.sessions for model in engine.models._room.loaded.values())
 
 
 def test_a_reset_that_waits_gives_way_to_the_next_one_of_its_session(
@@ -348,7 +348,7 @@ def test_a_session_that_moves_takes_its_checkpoint_along(serving: Callable[..., 
     there.adopt("s", state, timeout_s=10)
     assert act(there, "s") == [2, 2]
     assert library.loads["b/2"] == 2
-    wait_for(lambda: not any(model.sessions for model in here.models._loaded.values()))
+    wait_for(lambda: not any(model.sessions for model in here.models._room.loaded.values()))
 
 
 def test_a_session_goes_on_by_its_checkpoint_where_its_replica_sends_it(library: Library) -> None:

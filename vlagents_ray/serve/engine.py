@@ -21,7 +21,8 @@ from vlagents_ray.serve.batching import BatchQueue, Rank, Ticket
 from vlagents_ray.serve.checkpoints import Checkpoints, Wish
 from vlagents_ray.serve.leavers import Leavers
 from vlagents_ray.serve.model import Loader, Model
-from vlagents_ray.serve.models import Models, too_late
+from vlagents_ray.serve.models import Models
+from vlagents_ray.serve.room import too_late
 from vlagents_ray.serve.sessions import Session, SessionTable
 from vlagents_ray.serve.stats import Stats
 from vlagents_ray.wire.messages import Reply, Request

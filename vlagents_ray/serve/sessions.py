@@ -170,7 +170,7 @@ class Session:
 
     id: str
     agent: Agent | None = None  # None until its first `reset` succeeded
-    model: Model | None = None  # what `agent` is a copy of; `vlagents_ray.serve.models` alone sets it
+    model: Model | None = None  # what `agent` is a copy of; `vlagents_ray.serve.models` and its room alone set it
     over: bool = False  # in no table any more
     resetting: Ticket | None = None  # its reset under way, as long as that waits for its checkpoint
     owner: str = ""  # the connection that it ends with; empty: it ends when closed, or idle for long
