@@ -122,10 +122,9 @@ class PolicyReplica:
     async def refusal(self) -> str | None:
         """Why the policy cannot act yet; None when it can. For whoever started the server, who is told all of it."""
         try:
-            self._engine.require_ready()
-        except VLAgentsError as error:
-            failure = self._loading.exception() if self._loading.done() else None
-            return str(failure or error)
+            self._engine.check_health()
+        except Exception as error:  # noqa: BLE001 - whatever a policy says is wrong with it
+            return str(error)
         return None
 
     def metadata(self) -> dict[str, Any]:

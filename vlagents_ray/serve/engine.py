@@ -63,7 +63,8 @@ class Engine:
         self.models = Models(self._source, Loader(self._source, version, batch_sizes, check), self.sessions)
         self._batch_sizes = batch_sizes
         self.stats = Stats()
-        self._unready: VLAgentsError | None = PolicyUnavailable("the policy is loading; try again")
+        self._unready: VLAgentsError | None = PolicyUnavailable("the policy is loading; try again")  # for clients
+        self._failure: PolicyFailed | None = None  # why it did not load, for the operator
         self.strays: FindsStrays | None = None  # where to look for a session that is not here
         self.draining = False  # the replica will stop, and others will go on: clients are told
         self.leavers = Leavers()  # told the same although it goes on, since others hold fewer sessions
@@ -83,8 +84,9 @@ class Engine:
             self.queue.start()
         except Exception as error:
             failed = f"the policy did not load: {type(error).__name__}"
-            self._unready = PolicyFailed(f"{failed}; the server's log says why")  # clients are told no more
-            raise PolicyFailed(f"{failed}: {error}") from error
+            self._unready = PolicyFailed(f"{failed}; the server's log says why")
+            self._failure = PolicyFailed(f"{failed}: {error}")
+            raise self._failure from error
         self._unready = None
 
     @property
@@ -104,7 +106,12 @@ class Engine:
             raise PolicyFailed("the policy's thread has ended")
 
     def check_health(self) -> None:
-        """As `require_ready`, and what the agents say of themselves; for a replica that may have to be replaced."""
+        """As `require_ready`, with the whole reason, and what the agents say of themselves.
+
+        For the operator, and whoever may have to replace the replica.
+        """
+        if self._failure is not None:
+            raise self._failure
         self.require_ready()
         self.models.check_health()
 

@@ -216,6 +216,9 @@ def test_why_a_policy_does_not_load_is_said(policy: str, config: dict[str, Any],
     with pytest.raises(VLAgentsError) as error:
         one.start()
     assert said in str(error.value)
+    with pytest.raises(PolicyFailed) as seen:  # by the operator
+        one.check_health()
+    assert said in str(seen.value)
     with pytest.raises(PolicyFailed) as told:  # what its clients are told
         one.require_ready()
     assert said not in str(told.value)
