@@ -22,10 +22,12 @@ from vlagents_ray.errors import (
     UnknownCheckpoint,
     UnknownSession,
 )
-from vlagents_ray.serve import models
+from vlagents_ray.serve import room
+from vlagents_ray.serve.batching import Ticket
 from vlagents_ray.serve.checkpoints import Checkpoints, Wish
 from vlagents_ray.serve.engine import Engine
 from vlagents_ray.serve.moving import export
+from vlagents_ray.serve.sessions import Session
 from vlagents_ray.wire.messages import Reply, Request
 
 
@@ -47,6 +49,11 @@ def serving(library: Library) -> Iterator[Callable[..., Engine]]:
         gate.set()
     for engine in engines:
         engine.close()
+
+
+def holders(engine: Engine) -> dict[str | None, int]:
+    """How many sessions keep which checkpoint."""
+    return {model.checkpoint: model.sessions for model in engine.models._room.loaded.values()}
 
 
 def test_sessions_act_by_the_checkpoint_that_they_chose(serving: Callable[..., Engine]) -> None:
@@ -130,7 +137,7 @@ def test_what_does_not_load_says_why_and_is_tried_again(serving: Callable[..., E
     engine = serving(choices=["broken"])
     reset(engine, "own")
     for tried in (1, 2):
-        with pytest.raises(CheckpointFailed, match="checkpoint 'b' did not load: FileNotFoundError: no such"):
+        with pytest.raises(CheckpointFailed, match="checkpoint 'b' did not load: FileNotFoundError; the server"):
             reset(engine, "chosen", checkpoint="b")
         assert library.loads["broken"] == tried
     assert act(engine, "own") == [1, 1]
@@ -173,7 +180,7 @@ def test_ten_checkpoints_have_their_turns_with_room_for_two(
     serving: Callable[..., Engine], library: Library, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Ten clients, each with a checkpoint of its own, that begin one episode after the other for ever."""
-    monkeypatch.setattr(models, "PATIENCE_S", 0.0)
+    monkeypatch.setattr(room, "PATIENCE_S", 0.0)
     engine = serving(steps=True)
     replies: queue.SimpleQueue[tuple[int, Reply]] = queue.SimpleQueue()
 
@@ -216,7 +223,85 @@ def test_a_session_that_is_closed_while_it_waits_is_not_opened_again(
     gate.set()
     assert isinstance(waiting.get(timeout=10).error, UnknownSession)
     assert engine.sessions.ids() == []
-    assert not any(model.sessions for model in engine.models._loaded.values())
+    assert not any(model.sessions for model in engine.models._room.loaded.values())
+
+
+def test_a_reset_that_waits_gives_way_to_the_next_one_of_its_session(
+    serving: Callable[..., Engine], library: Library
+) -> None:
+    engine = serving(choices=["b/2"])
+    gate = library.hold("b/2")
+    waiting = begin(engine, "s", checkpoint="b")
+    library.wait_for("b/2")
+    assert reset(engine, "s") == "a/1"
+    assert act(engine, "s") == [1, 1]
+    gate.set()
+    assert waiting.get(timeout=10).error is not None
+    assert reset(engine, "other", checkpoint="b") == "b/2"
+    assert act(engine, "s") == [1, 2]
+    assert holders(engine) == {"a/1": 1, "b/2": 1}
+
+
+def test_a_reset_of_a_session_that_is_closed_and_begun_anew_does_not_touch_it(
+    serving: Callable[..., Engine], library: Library, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    engine = serving(choices=["b/2"])
+    put = engine.queue.put
+
+    def late(*tickets: Ticket) -> None:
+        """What is asked of the session comes just before its reset that waited."""
+        monkeypatch.undo()
+        others.extend(ask(engine, "s", op) for op in ("close", "reset"))
+        put(*tickets)
+
+    others: list[queue.SimpleQueue[Reply]] = []
+    gate = library.hold("b/2")
+    waiting = begin(engine, "s", checkpoint="b")
+    library.wait_for("b/2")
+    monkeypatch.setattr(engine.queue, "put", late)
+    gate.set()
+    assert isinstance(waiting.get(timeout=10).error, UnknownSession)
+    assert [replies.get(timeout=10).error for replies in others] == [None] * 2
+    assert act(engine, "s") == [1, 1]
+    assert holders(engine) == {"a/1": 1, "b/2": 0}
+
+
+def test_a_reset_that_is_given_up_once_its_checkpoint_is_there_keeps_none(
+    serving: Callable[..., Engine], library: Library, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    engine = serving(choices=["b/2"])
+    put = engine.queue.put
+
+    def given_up(*tickets: Ticket) -> None:
+        for ticket in tickets:
+            ticket.cancelled = True
+        put(*tickets)
+
+    gate = library.hold("b/2")
+    begin(engine, "s", checkpoint="b")
+    library.wait_for("b/2")
+    monkeypatch.setattr(engine.queue, "put", given_up)
+    gate.set()
+    wait_for(lambda: holders(engine) == {"a/1": 0, "b/2": 0})
+
+
+def test_a_session_that_closes_while_it_arrives_keeps_no_checkpoint(
+    serving: Callable[..., Engine], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here, there = serving(), serving()
+    reset(here, "s")
+    state = export(here, "s")
+    assert state is not None
+    opened = there.sessions.open
+
+    def closed_at_once(session_id: str) -> Session:
+        session = opened(session_id)
+        there.sessions.close(session_id)
+        return session
+
+    monkeypatch.setattr(there.sessions, "open", closed_at_once)
+    there.adopt("s", state)
+    assert holders(there) == {"a/1": 0}
 
 
 def test_an_episode_that_could_not_begin_keeps_no_checkpoint(serving: Callable[..., Engine]) -> None:
@@ -263,7 +348,7 @@ def test_a_session_that_moves_takes_its_checkpoint_along(serving: Callable[..., 
     there.adopt("s", state, timeout_s=10)
     assert act(there, "s") == [2, 2]
     assert library.loads["b/2"] == 2
-    wait_for(lambda: not any(model.sessions for model in here.models._loaded.values()))
+    wait_for(lambda: not any(model.sessions for model in here.models._room.loaded.values()))
 
 
 def test_a_session_goes_on_by_its_checkpoint_where_its_replica_sends_it(library: Library) -> None:

@@ -120,10 +120,10 @@ class PolicyReplica:
         return None if self._keys is None else self._keys.check(token, self._app)
 
     async def refusal(self) -> str | None:
-        """Why the policy cannot act yet; None when it can. For whoever started the server."""
+        """Why the policy cannot act yet; None when it can. For whoever started the server, who is told all of it."""
         try:
-            self._engine.require_ready()
-        except VLAgentsError as error:
+            self._engine.check_health()
+        except Exception as error:  # noqa: BLE001 - whatever a policy says is wrong with it
             return str(error)
         return None
 

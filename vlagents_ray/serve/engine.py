@@ -22,6 +22,7 @@ from vlagents_ray.serve.checkpoints import Checkpoints, Wish
 from vlagents_ray.serve.leavers import Leavers
 from vlagents_ray.serve.model import Loader, Model
 from vlagents_ray.serve.models import Models
+from vlagents_ray.serve.room import too_late
 from vlagents_ray.serve.sessions import Session, SessionTable
 from vlagents_ray.serve.stats import Stats
 from vlagents_ray.wire.messages import Reply, Request
@@ -62,7 +63,8 @@ class Engine:
         self.models = Models(self._source, Loader(self._source, version, batch_sizes, check), self.sessions)
         self._batch_sizes = batch_sizes
         self.stats = Stats()
-        self._unready: VLAgentsError | None = PolicyUnavailable("the policy is loading; try again")
+        self._unready: VLAgentsError | None = PolicyUnavailable("the policy is loading; try again")  # for clients
+        self._failure: PolicyFailed | None = None  # why it did not load, for the operator
         self.strays: FindsStrays | None = None  # where to look for a session that is not here
         self.draining = False  # the replica will stop, and others will go on: clients are told
         self.leavers = Leavers()  # told the same although it goes on, since others hold fewer sessions
@@ -81,9 +83,10 @@ class Engine:
         try:
             self.queue.start()
         except Exception as error:
-            text = f"the policy did not load: {type(error).__name__}: {error}"
-            self._unready = PolicyFailed(text)
-            raise self._unready from error
+            failed = f"the policy did not load: {type(error).__name__}"
+            self._unready = PolicyFailed(f"{failed}; the server's log says why")
+            self._failure = PolicyFailed(f"{failed}: {error}")
+            raise self._failure from error
         self._unready = None
 
     @property
@@ -103,7 +106,12 @@ class Engine:
             raise PolicyFailed("the policy's thread has ended")
 
     def check_health(self) -> None:
-        """As `require_ready`, and what the agents say of themselves; for a replica that may have to be replaced."""
+        """As `require_ready`, with the whole reason, and what the agents say of themselves.
+
+        For the operator, and whoever may have to replace the replica.
+        """
+        if self._failure is not None:
+            raise self._failure
         self.require_ready()
         self.models.check_health()
 
@@ -146,8 +154,8 @@ class Engine:
             if session.agent is None:
                 raise NotReset(f"session {session_id!r}: act before a successful reset; reset first")
             session.owner, session.transport, session.connection = owner, transport, turn
-            if session.model is not None:
-                session.model.check(request)
+            if (model := session.model) is not None:  # which another thread may take away
+                model.check(request)
         elif request.op == "reset":
             ticket.wish, request.kwargs = self._source.wish(request.kwargs)
             if (model := self.models.loaded(ticket.wish)) is not None:  # else when it is
@@ -239,6 +247,7 @@ class Engine:
         session, model = self._ready(ticket)
         if session.agent is not None and ticket.request.obs is not None:  # `_ready` and the decoder have seen to both
             with model.busy:
+                model.require_open()
                 session.agent.observe(ticket.request.obs)
         ticket.request.obs = None
         ticket.answer(Reply(ticket.request.request_id, info={}))
@@ -246,11 +255,18 @@ class Engine:
     def _reset(self, ticket: Ticket) -> None:
         if ticket.loaded is None:
             session = self.sessions.open(ticket.session_id, ticket.connection, ticket.transport, ticket.owner)
-            session.agent, session.steps = None, 0
-            if self.models.hold(session, ticket.wish, partial(self._go_on, ticket), partial(_given_up, ticket)) is None:
+            session.agent, session.steps, session.resetting = None, 0, ticket
+            given_up = partial(_given_up, ticket, session)
+            if self.models.hold(session, ticket.wish, partial(self._go_on, ticket), given_up) is None:
                 return  # it comes back by `_go_on`
         else:
             session = self.sessions.get(ticket.session_id)
+            if session.resetting is not ticket:
+                raise UnknownSession(f"session {ticket.session_id!r}: reset anew, or closed, while this reset waited")
+            if _given_up(ticket, session):
+                self.models.let_go(session)
+                raise too_late(ticket.wish)
+        session.resetting = None
         try:
             self._begin(ticket, session)
         except BaseException:
@@ -265,6 +281,7 @@ class Engine:
         model.check(request)
         begun = time.perf_counter()
         with model.busy:
+            model.require_open()
             agent = model.copies.make()
             info = agent.reset(request.obs, request.instruction, **request.kwargs)
             if not isinstance(info, dict):
@@ -288,6 +305,7 @@ class Engine:
                 raise error
             self.queue.put(ticket)
         except VLAgentsError as reason:
+            ticket.request.obs, ticket.request.history = None, []  # its session may remember the ticket
             ticket.answer(Reply(ticket.request.request_id, error=reason))
 
     def _act(self, model: Model, acting: list[tuple[Ticket, Session]]) -> None:
@@ -301,6 +319,7 @@ class Engine:
         results: Sequence[Act | Exception]
         try:
             with model.busy:
+                model.require_open()
                 results = model.agent.act_batch(observations, agents + padding)  # type: ignore[arg-type]
                 _synchronize()
             if len(results) != rows:
@@ -328,9 +347,9 @@ class Engine:
             self.queue.answer_later(unsent)
 
 
-def _given_up(ticket: Ticket) -> bool:
-    """Does nobody wait for the answer any more?"""
-    return ticket.cancelled or ticket.expired(time.perf_counter())
+def _given_up(ticket: Ticket, session: Session) -> bool:
+    """Does nobody wait for that reset any more, or was the session reset again?"""
+    return ticket.cancelled or ticket.expired(time.perf_counter()) or session.resetting is not ticket
 
 
 def _synchronize() -> None:

@@ -91,7 +91,7 @@ class _Door:
         """Asks for no key, so it tells nothing else."""
         if self._engine.ready:
             return PlainTextResponse("OK\n")
-        unready = PolicyUnavailable("the policy is loading, or did not load; GET /v1/metadata says why")
+        unready = PolicyUnavailable("the policy is loading, or did not load; GET /v1/metadata says which")
         return problem_response(unready, request_id(http))
 
     async def show_metadata(self, http: HttpRequest) -> Response:

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from vlagents_ray.contract import Contract, check_observation, require_match
+from vlagents_ray.errors import UnknownSession
 from vlagents_ray.interface import Agent
 from vlagents_ray.serve.checkpoints import Checkpoints, Wish, resolved
 from vlagents_ray.serve.padding import Padding
@@ -36,6 +37,7 @@ class Model:
     version: tuple[str, str]  # equal in replicas that can take each other's sessions of it over
     since: float = field(default_factory=time.monotonic)
     sessions: int = 0  # that have an episode on it, or are about to
+    closed: bool = False
     busy: threading.Lock = field(default_factory=threading.Lock)  # held while its agent runs, or is closed
 
     @property
@@ -51,9 +53,15 @@ class Model:
             if obs is not None:
                 check_observation(obs, self.contract)
 
+    def require_open(self) -> None:
+        """`UnknownSession` if it was closed while somebody waited for `busy`: its sessions had ended by then."""
+        if self.closed:
+            raise UnknownSession(f"{self.wish} has just been unloaded for another; reset the session")
+
     def close(self) -> None:
         """Give back what it took, after the batch under way. The memory is free when nobody refers to it any more."""
         with self.busy:
+            self.closed = True
             _give_back(self.agent)
 
 

@@ -36,6 +36,7 @@ from vlagents_ray.interface import Agent
 
 if TYPE_CHECKING:
     from vlagents_ray.serve.model import Model
+    from vlagents_ray.serve.waiting import Ticket
 
 logger = logging.getLogger(__name__)
 
@@ -169,8 +170,9 @@ class Session:
 
     id: str
     agent: Agent | None = None  # None until its first `reset` succeeded
-    model: Model | None = None  # what `agent` is a copy of; `vlagents_ray.serve.models` alone sets it
+    model: Model | None = None  # what `agent` is a copy of; `vlagents_ray.serve.models` and its room alone set it
     over: bool = False  # in no table any more
+    resetting: Ticket | None = None  # its reset under way, as long as that waits for its checkpoint
     owner: str = ""  # the connection that it ends with; empty: it ends when closed, or idle for long
     steps: int = 0  # acts since its last reset
     transport: str = ""  # the door that it came through

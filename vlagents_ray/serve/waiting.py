@@ -172,11 +172,12 @@ class Waiting:
         while lane:
             ticket = lane.popleft()
             self.depth[ticket.rank] -= 1
-            if ticket.cancelled:
-                continue
-            if ticket.expired(now):
-                expired.append(ticket)
-                continue
+            if ticket.loaded is None:  # else its session holds a checkpoint, which is let go of when it runs
+                if ticket.cancelled:
+                    continue
+                if ticket.expired(now):
+                    expired.append(ticket)
+                    continue
             batch.append(ticket)
             break
         if lane:

@@ -184,7 +184,7 @@ def test_a_child_that_dies_loses_the_connection_and_makes_the_replica_unhealthy(
     os.kill(told["pid"], signal.SIGKILL)
     error = ask(one, "a", "act").error
     assert isinstance(error, ConnectionLost)
-    assert "exit status -9" in str(error)
+    assert str(error) == "the policy's process ended with exit status -9; the replica is being replaced"
     with pytest.raises(PolicyUnavailable, match="exit status -9"):
         one.check_health()
     assert not one.ready
@@ -216,6 +216,13 @@ def test_why_a_policy_does_not_load_is_said(policy: str, config: dict[str, Any],
     with pytest.raises(VLAgentsError) as error:
         one.start()
     assert said in str(error.value)
+    with pytest.raises(PolicyFailed) as seen:  # by the operator
+        one.check_health()
+    assert said in str(seen.value)
+    with pytest.raises(PolicyFailed) as told:  # what its clients are told
+        one.require_ready()
+    assert said not in str(told.value)
+    assert sys.executable not in str(told.value)
     one.close()
 
 

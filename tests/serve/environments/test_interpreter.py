@@ -135,6 +135,13 @@ def test_not_an_interpreter(tmp_path: Path, text: str, mode: int, said: str) -> 
         probe(script(tmp_path / "python", text, mode))
 
 
+def test_settings_stand_on_no_command_line_where_every_user_could_read_them(tmp_path: Path) -> None:
+    echoing = script(tmp_path / "python", '#!/bin/sh\nshift 2\necho "arguments: $@"\n')
+    with pytest.raises(ConfigError, match="arguments: ray") as error:
+        check_policy(args(python=echoing), "noop", {"token": "a secret"})
+    assert "a secret" not in str(error.value)
+
+
 def test_an_old_python(tmp_path: Path) -> None:
     old = script(tmp_path / "python", '#!/bin/sh\necho \'VLA{"python": "3.8.10"}\'\n')
     with pytest.raises(ConfigError, match=r"is Python 3.8.10, want 3.10 or newer"):
@@ -173,6 +180,8 @@ def test_the_policy_is_built_where_it_will_run(tmp_path: Path, monkeypatch: pyte
     assert contract.action.dim == 15
     with pytest.raises(ConfigError, match=rf"in {python}: policy Policy: .*'gane'"):
         check_policy(environment, "only_there:Policy", {"gane": 2.0})
+    with pytest.raises(ConfigError, match=rf"in {python}: policy only_there:Policy: KeyError: 'SOURCE'"):
+        check_policy(args(python=str(python)), "only_there:Policy", {})
     with pytest.raises(ConfigError, match=rf"in {python}: .*no class 'Police'"):
         check_policy(environment, "only_there:Police", {})
     monkeypatch.chdir(tmp_path)

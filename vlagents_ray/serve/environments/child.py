@@ -170,13 +170,13 @@ class Child:
             self._free.append(name)
 
     def _ended(self) -> str:
-        """What became of it; its pipes and sockets close a moment before its exit status is known."""
+        """What became of it, for clients too; its pipes and sockets close a moment before its exit status is known."""
         if self._process is None:
             return "the policy's process has not started"
         try:
-            return f"the policy's process ({self._python}) ended with exit status {self._process.wait(_EXIT_S)}"
+            return f"the policy's process ended with exit status {self._process.wait(_EXIT_S)}"
         except subprocess.TimeoutExpired:
-            return f"the policy's process ({self._python}) hung up"
+            return "the policy's process hung up"
 
 
 def _write(process: subprocess.Popen[bytes], data: bytes) -> None:

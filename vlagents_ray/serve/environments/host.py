@@ -22,7 +22,7 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import PolicyFailed, VLAgentsError
+from vlagents_ray.errors import ConfigError, PolicyFailed, VLAgentsError
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.serve.engine import Engine
@@ -52,6 +52,8 @@ def examine(policy: str, config: dict[str, Any], wrappers: Sequence[Any] = ()) -
         agent = build_agent(policy, config, wrappers)
     except VLAgentsError as error:
         return {"code": error.code, "error": str(error)}
+    except Exception as error:  # noqa: BLE001 - whatever a policy raises when it is built
+        return {"code": ConfigError.code, "error": f"policy {policy}: {type(error).__name__}: {error}"}
     contract = unloaded_contract(agent)
     return {"contract": None if contract is None else contract.to_json()}
 

@@ -27,12 +27,12 @@ import json, sys
 found = {"python": "%d.%d.%d" % sys.version_info[:3]}
 if sys.version_info >= (3, 10):
     from importlib.metadata import PackageNotFoundError, version
-    for name in sys.argv[2:]:
+    for name in sys.argv[1:]:
         try:
             found[name] = version(name)
         except PackageNotFoundError:
             pass
-    settings = json.loads(sys.argv[1])
+    settings = json.load(sys.stdin)
     if settings["policy"] is not None and found.get("vlagents-ray") == settings["version"]:
         from vlagents_ray.serve.environments.host import examine
         found["policy"] = examine(**settings["policy"])
@@ -129,10 +129,15 @@ def _minor(version: str) -> tuple[int, ...]:
 
 
 def _asked(python: str, settings: str, env_vars: Mapping[str, str]) -> dict[str, Any]:
-    command = [python, "-c", _PROBE, settings, *_PACKAGES]
     try:
         done = subprocess.run(  # noqa: S603 - the deployment's own interpreter
-            command, capture_output=True, text=True, timeout=_TIMEOUT_S, check=False, env={**os.environ, **env_vars}
+            [python, "-c", _PROBE, *_PACKAGES],
+            input=settings,  # not an argument, which every user of the machine could read
+            capture_output=True,
+            text=True,
+            timeout=_TIMEOUT_S,
+            check=False,
+            env={**os.environ, **env_vars},
         )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise ConfigError(
