@@ -93,16 +93,19 @@ class Pi0(ModelPolicy):
     def contract(self) -> Contract:
         """Dimensions and the chunk's length are known once the checkpoint is loaded."""
         loaded = self.model
-        state_dim = None if loaded is None else len(loaded.processor.state_mean)
         return Contract(
             cameras=camera_specs(self.cameras),
-            state=state_specs(self.state, state_dim),
+            state=state_specs(self.state, self.state_dim),
             gripper=needs_gripper(self.state),
             instruction=True,
             action=ActionSpec(dim=None if loaded is None else len(loaded.processor.actions_mean)),
             chunk=None if loaded is None else self.chunk(loaded.network.config.chunk_size),
             history=1,
         )
+
+    @property
+    def state_dim(self) -> int | None:
+        return None if self.model is None else len(self.model.processor.state_mean)
 
     def load(self) -> Loaded:
         """The model with every parameter of the checkpoint, and its processor with all statistics."""
@@ -136,7 +139,7 @@ class Pi0(ModelPolicy):
         side = model.processor.image_processor.pad_size
         found = camera_images(obs, self.cameras)
         images = [resize_with_pad(found[name], side["height"], side["width"]) for name in self.cameras]
-        return images, state_vector(obs, self.state, len(model.processor.state_mean))
+        return images, state_vector(obs, self.state, self.state_dim)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
         """One flow for all rows."""

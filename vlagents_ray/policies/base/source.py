@@ -14,9 +14,9 @@ from vlagents_ray.errors import ConfigError
 def use_source(package: str, variable: str, source_dir: str | None = None, within: Sequence[str] = (".",)) -> None:
     """Make `package` importable: from `source_dir`, from the checkout that `variable` names, or as it is installed.
 
-    What is named comes first, as Python takes any folder of that name for the package, such as a checkout in the working
-    directory. `within` are the checkout's folders to import from; the first one holds `package`. Raises `ConfigError`
-    where it is in none of them.
+    What is named comes first, as Python takes any folder of the package's name for it, such as a checkout in the
+    working directory. `within` are the checkout's folders to import from; the first one holds `package`. Raises
+    `ConfigError` where it is in none of them.
     """
     checkout = source_dir or os.environ.get(variable)
     if not checkout and importlib.util.find_spec(package) is not None:

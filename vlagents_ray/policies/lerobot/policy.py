@@ -14,9 +14,9 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import torch_device
 from vlagents_ray.policies.base.observing import (
-    GRIPPER,
     camera_images,
     choose_cameras,
+    needs_gripper,
     state_specs,
     state_vector,
 )
@@ -58,6 +58,11 @@ class LeRobot(ModelPolicy):
     def history(self) -> int:
         return 1 if self.model is None else self.model.kind.steps
 
+    @property
+    def state_dim(self) -> int | None:
+        feature = None if self.model is None else self.model.kind.config.robot_state_feature
+        return None if feature is None else int(feature.shape[0])
+
     def load(self) -> Loaded:
         """Read the checkpoint. Raises `ConfigError` where anything of it is missing, unknown or random."""
         folder = checkpoint.find(self.config)
@@ -74,7 +79,7 @@ class LeRobot(ModelPolicy):
         contract = Contract(
             cameras={ours: _camera(settings, key) for key, ours in cameras.items()},
             state=_states(parts, settings.robot_state_feature, environment),
-            gripper=GRIPPER in parts or None,
+            gripper=needs_gripper(parts),
             instruction=processors.instructed or None,
             action=ActionSpec(dim=processors.width(settings.action_feature.shape[0])),
             chunk=self.chunk(kind.horizon),
@@ -87,7 +92,7 @@ class LeRobot(ModelPolicy):
         model: Loaded = self.model
         frame = {key: image.copy() for key, image in camera_images(obs, model.cameras).items()}
         if model.state:
-            frame[STATE] = state_vector(obs, model.state, model.kind.config.robot_state_feature.shape[0])
+            frame[STATE] = state_vector(obs, model.state, self.state_dim)
         if model.environment:
             frame[ENVIRONMENT] = state_vector(obs, [ENVIRONMENT_STATE], model.environment)
         return frame
