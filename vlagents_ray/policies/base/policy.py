@@ -99,10 +99,15 @@ class ModelPolicy(Agent, abc.ABC):
             np.random.default_rng([*seed, 1]),
             Plan(ENSEMBLE, self.config.ensemble_m),
         )
+        self.notice(obs)
         return {}
+
+    def notice(self, obs: Obs) -> None:
+        """Take into the session's memory what has to be known of every observation, also where no chunk is wanted."""
 
     def observe(self, obs: Obs) -> None:
         """Add an observation to the history."""
+        self.notice(obs)
         self._begun().frames.append(self.perceive(obs))
 
     def act(self, obs: Obs) -> Act:
@@ -146,6 +151,7 @@ class ModelPolicy(Agent, abc.ABC):
         """What the model is asked for this session: nothing while rows are left, else its chunk, then its samples."""
         episode = session._begun()
         samples = wanted_samples(obs, self.config)
+        session.notice(obs)
         if episode.rows and self.history == 1:
             return []
         episode.frames.append(self.perceive(obs))
