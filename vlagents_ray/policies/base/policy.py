@@ -179,8 +179,8 @@ class ModelPolicy(Agent, abc.ABC):
         own, *samples = found
         try:  # before it is kept for later ticks
             chunk = check_action(self._used(own.actions), self.contract)  # type: ignore[union-attr]
-        except InvalidAction as error:
-            return error
+        except InvalidAction as broken:
+            return broken
         info: dict[str, Any] = dict(own.info)  # type: ignore[union-attr]
         if samples:
             info[DISTRIBUTION] = self._distribution(own, samples)  # type: ignore[arg-type]

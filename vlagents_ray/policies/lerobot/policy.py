@@ -127,6 +127,8 @@ def _with_defaults(config: LeRobotConfig, kind: Kind) -> LeRobotConfig:
     """The settings, where they are silent as the checkpoint was made to be run."""
     coefficient = getattr(kind.config, "temporal_ensemble_coeff", None)
     defaults: dict[str, Any] = {} if config.actions == "ensemble" else {"execute": kind.usual}
+    if kind.steps > 1:  # trained on consecutive frames, so that it has to see those within a chunk, too
+        defaults["actions"] = "queue"
     if coefficient is not None:  # its n_action_steps is 1, since LeRobot then asks at every tick
         defaults = {"actions": "ensemble", "ensemble_m": coefficient, "execute": None}
     if (config.execute or 0) > kind.horizon:
