@@ -11,7 +11,7 @@ from pydantic import BaseModel
 
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.contract import ActionSpec, Contract
-from vlagents_ray.errors import ConfigError, InvalidObservation
+from vlagents_ray.errors import ConfigError, InvalidObservation, PolicyFailed
 from vlagents_ray.policies.wrapper import Wrapper, build_agent
 from vlagents_ray.serve.sessions import AgentCopies
 from vlagents_ray.testing import check_agent
@@ -126,3 +126,12 @@ def test_the_first_wrapper_is_the_nearest_to_the_robot() -> None:
 def test_wrong_entries_are_refused(wrappers: list[Any], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         build_agent(BRIGHT, {}, wrappers)
+
+
+def test_what_keeps_the_inner_agent_from_acting_is_said_by_the_wrapper_too() -> None:
+    class Lost(Bright):
+        def check_health(self) -> None:
+            raise PolicyFailed("the device is lost")
+
+    with pytest.raises(PolicyFailed, match="the device is lost"):
+        Dim(Lost(), DimConfig()).check_health()

@@ -19,7 +19,7 @@ from vlagents_ray.errors import ConfigError, InvalidObservation, PolicyFailed
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
-from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
+from vlagents_ray.policies.base.checkpoint import find_checkpoint
 from vlagents_ray.policies.base.observing import (
     camera_images,
     camera_specs,
@@ -28,6 +28,7 @@ from vlagents_ray.policies.base.observing import (
     state_specs,
     state_vector,
 )
+from vlagents_ray.policies.base.pretrained import from_pretrained
 from vlagents_ray.policies.base.realtime import Guide
 from vlagents_ray.policies.base.resizing import resize_with_pad
 from vlagents_ray.registry import require
@@ -93,16 +94,19 @@ class Pi0(ModelPolicy):
     def contract(self) -> Contract:
         """Dimensions and the chunk's length are known once the checkpoint is loaded."""
         loaded = self.model
-        state_dim = None if loaded is None else len(loaded.processor.state_mean)
         return Contract(
             cameras=camera_specs(self.cameras),
-            state=state_specs(self.state, state_dim),
+            state=state_specs(self.state, self.state_dim),
             gripper=needs_gripper(self.state),
             instruction=True,
             action=ActionSpec(dim=None if loaded is None else len(loaded.processor.actions_mean)),
             chunk=None if loaded is None else self.chunk(loaded.network.config.chunk_size),
             history=1,
         )
+
+    @property
+    def state_dim(self) -> int | None:
+        return None if self.model is None else len(self.model.processor.state_mean)
 
     def load(self) -> Loaded:
         """The model with every parameter of the checkpoint, and its processor with all statistics."""
@@ -136,7 +140,7 @@ class Pi0(ModelPolicy):
         side = model.processor.image_processor.pad_size
         found = camera_images(obs, self.cameras)
         images = [resize_with_pad(found[name], side["height"], side["width"]) for name in self.cameras]
-        return images, state_vector(obs, self.state, len(model.processor.state_mean))
+        return images, state_vector(obs, self.state, self.state_dim)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
         """One flow for all rows."""
@@ -231,22 +235,8 @@ def _velocity(network: Any, inputs: Mapping[str, Any], dtype: Any) -> Callable[[
 
 
 def _network(path: Path, device: Any, dtype: Any) -> Any:
-    transformers = require("transformers")
-    network = transformers.PI0ForConditionalGeneration.from_pretrained(path, dtype=dtype, local_files_only=True)
-    require_loaded(network, SavedTensors.of(path).renamed(_names(network)))
+    network = from_pretrained(require("transformers").PI0ForConditionalGeneration, path, dtype=dtype)
     return network.eval().requires_grad_(False).to(device)
-
-
-def _names(network: Any) -> Callable[[str], str]:
-    """A tensor's name in the file -> in the model: transformers saves π0 under the names of LeRobot's checkpoints."""
-    renamings = require("transformers.conversion_mapping").get_model_conversion_mapping(network)
-    rename = require("transformers.core_model_loading").rename_source_key
-    known = network.state_dict()
-
-    def name(key: str) -> str:
-        return str(rename(key, renamings, [], network.base_model_prefix, known)[0])
-
-    return name
 
 
 def _processor(path: Path) -> Any:

@@ -74,6 +74,10 @@ class Wrapper(Agent, abc.ABC):
             results[i] = act
         return results
 
+    def check_health(self) -> None:
+        """Ask the inner agent."""
+        self.agent.check_health()
+
     def close(self) -> None:
         """Close the inner agent."""
         self.agent.close()

@@ -73,7 +73,8 @@ def test_the_contract_is_what_the_checkpoint_was_trained_with(loaded: Load) -> N
     contract = loaded("diffusion").contract
     assert contract.cameras == {tiny.CAMERA: CameraSpec(tiny.SIDE, tiny.SIDE)}
     assert contract.state == {"joints": StateSpec(tiny.STATE)}
-    assert (contract.action.dim, contract.chunk, contract.history) == (tiny.ACTION, tiny.EXECUTED, 2)
+    assert (contract.action.dim, contract.chunk, contract.history) == (tiny.ACTION, 1, 2)  # a queue, for its history
+    assert loaded("diffusion", actions="chunk").contract.chunk == tiny.EXECUTED
     assert loaded("smolvla").contract.cameras == {tiny.CAMERA: CameraSpec()}  # it resizes any image itself
 
 
@@ -104,14 +105,15 @@ def test_an_ensemble_and_its_coefficient_are_the_checkpoints_defaults(loaded: Lo
 
 
 def test_more_rows_than_usual_can_be_executed_and_are_the_same_at_first(loaded: Load) -> None:
-    longer = begun(loaded("diffusion", execute=7)).act(view()).action
+    longer = begun(loaded("diffusion", actions="chunk", execute=7)).act(view()).action
+    usual = begun(loaded("diffusion", actions="chunk")).act(view()).action
     assert longer.shape == (7, tiny.ACTION)
-    np.testing.assert_allclose(longer[: tiny.EXECUTED], begun(loaded("diffusion")).act(view()).action, atol=ATOL)
+    np.testing.assert_allclose(longer[: tiny.EXECUTED], usual, atol=ATOL)
 
 
 @pytest.mark.parametrize("kind", ["diffusion", "tdmpc", "smolvla"])
 def test_samples_change_no_action_of_the_session(kind: str, loaded: Load) -> None:
-    plain, asked = begun(loaded(kind)), begun(loaded(kind))
+    plain, asked = begun(loaded(kind, actions="chunk")), begun(loaded(kind, actions="chunk"))
     for tick in range(2):
         act = asked.act(view(tick, **{SAMPLES: 3}))
         assert act.info[DISTRIBUTION]["samples"].shape == (3, *act.action.shape)

@@ -28,7 +28,7 @@ def test_leftovers_and_delays_of_neighbours_do_not_matter(loaded: Load) -> None:
         view(1),
         view(2, **{LEFTOVER: plan[:3], DELAY: 1}),
         view(3, **{LEFTOVER: plan[:0], DELAY: 3}),
-        view(4, **{LEFTOVER: np.tile(plan, (4, 1)), DELAY: -1}),
+        view(4, **{LEFTOVER: np.tile(plan, (4, 1)), DELAY: 0}),
     ]
     alone = [begun(policy, i).act(one).action for i, one in enumerate(views)]
     acts = policy.act_batch(views, [begun(policy, i) for i in range(len(views))])

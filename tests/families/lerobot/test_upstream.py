@@ -89,7 +89,7 @@ def test_flow_matching_is_theirs_with_the_same_noise(
 def test_what_draws_by_itself_is_theirs_from_the_same_seed(
     kind: str, loaded: Load, upstream: Callable[[str], Theirs]
 ) -> None:
-    theirs, policy = upstream(kind), loaded(kind)
+    theirs, policy = upstream(kind), loaded(kind, actions="chunk")
     rows = begun(policy).act(view()).action
     torch.manual_seed(int(draws_of(policy).integers(2**63)))
     for row in rows:
@@ -100,7 +100,7 @@ def test_diffusion_is_theirs_over_several_chunks(
     loaded: Load, upstream: Callable[[str], Theirs], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The scheduler adds noise at each step: it gets ours."""
-    theirs, policy = upstream("diffusion"), loaded("diffusion", actions="queue")
+    theirs, policy = upstream("diffusion"), loaded("diffusion")
     draws, config = draws_of(policy), theirs.policy.config
     step = theirs.policy.diffusion.noise_scheduler.step
 

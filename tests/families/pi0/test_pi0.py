@@ -195,6 +195,20 @@ def test_a_lost_tensor_is_an_error_and_not_random(whole: Path) -> None:
         Pi0.from_config({"checkpoint": str(whole)}).initialize()
 
 
+def test_a_tensor_of_another_shape_is_an_error(whole: Path) -> None:
+    tensors = load_file(whole / "model.safetensors")
+    tensors["action_out_proj.bias"] = tensors["action_out_proj.bias"][:-1].clone()
+    save_file(tensors, whole / "model.safetensors", metadata={"format": "pt"})
+    with pytest.raises(ConfigError, match=r"action_out_proj\.bias|does not load"):
+        Pi0.from_config({"checkpoint": str(whole)}).initialize()
+
+
+def test_fixed_sizes_are_warmed_up_and_change_no_action(folder: Path, loaded: Pi0) -> None:
+    fixed = Pi0.from_config({"checkpoint": str(folder), "batch_sizes": [2]})
+    fixed.initialize()
+    np.testing.assert_allclose(begun(fixed, 0).act(seen(0)).action, begun(loaded, 0).act(seen(0)).action, atol=BATCHED)
+
+
 @pytest.mark.parametrize("cameras", [{}, {"agentview": "front"}])
 def test_cameras_that_the_model_does_not_have_are_an_error(cameras: dict[str, str]) -> None:
     with pytest.raises(ConfigError, match=r"want .*base_0_rgb"):

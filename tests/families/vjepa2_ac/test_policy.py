@@ -78,6 +78,28 @@ def test_a_session_gets_the_same_in_any_company(policy: VJepa2Ac) -> None:
             assert np.allclose(act.action, own, atol=1e-5)
 
 
+@pytest.mark.parametrize("between", ["act", "observe"])
+def test_a_goal_is_taken_from_an_observation_that_no_plan_is_made_for(checkpoint: Path, between: str) -> None:
+    queueing = VJepa2Ac.from_config({"checkpoint": str(checkpoint), **SETTINGS, "actions": "queue", "execute": 2})
+    queueing.initialize()
+    turned, wanted = begun(queueing, 0, goal=0), begun(queueing, 0, goal=1)
+    for session in (turned, wanted):
+        session.act(obs(4))
+    getattr(turned, between)(obs(5, goal=1))
+    wanted.act(obs(5))
+    if between == "observe":
+        turned.act(obs(5))
+    assert np.allclose(turned.act(obs(6)).action, wanted.act(obs(6)).action, atol=1e-5)
+
+
+def test_bfloat16_plans_nearly_as_float32(checkpoint: Path, policy: VJepa2Ac) -> None:
+    quick = VJepa2Ac.from_config({"checkpoint": str(checkpoint), **SETTINGS, "dtype": "bfloat16"})
+    quick.initialize()
+    one, other = (begun(which, 3).act(obs(4)) for which in (quick, policy))
+    assert one.info["energy"] == pytest.approx(other.info["energy"], rel=0.05)
+    assert np.allclose(one.action[:, :3], other.action[:, :3], atol=0.05)  # of at most 0.05 to each side
+
+
 def test_plans_are_those_of_upstreams_own_planner(policy: VJepa2Ac, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same images, pose and draws, through upstream's encoder, predictor, transform and `cem`."""
     import torch

@@ -10,10 +10,10 @@ import pytest
 
 from vlagents_ray import Obs
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
-from vlagents_ray.errors import InvalidObservation, MissingState, NotReset
-from vlagents_ray.interface import DISTRIBUTION, LEFTOVER, SAMPLES, Act
+from vlagents_ray.errors import InvalidAction, InvalidObservation, MissingState, NotReset
+from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, Act
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
-from vlagents_ray.policies.base.observing import state_vector
+from vlagents_ray.policies.base.observing import state_specs, state_vector
 from vlagents_ray.testing import check_agent
 
 HORIZON, DIM = 4, 2
@@ -126,7 +126,11 @@ def test_samples_come_with_their_mean_and_change_no_action() -> None:
         ({}, Obs(state={"joints": np.zeros(3, np.float32)}), InvalidObservation),
         ({}, at(0.0, **{SAMPLES: -1}), InvalidObservation),
         ({"actions": "queue"}, at(0.0, **{SAMPLES: 2}), InvalidObservation),
+        ({}, at(0.0, **{SAMPLES: "many"}), InvalidObservation),
+        ({"max_samples": 8}, at(0.0, **{SAMPLES: 9}), InvalidObservation),
+        ({}, at(0.0, **{DELAY: "2 ticks"}), InvalidObservation),
         ({}, at(0.0, **{LEFTOVER: np.zeros(3)}), InvalidObservation),
+        ({}, at(0.0, **{LEFTOVER: "the plan"}), InvalidObservation),
         ({}, at(0.0, **{LEFTOVER: np.zeros((2, DIM + 1))}), InvalidObservation),
     ],
 )
@@ -137,6 +141,35 @@ def test_a_bad_observation_fails_its_own_session_alone(
     bad, good = policy.act_batch([obs, at(1.0)], [begun(policy), begun(policy)])
     assert isinstance(bad, error)
     assert isinstance(good, Act)
+
+
+@pytest.mark.parametrize("actions", ["queue", "ensemble"])
+def test_a_broken_chunk_fails_one_tick_and_is_kept_for_no_later_one(actions: str) -> None:
+    policy = loaded(actions=actions)
+    bad, good = begun(policy), begun(policy)
+    broken, whole = policy.act_batch([at(np.nan), at(1.0)], [bad, good])
+    assert isinstance(broken, InvalidAction)
+    assert isinstance(whole, Act)
+    bad.episode.frames.clear()  # of which the broken one would be seen once more
+    assert np.isfinite(bad.act(at(1.0)).action).all()
+
+
+def test_warms_up_with_a_state_of_several_parts_whose_lengths_are_not_known() -> None:
+    class Parts(Wobble):
+        @property
+        def contract(self) -> Contract:
+            return Contract(state=state_specs(("joints", "gripper", "fingers"), 10), gripper=True)
+
+        @property
+        def state_dim(self) -> int:
+            return 10
+
+        def perceive(self, obs: Obs) -> np.ndarray:
+            return state_vector(obs, ("joints", "gripper", "fingers"), 10)[:DIM]
+
+    policy = Parts.from_config({"checkpoint": "none", "batch_sizes": [1, 2]})
+    policy.initialize()
+    assert policy.model["batches"] == [1, 2]
 
 
 def test_nothing_acts_before_its_reset() -> None:

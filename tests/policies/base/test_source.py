@@ -36,6 +36,17 @@ def test_a_checkout_is_imported_from(checkout: Path, monkeypatch: pytest.MonkeyP
     assert len(sys.path) == length
 
 
+def test_a_checkout_that_is_named_is_taken_though_a_folder_elsewhere_has_the_packages_name(
+    checkout: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As the checkout itself has, seen from the folder that it lies in; Python takes any folder for a package."""
+    (checkout / "here" / NAME).mkdir(parents=True)
+    monkeypatch.syspath_prepend(str(checkout / "here"))
+    monkeypatch.setenv(VARIABLE, str(checkout))
+    use_source(NAME, VARIABLE, within=["src"])
+    assert importlib.import_module(NAME).__file__ == str(checkout / "src" / NAME / "__init__.py")
+
+
 def test_what_is_installed_needs_no_checkout() -> None:
     before = list(sys.path)
     use_source("json", VARIABLE)

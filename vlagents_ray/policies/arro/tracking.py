@@ -134,5 +134,6 @@ class Tracking:
             regions = self._segmenter.propose([images[i] for i in asked])
             chosen = self._selector.select([images[i] for i in asked], regions)
             for i, masks, numbers in zip(asked, regions, chosen, strict=True):
-                grippers[i] = [(GRIPPER, masks[number]) for number in numbers]
+                # copies: a view of one would keep all that were proposed
+                grippers[i] = [(GRIPPER, masks[number].copy()) for number in numbers]
         return grippers

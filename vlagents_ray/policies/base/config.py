@@ -41,6 +41,7 @@ class ModelConfig(BaseModel, extra="forbid"):
         default=0.01, description="weights exp(-m * i) of the average, oldest first (ACT, arXiv 2304.13705)"
     )
 
+    max_samples: int = Field(default=1024, ge=0, description="of its distribution that an observation may ask for")
     max_rows: int = Field(default=64, ge=1, description="rows in one forward pass, at most; samples count as rows")
     batch_sizes: list[int] | None = Field(
         default=None,

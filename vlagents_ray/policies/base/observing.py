@@ -1,4 +1,4 @@
-"""From our names to a model's: cameras one by one, proprioception as one vector."""
+"""From our names to a model's: cameras one by one, proprioception as one vector; and what `Obs.info` asks for."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from vlagents_ray.contract import CameraSpec, StateSpec
+from vlagents_ray.contract import CameraSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, MissingState
-from vlagents_ray.interface import Obs
+from vlagents_ray.interface import LEFTOVER, SAMPLES, Obs
+from vlagents_ray.policies.base.config import ModelConfig
 
 GRIPPER = "gripper"  # as a part of the state: `Obs.gripper`
 CLOSED = "gripper_closed"  # how far it is closed: 1 - `Obs.gripper`
@@ -71,3 +72,43 @@ def state_specs(parts: Sequence[str], dim: int | None = None) -> dict[str, State
     """For a contract: the parts, and how long one is where it alone makes the vector."""
     own = [part for part in parts if part not in (GRIPPER, CLOSED)]
     return {part: StateSpec(dim=dim if list(parts) == own and len(own) == 1 else None) for part in own}
+
+
+def wanted_samples(obs: Obs, config: ModelConfig) -> int:
+    """How many draws of the action distribution are asked for."""
+    samples = count_in(obs, SAMPLES)
+    if samples > config.max_samples:
+        raise InvalidObservation(
+            f"info[{SAMPLES!r}]: got {samples}, want at most {config.max_samples}; ask for fewer, or set the policy's "
+            f"`max_samples`"
+        )
+    if samples and config.actions != "chunk":
+        raise InvalidObservation(
+            f"info[{SAMPLES!r}]: got {samples} with actions: {config.actions}, want none; samples are of whole chunks, "
+            f"so set the policy's `actions` to 'chunk'"
+        )
+    return samples
+
+
+def leftover_plan(obs: Obs, contract: Contract | None) -> np.ndarray | None:
+    """The plan to go on from, (H, D) float32 of its own memory, if there is one."""
+    given = obs.info.get(LEFTOVER)
+    if given is None:
+        return None
+    dim = None if contract is None else contract.action.dim
+    try:
+        left = np.array(given, np.float32)
+    except (TypeError, ValueError):
+        left = np.zeros(0, np.float32)  # no numbers, which is refused below
+    if left.ndim != 2 or dim not in (None, left.shape[1]) or not np.isfinite(left).all():
+        got = given.shape if isinstance(given, np.ndarray) else type(given).__name__
+        raise InvalidObservation(f"info[{LEFTOVER!r}]: got {got}, want (H, {dim or 'D'}) finite float32")
+    return left
+
+
+def count_in(obs: Obs, name: str) -> int:
+    """The whole number of that name in `Obs.info`; 0 if there is none."""
+    value = obs.info.get(name) or 0
+    if not isinstance(value, int | np.integer) or value < 0:
+        raise InvalidObservation(f"info[{name!r}]: got {value!r}, want an int from 0")
+    return int(value)

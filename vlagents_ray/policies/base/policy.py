@@ -12,10 +12,11 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vlagents_ray.client.plan import ENSEMBLE, Chunk, Plan
-from vlagents_ray.contract import Contract
-from vlagents_ray.errors import InvalidObservation, NotReset, PolicyFailed
-from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, Act, Agent, Obs
+from vlagents_ray.contract import Contract, check_action
+from vlagents_ray.errors import InvalidAction, InvalidObservation, NotReset, PolicyFailed
+from vlagents_ray.interface import DELAY, DISTRIBUTION, Act, Agent, Obs
 from vlagents_ray.policies.base.config import ModelConfig
+from vlagents_ray.policies.base.observing import count_in, leftover_plan, wanted_samples
 from vlagents_ray.policies.base.row import Prediction, Row
 
 
@@ -51,6 +52,11 @@ class ModelPolicy(Agent, abc.ABC):
     def history(self) -> int:
         """Observations that `predict` gets of each session, at most."""
         return 1
+
+    @property
+    def state_dim(self) -> int | None:
+        """Numbers of the model's state vector, once loaded; to warm up where its parts may be of any length."""
+        return None
 
     def chunk(self, horizon: int) -> int:
         """For the contract: how many of the model's `horizon` rows an `act` returns."""
@@ -93,10 +99,15 @@ class ModelPolicy(Agent, abc.ABC):
             np.random.default_rng([*seed, 1]),
             Plan(ENSEMBLE, self.config.ensemble_m),
         )
+        self.notice(obs)
         return {}
+
+    def notice(self, obs: Obs) -> None:
+        """Take into the session's memory what has to be known of every observation, also where no chunk is wanted."""
 
     def observe(self, obs: Obs) -> None:
         """Add an observation to the history."""
+        self.notice(obs)
         self._begun().frames.append(self.perceive(obs))
 
     def act(self, obs: Obs) -> Act:
@@ -139,7 +150,8 @@ class ModelPolicy(Agent, abc.ABC):
     def _rows(self, obs: Obs, session: ModelPolicy) -> list[Row]:
         """What the model is asked for this session: nothing while rows are left, else its chunk, then its samples."""
         episode = session._begun()
-        samples = _samples(obs, self.config)
+        samples = wanted_samples(obs, self.config)
+        session.notice(obs)
         if episode.rows and self.history == 1:
             return []
         episode.frames.append(self.perceive(obs))
@@ -149,8 +161,8 @@ class ModelPolicy(Agent, abc.ABC):
             frames=tuple(episode.frames),
             instruction=episode.instruction,
             rng=episode.rng,
-            leftover=_leftover(obs, self.contract),
-            delay=int(obs.info.get(DELAY) or 0),
+            leftover=leftover_plan(obs, self.contract),
+            delay=count_in(obs, DELAY),
             info=obs.info,
             memory=episode.memory,
         )
@@ -165,7 +177,10 @@ class ModelPolicy(Agent, abc.ABC):
         if (error := next((p for p in found if isinstance(p, Exception)), None)) is not None:
             return error
         own, *samples = found
-        chunk = self._used(own.actions)  # type: ignore[union-attr]
+        try:  # before it is kept for later ticks
+            chunk = check_action(self._used(own.actions), self.contract)  # type: ignore[union-attr]
+        except InvalidAction as broken:
+            return broken
         info: dict[str, Any] = dict(own.info)  # type: ignore[union-attr]
         if samples:
             info[DISTRIBUTION] = self._distribution(own, samples)  # type: ignore[arg-type]
@@ -212,38 +227,20 @@ class ModelPolicy(Agent, abc.ABC):
 
     def _example(self) -> Row:
         """A row to warm up with: black images and zeros, as the contract wants them."""
-        contract = self.contract
-        cameras = {} if contract is None or contract.cameras is None else contract.cameras
-        state = {} if contract is None or contract.state is None else contract.state
+        contract = self.contract or Contract()
+        lengths = {name: part.dim or 1 for name, part in (contract.state or {}).items()}
+        unstated = [name for name, part in (contract.state or {}).items() if part.dim is None]
+        if unstated and self.state_dim is not None:
+            lengths[unstated[0]] += self.state_dim - len(unstated) - bool(contract.gripper)
         obs = Obs(
-            cameras={n: np.zeros((c.height or 224, c.width or 224, 3), np.uint8) for n, c in cameras.items()},
+            cameras={
+                name: np.zeros((one.height or 224, one.width or 224, 3), np.uint8)
+                for name, one in (contract.cameras or {}).items()
+            },
             gripper=1.0,
-            state={name: np.zeros(part.dim or 1, np.float32) for name, part in state.items()},
+            state={name: np.zeros(length, np.float32) for name, length in lengths.items()},
         )
         return Row((self.perceive(obs),) * self.history, "warm up", np.random.default_rng(0))
-
-
-def _samples(obs: Obs, config: ModelConfig) -> int:
-    samples = obs.info.get(SAMPLES) or 0
-    if not isinstance(samples, int) or samples < 0:
-        raise InvalidObservation(f"info[{SAMPLES!r}]: got {samples!r}, want how many, an int from 0")
-    if samples and config.actions != "chunk":
-        raise InvalidObservation(
-            f"info[{SAMPLES!r}]: got {samples} with actions: {config.actions}, want none; samples are of whole chunks, "
-            f"so set the policy's `actions` to 'chunk'"
-        )
-    return samples
-
-
-def _leftover(obs: Obs, contract: Contract | None) -> np.ndarray | None:
-    left = obs.info.get(LEFTOVER)
-    if left is None:
-        return None
-    left = np.asarray(left, np.float32)
-    dim = None if contract is None else contract.action.dim
-    if left.ndim != 2 or dim not in (None, left.shape[1]) or not np.isfinite(left).all():
-        raise InvalidObservation(f"info[{LEFTOVER!r}]: got {left.shape}, want (H, {dim or 'D'}) finite float32")
-    return left.copy()
 
 
 def _sample(row: Row, draws: np.random.Generator) -> Row:

@@ -12,16 +12,15 @@ from vlagents_ray.errors import ConfigError
 
 
 def use_source(package: str, variable: str, source_dir: str | None = None, within: Sequence[str] = (".",)) -> None:
-    """Make `package` importable: from `source_dir`, as it is installed, or from the checkout that `variable` names.
+    """Make `package` importable: from `source_dir`, from the checkout that `variable` names, or as it is installed.
 
-    `within` are the checkout's folders to import from; the first one holds `package`. Raises `ConfigError` where it
-    is in none of them.
+    What is named comes first, as Python takes any folder of the package's name for it, such as a checkout in the
+    working directory. `within` are the checkout's folders to import from; the first one holds `package`. Raises
+    `ConfigError` where it is in none of them.
     """
-    checkout = source_dir
-    if checkout is None:
-        if importlib.util.find_spec(package) is not None:
-            return
-        checkout = os.environ.get(variable)
+    checkout = source_dir or os.environ.get(variable)
+    if not checkout and importlib.util.find_spec(package) is not None:
+        return
     folders = [] if not checkout else [Path(checkout).expanduser().resolve() / folder for folder in within]
     if not folders or not (folders[0] / package).is_dir():
         where = f"${variable}, which is not set" if not checkout else f"{checkout!r}"

@@ -12,8 +12,8 @@ from vlagents_ray.policies.base import ModelConfig
 class LeRobotConfig(ModelConfig):
     """A folder or hub id with `config.json`, `model.safetensors` and LeRobot's two processor pipelines.
 
-    Unset, `actions`, `execute` and `ensemble_m` are the checkpoint's own: its temporal ensemble, its `n_action_steps`.
-    `dtype: auto` is the checkpoint's, too.
+    Unset, `actions`, `execute` and `ensemble_m` are the checkpoint's own: its temporal ensemble, its `n_action_steps`,
+    a queue where it looks at several observations. `dtype: auto` is the checkpoint's, too.
     """
 
     overrides: dict[str, Any] = Field(

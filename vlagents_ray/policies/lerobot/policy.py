@@ -14,9 +14,9 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import torch_device
 from vlagents_ray.policies.base.observing import (
-    GRIPPER,
     camera_images,
     choose_cameras,
+    needs_gripper,
     state_specs,
     state_vector,
 )
@@ -58,6 +58,11 @@ class LeRobot(ModelPolicy):
     def history(self) -> int:
         return 1 if self.model is None else self.model.kind.steps
 
+    @property
+    def state_dim(self) -> int | None:
+        feature = None if self.model is None else self.model.kind.config.robot_state_feature
+        return None if feature is None else int(feature.shape[0])
+
     def load(self) -> Loaded:
         """Read the checkpoint. Raises `ConfigError` where anything of it is missing, unknown or random."""
         folder = checkpoint.find(self.config)
@@ -74,7 +79,7 @@ class LeRobot(ModelPolicy):
         contract = Contract(
             cameras={ours: _camera(settings, key) for key, ours in cameras.items()},
             state=_states(parts, settings.robot_state_feature, environment),
-            gripper=GRIPPER in parts or None,
+            gripper=needs_gripper(parts),
             instruction=processors.instructed or None,
             action=ActionSpec(dim=processors.width(settings.action_feature.shape[0])),
             chunk=self.chunk(kind.horizon),
@@ -87,7 +92,7 @@ class LeRobot(ModelPolicy):
         model: Loaded = self.model
         frame = {key: image.copy() for key, image in camera_images(obs, model.cameras).items()}
         if model.state:
-            frame[STATE] = state_vector(obs, model.state, model.kind.config.robot_state_feature.shape[0])
+            frame[STATE] = state_vector(obs, model.state, self.state_dim)
         if model.environment:
             frame[ENVIRONMENT] = state_vector(obs, [ENVIRONMENT_STATE], model.environment)
         return frame
@@ -122,6 +127,8 @@ def _with_defaults(config: LeRobotConfig, kind: Kind) -> LeRobotConfig:
     """The settings, where they are silent as the checkpoint was made to be run."""
     coefficient = getattr(kind.config, "temporal_ensemble_coeff", None)
     defaults: dict[str, Any] = {} if config.actions == "ensemble" else {"execute": kind.usual}
+    if kind.steps > 1:  # trained on consecutive frames, so that it has to see those within a chunk, too
+        defaults["actions"] = "queue"
     if coefficient is not None:  # its n_action_steps is 1, since LeRobot then asks at every tick
         defaults = {"actions": "ensemble", "ensemble_m": coefficient, "execute": None}
     if (config.execute or 0) > kind.horizon:

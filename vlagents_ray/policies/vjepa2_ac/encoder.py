@@ -44,7 +44,7 @@ class Encoder:
         torch = require("torch")
         device = self._model.device
         clip = torch.as_tensor(pixels).to(device, self._model.dtype, non_blocking=True)[:, None].repeat(1, 2, 1, 1, 1)
-        features = self._model(pixel_values_videos=clip, skip_predictor=True).last_hidden_state
+        features = self._model(pixel_values_videos=clip, skip_predictor=True).last_hidden_state.float()
         return torch.nn.functional.layer_norm(features, features.shape[-1:]) if self._normalize else features
 
 

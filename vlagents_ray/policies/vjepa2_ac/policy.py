@@ -38,23 +38,27 @@ class Frame:
 
     pixels: np.ndarray  # (3, side, side) float32
     pose: np.ndarray  # (7,) float32: x, y, z m, roll, pitch, yaw rad, closedness
-    goal: np.ndarray | None  # (3, side, side) float32, if the observation brings one
 
 
 class WorldModel:
-    """Encoder and predictor."""
+    """Encoder and predictor: weights and features are float32, what is between may be computed in another type."""
 
-    def __init__(self, encoder: Any, predictor: Any, config: VJepa2AcConfig) -> None:
+    def __init__(self, encoder: Any, predictor: Any, config: VJepa2AcConfig, dtype: Any) -> None:
         self.encode = Encoder(encoder, config.normalize)
         self._predictor = predictor
         self._normalize = config.normalize
+        self._device, self._dtype = encoder.device.type, dtype
+
+    def autocast(self) -> Any:
+        """Within it the type is `dtype`, as upstream trains; its attention takes no weights of another one."""
+        torch = require("torch")
+        return torch.autocast(self._device, self._dtype, enabled=self._dtype != torch.float32)
 
     def __call__(self, features: Tensor, actions: Tensor, poses: Tensor) -> Tensor:
         """The next frame's features: see `planner.World`."""
         torch = require("torch")
         tokens = features.shape[2]
-        steps = (part.to(features.dtype) for part in (actions, poses))
-        following = self._predictor(features.flatten(1, 2), *steps)[:, -tokens:]
+        following = self._predictor(features.flatten(1, 2), actions, poses)[:, -tokens:].float()
         return torch.nn.functional.layer_norm(following, following.shape[-1:]) if self._normalize else following
 
 
@@ -97,25 +101,28 @@ class VJepa2Ac(ModelPolicy):
         dtype = torch_dtype(self.config.dtype, device, preferred="float32")  # in which upstream plans
         encoder = load_encoder(self.config, saved.get("encoder"))
         predictor = load_predictor(self.config, saved["predictor"], encoder.config.hidden_size)
-        return WorldModel(encoder.to(device, dtype).eval(), predictor.to(device, dtype).eval(), self.config)
+        return WorldModel(encoder.to(device).eval(), predictor.to(device).eval(), self.config, dtype)
 
-    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        """Begin an episode, to the goal in `obs` if there is one."""
-        told = super().reset(obs, instruction, **kwargs)
-        goal = self._goal(obs)
-        if goal is not None:
-            self._begun().memory[_GOAL] = goal
-        return told
+    def notice(self, obs: Obs) -> None:
+        """Take over the goal in `obs`, if there is one; features of the same image are kept."""
+        image = obs.info.get(GOAL_IMAGE)
+        if image is None:
+            return
+        if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+            got = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
+            raise InvalidObservation(f"info[{GOAL_IMAGE!r}]: got {got}, want (H, W, 3) uint8 RGB")
+        goal, memory = to_pixels(image, self.config.image_size), self._begun().memory
+        if _GOAL not in memory or not np.array_equal(goal, memory[_GOAL]):
+            memory[_GOAL] = goal
+            memory.pop(_GOAL_FEATURES, None)
 
     def perceive(self, obs: Obs) -> Frame:
         pose = state_vector(obs, [*self._state, GRIPPER], 7)
         pose[6] = 1 - pose[6]
         [image] = camera_images(obs, self._cameras).values()
-        return Frame(to_pixels(image, self.config.image_size), pose, self._goal(obs))
+        return Frame(to_pixels(image, self.config.image_size), pose)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
-        for row in rows:
-            _remember(row)
         ready = [row for row in rows if _GOAL in row.memory]
         found = iter(self._plans(ready) if ready else [])
         no_goal = InvalidObservation(
@@ -128,7 +135,7 @@ class VJepa2Ac(ModelPolicy):
         config, world = self.config, self.model
         new = [row for row in rows if _GOAL_FEATURES not in row.memory]
         shape = (config.iterations, config.rollout, config.samples, DRAWN)
-        with torch.inference_mode():
+        with torch.inference_mode(), world.autocast():
             pixels = [row.frames[-1].pixels for row in rows] + [row.memory[_GOAL] for row in new]
             features = world.encode(np.stack(pixels))
             for row, goal in zip(new, features[len(rows) :], strict=True):
@@ -139,33 +146,16 @@ class VJepa2Ac(ModelPolicy):
             )
             goals = torch.stack([row.memory[_GOAL_FEATURES] for row in rows])
             plans = plan(world, features[: len(rows)], poses, goals, noise, config)
-        actions, std, energy = (part.float().cpu().numpy() for part in (plans.actions, plans.std, plans.energy))
+        actions, std, energy = (part.cpu().numpy() for part in (plans.actions, plans.std, plans.energy))
         predictions = []
         for i, row in enumerate(rows):
             steps = _openings(actions[i], row.frames[-1].pose[6])
             predictions.append(Prediction(steps, mean=steps, std=std[i], info={"energy": float(energy[i])}))
         return predictions
 
-    def _goal(self, obs: Obs) -> np.ndarray | None:
-        image = obs.info.get(GOAL_IMAGE)
-        if image is None:
-            return None
-        if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-            got = f"{image.shape} {image.dtype}" if isinstance(image, np.ndarray) else type(image).__name__
-            raise InvalidObservation(f"info[{GOAL_IMAGE!r}]: got {got}, want (H, W, 3) uint8 RGB")
-        return to_pixels(image, self.config.image_size)
-
     def _example(self) -> Row:
         example = super()._example()
         return replace(example, memory={_GOAL: example.frames[-1].pixels})
-
-
-def _remember(row: Row) -> None:
-    """Take over the goal of the newest observation; features of the same image are kept."""
-    goal = row.frames[-1].goal
-    if goal is not None and (_GOAL not in row.memory or not np.array_equal(goal, row.memory[_GOAL])):
-        row.memory[_GOAL] = goal
-        row.memory.pop(_GOAL_FEATURES, None)
 
 
 def _openings(actions: np.ndarray, closedness: float) -> np.ndarray:
