@@ -9,8 +9,8 @@ from vlagents_ray.policies.scripted import Scripted
 from vlagents_ray.registry import names, policy_class
 from vlagents_ray.testing import check_agent, check_env
 
-# Registered names whose own test modules run the suites, because they need a simulator or a setting.
-CHECKED_ELSEWHERE = {"maniskill", "metaworld", "replay"}
+# Registered names whose own test modules run the suites, because they need a simulator, a setting or a checkpoint.
+CHECKED_ELSEWHERE = {"maniskill", "metaworld", "openvla", "openvla_oft", "replay"}
 ENV_NAMES = {
     "tabletop": ["tabletop"],
     "gymnasium": ["gymnasium/Pendulum-v1", "gymnasium/gym_pusht/PushT-v0"],
