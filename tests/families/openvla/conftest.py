@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -11,11 +12,12 @@ import numpy as np
 import pytest
 import torch
 
-from tests.families.openvla import tiny
 from vlagents_ray import Obs
 from vlagents_ray.policies.base import ModelPolicy
 from vlagents_ray.registry import policy_class
 
+# They run in this family's environment; in another one there is nothing to collect.
+collect_ignore_glob = [] if importlib.util.find_spec("tokenizers") else ["test_*.py"]
 torch.set_num_threads(1)  # of products this small, several cores make slower ones
 
 LIBRARIES = [
@@ -28,6 +30,8 @@ WORDS = ("Pick up the black bowl", "open the drawer", "put the bowl, which stand
 @pytest.fixture(scope="session")
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     """The folder of a kind's checkpoint."""
+    from tests.families.openvla import tiny
+
     root = tmp_path_factory.mktemp("openvla")
     return lru_cache(lambda kind: tiny.make(root / kind, kind))
 

@@ -1,4 +1,7 @@
-"""OpenVLA's and OpenVLA-OFT's own code, out of the source trees that $OPENVLA_SRC and $OPENVLA_OFT_SRC name."""
+"""OpenVLA's and OpenVLA-OFT's own code, out of the source trees that $OPENVLA_SRC and $OPENVLA_OFT_SRC name.
+
+OFT's also needs `diffusers==0.30.3` and `peft==0.11.1`, which serving does not.
+"""
 
 from __future__ import annotations
 
