@@ -11,8 +11,8 @@ from vlagents_ray.policies.scripted import Scripted
 from vlagents_ray.registry import names, policy_class
 from vlagents_ray.testing import check_agent, check_env
 
-# Registered names whose own test modules run the suites, because they need a simulator, a setting or an environment.
-CHECKED_ELSEWHERE = {"maniskill", "metaworld", "replay", "vjepa2_ac"}
+# Registered names whose own test modules run the suites, because they need a simulator or a setting.
+CHECKED_ELSEWHERE = {"maniskill", "metaworld", "replay"}
 ENV_NAMES = {
     "tabletop": ["tabletop"],
     "gymnasium": ["gymnasium/Pendulum-v1", "gymnasium/gym_pusht/PushT-v0"],

@@ -12,10 +12,10 @@ from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.observing import (
-    GRIPPER,
     camera_images,
     camera_specs,
     choose_cameras,
+    needs_gripper,
     state_specs,
     state_vector,
 )
@@ -55,13 +55,18 @@ class DiffusionPolicy(ModelPolicy):
         own = {part: StateSpec(size) for part, size in zip(parts, sizes, strict=False)}
         return Contract(
             cameras=camera_specs(self._cameras(network)),
-            state=own if self.config.state is None else state_specs(parts, sum(sizes)),
-            gripper=GRIPPER in parts,
+            state=own if self.config.state is None else state_specs(parts, self.state_dim),
+            gripper=needs_gripper(parts),
             instruction=False,
             action=_action(network.module.action_dim, absolute=network.absolute),
             chunk=self.chunk(network.module.n_action_steps),
             history=self.history,
         )
+
+    @property
+    def state_dim(self) -> int | None:
+        """Numbers in all the checkpoint's vectors, once it is loaded."""
+        return None if self.model is None else sum(self.model.vectors.values())
 
     def load(self) -> Network:
         """Read the checkpoint, and refuse names of cameras that it does not have."""
@@ -76,7 +81,7 @@ class DiffusionPolicy(ModelPolicy):
             name: _resized(image, *network.images[name])
             for name, image in camera_images(obs, self._cameras(network)).items()
         }
-        vector = state_vector(obs, self._parts(network), sum(network.vectors.values()))
+        vector = state_vector(obs, self._parts(network), self.state_dim)
         ends = np.cumsum([0, *network.vectors.values()])
         return seen | {name: vector[a:b] for name, (a, b) in zip(network.vectors, pairwise(ends), strict=True)}
 

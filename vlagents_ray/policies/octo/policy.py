@@ -11,7 +11,14 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import GOAL_IMAGE, Obs
 from vlagents_ray.policies.base import ModelPolicy, Prediction, Row
-from vlagents_ray.policies.base.observing import camera_images, camera_specs, choose_cameras, state_specs, state_vector
+from vlagents_ray.policies.base.observing import (
+    camera_images,
+    camera_specs,
+    choose_cameras,
+    needs_gripper,
+    state_specs,
+    state_vector,
+)
 from vlagents_ray.policies.octo.config import OctoConfig
 from vlagents_ray.policies.octo.images import resized
 from vlagents_ray.policies.octo.network import PROPRIO, Network, normalised_state, real_actions
@@ -44,13 +51,18 @@ class Octo(ModelPolicy):
         dim = len(network.statistics(self.config.dataset, "action")["mean"])
         return Contract(
             cameras=camera_specs(self._cameras(network)),
-            state=state_specs(self.config.state or (), network.proprio_dim),
-            gripper="gripper" in (self.config.state or ()),
+            state=state_specs(self.config.state or (), self.state_dim),
+            gripper=needs_gripper(self.config.state or ()),
             instruction=instruction,
             action=_action(dim, self.config.dataset),
             chunk=self.chunk(network.head.action_horizon),
             history=self.history,
         )
+
+    @property
+    def state_dim(self) -> int | None:
+        """Numbers in the state vector, if the checkpoint reads one, once it is loaded."""
+        return None if self.model is None else self.model.proprio_dim
 
     def load(self) -> Network:
         """Read the checkpoint, and refuse settings that it cannot serve."""

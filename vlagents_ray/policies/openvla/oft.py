@@ -14,10 +14,10 @@ from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base.observing import (
-    GRIPPER,
     camera_images,
     camera_specs,
     choose_cameras,
+    needs_gripper,
     state_specs,
     state_vector,
 )
@@ -75,16 +75,20 @@ class OpenVLAOFT(PrismaticPolicy):
     @property
     def contract(self) -> Contract:
         """The cameras and states of training, and an instruction; a chunk of the checkpoint's datasets' actions."""
-        dim = None if self.model is None or self.model.proprio is None else self.model.proprio.dim
         return Contract(
             cameras=camera_specs(self._cameras),
-            state=state_specs(self._state, dim),
-            gripper=GRIPPER in self._state or None,
+            state=state_specs(self._state, self.state_dim),
+            gripper=needs_gripper(self._state) or None,
             instruction=True,
             action=self._action(),
             chunk=self.chunk(self.config.horizon),
             history=1,
         )
+
+    @property
+    def state_dim(self) -> int | None:
+        """Numbers in the state vector, if any: the projector's, once it is loaded."""
+        return None if self.model is None or self.model.proprio is None else self.model.proprio.dim
 
     def load(self) -> Parallel:
         """Read the checkpoint and its components; what is missing, or there and not used, is a `ConfigError`."""
