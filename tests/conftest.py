@@ -23,6 +23,10 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     """Skip what this machine cannot run; the Vulkan device is looked for when the first test wants it."""
     if item.get_closest_marker("gpu") and not any(Path("/dev").glob("nvidia[0-9]*")):
         pytest.skip("no NVIDIA GPU")
+    for marker in item.iter_markers("source"):
+        [variable] = marker.args
+        if not os.environ.get(variable):
+            pytest.skip(f"{variable} names no checkout of this family's source")
     if item.get_closest_marker("vulkan"):
         from vlagents_ray.envs.maniskill import ManiSkill
 

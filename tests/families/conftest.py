@@ -6,9 +6,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
-
-import pytest
 
 # folder -> the package without which its tests cannot be imported
 _NEEDS = {
@@ -23,11 +20,3 @@ _NEEDS = {
 }
 
 collect_ignore = [folder for folder, package in _NEEDS.items() if importlib.util.find_spec(package) is None]
-
-
-def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Skip what wants a checkout that is not there."""
-    for marker in item.iter_markers("source"):
-        [variable] = marker.args
-        if not os.environ.get(variable):
-            pytest.skip(f"{variable} names no checkout of this family's source")
