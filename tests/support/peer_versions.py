@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 from peers import FOLDER, peers_python
+
+from vlagents_ray.serve.environments.making import install
 
 
 def package(requirement: str) -> Path:
@@ -14,7 +14,6 @@ def package(requirement: str) -> Path:
     folder = FOLDER / requirement.replace("==", "-")
     done = folder / ".installed"
     if not done.exists():
-        command = [str(peers_python()), "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps"]
-        subprocess.run([*command, "--upgrade", "--target", str(folder), requirement], check=True, stdout=sys.stderr)
+        install(peers_python(), ["--no-deps", "--target", str(folder), requirement])
         done.touch()
     return folder
