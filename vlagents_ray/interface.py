@@ -125,8 +125,16 @@ class Agent:
         """
 
     def act(self, obs: Obs) -> Act:
-        """One action, or one chunk of actions, for this observation."""
-        raise NotImplementedError(f"{type(self).__name__} must define act(obs) -> Act")
+        """One action, or one chunk of actions, for this observation.
+
+        An agent defines it, or `act_batch`, of which this is then a batch of one.
+        """
+        if type(self).act_batch is Agent.act_batch:
+            raise NotImplementedError(f"{type(self).__name__} must define act(obs) -> Act, or act_batch")
+        [act] = self.act_batch([obs], [self])
+        if isinstance(act, Exception):
+            raise act
+        return act
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         """Actions for several sessions at once; adapters that can batch make it one forward pass.

@@ -21,6 +21,7 @@ import psutil
 import pytest
 import yaml
 from eval_fakes import wait_for
+from ray.autoscaler._private.constants import AUTOSCALER_METRIC_PORT
 from rpyc_client import Client, call
 
 from tests.integration.conftest import serving
@@ -147,6 +148,19 @@ def test_a_taken_port_is_said_at_once() -> None:
         )  # fmt: skip
     assert result.returncode == 2
     assert "choose another --port" in result.stderr
+
+
+def test_rays_metrics_stay_off_the_port_that_every_ray_has_for_them() -> None:
+    """They answer any path with 200: a server that wanted that port would seem to be there."""
+
+    def monitors() -> set[int]:
+        children = psutil.Process().children(recursive=True)
+        found = [p for p in children if any(word.endswith("monitor.py") for word in p.cmdline())]
+        return {c.laddr.port for p in found for c in p.net_connections("inet") if c.status == psutil.CONN_LISTEN}
+
+    with serving("noop"):
+        wait_for(monitors)
+        assert AUTOSCALER_METRIC_PORT not in monitors()
 
 
 def test_serve_deploy_takes_the_same_file(tmp_path: Path) -> None:

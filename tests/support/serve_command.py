@@ -6,7 +6,6 @@ import contextlib
 import os
 import shlex
 import shutil
-import socket
 import subprocess
 import time
 import urllib.error
@@ -16,13 +15,14 @@ from pathlib import Path
 
 from readme_blocks import ENV
 
+from vlagents_ray.serve.ports import free_port
+
 START_S, STOP_S = 180, 60
 
 
 def free_address() -> str:
     """A "host:port" on which nobody listens."""
-    with socket.create_server(("127.0.0.1", 0)) as free:
-        return f"127.0.0.1:{free.getsockname()[1]}"
+    return f"127.0.0.1:{free_port()}"
 
 
 @contextlib.contextmanager

@@ -22,7 +22,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Agent, Obs
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.serve.config import ServerArgs
-from vlagents_ray.serve.engine import Engine
+from vlagents_ray.serve.engine import Engine, synchronise
 from vlagents_ray.serve.sessions import AgentCopies
 from vlagents_ray.testing.observations import random_observation
 from vlagents_ray.wire.messages import Reply, Request
@@ -126,7 +126,7 @@ def _bare(agent: Agent, copies: AgentCopies, plan: PolicyPlan, size: int) -> dic
         for act in agent.act_batch(views, sessions):
             if isinstance(act, Exception):
                 raise act
-        _synchronise()
+        synchronise()
         times.append(time.perf_counter() - begun)
     times = times[_WARM:]
     return {"actions_per_s": size * len(times) / sum(times), "batch_ms": statistics.median(times) * 1e3}
@@ -187,11 +187,6 @@ def _jax_device() -> Any:
     jax = sys.modules.get("jax")
     device = None if jax is None else jax.local_devices()[0]
     return None if device is None or device.platform == "cpu" else device
-
-
-def _synchronise() -> None:
-    if (cuda := _cuda()) is not None:
-        cuda.synchronize()
 
 
 def _forget_peak() -> None:

@@ -190,10 +190,7 @@ class RemoteAgent(Agent):
         `total_ms`, which is the sum and what lies between; here `round_trip_ms` and, as the rest of
         it, `wire_ms`: this side's coding, the network, proxies. `batch_size` is no time.
         """
-        [act] = self.act_batch([obs], [self])
-        if isinstance(act, Exception):
-            raise act
-        return act
+        return super().act(obs)
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         """One action for each of several sessions of this connection, in one message each way.

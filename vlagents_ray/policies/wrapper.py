@@ -60,10 +60,6 @@ class Wrapper(Agent, abc.ABC):
         """Show the inner agent an observation that no action is wanted for."""
         self.agent.observe(self._change(obs))
 
-    def act(self, obs: Obs) -> Act:
-        """What the inner agent does for the changed observation."""
-        return self.agent.act(self._change(obs))
-
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         """One batch here, and one of the inner agent."""
         changed = self.change_batch(obs, sessions)  # type: ignore[arg-type]

@@ -12,6 +12,7 @@ from typing import Any
 
 from vlagents_ray.errors import UnknownCheckpoint
 from vlagents_ray.interface import Agent
+from vlagents_ray.policies.base.checkpoint import at_step
 
 CHOICE, STEP = "checkpoint", "checkpoint_step"  # options of a reset, and settings of a policy
 
@@ -93,6 +94,4 @@ class Checkpoints:
 def resolved(settings: Mapping[str, Any]) -> str | None:
     """The checkpoint that settings name, with its step filled in."""
     checkpoint, step = settings.get(CHOICE), settings.get(STEP)
-    if not isinstance(checkpoint, str) or step is None:
-        return checkpoint
-    return checkpoint.replace("{step}", str(step))
+    return at_step(checkpoint, step) if isinstance(checkpoint, str) else checkpoint

@@ -49,7 +49,7 @@ class PolicyReplica:
     """Loads the policy when it starts.
 
     While no replica of the application can act, its door answers 503 at once. A replica that joins
-    others loads in its constructor, so that Serve routes to it only when it can act too.
+    others loads in its first `reconfigure`, so that Serve routes to it only when it can act too.
     """
 
     async def __init__(self, args: dict[str, Any], gateway: Any = None) -> None:  # type: ignore[misc]
@@ -99,9 +99,9 @@ class PolicyReplica:
         self._engine.models.configure(config)
         if not self._configured:
             self._configured = True
-            await self._load()
+            await self._start()
 
-    async def _load(self) -> None:
+    async def _start(self) -> None:
         self._loading = asyncio.ensure_future(asyncio.to_thread(self._engine.start))
         if await asyncio.to_thread(_others_run):
             await self._loading

@@ -289,7 +289,7 @@ class Engine:
             for obs in request.history:
                 agent.observe(obs)
         if model.checkpoint is not None:
-            info = {"checkpoint": model.checkpoint, **info}
+            info = {**info, "checkpoint": model.checkpoint}  # which is what was loaded, whatever the policy says
         spent = timing(ticket.arrived, begun, time.perf_counter())
         require_sendable(info)
         session.agent = agent
@@ -321,7 +321,7 @@ class Engine:
             with model.busy:
                 model.require_open()
                 results = model.agent.act_batch(observations, agents + padding)  # type: ignore[arg-type]
-                _synchronize()
+                synchronise()
             if len(results) != rows:
                 raise PolicyFailed(f"act_batch: got {rows} observations, returned {len(results)} actions")
         except Exception as error:  # noqa: BLE001 - becomes the replies
@@ -352,7 +352,7 @@ def _given_up(ticket: Ticket, session: Session) -> bool:
     return ticket.cancelled or ticket.expired(time.perf_counter()) or session.resetting is not ticket
 
 
-def _synchronize() -> None:
+def synchronise() -> None:
     """Wait for the GPU, so that `inference_ms` is the truth."""
     torch = sys.modules.get("torch")
     if torch is not None and torch.cuda.is_initialized():

@@ -19,6 +19,8 @@ _MODE = "RAY_AUTH_MODE"
 # Ray asks it whether this machine is one of a cluster, and takes the loopback address for a node's own if not: then
 # all that it listens at is there. (An argument that says so, `_node_ip_address`, is turned into another address.)
 _ALONE = "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"
+# Where Ray's monitor shows its metrics: any page of them is answered with 200. Every Ray wants the same one.
+_METRICS = "AUTOSCALER_METRIC_PORT"
 
 
 @contextlib.contextmanager
@@ -44,6 +46,7 @@ def own_ray(
         environment = {"RAY_worker_niceness": "0"}
         # Where replicas listen for WebSockets. Not for the network where that is to see nothing but TLS.
         ours = {MARK: name, _ALONE: "0", HOST: host if tls is None else LOOPBACK}
+        ours[_METRICS] = str(free_port(LOOPBACK, but={port}))
         front = None
         if (binary := haproxy_binary()) is not None:
             front = _front(folder, host, port, tls)
@@ -69,13 +72,10 @@ def own_ray(
 def _front(folder: Path, host: str, port: int, tls: Tls | None) -> Front | None:
     if tls is None and host in (LOOPBACK, "localhost"):
         return None
-    inside = port
-    while inside == port:
-        inside = free_port(LOOPBACK)
     return Front(
         host,
         port,
-        inside,
+        free_port(LOOPBACK, but={port}),
         None if tls is None else tls.bundle(folder),
         None if tls is None or tls.client_ca is None else tls.client_ca.absolute(),
     )

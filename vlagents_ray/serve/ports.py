@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import socket
+from collections.abc import Collection
 
 from vlagents_ray.errors import ConfigError
 
@@ -13,15 +14,15 @@ _PORTS = (30_000, 32_700)  # of HAProxy and the like
 _BLOCKS = (20_000, 30_000)
 
 
-def free_port(host: str = LOOPBACK) -> int:
-    """A TCP port that nobody listens on at this moment.
+def free_port(host: str = LOOPBACK, but: Collection[int] = ()) -> int:
+    """A TCP port that nobody listens on at this moment, none of `but`.
 
     Drawn at random below the range from which the system gives ports to whoever asks for any, so
     that it is still free when its process has started.
     """
     for _ in range(100):
         port = random.randrange(*_PORTS)
-        if is_free(host, port):
+        if port not in but and is_free(host, port):
             return port
     raise ConfigError(f"no free port between {_PORTS[0]} and {_PORTS[1]}")
 

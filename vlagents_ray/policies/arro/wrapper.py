@@ -95,9 +95,6 @@ class Arro(Wrapper):
             for one, session in zip(results, sessions, strict=True)
         ]
 
-    def act(self, obs: Obs) -> Act:
-        return self._told(super().act(obs))
-
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         acts = super().act_batch(obs, sessions)
         return [

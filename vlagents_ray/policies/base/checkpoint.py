@@ -10,10 +10,15 @@ from typing import Any
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import require
 
-STEP = "{step}"
+STEP = "{step}"  # in a checkpoint's name
 _INDEX = ".safetensors.index.json"
 _COMPARED = 64  # elements of each tensor: enough to tell trained weights from random ones
 _LISTED = 8
+
+
+def at_step(name: str, step: int | str | None) -> str:
+    """The name of a checkpoint with its step filled in, if it has a place for one."""
+    return name if step is None else name.replace(STEP, str(step))
 
 
 def find_checkpoint(name: str, step: int | None = None, needs: Iterable[str] = ()) -> Path:
@@ -23,7 +28,7 @@ def find_checkpoint(name: str, step: int | None = None, needs: Iterable[str] = (
     glob patterns) that a folder must hold.
     Raises `ConfigError` when there is no such checkpoint, or a file is missing.
     """
-    names = [name.replace(STEP, digits) for digits in (str(step), f"{step or 0:06d}")]
+    names = [at_step(name, digits) for digits in (step, f"{step or 0:06d}")]
     name = next((one for one in names if Path(one).expanduser().exists()), names[0])
     path = Path(name).expanduser()
     if not path.exists():

@@ -90,11 +90,9 @@ def wanted_samples(obs: Obs, config: ModelConfig) -> int:
     return samples
 
 
-def leftover_plan(obs: Obs, contract: Contract | None) -> np.ndarray | None:
-    """The plan to go on from, (H, D) float32 of its own memory, if there is one."""
-    given = obs.info.get(LEFTOVER)
-    if given is None:
-        return None
+def leftover_plan(obs: Obs, contract: Contract | None) -> np.ndarray:
+    """The plan to go on from, (H, D) float32 of its own memory, of an observation that brings one."""
+    given = obs.info[LEFTOVER]
     dim = None if contract is None else contract.action.dim
     try:
         left = np.array(given, np.float32)

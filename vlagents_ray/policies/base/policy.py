@@ -14,7 +14,7 @@ import numpy as np
 from vlagents_ray.client.plan import ENSEMBLE, Chunk, Plan
 from vlagents_ray.contract import Contract, check_action
 from vlagents_ray.errors import InvalidAction, InvalidObservation, NotReset, PolicyFailed
-from vlagents_ray.interface import DELAY, DISTRIBUTION, Act, Agent, Obs
+from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER, Act, Agent, Obs
 from vlagents_ray.policies.base.config import ModelConfig
 from vlagents_ray.policies.base.observing import count_in, leftover_plan, wanted_samples
 from vlagents_ray.policies.base.row import Prediction, Row
@@ -110,15 +110,11 @@ class ModelPolicy(Agent, abc.ABC):
         self.notice(obs)
         self._begun().frames.append(self.perceive(obs))
 
-    def act(self, obs: Obs) -> Act:
-        """A chunk (H, D), or one action (D,), as `config.actions` says."""
-        [act] = self.act_batch([obs], [self])
-        if isinstance(act, Exception):
-            raise act
-        return act
-
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        """One forward pass for all sessions that need the model at this tick."""
+        """A chunk (H, D), or one action (D,), as `config.actions` says, for each session.
+
+        One forward pass serves all that need the model at this tick.
+        """
         results: list[Act | Exception | None] = [None] * len(obs)
         rows: list[Row] = []
         owners: list[int] = []
@@ -161,7 +157,7 @@ class ModelPolicy(Agent, abc.ABC):
             frames=tuple(episode.frames),
             instruction=episode.instruction,
             rng=episode.rng,
-            leftover=leftover_plan(obs, self.contract),
+            leftover=None if obs.info.get(LEFTOVER) is None else leftover_plan(obs, self.contract),
             delay=count_in(obs, DELAY),
             info=obs.info,
             memory=episode.memory,
@@ -177,16 +173,17 @@ class ModelPolicy(Agent, abc.ABC):
         if (error := next((p for p in found if isinstance(p, Exception)), None)) is not None:
             return error
         own, *samples = found
-        try:  # before it is kept for later ticks
-            chunk = check_action(self._used(own.actions), self.contract)  # type: ignore[union-attr]
-        except InvalidAction as broken:
-            return broken
+        chunk = self._used(own.actions)  # type: ignore[union-attr]
         info: dict[str, Any] = dict(own.info)  # type: ignore[union-attr]
         if samples:
             info[DISTRIBUTION] = self._distribution(own, samples)  # type: ignore[arg-type]
         if self.config.actions == "chunk":
             episode.tick += 1
             return Act(chunk, info=info)
+        try:  # before it is kept for later ticks
+            check_action(chunk, self.contract)
+        except InvalidAction as broken:
+            return broken
         if self.config.actions == "queue":
             episode.rows.extend(chunk)
             return self._next(episode, info)

@@ -55,12 +55,6 @@ class ChildAgent(Agent):
     def observe(self, obs: Obs) -> None:
         self._ask(Request("observe", obs))
 
-    def act(self, obs: Obs) -> Act:
-        [act] = self.act_batch([obs], [self])
-        if isinstance(act, Exception):
-            raise act
-        return act
-
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         requests = [
             Request("act", one, session=session._session or "")
