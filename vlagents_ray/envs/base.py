@@ -26,6 +26,12 @@ class EvalEnv(ABC):
     max_steps: int
     """The task's step limit; `step` reports `truncated` when it is reached."""
 
+    init_states: int | None = None
+    """How many initial states the benchmark has fixed for the task; None if seeds alone draw them.
+
+    Episode i of an evaluation begins in state i modulo this, handed to `reset` as `options["init_state"]`.
+    """
+
     @property
     @abstractmethod
     def contract(self) -> Contract:

@@ -138,7 +138,7 @@ def _play(
     watch("env reset", 0)
     begun = perf_counter()
     with env_side("reset"):
-        obs, _ = env.reset(seed=key.seed, options=reset_options or None)
+        obs, _ = env.reset(seed=key.seed, options=_begin(env, key, reset_options))
         tally.instruction = env.instruction
     tally.reset_ms = 1e3 * (perf_counter() - begun)
     record(obs)
@@ -199,6 +199,11 @@ def policy_side(what: str) -> Iterator[None]:
 def is_remote(agent: Agent) -> bool:
     """Does the policy run elsewhere? Then its server says what it is, as `metadata`."""
     return hasattr(agent, "metadata")
+
+
+def _begin(env: EvalEnv, key: EpisodeKey, options: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    begin = {} if env.init_states is None else {"init_state": key.episode % env.init_states}
+    return begin | dict(options or {}) or None
 
 
 def _given(env: EvalEnv, agent: Agent, key: EpisodeKey) -> dict[str, Any]:
