@@ -6,6 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
+from assets import assets
 from fail_on_skip import pytest_make_collect_report, pytest_runtest_makereport
 
 from vlagents_ray.envs.headless import prepare_rendering
@@ -27,6 +28,10 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         [variable] = marker.args
         if not os.environ.get(variable):
             pytest.skip(f"{variable} names no checkout of this family's source")
+    for marker in item.iter_markers("assets"):
+        [simulator] = marker.args
+        if assets(simulator) is None:
+            pytest.skip(f"no assets of {simulator}: VLAGENTS_RAY_ASSETS names their folder")
     if item.get_closest_marker("vulkan"):
         from vlagents_ray.envs.maniskill import ManiSkill
 

@@ -1,7 +1,7 @@
 """On CI a test that skips itself has failed: `VLAGENTS_FAIL_ON_SKIP=1` makes it so.
 
-CI installs all that tests need but a GPU, and sources that are on no package index: only tests marked `gpu` and
-`source` may be skipped there.
+CI installs all that tests need but a GPU, and sources and assets that are on no package index: only tests marked `gpu`,
+`source` and `assets` may be skipped there.
 tests/conftest.py takes the two hooks from here.
 """
 
@@ -13,13 +13,14 @@ from typing import TypeVar
 
 import pytest
 
+_MAY_BE_MISSING = ("gpu", "source", "assets")
 Report = TypeVar("Report", pytest.CollectReport, pytest.TestReport)
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
     report = yield
-    return report if item.get_closest_marker("gpu") or item.get_closest_marker("source") else _failed_if_skipped(report)
+    return report if any(item.get_closest_marker(marker) for marker in _MAY_BE_MISSING) else _failed_if_skipped(report)
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
