@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 import ray
 from eval_fakes import LINE
+from flat_config import flat_config
 
 from vlagents_ray.evaluate import EvalConfig
 
@@ -19,16 +20,8 @@ def config(tmp_path: Path) -> Callable[..., EvalConfig]:
     """Settings of a small evaluation of `Line` in a folder of this test's own."""
 
     def make(**changes: Any) -> EvalConfig:
-        settings = {
-            "envs": [LINE],
-            "episodes": 6,
-            "workers": 2,
-            "out": tmp_path / "out",
-            "video": "none",
-            "env_timeout_s": 5,
-            "runtime_env": WORKER_PATH,
-        }
-        return EvalConfig(**(settings | changes))
+        settings = {"envs": [LINE], "episodes": 6, "workers": 2, "out": tmp_path / "out", "video": "none"}
+        return flat_config(**settings | {"env_timeout_s": 5, "runtime_env": WORKER_PATH} | changes)
 
     return make
 

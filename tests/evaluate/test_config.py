@@ -20,15 +20,21 @@ def test_an_env_is_named_once(config: Callable[..., EvalConfig]) -> None:
         config(envs=["a", "b", "a"])
 
 
-def test_an_env_may_have_options_of_its_own(config: Callable[..., EvalConfig]) -> None:
-    settings = config(envs=["a", "b/c"], env_options={"width": 1, "height": 2, "b/c": {"width": 3, "wrist": True}})
-    assert settings.options_for("a") == {"width": 1, "height": 2}
-    assert settings.options_for("b/c") == {"width": 3, "height": 2, "wrist": True}
+def test_a_range_of_steps_includes_the_last(config: Callable[..., EvalConfig]) -> None:
+    [policy] = config(steps={"first": 1000, "last": 3000, "every": 1000}).policies
+    assert policy.steps == [1000, 2000, 3000]
 
 
-def test_options_of_an_env_are_a_mapping(config: Callable[..., EvalConfig]) -> None:
-    with pytest.raises(ValidationError, match="want a mapping"):
-        config(envs=["a"], env_options={"a": 3})
+def test_two_policies_have_two_names(config: Callable[..., EvalConfig]) -> None:
+    policies = [{"name": "a", "url": "http://x"}, {"name": "a", "url": "http://y"}]
+    with pytest.raises(ValidationError, match="two policies are named"):
+        config(policies=policies)
+
+
+def test_seeds_that_would_play_an_episode_twice_are_refused(config: Callable[..., EvalConfig]) -> None:
+    assert config(episodes=5, seeds=[10, 0, 5]).suites[0].seeds == [10, 0, 5]
+    with pytest.raises(ValidationError, match="would play some twice; want them 5 or more apart"):
+        config(episodes=5, seeds=[0, 4])
 
 
 def test_a_fingerprint_ignores_order_and_nothing_else() -> None:

@@ -2,29 +2,59 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
+from eval_fakes import LINE, OTHER_LINE
+from flat_config import flat_config
 
-from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.envs.tabletop import Tabletop
+from vlagents_ray.errors import ConfigError, UnknownEnv
+from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig
+from vlagents_ray.evaluate.cells import cells, expand
 from vlagents_ray.evaluate.jobs import EpisodeKey, Job, JobQueue, plan
 
-
-def keys_of(env: str, count: int) -> list[EpisodeKey]:
-    return [EpisodeKey(env, i, i, "0") for i in range(count)]
+Config = Callable[..., EvalConfig]
 
 
-def test_a_plan_numbers_and_seeds_every_episode_of_every_env(config: Callable[..., EvalConfig]) -> None:
-    keys = plan(config(envs=["a", "b"], episodes=3, seed=7))
-    assert [(key.env, key.episode, key.seed) for key in keys] == [
-        ("a", 0, 7),
-        ("a", 1, 8),
-        ("a", 2, 9),
-        ("b", 0, 7),
-        ("b", 1, 8),
-        ("b", 2, 9),
+def jobs_of(env: str, count: int, **settings: Any) -> list[Job]:
+    return plan(cells(flat_config(envs=[env], episodes=count, out="out", **settings)))
+
+
+def keys(config: EvalConfig) -> list[EpisodeKey]:
+    return [job.key for job in plan(cells(config))]
+
+
+def test_a_plan_numbers_and_seeds_every_episode_of_every_env(config: Config) -> None:
+    found = keys(config(envs=[LINE, OTHER_LINE], episodes=3, seed=7))
+    assert [(key.env, key.episode, key.seed) for key in found] == [
+        (LINE, 0, 7),
+        (LINE, 1, 8),
+        (LINE, 2, 9),
+        (OTHER_LINE, 0, 7),
+        (OTHER_LINE, 1, 8),
+        (OTHER_LINE, 2, 9),
     ]
-    assert len(set(map(str, keys))) == 6
+    assert len(set(map(str, found))) == 6
+
+
+def test_a_further_seed_is_a_further_set_of_episodes(config: Config) -> None:
+    found = keys(config(episodes=2, seeds=[0, 100]))
+    assert [(key.episode, key.seed) for key in found] == [(0, 0), (1, 1), (0, 100), (1, 101)]
+
+
+def test_a_sweep_plays_checkpoint_by_checkpoint(config: Config) -> None:
+    jobs = plan(cells(config(envs=[LINE, OTHER_LINE], episodes=1, steps=[10, 20])))
+    assert [(job.cell.contender, job.key.env) for job in jobs] == [
+        ("policy@10", LINE),
+        ("policy@10", OTHER_LINE),
+        ("policy@20", LINE),
+        ("policy@20", OTHER_LINE),
+    ]
+    assert [job.cell.policy_options for job in jobs[::2]] == [{"checkpoint_step": 10}, {"checkpoint_step": 20}]
+    assert len({str(job.key) for job in jobs}) == 4
+    assert jobs[0].cell.place == jobs[2].cell.place, "checkpoints share the env that a worker has made"
 
 
 @pytest.mark.parametrize(
@@ -41,7 +71,7 @@ def test_a_plan_numbers_and_seeds_every_episode_of_every_env(config: Callable[..
     ],
 )
 def test_what_changes_the_outcome_changes_the_key(config: Callable[..., EvalConfig], change: dict[str, Any]) -> None:
-    assert not set(map(str, plan(config()))) & set(map(str, plan(config(**change))))
+    assert not set(map(str, keys(config()))) & set(map(str, keys(config(**change))))
 
 
 @pytest.mark.parametrize(
@@ -60,42 +90,90 @@ def test_what_changes_the_outcome_changes_the_key(config: Callable[..., EvalConf
 def test_what_does_not_change_the_outcome_keeps_the_key(
     config: Callable[..., EvalConfig], change: dict[str, Any]
 ) -> None:
-    assert plan(config()) == plan(config(**change))
+    assert keys(config()) == keys(config(**change))
 
 
-def test_options_of_one_env_leave_the_keys_of_another_alone(config: Callable[..., EvalConfig]) -> None:
-    plain = plan(config(envs=["a", "b"]))
-    changed = plan(config(envs=["a", "b"], env_options={"b": {"width": 8}}))
-    assert [key.env for key in plain if key in changed] == ["a"] * 6
+def test_suites_have_options_of_their_own(config: Config) -> None:
+    plain, changed = (
+        keys(
+            EvalConfig(
+                policies=[PolicyConfig()],
+                suites=[SuiteConfig(envs=[LINE]), SuiteConfig(envs=[OTHER_LINE], env_options=options)],
+                out=Path("out"),
+            )
+        )
+        for options in ({}, {"width": 8})
+    )
+    assert {key.env for key in plain if key in changed} == {LINE}
+
+
+def test_an_env_in_two_suites_of_one_name_is_refused() -> None:
+    suites = [SuiteConfig(envs=[LINE]), SuiteConfig(envs=[LINE], env_options={"width": 8})]
+    with pytest.raises(ConfigError, match="stand in two suites of one name"):
+        cells(EvalConfig(policies=[PolicyConfig()], suites=suites, out=Path("out")))
+
+
+def test_a_pattern_stands_for_the_tasks_that_match() -> None:
+    assert expand("tabletop/*") == [f"tabletop/{task}" for task in Tabletop.tasks()]
+    assert expand("tabletop") == ["tabletop"]
+    with pytest.raises(UnknownEnv, match="matches none of the tasks of 'tabletop'"):
+        expand("tabletop/x*")
 
 
 def test_a_worker_stays_with_the_env_it_has_made() -> None:
-    queue = JobQueue(keys_of("a", 2) + keys_of("b", 5))
-    taken = [queue.take("a", Counter()) for _ in range(3)]
-    assert [job.key.env for job in taken if job] == ["a", "a", "b"]
+    first, other = jobs_of(LINE, 2), jobs_of(OTHER_LINE, 5)
+    queue = JobQueue(first + other)
+    kind, made = first[0].cell.kind, first[0].cell.place
+    taken = [queue.take(kind, made, Counter()) for _ in range(3)]
+    assert [job.key.env for job in taken if job] == [LINE, LINE, OTHER_LINE]
 
 
 def test_workers_without_an_env_spread_over_the_envs() -> None:
-    queue = JobQueue(keys_of("a", 4) + keys_of("b", 4))
+    jobs = jobs_of(LINE, 4) + jobs_of(OTHER_LINE, 4)
+    queue = JobQueue(jobs)
     working: Counter[str] = Counter()
     for _ in range(4):
-        job = queue.take(None, working)
+        job = queue.take(jobs[0].cell.kind, None, working)
         assert job is not None
-        working[job.key.env] += 1
-    assert working == {"a": 2, "b": 2}
+        working[job.cell.place] += 1
+    assert sorted(working.values()) == [2, 2]
 
 
-def test_no_worker_idles_while_any_episode_waits() -> None:
-    queue = JobQueue(keys_of("a", 1))
-    job = queue.take("b", Counter({"a": 5}))
-    assert job == Job(keys_of("a", 1)[0])
-    assert queue.take("b", Counter()) is None
+def test_no_worker_idles_while_any_episode_of_its_kind_waits() -> None:
+    [only] = jobs_of(LINE, 1)
+    queue = JobQueue([only])
+    assert queue.take("another kind", None, Counter()) is None
+    assert queue.take(only.cell.kind, "elsewhere", Counter({only.cell.place: 5})) == only
+    assert queue.take(only.cell.kind, only.cell.place, Counter()) is None
     assert len(queue) == 0
 
 
 def test_a_further_attempt_comes_before_new_episodes() -> None:
-    queue = JobQueue(keys_of("a", 3))
-    first = queue.take("a", Counter())
+    jobs = jobs_of(LINE, 3)
+    queue = JobQueue(jobs)
+    kind, made = jobs[0].cell.kind, jobs[0].cell.place
+    first = queue.take(kind, made, Counter())
     assert first is not None
     queue.put_back(first.again())
-    assert queue.take("a", Counter()) == Job(first.key, attempt=2)
+    assert queue.take(kind, made, Counter()) == first.again()
+    assert first.again().attempt == 2
+
+
+def test_workers_are_wanted_where_most_wait_for_each() -> None:
+    many, few = jobs_of(LINE, 6), jobs_of(OTHER_LINE, 2, cpus_per_worker=2.0)
+    queue = JobQueue(many + few)
+    kinds: Counter[str] = Counter()
+    while (cell := queue.wants(kinds, kinds)) is not None:
+        kinds[cell.kind] += 1
+    assert kinds == {many[0].cell.kind: 6, few[0].cell.kind: 2}, "no more than there are episodes"
+    assert queue.wants({many[0].cell.kind: 6}, {}) == few[0].cell
+
+
+def test_a_cell_that_is_dropped_leaves_the_others() -> None:
+    jobs = jobs_of(LINE, 6, steps=[1, 2])
+    queue = JobQueue(jobs)
+    assert queue.drop(jobs[0].cell.fingerprint) == 6
+    assert len(queue) == 6
+    job = queue.take(jobs[0].cell.kind, None, Counter())
+    assert job is not None
+    assert job.cell.step == 2

@@ -3,9 +3,11 @@ from __future__ import annotations
 from io import StringIO
 
 import pytest
+from flat_config import flat_config
 from rich.console import Console
 
 from vlagents_ray.evaluate import Rate, progress_for
+from vlagents_ray.evaluate.cells import Cell, cells
 from vlagents_ray.evaluate.episode import EpisodeResult, Status
 from vlagents_ray.evaluate.jobs import EpisodeKey, Job
 from vlagents_ray.evaluate.progress import LineProgress, LiveProgress, Progress
@@ -14,8 +16,16 @@ from vlagents_ray.evaluate.rollout import Failure
 RETRY = Failure("worker", "env_failed", "the simulator exploded\nwith a long story")
 
 
+def planned(episodes: int) -> Cell:
+    [cell] = cells(flat_config(envs=["tabletop"], episodes=episodes, out="out"))
+    return cell
+
+
+TEN = planned(10)
+
+
 def key(i: int) -> EpisodeKey:
-    return EpisodeKey("tabletop", i, i, "0")
+    return EpisodeKey("tabletop", i, i, TEN.fingerprint)
 
 
 def result(i: int, success: bool | None, status: Status = "done") -> EpisodeResult:
@@ -23,11 +33,11 @@ def result(i: int, success: bool | None, status: Status = "done") -> EpisodeResu
 
 
 def shown(progress: Progress, out: StringIO) -> str:
-    progress.begin({"tabletop": 10}, {"tabletop": Rate(2, 4)})
-    progress.episode(result(4, True))
-    progress.retry(Job(key(5)), RETRY)
-    progress.episode(result(5, False))
-    progress.episode(result(6, None, "infra_failed"))
+    progress.begin([TEN], {TEN.fingerprint: Rate(2, 4)})
+    progress.episode(TEN, result(4, True))
+    progress.retry(Job(key(5), TEN), RETRY)
+    progress.episode(TEN, result(5, False))
+    progress.episode(TEN, result(6, None, "infra_failed"))
     progress.end()
     return out.getvalue()
 
@@ -53,9 +63,10 @@ def test_progress_tells_success_so_far_and_what_infrastructure_cost(terminal: bo
 def test_lines_are_sparse(monkeypatch: pytest.MonkeyPatch) -> None:
     out = StringIO()
     progress = LineProgress(Console(file=out, width=120), every_s=1e9)
-    progress.begin({"tabletop": 100}, {})
+    many = planned(100)
+    progress.begin([many], {})
     for i in range(100):
-        progress.episode(result(i, True))
+        progress.episode(many, result(i, True))
     progress.end()
     lines = out.getvalue().splitlines()
     assert len(lines) == 2

@@ -6,6 +6,7 @@ from typing import Any, ClassVar
 
 import pytest
 from eval_fakes import LINE, OTHER_LINE, Line, ToZero
+from flat_config import flat_config
 
 from vlagents_ray.errors import (
     ConfigError,
@@ -20,15 +21,22 @@ from vlagents_ray.errors import (
     UnknownSession,
     VLAgentsError,
 )
-from vlagents_ray.evaluate import EvalConfig, rollout
+from vlagents_ray.evaluate import EvalConfig, PolicyConfig, rollout
+from vlagents_ray.evaluate.cells import cells
 from vlagents_ray.evaluate.jobs import EpisodeKey, Job
 from vlagents_ray.evaluate.rollout import Rollout, explain
+from vlagents_ray.interface import Agent
 
 Config = Callable[..., EvalConfig]
 
 
-def job(seed: int = 0, env: str = LINE) -> Job:
-    return Job(EpisodeKey(env, seed, seed, "0"))
+def job(seed: int = 0, env: str = LINE, **settings: Any) -> Job:
+    [cell] = cells(flat_config(envs=[env], out="out", **settings))
+    return Job(EpisodeKey(env, seed, seed, "0"), cell)
+
+
+def rollout_of(config: Config, make: Callable[[], Agent], **changes: Any) -> Rollout:
+    return Rollout(config(**changes), lambda _policy: make())
 
 
 def test_the_env_is_made_once_and_closed_when_another_is_needed(
@@ -36,9 +44,9 @@ def test_the_env_is_made_once_and_closed_when_another_is_needed(
 ) -> None:
     closed = []
     monkeypatch.setattr(Line, "close", lambda self: closed.append(type(self).__name__))
-    worker = Rollout(config(), ToZero)
+    worker = rollout_of(config, ToZero)
     reports = [worker.run(one) for one in (job(0), job(1), job(0, OTHER_LINE), job(2))]
-    assert [report.made.env if report.made else None for report in reports] == [LINE, None, OTHER_LINE, LINE]
+    assert [report.made is not None for report in reports] == [True, False, True, True]
     assert closed == ["Line", "OtherLine"]
     worker.close()
     assert closed == ["Line", "OtherLine", "Line"]
@@ -48,7 +56,7 @@ def test_a_worker_reports_what_it_found_out_about_env_and_policy(config: Config)
     class Remote(ToZero):
         metadata: ClassVar[dict[str, Any]] = {"policy": "to-zero", "checkpoint": "a"}
 
-    worker = Rollout(config(), Remote)
+    worker = rollout_of(config, Remote)
     first, second = worker.run(job(0)), worker.run(job(1))
     assert first.policy == {"policy": "to-zero", "checkpoint": "a"}
     assert first.made is not None
@@ -67,7 +75,7 @@ def test_a_contract_mismatch_is_reported_before_any_step_with_every_difference(c
         def reset(self, *args: Any, **kwargs: Any) -> Any:
             raise AssertionError
 
-    failure = Rollout(config(), Picky).run(job()).failure
+    failure = rollout_of(config, Picky).run(job()).failure
     assert failure is not None
     assert (failure.cause, failure.code) == ("user", ContractMismatch.code)
     assert "camera 'wrist'" in failure.message
@@ -81,7 +89,7 @@ def test_after_a_lost_connection_the_next_attempt_has_a_new_agent(
     agents: list[ToZero] = []
     closed: list[ToZero] = []
 
-    def connect() -> ToZero:
+    def connect(_policy: PolicyConfig) -> ToZero:
         agents.append(ToZero(lost_on=3 if not agents else None))
         monkeypatch.setattr(agents[-1], "close", lambda agent=agents[-1]: closed.append(agent), raising=False)
         return agents[-1]
@@ -100,14 +108,14 @@ def test_a_policy_that_cannot_start_stops_the_evaluation(config: Config) -> None
         def initialize(self) -> None:
             raise OSError("no such checkpoint")
 
-    failure = Rollout(config(), Unloadable).run(job()).failure
+    failure = rollout_of(config, Unloadable).run(job()).failure
     assert failure is not None
     assert failure.cause == "user"
     assert "no such checkpoint" in failure.message
 
 
 def test_an_env_that_cannot_be_made_is_an_infrastructure_failure(config: Config) -> None:
-    failure = Rollout(config(env_options={"broken": "GPU lost"}), ToZero).run(job()).failure
+    failure = rollout_of(config, ToZero).run(job(env_options={"broken": "GPU lost"})).failure
     assert failure is not None
     assert (failure.cause, failure.code) == ("worker", EnvFailed.code)
     assert "GPU lost" in failure.message
@@ -115,7 +123,7 @@ def test_an_env_that_cannot_be_made_is_an_infrastructure_failure(config: Config)
 
 def test_an_env_that_says_what_it_misses_stops_the_evaluation(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Line, "missing", classmethod(lambda _cls: "no Vulkan device; install mesa-vulkan-drivers"))
-    failure = Rollout(config(env_options={"broken": "no device"}), ToZero).run(job()).failure
+    failure = rollout_of(config, ToZero).run(job(env_options={"broken": "no device"})).failure
     assert failure is not None
     assert (failure.cause, failure.code) == ("user", MissingDependency.code)
     assert "install mesa-vulkan-drivers" in failure.message
@@ -123,15 +131,15 @@ def test_an_env_that_says_what_it_misses_stops_the_evaluation(config: Config, mo
 
 @pytest.mark.parametrize(("video", "seed", "cameras"), [("none", 0, []), ("failures", 2, []), ("all", 2, ["front"])])
 def test_videos_come_as_wanted(config: Config, video: str, seed: int, cameras: list[str]) -> None:
-    worker = Rollout(config(video=video, env_options={"camera": [32, 32]}), ToZero)
-    report = worker.run(job(seed))
+    worker = rollout_of(config, ToZero, video=video)
+    report = worker.run(job(seed, env_options={"camera": [32, 32]}))
     assert report.result is not None
     assert sorted(report.videos) == cameras
 
 
 def test_failed_episodes_leave_a_video(config: Config) -> None:
-    worker = Rollout(config(video="failures", env_options={"camera": [32, 32]}), ToZero)
-    reports = [worker.run(job(seed)) for seed in range(12)]
+    worker = rollout_of(config, ToZero, video="failures")
+    reports = [worker.run(job(seed, env_options={"camera": [32, 32]})) for seed in range(12)]
     for report in reports:
         assert report.result is not None
         assert bool(report.videos) != report.result.success_once
@@ -147,7 +155,7 @@ def test_progress_tells_phase_age_and_place(config: Config, monkeypatch: pytest.
             pulses.append(worker.progress())
             return super().act(obs)
 
-    worker = Rollout(config(), Watched)
+    worker = rollout_of(config, Watched)
     assert worker.progress().phase == "idle"
     worker.run(job())
     assert [(pulse.phase, pulse.steps) for pulse in pulses[:3]] == [

@@ -17,6 +17,7 @@ from eval_fakes import EVERY, LINE, OTHER_LINE, Silent, Teller, ToZero, wait_for
 
 from vlagents_ray.errors import ConfigError, ConnectionLost, ContractMismatch, UnknownEnv
 from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, SilentProgress, check, evaluate, pool
+from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.store import Store
 
@@ -133,7 +134,7 @@ class TestOnACluster:
         class SignalAfterTwo(SilentProgress):
             seen = 0
 
-            def episode(self, result: EpisodeResult) -> None:
+            def episode(self, cell: Cell, result: EpisodeResult) -> None:
                 self.seen += 1
                 if self.seen == 2:
                     signal.raise_signal(number)
@@ -171,7 +172,7 @@ class TestOnACluster:
                     assert sum(1 for _ in container.decode(video=0)) == steps + 1
 
     def test_workers_start_with_pinned_threads_and_the_users_variables(self, config: Config) -> None:
-        runtime_env = config().runtime_env
+        runtime_env = config().worker.runtime_env
         env_vars = {**runtime_env["env_vars"], "LP_NUM_THREADS": "5", "EXTRA": "yes"}  # type: ignore[dict-item]
         evaluate(config(episodes=1, threads=3, runtime_env={**runtime_env, "env_vars": env_vars}), agent_factory=Teller)
         ((status, text),) = query(config(), "SELECT status, error FROM episodes")
@@ -200,5 +201,5 @@ def test_settings_can_be_checked_before_anything_is_served(config: Config) -> No
 
 
 def test_a_policy_must_be_somewhere(config: Config) -> None:
-    with pytest.raises(ConfigError, match="policy_url: got none"):
+    with pytest.raises(ConfigError, match="policy 'policy': got no url"):
         evaluate(config())

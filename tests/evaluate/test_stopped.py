@@ -39,7 +39,7 @@ def own_ray_folder() -> Iterator[Path]:
 
 
 def start(config: EvalConfig, ray_folder: Path) -> Popen[bytes]:
-    env_vars = config.runtime_env["env_vars"]
+    env_vars = config.worker.runtime_env["env_vars"]
     assert isinstance(env_vars, dict)
     environment = {
         **os.environ,
@@ -89,4 +89,4 @@ def test_a_stopped_and_resumed_evaluation_has_each_episode_exactly_once(
     wait_for(lambda: not processes(ray_folder))
     assert episodes(settings) == [(1, i, 1) for i in range(5)] + [(2, i, 1) for i in range(5, 9)]
     summary = json.loads((settings.out / "summary.json").read_text())
-    assert (summary["state"], summary["total"]["episodes"], summary["total"]["retries"]) == ("complete", 9, 0)
+    assert (summary["state"], summary["totals"][0]["episodes"], summary["totals"][0]["retries"]) == ("complete", 9, 0)

@@ -11,13 +11,24 @@ import pytest
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.evaluate.cells import cells
 from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.jobs import EpisodeKey, Job, plan
+from vlagents_ray.evaluate.results import Results
 from vlagents_ray.evaluate.rollout import Failure, Made
 from vlagents_ray.evaluate.store import Store
 
+
+def planned(config: EvalConfig) -> list[Job]:
+    return plan(cells(config))
+
+
 FAILURE = Failure("worker", "env_failed", "it hung", "Traceback ...")
 Config = Callable[..., EvalConfig]
+
+
+def recorded(config: EvalConfig) -> list[EpisodeResult]:
+    return [one.result for cell in Results.load(config.out).cells for one in cell.episodes]
 
 
 def done(key: EpisodeKey, success: bool = True) -> EpisodeResult:
@@ -25,7 +36,7 @@ def done(key: EpisodeKey, success: bool = True) -> EpisodeResult:
 
 
 def test_recorded_episodes_are_finished_and_lost_ones_are_not(config: Config) -> None:
-    keys = plan(config())
+    keys = [job.key for job in planned(config())]
     with Store(config()) as store:
         store.begin_run(config(), {})
         store.record(done(keys[0]), attempts=1)
@@ -35,49 +46,52 @@ def test_recorded_episodes_are_finished_and_lost_ones_are_not(config: Config) ->
 
 
 def test_an_episode_is_recorded_once(config: Config) -> None:
-    key = plan(config())[0]
+    key = planned(config())[0].key
     with Store(config()) as store:
         store.begin_run(config(), {})
         store.record(done(key), attempts=1)
         with pytest.raises(sqlite3.IntegrityError):
             store.record(done(key, success=False), attempts=1)
-        assert [row["success_once"] for row in store.rows("episodes")] == [1]
+        assert [one.success_once for one in recorded(config())] == [True]
 
 
 def test_a_lost_episode_gives_way_to_its_repetition(config: Config) -> None:
-    key = plan(config())[0]
+    key = planned(config())[0].key
     with Store(config()) as store:
         store.begin_run(config(), {})
         store.record(EpisodeResult(key, "infra_failed", error="hung"), attempts=4)
-        assert store.rows("episodes")[0]["success_once"] is None
+        assert [one.success_once for one in recorded(config())] == [None]
         store.record(done(key), attempts=1)
-        assert [(row["status"], row["success_once"]) for row in store.rows("episodes")] == [("done", 1)]
+        assert [(one.status, one.success_once) for one in recorded(config())] == [("done", True)]
 
 
 def test_what_is_recorded_is_there_for_another_process_at_once(config: Config) -> None:
     settings = config()
     with Store(settings) as store:
         store.begin_run(settings, {})
-        store.record(done(plan(settings)[0]), attempts=2, videos=["videos/a.mp4"])
+        store.record(done(planned(settings)[0].key), attempts=2, videos=["videos/a.mp4"])
         with closing(sqlite3.connect(settings.out / "results.db")) as db:
             assert db.execute("PRAGMA journal_mode").fetchone() == ("wal",)
             assert db.execute("SELECT steps, attempts, videos FROM episodes").fetchall() == [(4, 2, '["videos/a.mp4"]')]
 
 
 def test_every_failed_attempt_is_kept_with_its_error(config: Config) -> None:
-    key = plan(config())[0]
+    job = planned(config())[0]
     with Store(config()) as store:
         store.begin_run(config(), {})
-        store.record_attempt(Job(key), FAILURE, retried=True)
-        store.record_attempt(Job(key, 2), FAILURE, retried=False)
-        rows = store.rows("attempts")
-    assert [(row["attempt"], row["retried"], row["error"]) for row in rows] == [(1, 1, "it hung"), (2, 0, "it hung")]
+        store.record_attempt(job, FAILURE, retried=True)
+        store.record_attempt(job.again(), FAILURE, retried=False)
+        [cell] = Results.load(config().out).cells
+    assert [(one.attempt, one.retried, one.error) for one in cell.attempts] == [
+        (1, True, "it hung"),
+        (2, False, "it hung"),
+    ]
 
 
 def test_results_are_not_touched_without_resume(config: Config) -> None:
     with Store(config()) as store:
         store.begin_run(config(), {})
-        store.record(done(plan(config())[0]), attempts=1)
+        store.record(done(planned(config())[0].key), attempts=1)
     with pytest.raises(ConfigError, match=r"already has results \(1 episodes\).*--resume"):
         Store(config())
     with Store(config(resume=True)) as store:
@@ -89,17 +103,35 @@ def test_a_folder_that_was_opened_and_not_used_needs_no_resume(config: Config) -
     Store(config(seed=5)).close()
 
 
-@pytest.mark.parametrize("change", [{"policy": "other"}, {"seed": 100}, {"checkpoint": "b"}, {"execute": 2}])
-def test_results_of_other_settings_are_not_resumed(config: Config, change: dict[str, object]) -> None:
+@pytest.mark.parametrize(
+    ("change", "differing"),
+    [
+        ({"seed": 100}, "seeds"),
+        ({"seeds": [100, 0]}, "seeds"),
+        ({"checkpoint": "b"}, "checkpoint"),
+        ({"execute": 2}, "execute"),
+        ({"policy_config": {"a": 1}}, "policy_config"),
+        ({"env_options": {"camera": [8, 8]}}, "env_options"),
+    ],
+)
+def test_results_of_other_settings_are_not_resumed(config: Config, change: dict[str, object], differing: str) -> None:
     with Store(config()) as store:
         store.begin_run(config(), {})
-    (name,) = change
-    with pytest.raises(ConfigError, match=f"{name}: the results have .*, now it is"):
+    with pytest.raises(ConfigError, match=f"{differing}: the results have .*, now it is"):
         Store(config(resume=True, **change))
 
 
 @pytest.mark.parametrize(
-    "change", [{"episodes": 50}, {"workers": 7}, {"video": "all"}, {"envs": ["eval_fakes:OtherLine"]}]
+    "change",
+    [
+        {"episodes": 50},
+        {"seeds": [0, 100]},
+        {"workers": 7},
+        {"video": "all"},
+        {"envs": ["eval_fakes:OtherLine"]},
+        {"policy": "other"},
+        {"steps": [1, 2]},
+    ],
 )
 def test_more_of_the_same_is_resumed(config: Config, change: dict[str, object]) -> None:
     with Store(config()) as store:
@@ -116,20 +148,21 @@ def test_two_evaluations_do_not_write_to_one_folder(config: Config) -> None:
 def test_another_checkpoint_on_the_server_is_noticed(config: Config) -> None:
     with Store(config()) as store:
         store.begin_run(config(), {})
-        store.note_policy({"policy": "act", "checkpoint": "a", "uptime_s": 3})
-        store.note_policy({"policy": "act", "checkpoint": "a", "uptime_s": 9})
+        store.note_policy("policy", {"policy": "act", "checkpoint": "a", "uptime_s": 3})
+        store.note_policy("policy", {"policy": "act", "checkpoint": "a", "uptime_s": 9})
         with pytest.raises(ConfigError, match=r"checkpoint 'b'.*are of 'a'"):
-            store.note_policy({"policy": "act", "checkpoint": "b"})
-        assert store.policy() == {"policy": "act", "checkpoint": "a", "uptime_s": 9}
+            store.note_policy("policy", {"policy": "act", "checkpoint": "b"})
+        assert Results.load(config().out).policies == {"policy": {"policy": "act", "checkpoint": "a", "uptime_s": 9}}
 
 
 def test_what_is_known_of_an_env_survives_a_resume(config: Config) -> None:
-    (env,) = config().envs
+    [cell] = cells(config())
     with Store(config()) as store:
         store.begin_run(config(), {})
-        store.note_env(Made(env, {"simulator": "line"}, {}))
+        store.note_env(cell.place, Made({"simulator": "line"}, {}))
     with Store(config(resume=True)) as store:
-        assert store.rows("envs")[0]["described"] == '{"simulator": "line"}'
+        assert store.cells == [cell]
+    assert [one.described for one in Results.load(config().out).cells] == [{"simulator": "line"}]
 
 
 def test_a_results_file_of_another_version_is_refused(config: Config) -> None:
@@ -144,37 +177,38 @@ WRITER = """
 import sys
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.evaluate.episode import EpisodeResult
+from vlagents_ray.evaluate.cells import cells
 from vlagents_ray.evaluate.jobs import plan
 from vlagents_ray.evaluate.store import Store
 
 config = EvalConfig.model_validate_json(sys.argv[1])
 with Store(config) as store:
     store.begin_run(config, {})
-    for key in plan(config):
-        store.record(EpisodeResult(key, "done", True, True), 1)
-        print(key, flush=True)
+    for job in plan(store.cells):
+        store.record(EpisodeResult(job.key, "done", True, True), 1)
+        print(job.key, flush=True)
 """
 
 
 def test_a_killed_writer_loses_nothing_that_it_recorded(config: Config) -> None:
-    settings = config(episodes=1_000_000)
+    settings = config(envs=["tabletop"], episodes=1_000_000)
     with Popen([sys.executable, "-c", WRITER, settings.model_dump_json()], stdout=PIPE, text=True) as writer:
         assert writer.stdout is not None
         told = [writer.stdout.readline().strip() for _ in range(200)]
         writer.kill()
         told += [line.strip() for line in writer.stdout if line.endswith("\n")]
-    with Store(config(episodes=1_000_000, resume=True)) as store:
+    with Store(config(envs=["tabletop"], episodes=1_000_000, resume=True)) as store:
         finished = store.finished()
     assert set(told) <= finished
     assert len(finished) <= len(told) + 1
 
 
 def test_an_episode_of_another_checkpoint_is_not_added(config: Config) -> None:
-    first, second, third = plan(config(episodes=3))
+    first, second, third = (job.key for job in planned(config(episodes=3)))
     with Store(config(episodes=3)) as store:
         store.begin_run(config(episodes=3), {})
         store.record(replace(done(first), checkpoint="runs/1"), attempts=1)
         store.record(replace(done(second), checkpoint="runs/1"), attempts=1)
         with pytest.raises(ConfigError, match=r"played by checkpoint 'runs/2'.* are of 'runs/1'"):
             store.record(replace(done(third), checkpoint="runs/2"), attempts=1)
-        assert [row["checkpoint"] for row in store.rows("episodes")] == ["runs/1", "runs/1"]
+        assert [one.checkpoint for one in recorded(config())] == ["runs/1", "runs/1"]

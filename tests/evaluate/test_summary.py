@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from io import StringIO
 from pathlib import Path
 
@@ -10,8 +11,10 @@ from eval_fakes import LINE, OTHER_LINE
 from rich.console import Console
 
 from vlagents_ray.evaluate import EvalConfig, Summary, print_summary
+from vlagents_ray.evaluate.cells import cells
 from vlagents_ray.evaluate.episode import EpisodeResult
-from vlagents_ray.evaluate.jobs import Job, plan
+from vlagents_ray.evaluate.jobs import plan
+from vlagents_ray.evaluate.results import Results
 from vlagents_ray.evaluate.rollout import Failure, Made
 from vlagents_ray.evaluate.store import Store
 from vlagents_ray.evaluate.summary import summarize, versions, write_summary
@@ -23,25 +26,26 @@ Config = Callable[..., EvalConfig]
 def summary(config: Config) -> Summary:
     """Two envs with 3 planned episodes each: one finished but for a lost episode, one begun."""
     settings = config(envs=[LINE, OTHER_LINE], episodes=3, policy="act", policy_url="http://localhost:1")
-    keys = plan(settings)
+    jobs = plan(cells(settings))
+    keys = [job.key for job in jobs]
     with Store(settings) as store:
-        store.begin_run(settings, {})
-        store.note_env(Made(LINE, {"simulator": "line"}, {}))
-        store.note_policy({"policy": "act", "checkpoint": "a"})
+        store.begin_run(settings, versions())
+        store.note_env(jobs[0].cell.place, Made({"simulator": "line"}, {}))
+        store.note_policy("act", {"policy": "act", "checkpoint": "a"})
         store.record(
             EpisodeResult(keys[0], "done", True, False, 10, 2.0, seconds=1.0, transport="http", policy_ms=3.0), 1
         )
         store.record(EpisodeResult(keys[1], "policy_error", False, False, 2, 1.0, seconds=0.5, transport="http"), 2)
-        store.record_attempt(Job(keys[1]), Failure("policy", "connection_lost", "gone"), retried=True)
-        store.record_attempt(Job(keys[2], 4), Failure("worker", "env_failed", "hung"), retried=False)
+        store.record_attempt(jobs[1], Failure("policy", "connection_lost", "gone"), retried=True)
+        store.record_attempt(replace(jobs[2], attempt=4), Failure("worker", "env_failed", "hung"), retried=False)
         store.record(EpisodeResult(keys[2], "infra_failed", error="hung"), 4)
         store.record(EpisodeResult(keys[3], "done", True, True, 6, 3.0, seconds=1.0, transport="websocket"), 1)
         store.end_run("interrupted")
-        return summarize(store, settings, versions(), "interrupted")
+    return summarize(Results.load(settings.out))
 
 
 def test_infrastructure_failures_are_in_no_rate(summary: Summary) -> None:
-    group = summary.envs[0]
+    group = summary.cells[0]
     assert (group.planned, group.episodes, group.infra_failures, group.policy_errors) == (3, 2, 1, 1)
     assert (group.success_once.successes, group.success_at_end.successes) == (1, 0)
     assert (group.success_once.rate, group.mean_steps, group.mean_return) == (0.5, 6.0, 1.5)
@@ -53,18 +57,20 @@ def test_the_total_counts_all_envs(summary: Summary) -> None:
     assert (total.planned, total.episodes, total.steps, total.retries) == (6, 3, 18, 1)
     assert (total.success_once.successes, total.success_at_end.successes) == (2, 1)
     assert total.policy_ms == 3.0
-    assert summary.transports == ("http", "websocket")
+    assert summary.transports == ["http", "websocket"]
     assert summary.steps_per_second == pytest.approx(18 / summary.wall_seconds)
 
 
 def test_a_summary_is_plain_json_with_all_that_made_it(summary: Summary) -> None:
     written = json.loads(write_summary(summary).read_text())
     assert written["state"] == "interrupted"
-    assert [env["name"] for env in written["envs"]] == [LINE, OTHER_LINE]
-    assert written["total"]["success_once"]["wilson_95"] == pytest.approx([0.2077, 0.9385], abs=1e-4)
-    assert written["config"]["episodes"] == 3
-    assert written["policy"] == {"policy": "act", "checkpoint": "a"}
-    assert written["env_descriptions"] == {LINE: {"simulator": "line"}}
+    assert [cell["env"] for cell in written["cells"]] == [LINE, OTHER_LINE]
+    [total] = written["totals"]
+    assert (total["contender"], total["env"]) == ("act", "total")
+    assert total["success_once"]["wilson_95"] == pytest.approx([0.2077, 0.9385], abs=1e-4)
+    assert written["config"]["suites"][0]["episodes"] == 3
+    assert written["policies"] == {"act": {"policy": "act", "checkpoint": "a"}}
+    assert [cell["described"] for cell in written["cells"]] == [{"simulator": "line"}, {}]
     assert {"python", "ray", "numpy", "vlagents-ray", "git_commit"} <= set(written["versions"])
 
 

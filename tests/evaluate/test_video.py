@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 
 from vlagents_ray.errors import EnvFailed
+from vlagents_ray.evaluate import PolicyConfig, SuiteConfig, WorkerConfig
+from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.jobs import EpisodeKey
 from vlagents_ray.evaluate.video import VideoRecorder, save_videos
 from vlagents_ray.interface import HIGH_RES, Obs
 
+ENV = "maniskill/PushCube-v1"
 COLOURS = [(200, 40, 40), (40, 200, 40), (40, 40, 200), (220, 220, 220), (20, 20, 20)]
 
 
@@ -74,26 +77,29 @@ def test_a_camera_that_changes_its_size_is_an_env_failure() -> None:
         record([plain(COLOURS[0]), plain(COLOURS[0], 32, 32)])
 
 
+CELL = Cell(PolicyConfig(name="act", steps=[20]), 20, SuiteConfig(name="unseen", envs=[ENV]), ENV, WorkerConfig())
+
+
 def result(success: bool, status: str = "done") -> EpisodeResult:
-    key = EpisodeKey("maniskill/PushCube-v1", 3, 3, "0")
+    key = EpisodeKey(ENV, 3, 3, "0")
     return EpisodeResult(key, status, success_once=success)  # type: ignore[arg-type]
 
 
 def test_a_video_is_named_by_env_episode_outcome_and_camera(tmp_path: Path) -> None:
-    paths = save_videos(tmp_path, result(True), {"base_camera": b"1", "left/wrist": b"2"})
+    paths = save_videos(tmp_path, CELL, result(True), {"base_camera": b"1", "left/wrist": b"2"})
     assert paths == [
-        "videos/maniskill_PushCube-v1/ep0003_seed3_success_base_camera.mp4",
-        "videos/maniskill_PushCube-v1/ep0003_seed3_success_left_wrist.mp4",
+        "videos/act_20/unseen/maniskill_PushCube-v1/ep0003_seed3_success_base_camera.mp4",
+        "videos/act_20/unseen/maniskill_PushCube-v1/ep0003_seed3_success_left_wrist.mp4",
     ]
     assert (tmp_path / paths[0]).read_bytes() == b"1"
 
 
 def test_a_repeated_episode_replaces_its_videos(tmp_path: Path) -> None:
-    save_videos(tmp_path, result(True), {"front": b"old", "wrist": b"old"})
-    folder = tmp_path / "videos" / "maniskill_PushCube-v1"
+    save_videos(tmp_path, CELL, result(True), {"front": b"old", "wrist": b"old"})
+    folder = tmp_path / "videos" / "act_20" / "unseen" / "maniskill_PushCube-v1"
     (folder / "ep0003_seed3_success_side.part").write_bytes(b"cut off by a crash")
     (folder / "ep0003_seed33_success_front.mp4").write_bytes(b"another episode")
-    save_videos(tmp_path, result(False), {"front": b"new"})
+    save_videos(tmp_path, CELL, result(False), {"front": b"new"})
     assert sorted(path.name for path in folder.iterdir()) == [
         "ep0003_seed33_success_front.mp4",
         "ep0003_seed3_failure_front.mp4",
@@ -101,5 +107,5 @@ def test_a_repeated_episode_replaces_its_videos(tmp_path: Path) -> None:
 
 
 def test_an_episode_without_videos_makes_no_folder(tmp_path: Path) -> None:
-    assert save_videos(tmp_path, result(True), {}) == []
+    assert save_videos(tmp_path, CELL, result(True), {}) == []
     assert list(tmp_path.iterdir()) == []

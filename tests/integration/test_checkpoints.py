@@ -12,12 +12,14 @@ from urllib.parse import urlsplit
 
 import pytest
 from eval_fakes import wait_for
+from flat_config import flat_config
 from ray.serve.schema import ServeDeploySchema
 
 from tests.integration.test_sessions import TRANSPORTS, url
 from vlagents_ray import ConfigError, Obs, RemoteAgent
 from vlagents_ray.errors import CheckpointFailed, UnknownCheckpoint
-from vlagents_ray.evaluate import EvalConfig, evaluate
+from vlagents_ray.evaluate import evaluate
+from vlagents_ray.evaluate.summary import checkpoint_of
 from vlagents_ray.serve.cluster import Server, running_server
 from vlagents_ray.serve.files import deployment
 
@@ -242,17 +244,21 @@ def test_every_replica_swaps_and_new_ones_begin_with_what_was_swapped_to(fresh: 
 
 
 def test_an_evaluation_says_by_which_checkpoint(fresh: Server, folder: Path, tmp_path: Path) -> None:
-    config = EvalConfig(
-        envs=["eval_fakes:Line"], policy_url=fresh.url, policy_options={"checkpoint_step": 3}, episodes=2,
-        out=tmp_path / "results", video="none",
-    )  # fmt: skip
-    summary = evaluate(config)
-    assert summary.checkpoint == str(folder / "3")
+    settings = {"envs": ["eval_fakes:Line"], "policy_url": fresh.url, "episodes": 2, "video": "none"}
+    summary = evaluate(flat_config(**settings, policy_options={"checkpoint_step": 3}, out=tmp_path / "results"))
+    assert [checkpoint_of(cell) for cell in summary.results.cells] == [str(folder / "3")]
     assert (summary.total.episodes, summary.total.policy_errors) == (2, 0)
     for option, error in (({"checkpoint_step": 77}, CheckpointFailed), ({"checkpoint": "lat"}, UnknownCheckpoint)):
         out = tmp_path / error.__name__
         with pytest.raises(error):  # no episode is lost to it, and none counts as a failure of the policy
-            evaluate(config.model_copy(update={"policy_options": option, "out": out}))
+            evaluate(flat_config(**settings, policy_options=option, out=out))
+
+
+def test_a_sweep_evaluates_each_checkpoint_on_one_server(fresh: Server, folder: Path, tmp_path: Path) -> None:
+    settings = {"envs": ["eval_fakes:Line"], "policy_url": fresh.url, "episodes": 3, "video": "none", "workers": 2}
+    summary = evaluate(flat_config(**settings, steps=[3, 4], out=tmp_path / "results"))
+    assert [(group.contender, group.episodes) for group in summary.totals] == [("policy@3", 3), ("policy@4", 3)]
+    assert [checkpoint_of(cell) for cell in summary.results.cells] == [str(folder / "3"), str(folder / "4")]
 
 
 def test_a_file_that_cannot_be_is_refused_before_anything_starts(folder: Path) -> None:

@@ -15,11 +15,12 @@ import pytest
 import ray
 import yaml
 from environment_folders import ended, layered
-from eval_fakes import LINE, wait_for
+from eval_fakes import LINE
+from flat_config import flat_config, wait_for
 
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.client.ways import TransportName
-from vlagents_ray.evaluate import EvalConfig, evaluate
+from vlagents_ray.evaluate import evaluate
 from vlagents_ray.serve.cluster import Server, running_server
 from vlagents_ray.serve.environments.making import make_environment
 from vlagents_ray.serve.files import read_deployment
@@ -121,7 +122,7 @@ def test_an_env_on_the_node_with_another_numpy_drives_each(served: Served, app: 
 @pytest.mark.parametrize("app", ["old", "apart"])
 def test_an_evaluation_drives_a_policy_in_its_environment(served: Served, app: str, tmp_path: Path) -> None:
     before = len(served.said(app)) if served.notes[app].exists() else 0
-    config = EvalConfig(
+    config = flat_config(
         envs=[LINE], episodes=4, workers=2, out=tmp_path / "out", video="none", policy_url=served.server.apps[app]
     )
     summary = evaluate(config)

@@ -21,8 +21,9 @@ import pytest
 import ray
 import yaml
 from desk import DESK, DeskActor, play
+from flat_config import flat_config
 
-from vlagents_ray.evaluate import EvalConfig, evaluate
+from vlagents_ray.evaluate import evaluate
 from vlagents_ray.serve.cluster import Server, running_server
 from vlagents_ray.serve.files import read_deployment
 
@@ -144,7 +145,7 @@ def test_families_whose_packages_contradict_are_evaluated_side_by_side(server: S
     if set(present()) & {"openvla", "octo"}:  # which are older than numpy 2
         assert {found["numpy"].partition(".")[0] for found in told} == {"1", "2"}
     for name in present():
-        config = EvalConfig(
+        config = flat_config(
             envs=[DESK],
             episodes=2,
             workers=2,

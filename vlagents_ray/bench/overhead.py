@@ -28,7 +28,7 @@ import numpy as np
 from vlagents_ray.bench.cpu import CpuSampler
 from vlagents_ray.envs import make_env
 from vlagents_ray.errors import EnvFailed
-from vlagents_ray.evaluate import EvalConfig, evaluate
+from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, evaluate
 from vlagents_ray.evaluate.pool import THREAD_VARIABLES
 from vlagents_ray.interface import Act
 from vlagents_ray.serve.cluster import running_server
@@ -127,11 +127,8 @@ def measure_overhead(
             bare.append(bare_rate(env, options, action_dim, workers, episodes))
             tell(f"round {number + 1}/{rounds}: bare {bare[-1].steps_per_s:.1f} steps/s")
             config = EvalConfig(
-                envs=[env],
-                env_options=options,
-                policy="noop",
-                policy_url="serve://noop",
-                episodes=episodes * workers,
+                policies=[PolicyConfig(name="noop", url="serve://noop")],
+                suites=[SuiteConfig(envs=[env], env_options=options, episodes=episodes * workers)],
                 workers=workers,
                 video="none",
                 out=Path(folder) / str(number),

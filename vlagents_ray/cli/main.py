@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import math
-import os
 import threading
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 from rich.table import Table
@@ -16,16 +14,13 @@ from vlagents_ray.cli.bench import bench
 from vlagents_ray.cli.console import errors as _errors
 from vlagents_ray.cli.console import out
 from vlagents_ray.cli.environments import env
+from vlagents_ray.cli.evaluation import Address, Set, evaluate_command, run_evaluation
 from vlagents_ray.cli.keys import keys as keys_app
 from vlagents_ray.cli.settings import parse_settings
 from vlagents_ray.errors import ConfigError, VLAgentsError
-from vlagents_ray.serve.checkpoints import resolved
 from vlagents_ray.serve.cluster import running_server
-from vlagents_ray.serve.files import listens_at, own_settings, read_deployment, with_dialect
+from vlagents_ray.serve.files import listens_at, read_deployment, with_dialect
 from vlagents_ray.serve.tls import Tls
-
-if TYPE_CHECKING:
-    from ray.serve.schema import ServeDeploySchema
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -33,11 +28,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Serve Vision-Language-Action models with Ray, and evaluate them in parallel simulation.",
 )
-Policy = Annotated[str, typer.Option(help="A registered name, a deployment file, or the URL of a running server.")]
-Set = Annotated[list[str], typer.Option("--set", metavar="KEY=VALUE", help="A setting of the policy, repeatable.")]
-Address = Annotated[
-    str | None, typer.Option(help="A running Ray cluster ('auto' finds it); default: one for the run, on this machine.")
-]
 
 
 @app.command()
@@ -86,104 +76,27 @@ def serve(
                 threading.Event().wait()
 
 
-@app.command("eval")
-def evaluate_command(
-    envs: Annotated[list[str], typer.Argument(help="Environments: maniskill/PushCube-v1, tabletop, … (see `envs`).")],
-    policy: Policy,
-    out_dir: Annotated[Path, typer.Option("--out", help="Folder of the results.")],
-    episodes: Annotated[int, typer.Option(min=1, help="Episodes of each environment.")] = 10,
-    workers: Annotated[int, typer.Option(min=1, help="Environments rolled out in parallel.")] = 1,
-    seed: Annotated[int, typer.Option(min=0, help="Episode i uses seed + i.")] = 0,
-    video: Annotated[str, typer.Option(help="none, failures or all.")] = "failures",
-    resume: Annotated[bool, typer.Option(help="Go on with the results in --out.")] = False,
-    execute: Annotated[int | None, typer.Option(min=1, help="Rows executed of each chunk; default: all.")] = None,
-    retries: Annotated[int, typer.Option(min=0, help="Further attempts after an infrastructure failure.")] = 3,
-    settings: Set = [],  # noqa: B006 - typer reads it
-    env_set: Annotated[
-        list[str], typer.Option("--env-set", metavar="KEY=VALUE", help="An option of the environments: width=256.")
-    ] = [],  # noqa: B006
-    reset_set: Annotated[
-        list[str],
-        typer.Option("--reset-set", metavar="KEY=VALUE", help="An option of the policy's reset: checkpoint_step=9."),
-    ] = [],  # noqa: B006
-    address: Address = None,
-) -> None:
-    """Evaluate a policy: episodes in parallel, success rates with confidence intervals, videos."""
-    with _errors():
-        fields: dict[str, Any] = {
-            "envs": envs, "episodes": episodes, "workers": workers, "seed": seed, "video": video, "out": out_dir,
-            "resume": resume, "execute": execute, "retries": retries,
-            "env_options": parse_settings(env_set, "--env-set"),
-            "policy_options": parse_settings(reset_set, "--reset-set"),
-        }  # fmt: skip
-        run_evaluation(policy, parse_settings(settings, "--set"), fields, address)
-
-
-def run_evaluation(policy: str, settings: dict[str, Any], fields: dict[str, Any], address: str | None = None) -> None:
-    """Serve the policy if it is not a URL, evaluate it, print the table."""
-    from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, check, evaluate, print_summary, progress_for
-
-    with contextlib.ExitStack() as stack:
-        if "://" in policy:
-            if settings:
-                raise ConfigError(f"--set {sorted(settings)}: the server at {policy} has its settings already")
-            config = EvalConfig(policy_url=policy, **_served(policy), **fields)
-        else:
-            deployed = _single_application(policy, settings)
-            (app,) = deployed.applications
-            own = own_settings(app)
-            served = {"policy": app.args["policy"], "policy_config": own, "checkpoint": resolved(own)}
-            config = EvalConfig(policy_url=f"serve://{app.name}", **served, **fields)
-            check(config)  # what is wrong is said before anything starts
-            # Ray's CPUs are bookkeeping here: the number of workers that the user asked for must fit.
-            cpus = max(os.cpu_count() or 1, math.ceil(config.workers * config.cpus_per_worker))
-            stack.enter_context(running_server(deployed, address=address, num_cpus=cpus))
-        try:
-            summary = evaluate(config, progress=progress_for(out))
-        except EvaluationInterrupted as interrupted:
-            print_summary(out, interrupted.summary)
-            raise
-    print_summary(out, summary)
-
-
-def _served(url: str) -> dict[str, Any]:
-    """What the server at `url` says that it serves: a result belongs to that, not to an address."""
-    from vlagents_ray import RemoteAgent
-
-    with RemoteAgent(url) as agent:
-        said = agent.metadata
-    return {"policy": said["policy"], "policy_config": said.get("config", {}), "checkpoint": said.get("checkpoint")}
-
-
-def _single_application(policy: str, settings: dict[str, Any]) -> ServeDeploySchema:
-    deployed = read_deployment(policy, {"config": settings} if settings else None)
-    if len(deployed.applications) != 1:
-        names = [one.name for one in deployed.applications]
-        raise ConfigError(f"{policy}: holds {names}, want one application; serve it and give the URL of one of them")
-    return deployed
-
-
 @app.command()
 def demo(
     out_dir: Annotated[Path, typer.Option("--out", help="Folder of the results.")] = Path("runs/demo"),
 ) -> None:
     """The main job in a few minutes: serve the scripted policy, evaluate it in two environments, leave videos."""
     from vlagents_ray.envs.maniskill import ManiSkill
+    from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig
 
     with _errors():
         missing = ManiSkill.missing()
-        if missing is None:
-            fields: dict[str, Any] = {
-                "envs": ["maniskill/PushCube-v1", "maniskill/PickCube-v1"], "episodes": 10, "video": "all"
-            }  # fmt: skip
-        else:
+        suite = SuiteConfig(envs=["maniskill/PushCube-v1", "maniskill/PickCube-v1"], episodes=10)
+        if missing is not None:
             out.print(
                 f"ManiSkill cannot render here, so the demo uses the built-in tabletop: {missing}", style="yellow"
             )
-            fields = {"envs": ["tabletop"], "episodes": 20, "video": "all"}
-        run_evaluation("scripted", {}, {**fields, "workers": 2, "out": _fresh(out_dir)})
+            suite = SuiteConfig(envs=["tabletop"], episodes=20)
+        policy = PolicyConfig(name="scripted", source="scripted")
+        run_evaluation(EvalConfig(policies=[policy], suites=[suite], workers=2, video="all", out=_fresh(out_dir)))
 
 
+app.command("eval")(evaluate_command)
 app.add_typer(bench, name="bench")
 app.add_typer(env, name="env")
 app.add_typer(keys_app, name="keys")

@@ -1,12 +1,15 @@
 """Evaluation: episodes as keyed jobs, played in parallel by Ray actors, recorded exactly once.
 
-summary = evaluate(EvalConfig(envs=["tabletop"], policy_url="http://localhost:8000", out="runs/first"))
+summary = evaluate(
+    EvalConfig(policies=[{"url": "http://localhost:8000"}], suites=[{"envs": ["tabletop"]}], out="runs/first")
+)
 """
 
-from vlagents_ray.evaluate.config import EvalConfig
+from vlagents_ray.evaluate.config import EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig
 from vlagents_ray.evaluate.progress import Progress, SilentProgress, progress_for
 from vlagents_ray.evaluate.report import print_summary, results_table
-from vlagents_ray.evaluate.runner import EvaluationInterrupted, check, evaluate
+from vlagents_ray.evaluate.results import Results
+from vlagents_ray.evaluate.runner import EvaluationInterrupted, check, evaluate, most_cpus
 from vlagents_ray.evaluate.statistics import Rate, wilson
 from vlagents_ray.evaluate.summary import Group, Summary
 
@@ -14,12 +17,17 @@ __all__ = [
     "EvalConfig",
     "EvaluationInterrupted",
     "Group",
+    "PolicyConfig",
     "Progress",
     "Rate",
+    "Results",
     "SilentProgress",
+    "SuiteConfig",
     "Summary",
+    "WorkerConfig",
     "check",
     "evaluate",
+    "most_cpus",
     "print_summary",
     "progress_for",
     "results_table",

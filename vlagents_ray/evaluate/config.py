@@ -1,11 +1,12 @@
-"""The settings of an evaluation: closed, typed, and what of them decides an episode's outcome."""
+"""The settings of an evaluation: closed, typed; policies x checkpoints x suites x tasks x seeds."""
 
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import (
     BaseModel,
@@ -27,33 +28,114 @@ Video = Literal["none", "failures", "all"]
 Name = Annotated[str, Field(min_length=1)]
 
 
-class EvalConfig(BaseModel):
-    """What to evaluate, in what, how many episodes, and where the results go."""
-
+class _Closed(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    # What decides an episode's outcome, together with its number (see `outcome_settings`).
-    envs: list[Name] = Field(min_length=1)  # registered names, e.g. "maniskill/PushCube-v1"
-    env_options: dict[str, JsonValue] = {}  # for every env's constructor; a key in `envs` holds that env's own
-    reset_options: dict[str, JsonValue] = {}  # handed to every `reset` of every env
-    policy: Name = "policy"  # its name, for the record
-    policy_config: dict[str, JsonValue] = {}
-    policy_options: dict[str, JsonValue] = {}  # handed to every `reset` of the policy, e.g. {"checkpoint_step": 20000}
+
+class StepRange(_Closed):
+    """Steps of training at equal distances, the last one included."""
+
+    first: NonNegativeInt
+    last: NonNegativeInt
+    every: PositiveInt
+
+    @property
+    def steps(self) -> range:
+        """All of them."""
+        return range(self.first, self.last + 1, self.every)
+
+
+class PolicyConfig(_Closed):
+    """A policy, how it is reached, and which of its checkpoints are evaluated."""
+
+    name: Name = "policy"  # for the record; two policies of one evaluation have two
+    # A registered policy or a deployment file, which `vlagents-ray eval` serves for the length of the run; or else
+    source: str | None = None
+    url: str | None = None  # of its server, e.g. "http://gpu-box:8000", or "serve://NAME" in this cluster.
+    config: dict[str, JsonValue] = {}  # what it is served with, over a deployment file's own
+    options: dict[str, JsonValue] = {}  # handed to every `reset` of the policy
     checkpoint: str | None = None  # the server's own; what each episode was played by stands in its result
+    # A sweep over checkpoints: a list, or {first, last, every}; each is chosen by the reset option `checkpoint_step`.
+    steps: list[NonNegativeInt] = []
     execute: PositiveInt | None = None  # rows executed of each action chunk; None = all
-    seed: NonNegativeInt = 0  # episode i of an env uses seed + i
     # How images reach a policy over a network. JPEG changes them a little, so it has to be asked for; the others
     # do not, and "exact" takes the faster of raw and lossless, so that results never depend on the link.
     codec: Literal["exact", "raw", "lossless", "jpeg"] = "exact"
+    transport: TransportName = "auto"
 
-    # How much of it, and how.
-    episodes: PositiveInt = 10  # per env
-    workers: PositiveInt = 1
+    @field_validator("steps", mode="before")
+    @classmethod
+    def _range(cls, steps: object) -> object:
+        if not isinstance(steps, dict):
+            return steps
+        return list(StepRange.model_validate(steps).steps)
+
+    @field_validator("steps")
+    @classmethod
+    def _once(cls, steps: list[int]) -> list[int]:
+        if repeated := sorted({step for step in steps if steps.count(step) > 1}):
+            raise ValueError(f"{repeated} named twice; name each step once")
+        return steps
+
+    @model_validator(mode="after")
+    def _not_ours(self) -> Self:
+        ours = {"seed", "env", "contract"} | ({"checkpoint_step"} if self.steps else set())
+        if taken := sorted(ours & self.options.keys()):
+            raise ValueError(f"options: {taken} are set episode by episode; leave them out")
+        return self
+
+
+class WorkerConfig(_Closed):
+    """What a worker takes, and where it runs."""
+
+    cpus: NonNegativeFloat = 0.5  # low, so that workers and policy fit on a small machine
+    gpus: NonNegativeFloat = 0.0
+    threads: PositiveInt = 1  # of OpenMP, MKL, llvmpipe and the like
+    # Ray's; its env_vars win over the thread settings. A simulator with packages of its own names their Python,
+    # with Ray in it: {"py_executable": "/envs/rcs/bin/python"}.
+    runtime_env: dict[str, JsonValue] = {}
+
+
+class SuiteConfig(_Closed):
+    """Environments that are evaluated alike."""
+
+    name: str = ""  # for the record; an env that stands in two suites needs two names
+    envs: list[Name] = Field(min_length=1)  # registered names, "maniskill/PushCube-v1", or patterns, "libero/*"
+    env_options: dict[str, JsonValue] = {}  # for the constructor
+    reset_options: dict[str, JsonValue] = {}  # handed to every `reset` of the env
+    episodes: PositiveInt = 10  # of each env and seed
+    seeds: list[NonNegativeInt] = Field(default=[0], min_length=1)  # episode i uses seed + i
+    worker: WorkerConfig | None = None  # in place of the evaluation's
+
+    @field_validator("envs")
+    @classmethod
+    def _distinct(cls, envs: list[str]) -> list[str]:
+        if repeated := sorted({name for name in envs if envs.count(name) > 1}):
+            raise ValueError(f"{repeated} named twice; name each env once and raise `episodes`")
+        return envs
+
+    @model_validator(mode="after")
+    def _apart(self) -> Self:
+        ordered = sorted(self.seeds)
+        for low, high in itertools.pairwise(ordered):
+            if high - low < self.episodes:
+                raise ValueError(
+                    f"seeds: {low} and {high} with {self.episodes} episodes each would play some twice; "
+                    f"want them {self.episodes} or more apart"
+                )
+        return self
+
+
+class EvalConfig(_Closed):
+    """Which policies to evaluate, in what, and where the results go."""
+
+    policies: list[PolicyConfig] = Field(min_length=1)
+    suites: list[SuiteConfig] = Field(min_length=1)
     out: Path
+    workers: PositiveInt = 1  # environments rolled out in parallel
     video: Video = "failures"
     resume: bool = False
-    policy_url: str | None = None
-    transport: TransportName = "auto"
+    worker: WorkerConfig = WorkerConfig()
 
     # What happens when something breaks.
     retries: NonNegativeInt = 3  # further attempts after an infrastructure failure
@@ -64,55 +146,13 @@ class EvalConfig(BaseModel):
     connect_timeout_s: PositiveFloat = 120.0  # reaching the policy, a restart of its server included
     place_timeout_s: PositiveFloat = 120.0  # the cluster finding room for a worker
 
-    # What a worker takes.
-    cpus_per_worker: NonNegativeFloat = 0.5  # low, so that workers and policy fit on a small machine
-    gpus_per_worker: NonNegativeFloat = 0.0
-    threads: PositiveInt = 1  # of OpenMP, MKL, llvmpipe and the like, in each worker
-    runtime_env: dict[str, JsonValue] = {}  # Ray's; its env_vars win over the thread settings
-
-    @field_validator("envs")
+    @field_validator("policies")
     @classmethod
-    def _distinct(cls, envs: list[str]) -> list[str]:
-        repeated = sorted({name for name in envs if envs.count(name) > 1})
-        if repeated:
-            raise ValueError(f"{repeated} named twice; name each env once and raise `episodes`")
-        return envs
-
-    @field_validator("policy_options")
-    @classmethod
-    def _not_ours(cls, options: dict[str, JsonValue]) -> dict[str, JsonValue]:
-        if taken := sorted({"seed", "env", "contract"} & options.keys()):
-            raise ValueError(f"{taken} are set episode by episode; leave them out")
-        return options
-
-    @model_validator(mode="after")
-    def _options_are_mappings(self) -> Self:
-        for env in self.envs:
-            own = self.env_options.get(env, {})
-            if not isinstance(own, dict):
-                raise ValueError(f"env_options[{env!r}]: got {own!r}, want a mapping, the options of that env")  # noqa: TRY004 (pydantic wants ValueError)
-        return self
-
-    def options_for(self, env: str) -> dict[str, JsonValue]:
-        """The constructor's options of `env`: those for every env, then its own."""
-        common = {k: v for k, v in self.env_options.items() if k not in self.envs}
-        own = self.env_options.get(env)
-        return common | own if isinstance(own, dict) else common
-
-
-def outcome_settings(config: EvalConfig, env: str) -> dict[str, Any]:
-    """All settings that an episode of `env` depends on, apart from its number."""
-    return {
-        "env": env,
-        "env_options": config.options_for(env),
-        "reset_options": config.reset_options,
-        "policy": config.policy,
-        "policy_config": config.policy_config,
-        "policy_options": config.policy_options,
-        "checkpoint": config.checkpoint,
-        "execute": config.execute,
-        "codec": "jpeg" if config.codec == "jpeg" else "exact",
-    }
+    def _named_apart(cls, policies: list[PolicyConfig]) -> list[PolicyConfig]:
+        names = [policy.name for policy in policies]
+        if repeated := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"two policies are named {repeated}; give each a `name` of its own")
+        return policies
 
 
 def canonical(value: object) -> str:

@@ -31,6 +31,7 @@ class EpisodeResult:
     status: Status
     success_once: bool | None = None  # the task was solved after some step
     success_at_end: bool | None = None  # the task was solved after the last step
+    first_success: int | None = None  # steps after which the task was solved for the first time
     steps: int = 0  # actions executed
     episode_return: float = 0.0  # sum of rewards
     ending: Ending = "error"
@@ -42,6 +43,7 @@ class EpisodeResult:
     acts: int = 0  # answers of the policy; fewer than steps with action chunks
     policy_ms: float | None = None  # median of one act, transport included
     policy_p95_ms: float | None = None
+    timing_ms: dict[str, float] = field(default_factory=dict)  # medians of what `act.info["timing"]` says of one act
     transport: str = "local"
     checkpoint: str | None = None  # that the policy's reset named
 
@@ -53,13 +55,14 @@ class _Tally:
     steps: int = 0
     episode_return: float = 0.0
     success: bool = False
-    success_once: bool = False
+    first_success: int | None = None
     ending: Ending = "error"
     instruction: str = ""
     checkpoint: str | None = None
     reset_ms: float | None = None
     step_ms: list[float] = field(default_factory=list)
     act_ms: list[float] = field(default_factory=list)
+    timing_ms: dict[str, list[float]] = field(default_factory=dict)
 
 
 def run_episode(
@@ -105,8 +108,9 @@ def run_episode(
     return EpisodeResult(
         key=key,
         status="done" if error is None else "policy_error",
-        success_once=tally.success_once and error is None,
+        success_once=tally.first_success is not None and error is None,
         success_at_end=tally.success and error is None,
+        first_success=tally.first_success if error is None else None,
         steps=tally.steps,
         episode_return=tally.episode_return,
         ending=tally.ending,
@@ -118,6 +122,7 @@ def run_episode(
         acts=len(tally.act_ms),
         policy_ms=_quantile(tally.act_ms, 0.5),
         policy_p95_ms=_quantile(tally.act_ms, 0.95),
+        timing_ms={stage: float(np.median(spent)) for stage, spent in sorted(tally.timing_ms.items())},
         transport=str(getattr(agent, "transport", "local")),
         checkpoint=tally.checkpoint,
     )
@@ -154,6 +159,8 @@ def _play(
         with policy_side("act"):
             act = agent.act(_for_policy(obs))
         tally.act_ms.append(1e3 * (perf_counter() - begun))
+        for stage, spent in act.info.get("timing", {}).items():
+            tally.timing_ms.setdefault(stage, []).append(float(spent))
         chunk = Act(check_action(act.action, contract)).rows()[:execute]
         for row in chunk:
             watch("env step", tally.steps)
@@ -165,7 +172,8 @@ def _play(
             tally.steps += 1
             tally.episode_return += float(reward)
             tally.success = _success(info)
-            tally.success_once |= tally.success
+            if tally.success and tally.first_success is None:
+                tally.first_success = tally.steps
             if terminated or truncated or tally.steps >= env.max_steps:
                 tally.ending = "terminated" if terminated else "truncated"
                 return

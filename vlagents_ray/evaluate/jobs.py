@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from vlagents_ray.evaluate.config import EvalConfig, fingerprint, outcome_settings
+from vlagents_ray.evaluate.cells import Cell
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,47 +27,75 @@ class Job:
     """One attempt at an episode."""
 
     key: EpisodeKey
+    cell: Cell
     attempt: int = 1
 
     def again(self) -> Job:
         """The next attempt at the same episode."""
-        return Job(self.key, self.attempt + 1)
+        return replace(self, attempt=self.attempt + 1)
 
 
-def plan(config: EvalConfig) -> list[EpisodeKey]:
-    """Every episode that `config` asks for, env by env."""
-    keys = []
-    for env in config.envs:
-        settings = fingerprint(outcome_settings(config, env))
-        keys += [EpisodeKey(env, i, config.seed + i, settings) for i in range(config.episodes)]
-    return keys
+def plan(cells: Iterable[Cell]) -> list[Job]:
+    """Every episode of `cells`, cell by cell; those of a further seed follow those of the one before."""
+    return [
+        Job(EpisodeKey(cell.env, i, seed + i, cell.fingerprint), cell)
+        for cell in cells
+        for seed in cell.suite.seeds
+        for i in range(cell.suite.episodes)
+    ]
 
 
 class JobQueue:
-    """Jobs that wait, by env, so that a worker can go on with the env it has already made."""
+    """Jobs that wait, by the environment they need, so that a worker can go on with the one it has made."""
 
-    def __init__(self, keys: Iterable[EpisodeKey]) -> None:
-        self._waiting: dict[str, deque[Job]] = {}
-        for key in keys:
-            self._waiting.setdefault(key.env, deque()).append(Job(key))
+    def __init__(self, jobs: Iterable[Job]) -> None:
+        self._waiting: dict[str, deque[Job]] = {}  # by place
+        self._kinds: dict[str, str] = {}  # place -> kind
+        for job in jobs:
+            self._of(job).append(job)
 
     def __len__(self) -> int:
         return sum(map(len, self._waiting.values()))
 
     def put_back(self, job: Job) -> None:
         """Queue a further attempt, ahead of the episodes that have not been tried."""
-        self._waiting.setdefault(job.key.env, deque()).appendleft(job)
+        self._of(job).appendleft(job)
 
-    def take(self, made: str | None, working: Mapping[str, int]) -> Job | None:
-        """The next job for a worker that has made env `made`; None if none waits.
+    def take(self, kind: str, made: str | None, working: Mapping[str, int]) -> Job | None:
+        """The next job for a worker of `kind` that has made the env at place `made`; None if none of its kind waits.
 
         A worker stays with its env while that has episodes; then it goes where most wait for each
-        worker, counting `working`: how many workers are busy with which env.
+        worker, counting `working`: how many workers are busy at which place.
         """
         if made is not None and self._waiting.get(made):
             return self._waiting[made].popleft()
-        open_envs = [env for env, jobs in self._waiting.items() if jobs]
-        if not open_envs:
+        waiting = {place: len(jobs) for place, jobs in self._waiting.items() if jobs and self._kinds[place] == kind}
+        if not waiting:
             return None
-        env = max(open_envs, key=lambda name: len(self._waiting[name]) / (1 + working.get(name, 0)))
-        return self._waiting[env].popleft()
+        place = max(waiting, key=lambda one: waiting[one] / (1 + working.get(one, 0)))
+        return self._waiting[place].popleft()
+
+    def wants(self, workers: Mapping[str, int], unoccupied: Mapping[str, int]) -> Cell | None:
+        """A cell that one more worker would be for; None if those that are `unoccupied` suffice.
+
+        Both count workers by kind. It is of the kind of which most wait for each of the `workers`.
+        """
+        waiting: Counter[str] = Counter()
+        for place, jobs in self._waiting.items():
+            waiting[self._kinds[place]] += len(jobs)
+        short = [kind for kind, number in waiting.items() if number > unoccupied.get(kind, 0)]
+        if not short:
+            return None
+        kind = max(short, key=lambda one: waiting[one] / (1 + workers.get(one, 0)))
+        return next(jobs[0].cell for place, jobs in self._waiting.items() if jobs and self._kinds[place] == kind)
+
+    def drop(self, settings: str) -> int:
+        """Take out what waits of the cell with this fingerprint; returns how many."""
+        before = len(self)
+        for place, jobs in self._waiting.items():
+            self._waiting[place] = deque(job for job in jobs if job.key.settings != settings)
+        return before - len(self)
+
+    def _of(self, job: Job) -> deque[Job]:
+        self._kinds[job.cell.place] = job.cell.kind
+        return self._waiting.setdefault(job.cell.place, deque())

@@ -1,4 +1,4 @@
-"""Workers: Ray actors that play episodes, watched, killed and replaced. Nothing here knows results."""
+"""Workers: Ray actors that play episodes, watched, and killed when they hang. Nothing here knows results."""
 
 from __future__ import annotations
 
@@ -15,7 +15,8 @@ from ray.exceptions import RayActorError, RayError
 
 from vlagents_ray.client.credentials import KEY_VARIABLE
 from vlagents_ray.errors import ConfigError, EnvFailed
-from vlagents_ray.evaluate.config import EvalConfig
+from vlagents_ray.evaluate.cells import Cell
+from vlagents_ray.evaluate.config import EvalConfig, WorkerConfig
 from vlagents_ray.evaluate.episode import Phase
 from vlagents_ray.evaluate.jobs import Job
 from vlagents_ray.evaluate.rollout import AgentFactory, Failure, Pulse, Report, Rollout
@@ -42,12 +43,14 @@ THREAD_VARIABLES = (
 class Worker:
     """One worker as the driver sees it."""
 
+    config: WorkerConfig
+    kind: str  # stands for `config`
     actor: Any
     starting: Any  # ref of `ready()`; None once it runs
     since: float  # when it was started
     job: Job | None = None
     running: Any = None  # ref of `run(job)`
-    made: str | None = None  # the env it holds
+    made: str | None = None  # the place of the env it holds
     looking: Any = None  # ref of `progress()`
     looked: float = 0.0  # when it was asked
     pulse: Pulse = field(default_factory=lambda: Pulse("idle", 0.0, 0))
@@ -55,18 +58,11 @@ class Worker:
 
 
 class WorkerPool:
-    """Keeps up to `size` workers. Use as a context manager: leaving it kills every worker."""
+    """Up to `config.workers` workers. Use as a context manager: leaving it kills every worker."""
 
-    def __init__(self, config: EvalConfig, agent_factory: AgentFactory, size: int) -> None:
+    def __init__(self, config: EvalConfig, agent_factory: AgentFactory) -> None:
         self._config = config
         self._actor_class = ray.remote(concurrency_groups={"watch": 1})(Rollout)
-        self._options = {
-            "num_cpus": config.cpus_per_worker,
-            "num_gpus": config.gpus_per_worker,
-            "max_restarts": 0,
-            "scheduling_strategy": "SPREAD",
-            "runtime_env": _runtime_env(config),
-        }
         self._agent_factory = agent_factory
         self._failed_starts = 0
         self._limit_s: dict[Phase, float] = {
@@ -78,16 +74,16 @@ class WorkerPool:
             "policy act": config.policy_timeout_s,
         }
         self._workers: list[Worker] = []
-        for _ in range(size):
-            self._start()
+        self._leaving: list[Any] = []  # actors on their way out
 
     def __enter__(self) -> WorkerPool:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        for worker in self._workers:
-            ray.kill(worker.actor)
+        for actor in [worker.actor for worker in self._workers] + self._leaving:
+            ray.kill(actor)
         self._workers.clear()
+        self._leaving.clear()
 
     @property
     def busy(self) -> bool:
@@ -95,16 +91,49 @@ class WorkerPool:
         return any(worker.job is not None for worker in self._workers)
 
     def working(self) -> Counter[str]:
-        """How many workers are busy with which env."""
-        return Counter(worker.job.key.env for worker in self._workers if worker.job is not None)
+        """How many workers are busy at which place."""
+        return Counter(worker.job.cell.place for worker in self._workers if worker.job is not None)
+
+    def kinds(self) -> Counter[str]:
+        """How many workers there are of which kind."""
+        return Counter(worker.kind for worker in self._workers)
+
+    def unoccupied(self) -> Counter[str]:
+        """How many of them play nothing; some may still be starting."""
+        return Counter(worker.kind for worker in self._workers if worker.job is None)
 
     def idle(self) -> list[Worker]:
         """Workers that can take a job."""
         return [worker for worker in self._workers if worker.starting is None and worker.job is None]
 
+    def make_room(self) -> bool:
+        """Is there room for one more worker? An idle one leaves if there is none."""
+        if len(self._workers) < self._config.workers:
+            return True
+        idle = self.idle()
+        if not idle:
+            return False
+        self._workers.remove(idle[0])
+        idle[0].actor.close.remote()  # frees its simulator; some need that for a clean exit
+        idle[0].actor.__ray_terminate__.remote()
+        self._leaving.append(idle[0].actor)
+        return True
+
+    def start(self, cell: Cell) -> None:
+        """Have one more worker, which can play `cell`."""
+        options = {
+            "num_cpus": cell.worker.cpus,
+            "num_gpus": cell.worker.gpus,
+            "max_restarts": 0,
+            "scheduling_strategy": "SPREAD",
+            "runtime_env": _runtime_env(cell.worker),
+        }
+        actor = self._actor_class.options(**options).remote(self._config, self._agent_factory)
+        self._workers.append(Worker(cell.worker, cell.kind, actor, starting=actor.ready.remote(), since=monotonic()))
+
     def dispatch(self, worker: Worker, job: Job) -> None:
         """Have `worker` play `job`."""
-        phase: Phase = "env reset" if worker.made == job.key.env else "make"
+        phase: Phase = "env reset" if worker.made == job.cell.place else "make"
         worker.job = job
         worker.pulse, worker.heard = Pulse(phase, 0.0, 0), monotonic()
         worker.looked, worker.looking = monotonic(), None
@@ -113,7 +142,7 @@ class WorkerPool:
     def wait(self, timeout_s: float) -> Iterator[tuple[Job, Report]]:
         """Reports that arrive within `timeout_s`, those of workers that died or hung included.
 
-        Such a worker, and one that reports that its simulator broke, is replaced.
+        Such a worker, and one that reports that its simulator broke, is killed.
         """
         refs = {ref: worker for worker in self._workers for ref in _refs(worker)}
         if refs:
@@ -136,14 +165,9 @@ class WorkerPool:
         if late:
             log.warning("%d workers did not close their envs within %g s", len(late), CLOSE_S)
 
-    def _start(self) -> None:
-        actor = self._actor_class.options(**self._options).remote(self._config, self._agent_factory)
-        self._workers.append(Worker(actor, starting=actor.ready.remote(), since=monotonic()))
-
-    def _replace(self, worker: Worker) -> None:
+    def _end(self, worker: Worker) -> None:
         self._workers.remove(worker)
         ray.kill(worker.actor)
-        self._start()
 
     def _arrived(self, worker: Worker, ref: Any) -> Iterator[tuple[Job, Report]]:
         if ref == worker.starting:
@@ -161,9 +185,9 @@ class WorkerPool:
             except RayError as error:
                 report = _lost(f"the worker {'died' if isinstance(error, RayActorError) else 'failed'}: {error}")
             if report.made is not None:
-                worker.made = report.made.env
+                worker.made = job.cell.place
             if report.failure is not None and report.failure.cause == "worker":
-                self._replace(worker)
+                self._end(worker)
             yield job, report
 
     def _started(self, worker: Worker) -> None:
@@ -173,7 +197,7 @@ class WorkerPool:
             self._failed_starts += 1
             if self._failed_starts >= MOST_FAILED_STARTS:
                 raise EnvFailed(f"workers do not start, {self._failed_starts} in a row: {error}") from error
-            self._replace(worker)
+            self._end(worker)
         else:
             self._failed_starts = 0
             worker.starting = None
@@ -183,12 +207,12 @@ class WorkerPool:
         for worker in list(self._workers):
             if worker.starting is not None:
                 if now - worker.since > self._config.place_timeout_s:
-                    raise ConfigError(self._no_room())
+                    raise ConfigError(self._no_room(worker.config))
             elif worker.job is not None:
                 reason = self._overdue(worker, now)
                 if reason is not None:
                     job = worker.job
-                    self._replace(worker)
+                    self._end(worker)
                     yield job, _lost(reason, worker.pulse.stack)
                 elif worker.looking is None and now - worker.looked > WATCH_S:
                     worker.looked = now
@@ -206,12 +230,12 @@ class WorkerPool:
             return f"no sign of life for {silent_s:.0f} s, last seen in {pulse.phase}; the worker was killed"
         return None
 
-    def _no_room(self) -> str:
-        want = {"CPU": self._config.cpus_per_worker, "GPU": self._config.gpus_per_worker}
+    def _no_room(self, worker: WorkerConfig) -> str:
+        want = {"CPU": worker.cpus, "GPU": worker.gpus}
         return (
             f"the cluster found no room for a worker in {self._config.place_timeout_s:g} s: each wants {want}, "
             f"free are {ray.available_resources()} of {ray.cluster_resources()}; lower `workers` or "
-            f"`cpus_per_worker`, or raise `place_timeout_s` if the cluster is still growing"
+            f"`worker.cpus`, or raise `place_timeout_s` if the cluster is still growing"
         )
 
 
@@ -223,9 +247,9 @@ def _lost(reason: str, stack: str = "") -> Report:
     return Report(failure=Failure("worker", EnvFailed.code, reason, stack))
 
 
-def _runtime_env(config: EvalConfig) -> dict[str, Any]:
-    given: dict[str, Any] = dict(config.runtime_env)
-    variables = dict.fromkeys(THREAD_VARIABLES, str(config.threads))
+def _runtime_env(worker: WorkerConfig) -> dict[str, Any]:
+    given: dict[str, Any] = dict(worker.runtime_env)
+    variables = dict.fromkeys(THREAD_VARIABLES, str(worker.threads))
     if key := os.environ.get(KEY_VARIABLE):  # for the policy's server, on nodes that do not know it
         variables[KEY_VARIABLE] = key
     return given | {"env_vars": variables | given.get("env_vars", {})}

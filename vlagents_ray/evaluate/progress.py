@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from time import monotonic
 from typing import Protocol
 
@@ -11,21 +11,23 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.jobs import Job
 from vlagents_ray.evaluate.rollout import Failure
 from vlagents_ray.evaluate.statistics import Rate
 
 LINE_EVERY_S = 5.0
+MOST_ROWS = 12
 
 
 class Progress(Protocol):
     """What an evaluation tells while it runs. The calls come from one thread."""
 
-    def begin(self, planned: Mapping[str, int], recorded: Mapping[str, Rate]) -> None:
-        """Episodes planned per env, and those that earlier runs have finished."""
+    def begin(self, cells: Sequence[Cell], recorded: Mapping[str, Rate]) -> None:
+        """What is planned, and what earlier runs have finished, by a cell's fingerprint."""
 
-    def episode(self, result: EpisodeResult) -> None:
+    def episode(self, cell: Cell, result: EpisodeResult) -> None:
         """An episode is recorded."""
 
     def retry(self, job: Job, failure: Failure) -> None:
@@ -38,10 +40,10 @@ class Progress(Protocol):
 class SilentProgress:
     """Shows nothing."""
 
-    def begin(self, planned: Mapping[str, int], recorded: Mapping[str, Rate]) -> None:
+    def begin(self, cells: Sequence[Cell], recorded: Mapping[str, Rate]) -> None:
         """Nothing."""
 
-    def episode(self, result: EpisodeResult) -> None:
+    def episode(self, cell: Cell, result: EpisodeResult) -> None:
         """Nothing."""
 
     def retry(self, job: Job, failure: Failure) -> None:
@@ -54,33 +56,43 @@ class SilentProgress:
 class _Counts:
     """What both displays keep count of."""
 
-    def __init__(self, planned: Mapping[str, int], recorded: Mapping[str, Rate]) -> None:
+    def __init__(self, cells: Sequence[Cell], recorded: Mapping[str, Rate]) -> None:
         self._started = monotonic()
-        self._planned = dict(planned)
-        self._rates = {env: recorded.get(env, Rate(0, 0)) for env in planned}
-        self._infra_failed = dict.fromkeys(planned, 0)
+        self._cells = {cell.fingerprint: cell for cell in cells}
+        self._rates = {cell: recorded.get(cell, Rate(0, 0)) for cell in self._cells}
+        self._infra_failed = dict.fromkeys(self._cells, 0)
         self._steps = 0
         self._played = 0  # in this run
-        self._left = sum(planned.values()) - sum(rate.episodes for rate in recorded.values())
+        self._left = sum(cell.planned for cell in cells) - sum(rate.episodes for rate in self._rates.values())
+        self._alone = len({cell.contender for cell in cells}) == 1
         self.retries = 0
 
-    def add(self, result: EpisodeResult) -> None:
+    def add(self, cell: Cell, result: EpisodeResult) -> None:
         self._played += 1
         self._left -= 1
         self._steps += result.steps
-        env = result.key.env
         if result.status == "infra_failed":
-            self._infra_failed[env] += 1
+            self._infra_failed[cell.fingerprint] += 1
             return
-        before = self._rates[env]
-        self._rates[env] = Rate(before.successes + bool(result.success_once), before.episodes + 1)
+        before = self._rates[cell.fingerprint]
+        self._rates[cell.fingerprint] = Rate(before.successes + bool(result.success_once), before.episodes + 1)
 
-    def envs(self) -> list[tuple[str, str, str]]:
-        """(env, "done/planned", success so far)."""
+    def rows(self) -> list[tuple[str, str, str]]:
+        """(name, "done/planned", success so far); of many cells those that are under way."""
+        cells = list(self._cells)
+        if len(cells) > MOST_ROWS:
+            cells = [cell for cell in cells if 0 < self._done(cell) < self._cells[cell].planned][:MOST_ROWS]
         return [
-            (env, f"{rate.episodes + self._infra_failed[env]}/{self._planned[env]}", str(rate))
-            for env, rate in self._rates.items()
+            (self._name(cell), f"{self._done(cell)}/{self._cells[cell].planned}", str(self._rates[cell]))
+            for cell in cells
         ]
+
+    def _done(self, cell: str) -> int:
+        return self._rates[cell].episodes + self._infra_failed[cell]
+
+    def _name(self, cell: str) -> str:
+        contender, suite, env = self._cells[cell].name
+        return " ".join(filter(None, ("" if self._alone else contender, suite, env)))
 
     def overall(self) -> str:
         elapsed_s = monotonic() - self._started
@@ -98,17 +110,17 @@ class LiveProgress:
     """A table that is drawn anew, for terminals."""
 
     def __init__(self, console: Console) -> None:
-        self._counts = _Counts({}, {})
+        self._counts = _Counts([], {})
         self._live = Live(console=console, auto_refresh=True, refresh_per_second=4, get_renderable=self._drawing)
 
-    def begin(self, planned: Mapping[str, int], recorded: Mapping[str, Rate]) -> None:
+    def begin(self, cells: Sequence[Cell], recorded: Mapping[str, Rate]) -> None:
         """Start drawing."""
-        self._counts = _Counts(planned, recorded)
+        self._counts = _Counts(cells, recorded)
         self._live.start()
 
-    def episode(self, result: EpisodeResult) -> None:
+    def episode(self, cell: Cell, result: EpisodeResult) -> None:
         """Count it."""
-        self._counts.add(result)
+        self._counts.add(cell, result)
 
     def retry(self, job: Job, failure: Failure) -> None:
         """Count it, and say why above the table."""
@@ -123,7 +135,7 @@ class LiveProgress:
         table = Table(box=None)
         for title in ("env", "episodes", "success so far"):
             table.add_column(title)
-        for row in self._counts.envs():
+        for row in self._counts.rows():
             table.add_row(*row)
         return Group(table, Text(self._counts.overall()))
 
@@ -135,17 +147,17 @@ class LineProgress:
         self._console = console
         self._every_s = every_s
         self._last = 0.0
-        self._counts = _Counts({}, {})
+        self._counts = _Counts([], {})
 
-    def begin(self, planned: Mapping[str, int], recorded: Mapping[str, Rate]) -> None:
+    def begin(self, cells: Sequence[Cell], recorded: Mapping[str, Rate]) -> None:
         """The first line."""
-        self._counts = _Counts(planned, recorded)
+        self._counts = _Counts(cells, recorded)
         self._last = monotonic()
         self._line()
 
-    def episode(self, result: EpisodeResult) -> None:
+    def episode(self, cell: Cell, result: EpisodeResult) -> None:
         """A line, unless the last one is recent."""
-        self._counts.add(result)
+        self._counts.add(cell, result)
         if monotonic() - self._last >= self._every_s:
             self._last = monotonic()
             self._line()
@@ -160,7 +172,7 @@ class LineProgress:
         self._line()
 
     def _line(self) -> None:
-        envs = " · ".join(f"{env} {done}, success {rate}" for env, done, rate in self._counts.envs())
+        envs = " · ".join(f"{env} {done}, success {rate}" for env, done, rate in self._counts.rows())
         self._print(f"{envs} · {self._counts.overall()}")
 
     def _print(self, text: str) -> None:

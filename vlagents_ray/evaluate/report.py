@@ -10,21 +10,24 @@ from vlagents_ray.evaluate.summary import Group, Summary
 
 
 def results_table(summary: Summary) -> Table:
-    """Success, length and speed, a row an env and one for all."""
+    """Success, length and speed: for each policy at its checkpoint a row an env, and one for all."""
+    names = summary.results.contenders
     table = Table(
-        title=f"{summary.config['policy']}: success in %, with the Wilson 95 % interval",
+        title=f"{', '.join(names)}: success in %, with the Wilson 95 % interval",
         box=SIMPLE_HEAD,
         padding=0,
         pad_edge=False,
     )
+    if len(names) > 1:
+        table.add_column("policy", overflow="fold")
     table.add_column("env", overflow="fold")
     for title in ("episodes", "once", "at end", "steps", "policy ms", "env ms"):
         table.add_column(title, justify="right", no_wrap=True)
-    for group in summary.envs:
-        table.add_row(*_cells(group))
-    if len(summary.envs) > 1:
+    for name, total in zip(names, summary.totals, strict=True):
+        groups = [group for group in summary.cells if group.contender == name]
+        for group in [*groups, total] if len(groups) > 1 else groups:
+            table.add_row(*([name] if len(names) > 1 else []), *_cells(group))
         table.add_section()
-        table.add_row(*_cells(summary.total))
     return table
 
 
@@ -53,7 +56,7 @@ def print_summary(console: Console, summary: Summary) -> None:
 
 def _cells(group: Group) -> list[str]:
     return [
-        group.name,
+        " ".join(filter(None, (group.suite, group.env))),
         f"{group.episodes}/{group.planned}",
         str(group.success_once),
         "-" if group.success_at_end.rate is None else f"{group.success_at_end.rate:.0%}",

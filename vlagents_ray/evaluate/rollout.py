@@ -38,7 +38,8 @@ from vlagents_ray.errors import (
     UnknownSession,
     VLAgentsError,
 )
-from vlagents_ray.evaluate.config import EvalConfig
+from vlagents_ray.evaluate.cells import Cell
+from vlagents_ray.evaluate.config import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.episode import EpisodeResult, Phase, env_side, policy_side, run_episode
 from vlagents_ray.evaluate.jobs import Job
 from vlagents_ray.evaluate.video import VideoRecorder
@@ -48,7 +49,7 @@ from vlagents_ray.wire.plain import plain_values
 
 log = logging.getLogger(__name__)
 
-AgentFactory = Callable[[], Agent]
+AgentFactory = Callable[[PolicyConfig], Agent]
 Cause = Literal["user", "policy", "worker"]
 
 FIRST_WAIT_S = 0.5  # before trying again to reach a policy, doubled each time
@@ -74,7 +75,6 @@ class Failure:
 class Made:
     """What a worker found out when it made an env."""
 
-    env: str
     described: dict[str, Any]  # `EvalEnv.describe()`
     contract: dict[str, Any]
 
@@ -101,15 +101,16 @@ class Pulse:
 
 
 class Rollout:
-    """Plays jobs. Keeps one agent for all of them, and one env until a job needs another."""
+    """Plays jobs. Keeps its agent and its env until a job needs another."""
 
     def __init__(self, config: EvalConfig, agent_factory: AgentFactory) -> None:
         self._config = config
         self._agent_factory = agent_factory
         self._agent: Agent | None = None
+        self._policy: str | None = None  # whose agent it is
         self._broken_agents = 0  # in a row
         self._env: EvalEnv | None = None
-        self._env_name: str | None = None
+        self._place: str | None = None  # of the env
         self._thread = 0  # the one that plays
         self._now: tuple[Phase, float, int] = ("idle", monotonic(), 0)
 
@@ -130,13 +131,13 @@ class Rollout:
         made: Made | None = None
         policy: dict[str, Any] | None = None
         try:
-            if self._agent is None:
-                self._agent = self._connect()
+            if self._agent is None or self._policy != job.cell.policy.name:
+                self._agent = self._connect(job.cell.policy)
                 policy = _metadata(self._agent)
-            if self._env is None or self._env_name != job.key.env:
-                self._env = self._make_env(job.key.env)
+            if self._env is None or self._place != job.cell.place:
+                self._env = self._make_env(job.cell)
                 # The driver may have another numpy, which cannot read this one's pickles.
-                made = Made(job.key.env, plain_values(self._env.describe()), self._env.contract.to_json())
+                made = Made(plain_values(self._env.describe()), self._env.contract.to_json())
             agent, env = self._agent, self._env
             if made is not None or policy is not None:
                 require_match(agent.contract, env.contract)
@@ -145,9 +146,9 @@ class Rollout:
                     env,
                     agent,
                     job.key,
-                    execute=self._config.execute,
-                    reset_options=self._config.reset_options,
-                    policy_options=self._config.policy_options,
+                    execute=job.cell.policy.execute,
+                    reset_options=job.cell.suite.reset_options,
+                    policy_options=job.cell.policy_options,
                     watch=self._watch,
                     record=recorder.add if self._config.video != "none" else lambda _obs: None,
                 )
@@ -172,12 +173,13 @@ class Rollout:
     def _watch(self, phase: Phase, steps: int) -> None:
         self._now = (phase, monotonic(), steps)
 
-    def _connect(self) -> Agent:
+    def _connect(self, policy: PolicyConfig) -> Agent:
         self._watch("connect", 0)
+        self._drop_agent()
         if self._broken_agents:  # the server may be restarting, or full
             sleep(min(FIRST_WAIT_S * 2 ** (self._broken_agents - 1), LONGEST_WAIT_S))
         with policy_side("start"):
-            agent = self._agent_factory()
+            agent = self._agent_factory(policy)
         try:
             with policy_side("initialize"):
                 agent.initialize()
@@ -185,20 +187,21 @@ class Rollout:
         except VLAgentsError:
             agent.close()
             raise
+        self._policy = policy.name
         return agent
 
-    def _make_env(self, name: str) -> EvalEnv:
+    def _make_env(self, cell: Cell) -> EvalEnv:
         self._watch("make", 0)
         self._drop_env()  # first, so that a worker never holds two simulators
         try:
-            with env_side(f"{name!r}: make"):
-                env = make_env(name, **self._config.options_for(name))
+            with env_side(f"{cell.env!r}: make"):
+                env = make_env(cell.env, **cell.suite.env_options)
         except EnvFailed as error:
-            reason = env_class(name).missing()
+            reason = env_class(cell.env).missing()
             if reason is None:
                 raise
-            raise MissingDependency(f"env {name!r} cannot run here: {reason}") from error
-        self._env_name = name
+            raise MissingDependency(f"env {cell.env!r} cannot run here: {reason}") from error
+        self._place = cell.place
         return env
 
     def _drop_agent(self) -> None:
@@ -210,7 +213,7 @@ class Rollout:
                 log.warning("closing the agent: %s", error)
 
     def _drop_env(self) -> None:
-        env, self._env, self._env_name = self._env, None, None
+        env, self._env, self._place = self._env, None, None
         if env is not None:
             with env_side("close"):
                 env.close()

@@ -6,7 +6,7 @@ import functools
 import os
 import signal
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from math import ceil
 from types import FrameType
@@ -16,17 +16,18 @@ import ray
 
 from vlagents_ray.client import RemoteAgent
 from vlagents_ray.errors import ConfigError, from_code
-from vlagents_ray.evaluate.config import EvalConfig
+from vlagents_ray.evaluate.config import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.jobs import Job, JobQueue, plan
 from vlagents_ray.evaluate.pool import WorkerPool
 from vlagents_ray.evaluate.progress import Progress, SilentProgress
+from vlagents_ray.evaluate.results import Results
 from vlagents_ray.evaluate.rollout import AgentFactory, Failure, Report
 from vlagents_ray.evaluate.statistics import Rate
 from vlagents_ray.evaluate.store import Store
-from vlagents_ray.evaluate.summary import State, Summary, summarize, versions, write_summary
+from vlagents_ray.evaluate.summary import Summary, summarize, versions, write_summary
 from vlagents_ray.evaluate.video import save_videos
-from vlagents_ray.registry import env_class
+from vlagents_ray.interface import Agent
 from vlagents_ray.signals import own_sigterm
 
 POLL_S = 0.25  # how soon a signal is noticed
@@ -42,35 +43,32 @@ class EvaluationInterrupted(KeyboardInterrupt):
 
 
 def evaluate(
-    config: EvalConfig, *, agent_factory: AgentFactory | None = None, progress: Progress | None = None
+    config: EvalConfig, *, agent_factory: Callable[[], Agent] | None = None, progress: Progress | None = None
 ) -> Summary:
     """Play every episode of `config` that has no result yet; the results are in `config.out`.
 
     Episodes run in Ray actors: in the cluster that this process is connected to, or else in one
     that `RAY_ADDRESS` names, or in a local one started for the length of the run. Each worker talks to
-    the policy at `config.policy_url`, or to an agent of its own that `agent_factory` makes there.
+    the policy at its `url`, or to an agent of its own that `agent_factory` makes there.
 
     Raises `ConfigError` for settings that cannot be, or that contradict the results in `config.out`;
     `ContractMismatch` if policy and env do not fit; the last infrastructure error after
     `config.abort_after` lost episodes in a row; `EvaluationInterrupted` on Ctrl-C or SIGTERM.
     Whatever it raises, each recorded episode is kept and summary.json written.
     """
-    _require_known(config.envs)
-    factory = agent_factory or _remote_agents(config)
+    factory = _remote_agents(config) if agent_factory is None else functools.partial(_own_agent, agent_factory)
     with Store(config) as store:
         finished = store.finished()
-        keys = plan(config)
-        pending = [key for key in keys if str(key) not in finished]
-        made_with = versions()
-        store.begin_run(config, made_with)
-        state: State = "stopped"
+        pending = [job for job in plan(store.cells) if str(job.key) not in finished]
+        store.begin_run(config, versions())
+        state = "stopped"
         try:
             run = _Run(config, store, JobQueue(pending), progress or SilentProgress())
-            complete = not pending or run.play(factory, len(pending))
+            complete = not pending or run.play(factory)
             state = "complete" if complete else "interrupted"
         finally:
             store.end_run(state)
-            summary = summarize(store, config, made_with, state)
+            summary = summarize(Results.load(config.out))
             write_summary(summary)
     if state == "interrupted":
         raise EvaluationInterrupted(summary)
@@ -79,7 +77,6 @@ def evaluate(
 
 def check(config: EvalConfig) -> None:
     """Raise the `ConfigError` that `evaluate` would raise, before a policy is served for it."""
-    _require_known(config.envs)
     Store(config).close()
 
 
@@ -93,14 +90,12 @@ class _Run:
         self._progress = progress
         self._lost_in_a_row = 0
 
-    def play(self, factory: AgentFactory, episodes: int) -> bool:
+    def play(self, factory: AgentFactory) -> bool:
         """Play all that is queued; False if a signal ended it early."""
-        planned = dict.fromkeys(self._config.envs, self._config.episodes)
-        size = min(self._config.workers, episodes)
         with ray_cluster(self._config), stop_signals() as stop:
-            self._progress.begin(planned, self._recorded())
+            self._progress.begin(self._store.cells, self._recorded())
             try:
-                with WorkerPool(self._config, factory, size) as pool:
+                with WorkerPool(self._config, factory) as pool:
                     while (len(self._queue) or pool.busy) and not stop.is_set():
                         self._turn(pool)
                     if not stop.is_set():
@@ -111,23 +106,24 @@ class _Run:
 
     def _turn(self, pool: WorkerPool) -> None:
         for worker in pool.idle():
-            job = self._queue.take(worker.made, pool.working())
-            if job is None:
-                break
-            pool.dispatch(worker, job)
+            job = self._queue.take(worker.kind, worker.made, pool.working())
+            if job is not None:
+                pool.dispatch(worker, job)
+        while (cell := self._queue.wants(pool.kinds(), pool.unoccupied())) is not None and pool.make_room():
+            pool.start(cell)
         for job, report in pool.wait(POLL_S):
             self._handle(job, report)
 
     def _handle(self, job: Job, report: Report) -> None:
         if report.policy is not None:
-            self._store.note_policy(report.policy)
+            self._store.note_policy(job.cell.policy.name, report.policy)
         if report.made is not None:
-            self._store.note_env(report.made)
+            self._store.note_env(job.cell.place, report.made)
         if report.failure is not None:
             self._failed(job, report.failure)
         elif report.result is not None:
             self._lost_in_a_row = 0
-            self._record(report.result, job.attempt, report.videos)
+            self._record(job, report.result, report.videos)
 
     def _failed(self, job: Job, failure: Failure) -> None:
         retried = failure.cause != "user" and job.attempt <= self._config.retries
@@ -139,7 +135,7 @@ class _Run:
             self._progress.retry(job, failure)
             return
         lost = EpisodeResult(job.key, "infra_failed", error=f"{failure.code}: {failure.message}")
-        self._record(lost, job.attempt, {})
+        self._record(job, lost, {})
         self._lost_in_a_row += 1
         if self._lost_in_a_row == self._config.abort_after:
             raise from_code(
@@ -148,19 +144,19 @@ class _Run:
                 f"(--resume): {failure.message}",
             )
 
-    def _record(self, result: EpisodeResult, attempts: int, videos: Mapping[str, bytes]) -> None:
+    def _record(self, job: Job, result: EpisodeResult, videos: Mapping[str, bytes]) -> None:
         # Videos first: a crash in between repeats the episode, and its videos are overwritten.
-        paths = save_videos(self._config.out, result, dict(videos))
-        self._store.record(result, attempts, paths)
-        self._progress.episode(result)
+        paths = save_videos(self._config.out, job.cell, result, dict(videos))
+        self._store.record(result, job.attempt, paths)
+        self._progress.episode(job.cell, result)
 
     def _recorded(self) -> dict[str, Rate]:
-        rates = dict.fromkeys(self._config.envs, Rate(0, 0))
-        for row in self._store.rows("episodes"):
-            if row["env"] in rates and row["status"] != "infra_failed":
-                before = rates[row["env"]]
-                rates[row["env"]] = Rate(before.successes + row["success_once"], before.episodes + 1)
-        return rates
+        """By cell, what earlier runs have finished."""
+        counted = {cell.cell: cell.counted for cell in Results.load(self._config.out).cells}
+        return {
+            cell: Rate(sum(bool(one.success_once) for one in results), len(results))
+            for cell, results in counted.items()
+        }
 
 
 @contextmanager
@@ -172,7 +168,7 @@ def ray_cluster(config: EvalConfig) -> Iterator[None]:
     options: dict[str, Any] = {"log_to_driver": False, "logging_level": "WARNING"}
     if not os.environ.get("RAY_ADDRESS"):
         # Its CPUs are bookkeeping: the user's number of workers must fit.
-        needed = ceil(config.workers * config.cpus_per_worker)
+        needed = ceil(config.workers * most_cpus(config))
         options |= {"num_cpus": max(os.cpu_count() or 1, needed), "include_dashboard": False}
     with own_sigterm():
         ray.init(**options)
@@ -207,21 +203,32 @@ def stop_signals() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
-def _require_known(envs: Iterable[str]) -> None:
-    for env in envs:
-        env_class(env)
+def most_cpus(config: EvalConfig) -> float:
+    """What the hungriest worker takes."""
+    return max(worker.cpus for worker in [config.worker, *(suite.worker or config.worker for suite in config.suites)])
 
 
 def _remote_agents(config: EvalConfig) -> AgentFactory:
-    if config.policy_url is None:
-        raise ConfigError("policy_url: got none, want the URL of a policy's server, e.g. http://localhost:8000")
-    return functools.partial(
-        RemoteAgent,
-        config.policy_url,
-        transport=config.transport,
+    for policy in config.policies:
+        if policy.url is None:
+            raise ConfigError(
+                f"policy {policy.name!r}: got no url, want that of its server, e.g. http://localhost:8000"
+            )
+    return functools.partial(_remote_agent, config)
+
+
+def _own_agent(make: Callable[[], Agent], _policy: PolicyConfig) -> Agent:
+    return make()
+
+
+def _remote_agent(config: EvalConfig, policy: PolicyConfig) -> RemoteAgent:
+    assert policy.url is not None  # noqa: S101 - looked at by `_remote_agents`
+    return RemoteAgent(
+        policy.url,
+        transport=policy.transport,
         timeout_s=config.policy_timeout_s,
         connect_timeout_s=config.connect_timeout_s,
-        codec=config.codec,
+        codec=policy.codec,
         rank="simulation",
         resume=False,  # an episode that was interrupted is played again, so that its result depends on its key alone
     )

@@ -1,7 +1,7 @@
 """`results.db`: what an evaluation knows, in SQLite, one transaction an episode.
 
 A commit survives the death of the process that made it, whenever that comes; so an evaluation
-that is killed and resumed has each episode exactly once.
+that is killed and resumed has each episode exactly once. Read it with `vlagents_ray.evaluate.results`.
 """
 
 from __future__ import annotations
@@ -17,35 +17,40 @@ from pathlib import Path
 from typing import Any
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate.config import EvalConfig, canonical, outcome_settings
+from vlagents_ray.evaluate.cells import Cell, cells
+from vlagents_ray.evaluate.config import EvalConfig, canonical
 from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.jobs import Job
 from vlagents_ray.evaluate.rollout import Failure, Made
 
 FILE = "results.db"
 LOCK = "results.lock"
-SCHEMA_VERSION = 2
-IDENTITY = ("policy", "checkpoint")  # of the policy's metadata: what must not change between runs
+SCHEMA_VERSION = 3
+IDENTITY = ("policy", "checkpoint")  # of a policy's metadata: what must not change between runs
 
 _SCHEMA = """
-CREATE TABLE meta (name TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE runs (
     run INTEGER PRIMARY KEY, started REAL NOT NULL, ended REAL, state TEXT NOT NULL,
     config TEXT NOT NULL, versions TEXT NOT NULL
 );
-CREATE TABLE envs (env TEXT PRIMARY KEY, settings TEXT NOT NULL, described TEXT, contract TEXT);
+CREATE TABLE policies (name TEXT PRIMARY KEY, metadata TEXT NOT NULL);
+CREATE TABLE cells (
+    cell TEXT PRIMARY KEY, policy TEXT NOT NULL, step INTEGER, suite TEXT NOT NULL, env TEXT NOT NULL,
+    planned INTEGER NOT NULL, seeds TEXT NOT NULL, settings TEXT NOT NULL, described TEXT, contract TEXT
+);
 CREATE TABLE episodes (
-    key TEXT PRIMARY KEY, env TEXT NOT NULL, episode INTEGER NOT NULL, seed INTEGER NOT NULL,
-    settings TEXT NOT NULL, status TEXT NOT NULL, success_once INTEGER, success_at_end INTEGER,
+    key TEXT PRIMARY KEY, cell TEXT NOT NULL REFERENCES cells, env TEXT NOT NULL, episode INTEGER NOT NULL,
+    seed INTEGER NOT NULL, status TEXT NOT NULL, success_once INTEGER, success_at_end INTEGER, first_success INTEGER,
     steps INTEGER NOT NULL, episode_return REAL NOT NULL, ending TEXT NOT NULL, instruction TEXT NOT NULL,
     error TEXT, seconds REAL NOT NULL, reset_ms REAL, env_step_ms REAL, acts INTEGER NOT NULL,
-    policy_ms REAL, policy_p95_ms REAL, transport TEXT NOT NULL, checkpoint TEXT, videos TEXT NOT NULL,
-    attempts INTEGER NOT NULL, run INTEGER NOT NULL REFERENCES runs, finished REAL NOT NULL
+    policy_ms REAL, policy_p95_ms REAL, timing_ms TEXT NOT NULL, transport TEXT NOT NULL, checkpoint TEXT,
+    videos TEXT NOT NULL, attempts INTEGER NOT NULL, run INTEGER NOT NULL REFERENCES runs, finished REAL NOT NULL
 );
+CREATE INDEX episodes_of_cells ON episodes (cell, checkpoint);
 CREATE TABLE attempts (
-    key TEXT NOT NULL, attempt INTEGER NOT NULL, run INTEGER NOT NULL REFERENCES runs, at REAL NOT NULL,
-    cause TEXT NOT NULL, code TEXT NOT NULL, error TEXT NOT NULL, traceback TEXT NOT NULL,
-    retried INTEGER NOT NULL
+    key TEXT NOT NULL, cell TEXT NOT NULL REFERENCES cells, attempt INTEGER NOT NULL,
+    run INTEGER NOT NULL REFERENCES runs, at REAL NOT NULL, cause TEXT NOT NULL, code TEXT NOT NULL,
+    error TEXT NOT NULL, traceback TEXT NOT NULL, retried INTEGER NOT NULL
 );
 """
 
@@ -59,6 +64,7 @@ class Store:
         Raises `ConfigError` if there are results and `config.resume` is off, if they come from other
         settings, or if another evaluation is writing there.
         """
+        self.cells = cells(config)
         self._out = config.out
         self._out.mkdir(parents=True, exist_ok=True)
         self._lock = _lock(self._out)
@@ -106,7 +112,9 @@ class Store:
         key = row.pop("key")
         row |= {
             "key": str(result.key),
+            "cell": key.pop("settings"),
             **key,
+            "timing_ms": canonical(result.timing_ms),
             "videos": canonical(list(videos)),
             "attempts": attempts,
             "run": self._run,
@@ -118,51 +126,44 @@ class Store:
             self._db.execute(f"INSERT INTO episodes ({columns}) VALUES ({marks})", tuple(row.values()))  # noqa: S608 (our own column names)
 
     def _require_same_checkpoint(self, result: EpisodeResult) -> None:
-        row = self._db.execute("SELECT checkpoint FROM episodes WHERE checkpoint IS NOT NULL LIMIT 1").fetchone()
-        if row is not None and result.checkpoint not in (None, row[0]):
+        known = self._db.execute(
+            "SELECT checkpoint FROM episodes WHERE cell = ? AND checkpoint IS NOT NULL LIMIT 1", (result.key.settings,)
+        ).fetchone()
+        if known is not None and result.checkpoint not in (None, known[0]):
             raise ConfigError(
                 f"policy: {result.key} was played by checkpoint {result.checkpoint!r}, the results in {self._out} "
-                f"are of {row[0]!r}; serve that one again, or choose another out folder"
+                f"are of {known[0]!r}; serve that one again, or choose another out folder"
             )
 
     def record_attempt(self, job: Job, failure: Failure, *, retried: bool) -> None:
         """Note an attempt that infrastructure failed."""
-        where = (str(job.key), job.attempt, self._run, time.time())
+        where = (str(job.key), job.key.settings, job.attempt, self._run, time.time())
         why = (failure.cause, failure.code, failure.message, failure.traceback, retried)
         with self._db:
-            self._db.execute("INSERT INTO attempts VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", where + why)
+            self._db.execute("INSERT INTO attempts VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", where + why)
 
-    def note_env(self, made: Made) -> None:
-        """Keep what a worker found out about an env."""
+    def note_env(self, place: str, made: Made) -> None:
+        """Keep what a worker found out about the env of the cells at `place`."""
+        found = (json.dumps(made.described, default=str), canonical(made.contract))
         with self._db:
-            self._db.execute(
-                "UPDATE envs SET described = ?, contract = ? WHERE env = ?",
-                (json.dumps(made.described, default=str), canonical(made.contract), made.env),
+            self._db.executemany(
+                "UPDATE cells SET described = ?, contract = ? WHERE cell = ?",
+                [(*found, cell.fingerprint) for cell in self.cells if cell.place == place],
             )
 
-    def note_policy(self, metadata: dict[str, Any]) -> None:
-        """Keep what the policy's server says of itself; `ConfigError` if it is not the policy of before."""
-        known = self.policy()
-        for name in IDENTITY:
-            if known is not None and known.get(name) != metadata.get(name):
+    def note_policy(self, name: str, metadata: dict[str, Any]) -> None:
+        """Keep what a policy's server says of itself; `ConfigError` if it is not the policy of before."""
+        row = self._db.execute("SELECT metadata FROM policies WHERE name = ?", (name,)).fetchone()
+        known = None if row is None else json.loads(row[0])
+        for what in IDENTITY:
+            if known is not None and known.get(what) != metadata.get(what):
                 raise ConfigError(
-                    f"policy: the server has {name} {metadata.get(name)!r}, the results in {self._out} are of "
-                    f"{known.get(name)!r}; serve that one again, or choose another out folder"
+                    f"policy {name!r}: the server has {what} {metadata.get(what)!r}, the results in {self._out} are of "
+                    f"{known.get(what)!r}; serve that one again, or choose another out folder"
                 )
         with self._db:
             value = json.dumps(metadata, default=str)
-            self._db.execute("INSERT OR REPLACE INTO meta VALUES ('policy', ?)", (value,))
-
-    def policy(self) -> dict[str, Any] | None:
-        """The policy's metadata, if any worker has reached it."""
-        row = self._db.execute("SELECT value FROM meta WHERE name = 'policy'").fetchone()
-        return None if row is None else dict(json.loads(row[0]))
-
-    def rows(self, table: str) -> list[dict[str, Any]]:
-        """All rows of "episodes", "attempts", "envs" or "runs", oldest first."""
-        cursor = self._db.execute(f"SELECT * FROM {table} ORDER BY rowid")  # noqa: S608 (called with constants)
-        columns = [column[0] for column in cursor.description]
-        return [dict(zip(columns, row, strict=True)) for row in cursor]
+            self._db.execute("INSERT OR REPLACE INTO policies VALUES (?, ?)", (name, value))
 
     def _open(self, config: EvalConfig) -> sqlite3.Connection:
         db = sqlite3.connect(self._out / FILE)
@@ -172,13 +173,9 @@ class Store:
             version = db.execute("PRAGMA user_version").fetchone()[0]
             if version == 0:
                 db.executescript(f"BEGIN; {_SCHEMA} PRAGMA user_version = {SCHEMA_VERSION}; COMMIT;")
-            elif version != SCHEMA_VERSION:
-                raise ConfigError(
-                    f"{self._out / FILE}: got version {version} of the results file, want {SCHEMA_VERSION}; "
-                    f"choose another out folder"
-                )
+            require_version(self._out, db)
             self._require_resumable(db, config)
-            self._note_settings(db, config)
+            self._note_cells(db)
         except BaseException:
             db.close()
             raise
@@ -186,40 +183,61 @@ class Store:
 
     def _require_resumable(self, db: sqlite3.Connection, config: EvalConfig) -> None:
         runs, episodes = (db.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0] for table in ("runs", "episodes"))  # noqa: S608
-        if runs and not config.resume:
+        if not runs:
+            with db:
+                db.execute("DELETE FROM cells")  # of a plan that was given up before it began
+            return
+        if not config.resume:
             raise ConfigError(
                 f"{self._out} already has results ({episodes} episodes): resume them (--resume), "
                 f"or choose another out folder"
             )
-        stored = {env: json.loads(text) for env, text in db.execute("SELECT env, settings FROM envs")}
-        found = [
-            f"- {env}: {name}: the results have {stored[env].get(name)!r}, now it is {value!r}"
-            for env in config.envs
-            if env in stored
-            for name, value in _settings(config, env).items()
-            if stored[env].get(name) != value
-        ]
-        if runs and found:
+        found = [f"- {text}" for cell in self.cells for text in _differences(db, cell)]
+        if found:
             raise ConfigError(
                 f"{self._out} has results of other settings:\n"
                 + "\n".join(found)
                 + "\ntake the old settings, or choose another out folder"
             )
 
-    @staticmethod
-    def _note_settings(db: sqlite3.Connection, config: EvalConfig) -> None:
+    def _note_cells(self, db: sqlite3.Connection) -> None:
         with db:
-            for env in config.envs:
-                row = (env, canonical(_settings(config, env)))
+            for cell in self.cells:
+                identity = (cell.policy.name, cell.step, cell.suite.name, cell.env)
+                extent = (cell.planned, canonical(cell.suite.seeds))
                 db.execute(
-                    "INSERT INTO envs (env, settings) VALUES (?, ?) ON CONFLICT DO UPDATE SET settings = ?",
-                    (*row, row[1]),
+                    "INSERT INTO cells (cell, policy, step, suite, env, planned, seeds, settings)"
+                    " VALUES (?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET planned = ?, seeds = ?",
+                    (cell.fingerprint, *identity, *extent, canonical(cell.settings), *extent),
                 )
 
 
-def _settings(config: EvalConfig, env: str) -> dict[str, Any]:
-    """What must be the same to go on. The first seed is among it: else episode 3 would be two episodes."""
-    return outcome_settings(config, env) | {"seed": config.seed}
+def require_version(out: Path, db: sqlite3.Connection) -> None:
+    """`ConfigError` for a results file that this version of the package does not read."""
+    version = db.execute("PRAGMA user_version").fetchone()[0]
+    if version != SCHEMA_VERSION:
+        raise ConfigError(
+            f"{out / FILE}: got version {version} of the results file, want {SCHEMA_VERSION}; choose another out folder"
+        )
+
+
+def _differences(db: sqlite3.Connection, cell: Cell) -> list[str]:
+    """What of `cell` is not as the results have it; nothing if they do not have it yet.
+
+    The first seeds must be the same: else episode 3 would be two episodes.
+    """
+    row = db.execute(
+        "SELECT settings, seeds FROM cells WHERE policy = ? AND step IS ? AND suite = ? AND env = ?",
+        (cell.policy.name, cell.step, cell.suite.name, cell.env),
+    ).fetchone()
+    if row is None:
+        return []
+    stored, seeds = map(json.loads, row)
+    differing = [(name, stored.get(name), value) for name, value in cell.settings.items() if stored.get(name) != value]
+    if any(old != new for old, new in zip(seeds, cell.suite.seeds, strict=False)):
+        differing.append(("seeds", seeds, cell.suite.seeds))
+    where = " ".join(filter(None, cell.name))
+    return [f"{where}: {name}: the results have {old!r}, now it is {new!r}" for name, old, new in differing]
 
 
 def _lock(out: Path) -> int:

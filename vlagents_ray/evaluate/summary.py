@@ -8,27 +8,28 @@ import platform
 import shutil
 import subprocess
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from vlagents_ray.evaluate.config import EvalConfig
+from vlagents_ray.evaluate.episode import EpisodeResult
+from vlagents_ray.evaluate.results import CellResults, Results, Run
 from vlagents_ray.evaluate.statistics import Rate
-from vlagents_ray.evaluate.store import Store
 
 FILE = "summary.json"
-State = Literal["complete", "interrupted", "stopped"]
-Row = dict[str, Any]
+TOTAL = "total"
 
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """The episodes of one env, or of all. Rates count finished episodes: policy errors too, infrastructure not."""
+    """The episodes of one cell, or of all of a contender. Rates count policy errors, but no infrastructure failure."""
 
-    name: str
+    contender: str
+    suite: str
+    env: str  # or "total"
     planned: int
     success_once: Rate
     success_at_end: Rate
@@ -49,29 +50,39 @@ class Group:
 
     def to_json(self) -> dict[str, Any]:
         """As plain JSON values."""
-        plain = asdict(self)
         rates = {"success_once": self.success_once.to_json(), "success_at_end": self.success_at_end.to_json()}
-        return {"name": self.name, "planned": self.planned, "episodes": self.episodes, **rates} | {
-            k: v for k, v in plain.items() if k not in rates
-        }
+        return asdict(self) | {"episodes": self.episodes} | rates
 
 
 @dataclass(frozen=True, slots=True)
 class Summary:
     """The outcome of an evaluation; `to_json` is what stands in summary.json."""
 
-    out: Path
-    state: State  # "complete": went through every planned episode; "stopped": by an error
-    envs: tuple[Group, ...]
-    total: Group
+    results: Results
+    cells: tuple[Group, ...]
+    totals: tuple[Group, ...]  # one a contender
     wall_seconds: float  # all runs together, workers' start included
     rollout_seconds: float  # from the first reset to the last step, of all runs together
-    config: dict[str, Any]
-    policy: dict[str, Any]  # what its server said of itself
-    checkpoint: str | None  # that the episodes were played by; None if no reset named one
-    transports: tuple[str, ...]
-    described: dict[str, Any] = field(default_factory=dict)  # env -> `EvalEnv.describe()`
-    versions: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def out(self) -> Path:
+        """The folder of the results."""
+        return self.results.out
+
+    @property
+    def state(self) -> str:
+        """Of the last run: "complete" if it went through every planned episode, or why not."""
+        return self.results.runs[-1].state
+
+    @property
+    def total(self) -> Group:
+        """All episodes together, of whichever contender."""
+        return _group((TOTAL, "", TOTAL), self.results.cells)
+
+    @property
+    def transports(self) -> list[str]:
+        """How the observations went to the policies."""
+        return sorted({result.transport for cell in self.results.cells for result in cell.counted})
 
     @property
     def steps_per_second(self) -> float | None:
@@ -85,47 +96,41 @@ class Summary:
 
     def to_json(self) -> dict[str, Any]:
         """As plain JSON values."""
+        cells = [
+            group.to_json() | {"checkpoint": checkpoint_of(cell), "settings": cell.settings, "env": cell.env}
+            | {"described": cell.described, "contract": cell.contract}
+            for group, cell in zip(self.cells, self.results.cells, strict=True)
+        ]  # fmt: skip
+        last = self.results.runs[-1]
         return {
             "state": self.state,
-            "total": self.total.to_json(),
-            "envs": [group.to_json() for group in self.envs],
+            "cells": cells,
+            "totals": [group.to_json() for group in self.totals],
             "wall_seconds": self.wall_seconds,
             "rollout_seconds": self.rollout_seconds,
             "steps_per_second": self.steps_per_second,
             "rollout_steps_per_second": self.rollout_steps_per_second,
-            "transports": list(self.transports),
-            "policy": self.policy,
-            "checkpoint": self.checkpoint,
-            "env_descriptions": self.described,
-            "versions": self.versions,
-            "config": self.config,
+            "transports": self.transports,
+            "policies": self.results.policies,
+            "versions": last.versions,
+            "config": last.config,
         }
 
 
-def summarize(store: Store, config: EvalConfig, versions: dict[str, Any], state: State) -> Summary:
-    """What the store knows, the results of earlier runs included."""
-    episodes, attempts, runs, envs = (store.rows(table) for table in ("episodes", "attempts", "runs", "envs"))
-    names = list(dict.fromkeys([*config.envs, *(row["env"] for row in episodes)]))
-    env_of = {row["key"]: row["env"] for row in episodes}
-    groups = []
-    for name in names:
-        mine = [row for row in episodes if row["env"] == name]
-        planned = max(config.episodes if name in config.envs else 0, len(mine))
-        groups.append(_group(name, planned, mine, [a for a in attempts if env_of.get(a["key"]) == name]))
+def summarize(results: Results) -> Summary:
+    """What the results say, those of earlier runs included."""
     return Summary(
-        out=config.out,
-        state=state,
-        envs=tuple(groups),
-        total=_group("total", sum(group.planned for group in groups), episodes, attempts),
-        wall_seconds=sum(_wall_seconds(run, episodes) for run in runs),
-        rollout_seconds=sum(_rollout_seconds(run, episodes) for run in runs),
-        config=config.model_dump(mode="json"),
-        policy=store.policy() or {},
-        checkpoint=next((row["checkpoint"] for row in episodes if row["checkpoint"] is not None), None),
-        transports=tuple(sorted({row["transport"] for row in episodes if row["status"] != "infra_failed"})),
-        described={row["env"]: json.loads(row["described"]) for row in envs if row["described"] is not None},
-        versions=versions,
+        results,
+        tuple(_group((cell.contender, cell.suite, cell.env), [cell]) for cell in results.cells),
+        tuple(_group((name, "", TOTAL), results.of(name)) for name in results.contenders),
+        wall_seconds=sum(_wall_seconds(results, run) for run in results.runs),
+        rollout_seconds=sum(_rollout_seconds(results, run) for run in results.runs),
     )
+
+
+def checkpoint_of(cell: CellResults) -> str | None:
+    """The checkpoint that the episodes of a cell were played by; None if no reset named one."""
+    return next((one.checkpoint for one in cell.counted if one.checkpoint is not None), None)
 
 
 def write_summary(summary: Summary) -> Path:
@@ -157,22 +162,22 @@ def _commit() -> str | None:
     return asked.stdout.strip() or None if asked.returncode == 0 else None
 
 
-def _group(name: str, planned: int, episodes: Sequence[Row], attempts: Sequence[Row]) -> Group:
-    finished = [row for row in episodes if row["status"] != "infra_failed"]
+def _group(name: tuple[str, str, str], cells: Sequence[CellResults]) -> Group:
+    finished: list[EpisodeResult] = [result for cell in cells for result in cell.counted]
     return Group(
-        name=name,
-        planned=planned,
-        success_once=Rate(sum(row["success_once"] for row in finished), len(finished)),
-        success_at_end=Rate(sum(row["success_at_end"] for row in finished), len(finished)),
-        policy_errors=sum(row["status"] == "policy_error" for row in finished),
-        infra_failures=len(episodes) - len(finished),
-        retries=sum(row["retried"] for row in attempts),
-        steps=sum(row["steps"] for row in finished),
-        mean_steps=_mean([row["steps"] for row in finished]),
-        mean_return=_mean([row["episode_return"] for row in finished]),
-        env_step_ms=_median([row["env_step_ms"] for row in finished]),
-        policy_ms=_median([row["policy_ms"] for row in finished]),
-        policy_p95_ms=_median([row["policy_p95_ms"] for row in finished]),
+        *name,
+        planned=sum(max(cell.planned, len(cell.episodes)) for cell in cells),
+        success_once=Rate(sum(bool(one.success_once) for one in finished), len(finished)),
+        success_at_end=Rate(sum(bool(one.success_at_end) for one in finished), len(finished)),
+        policy_errors=sum(one.status == "policy_error" for one in finished),
+        infra_failures=sum(len(cell.episodes) for cell in cells) - len(finished),
+        retries=sum(attempt.retried for cell in cells for attempt in cell.attempts),
+        steps=sum(one.steps for one in finished),
+        mean_steps=_mean([one.steps for one in finished]),
+        mean_return=_mean([one.episode_return for one in finished]),
+        env_step_ms=_median([one.env_step_ms for one in finished]),
+        policy_ms=_median([one.policy_ms for one in finished]),
+        policy_p95_ms=_median([one.policy_p95_ms for one in finished]),
     )
 
 
@@ -185,16 +190,19 @@ def _median(values: Sequence[float | None]) -> float | None:
     return float(np.median(known)) if known else None
 
 
-def _wall_seconds(run: Row, episodes: Sequence[Row]) -> float:
+def _wall_seconds(results: Results, run: Run) -> float:
     """How long a run took; one that was killed, until its last episode."""
-    ended = run["ended"]
-    if ended is None:
-        ended = max((row["finished"] for row in episodes if row["run"] == run["run"]), default=run["started"])
-    return float(ended - run["started"])
+    if run.ended is not None:
+        return run.ended - run.started
+    return max((finished for finished, _ in _played(results, run)), default=run.started) - run.started
 
 
-def _rollout_seconds(run: Row, episodes: Sequence[Row]) -> float:
-    mine = [row for row in episodes if row["run"] == run["run"]]
-    if not mine:
-        return 0.0
-    return float(max(row["finished"] for row in mine) - min(row["finished"] - row["seconds"] for row in mine))
+def _rollout_seconds(results: Results, run: Run) -> float:
+    played = _played(results, run)
+    return max(finished for finished, _ in played) - min(begun for _, begun in played) if played else 0.0
+
+
+def _played(results: Results, run: Run) -> list[tuple[float, float]]:
+    """When each episode of a run ended and began."""
+    mine = [one for cell in results.cells for one in cell.episodes if one.run == run.run]
+    return [(one.finished, one.finished - one.result.seconds) for one in mine]

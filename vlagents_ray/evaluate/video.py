@@ -14,6 +14,7 @@ import re
 from pathlib import Path
 
 from vlagents_ray.errors import EnvFailed, InvalidObservation
+from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.jobs import EpisodeKey
 from vlagents_ray.interface import HIGH_RES, Obs
@@ -57,13 +58,15 @@ class VideoRecorder:
             self._tracks.popitem()[1][1].abandon()
 
 
-def save_videos(out: Path, result: EpisodeResult, videos: dict[str, bytes]) -> list[str]:
-    """Write `out/videos/ENV/epNNNN_seedS_OUTCOME_CAMERA.mp4`; returns the paths relative to `out`.
+def save_videos(out: Path, cell: Cell, result: EpisodeResult, videos: dict[str, bytes]) -> list[str]:
+    """Write `out/videos/POLICY/SUITE/ENV/epNNNN_seedS_OUTCOME_CAMERA.mp4`; returns the paths relative to `out`.
+
+    A suite without a name has no folder.
 
     Each file is whole from the moment it has its name, and what an earlier attempt at the episode
     left is removed.
     """
-    folder = out / "videos" / _plain(result.key.env)
+    folder = out.joinpath("videos", *(_plain(part) for part in cell.name if part))
     stem = _stem(result.key)
     for old in folder.glob(f"{stem}_*"):
         old.unlink()

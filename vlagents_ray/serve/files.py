@@ -77,6 +77,33 @@ def with_dialect(config: ServeDeploySchema, name: str, settings: Mapping[str, An
     return changed
 
 
+def together(policies: Mapping[str, ServeDeploySchema]) -> ServeDeploySchema:
+    """One deployment of several policies, each an application under its name; doors of other dialects stay shut.
+
+    Raises `ConfigError` for a part that holds more than one application.
+    """
+    applications = []
+    for name, part in policies.items():
+        if len(part.applications) != 1:
+            found = [one.name for one in part.applications]
+            raise ConfigError(f"{name}: holds {found}, want one application; serve it and give the URL of one of them")
+        app = part.applications[0].model_dump(exclude_unset=True)
+        app.get("args", {}).pop("dialects", None)
+        applications.append(app | {"name": name, "route_prefix": f"/{name}"})
+    return _checked({"applications": applications}, ", ".join(policies))
+
+
+def with_settings(config: ServeDeploySchema, settings: Mapping[str, Any], *, steps: bool = False) -> ServeDeploySchema:
+    """The deployment, with these settings of its policy over the file's; `steps` lets sessions choose any step."""
+    changed = config.model_copy(deep=True)
+    for app in _ours(changed):
+        app.args["config"] = own_settings(app) | dict(settings)
+        app.deployments = [one for one in app.deployments if one.name != POLICY]
+        if steps:
+            app.args["checkpoints"] = (app.args.get("checkpoints") or {}) | {"steps": True}
+    return _checked(changed.model_dump(exclude_unset=True), "settings")
+
+
 def listens_at(config: ServeDeploySchema) -> tuple[str, int]:
     """Host and port that the file names, or ours; Serve's own default would listen to everybody."""
     http = config.http_options

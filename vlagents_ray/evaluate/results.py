@@ -1,0 +1,163 @@
+"""What a folder of results holds, for whoever reads it: the table, the report, exports."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate.cells import contender
+from vlagents_ray.evaluate.episode import EpisodeResult
+from vlagents_ray.evaluate.jobs import EpisodeKey
+from vlagents_ray.evaluate.store import FILE, require_version
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """An episode as it was recorded."""
+
+    result: EpisodeResult
+    videos: tuple[str, ...]  # paths relative to the folder
+    attempts: int
+    run: int
+    finished: float  # seconds since 1970
+
+    @property
+    def counts(self) -> bool:
+        """Is it in the rates? What infrastructure kept from ending is not."""
+        return self.result.status != "infra_failed"
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """An attempt at an episode that infrastructure failed."""
+
+    key: str
+    cell: str
+    attempt: int
+    run: int
+    at: float  # seconds since 1970
+    cause: str
+    code: str
+    error: str
+    traceback: str
+    retried: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One run over the plan: the first, or one that resumed it."""
+
+    run: int
+    started: float  # seconds since 1970
+    ended: float | None  # None: it was killed
+    state: str  # "complete", "interrupted", "stopped" by an error, or "running"
+    config: dict[str, Any]
+    versions: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class CellResults:
+    """What came of one cell: a policy, at a checkpoint, in an env."""
+
+    cell: str  # fingerprint of its settings
+    policy: str
+    step: int | None
+    suite: str
+    env: str
+    planned: int
+    settings: dict[str, Any]
+    described: dict[str, Any]  # `EvalEnv.describe()`; {} if no worker has made it
+    contract: dict[str, Any]
+    episodes: tuple[Episode, ...]  # by seed
+    attempts: tuple[Attempt, ...]
+
+    @property
+    def contender(self) -> str:
+        """The policy at its checkpoint, in a word."""
+        return contender(self.policy, self.step)
+
+    @property
+    def counted(self) -> list[EpisodeResult]:
+        """The results that are in the rates."""
+        return [episode.result for episode in self.episodes if episode.counts]
+
+
+@dataclass(frozen=True, slots=True)
+class Results:
+    """All of a folder."""
+
+    out: Path
+    cells: tuple[CellResults, ...]  # in the order of the plan
+    runs: tuple[Run, ...]
+    policies: dict[str, dict[str, Any]]  # what each policy's server said of itself
+
+    @classmethod
+    def load(cls, out: Path) -> Results:
+        """Read `out`, which an evaluation may be writing to. Raises `ConfigError` if it holds no results."""
+        with _reading(out) as db:
+            episodes: dict[str, list[Episode]] = {}
+            for row in _rows(db, "episodes", "seed"):
+                episodes.setdefault(row["cell"], []).append(_episode(row))
+            attempts: dict[str, list[Attempt]] = {}
+            for row in _rows(db, "attempts"):
+                attempts.setdefault(row["cell"], []).append(Attempt(**row | {"retried": bool(row["retried"])}))
+            return cls(
+                out,
+                tuple(
+                    _cell(row, tuple(episodes.get(row["cell"], ())), tuple(attempts.get(row["cell"], ())))
+                    for row in _rows(db, "cells")
+                ),
+                tuple(_run(row) for row in _rows(db, "runs")),
+                {row["name"]: json.loads(row["metadata"]) for row in _rows(db, "policies")},
+            )
+
+    @property
+    def contenders(self) -> list[str]:
+        """The policies at their checkpoints, in the order of the plan."""
+        return list(dict.fromkeys(cell.contender for cell in self.cells))
+
+    def of(self, contender: str) -> list[CellResults]:
+        """The cells of one contender."""
+        return [cell for cell in self.cells if cell.contender == contender]
+
+
+@contextmanager
+def _reading(out: Path) -> Iterator[sqlite3.Connection]:
+    if not (out / FILE).is_file():
+        raise ConfigError(f"{out}: got no {FILE} there, want a folder that an evaluation wrote its results to")
+    with closing(sqlite3.connect(out / FILE)) as db:
+        require_version(out, db)
+        db.row_factory = sqlite3.Row
+        db.execute("BEGIN")  # one state of all tables
+        yield db
+
+
+def _rows(db: sqlite3.Connection, table: str, order: str = "rowid") -> Iterator[dict[str, Any]]:
+    return (dict(row) for row in db.execute(f"SELECT * FROM {table} ORDER BY {order}"))  # noqa: S608 (constants)
+
+
+def _episode(row: dict[str, Any]) -> Episode:
+    names = {field.name for field in dataclasses.fields(EpisodeResult)}
+    known = {name: value for name, value in row.items() if name in names and name != "key"}
+    for name in ("success_once", "success_at_end"):
+        known[name] = None if known[name] is None else bool(known[name])
+    key = EpisodeKey(row["env"], row["episode"], row["seed"], row["cell"])
+    result = EpisodeResult(**known | {"key": key, "timing_ms": json.loads(row["timing_ms"])})
+    return Episode(result, tuple(json.loads(row["videos"])), row["attempts"], row["run"], row["finished"])
+
+
+def _cell(row: dict[str, Any], episodes: tuple[Episode, ...], attempts: tuple[Attempt, ...]) -> CellResults:
+    del row["seeds"]
+    parsed = {name: json.loads(row[name] or "{}") for name in ("settings", "described", "contract")}
+    return CellResults(**row | parsed, episodes=episodes, attempts=attempts)
+
+
+def _run(row: dict[str, Any]) -> Run:
+    return Run(**row | {name: json.loads(row[name]) for name in ("config", "versions")})
