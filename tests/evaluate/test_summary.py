@@ -33,13 +33,24 @@ def summary(config: Config) -> Summary:
         store.note_env(jobs[0].cell.place, Made({"simulator": "line"}, {}))
         store.note_policy("act", {"policy": "act", "checkpoint": "a"})
         store.record(
-            EpisodeResult(keys[0], "done", True, False, 10, 2.0, seconds=1.0, transport="http", policy_ms=3.0), 1
+            EpisodeResult(
+                keys[0], "done", True, False, steps=10, episode_return=2.0, seconds=1.0, transport="http", policy_ms=3.0
+            ),
+            1,
         )
-        store.record(EpisodeResult(keys[1], "policy_error", False, False, 2, 1.0, seconds=0.5, transport="http"), 2)
+        store.record(
+            EpisodeResult(
+                keys[1], "policy_error", False, False, steps=2, episode_return=1.0, seconds=0.5, transport="http"
+            ),
+            2,
+        )
         store.record_attempt(jobs[1], Failure("policy", "connection_lost", "gone"), retried=True)
         store.record_attempt(replace(jobs[2], attempt=4), Failure("worker", "env_failed", "hung"), retried=False)
         store.record(EpisodeResult(keys[2], "infra_failed", error="hung"), 4)
-        store.record(EpisodeResult(keys[3], "done", True, True, 6, 3.0, seconds=1.0, transport="websocket"), 1)
+        store.record(
+            EpisodeResult(keys[3], "done", True, True, steps=6, episode_return=3.0, seconds=1.0, transport="websocket"),
+            1,
+        )
         store.end_run("interrupted")
     return summarize(Results.load(settings.out))
 
