@@ -53,9 +53,9 @@ class ActionSpec:
     frame: str | None = None  # frame of a Cartesian command: "base", "tool"
     gripper_open: float | None = None  # the action's value that opens the gripper
     gripper_closed: float | None = None  # and the one that closes it
-    arms: tuple[str, ...] | None = None  # of several, in the order of the row: each its command, then its gripper
     low: float | None = None  # bounds of every component
     high: float | None = None
+    arms: tuple[str, ...] | None = None  # of several, in the order of the row: each its command, then its gripper
 
 
 @dataclass(frozen=True, slots=True)

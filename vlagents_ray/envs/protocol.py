@@ -13,7 +13,8 @@ class Protocol:
     name: str
     source: str  # where these settings are written down
     max_steps: int
-    control_hz: float | None
+    control_hz: float
+    control: str  # what an action commands
     success: str  # when an episode counts as solved
     begins: str  # what an episode's seed and initial state decide
     ends_on_success: bool

@@ -74,7 +74,7 @@ class Rcs(EvalEnv):
         self._name = f"{self.suite}/{task}"
         self._task = self._find(task, module)
         protocol = self._task.protocol
-        limit = max_steps if max_steps is not None else protocol and protocol.max_steps
+        limit = protocol.max_steps if max_steps is None and protocol is not None else max_steps
         if limit is None:
             raise ConfigError(f"{self._name} has no step limit of its own; set max_steps")
         sizes = {"width": width, "height": height, "record_size": min(record_size or (1,)), "max_steps": limit}
@@ -108,9 +108,7 @@ class Rcs(EvalEnv):
             self._loose = _loose_joints(self._sim.model)
             self._arms = Arms(self._env.action_space, self._env.observation_space, self._mode)
         self._contract = Contract(
-            cameras={
-                name: CameraSpec(height, width) for name in config.camera_cfgs or () if not _for_the_record(name)
-            },
+            cameras={name: CameraSpec(height, width) for name in config.camera_cfgs or () if not _for_the_record(name)},
             state=self._arms.state,
             gripper=self._arms.has_gripper,
             instruction=True,
@@ -165,15 +163,14 @@ class Rcs(EvalEnv):
         return making.missing(*cls.packages)
 
     def describe(self) -> dict[str, Any]:
-        played = {"max_steps": self.max_steps, "control_hz": self._contract.control_hz}
+        control = f"{self._mode}, delta" if self._contract.action.delta else self._mode
+        played = {"max_steps": self.max_steps, "control_hz": self._contract.control_hz, "control": control}
         protocol = self._task.protocol
         return {
             "simulator": "rcs",
             "task": self._task.id,
             **{name: version(name) for name in ("rcs-core", *self.packages[1:], "mujoco")},
             "robots": {name: robot.get_config().robot_type.id for name, robot in self._robots().items()},
-            "control_mode": self._mode,
-            "delta": bool(self._contract.action.delta),
             "protocol": protocol.describe(**played) if protocol is not None else played,
         }
 
@@ -187,7 +184,9 @@ class Rcs(EvalEnv):
             found = self.known[task]
             return replace(found, module=module) if module is not None else found
         if "/" not in task:
-            raise UnknownEnv(f"{self.suite} has no task {task!r}: want one of {self.tasks()}, or an id, as in 'lab/shelf'")
+            raise UnknownEnv(
+                f"{self.suite} has no task {task!r}: want one of {self.tasks()}, or an id, as in 'lab/shelf'"
+            )
         return Task(id=task, module=module)
 
     def _observe(self, raw: Mapping[str, Any]) -> Obs:
@@ -201,9 +200,7 @@ class Rcs(EvalEnv):
                 if _for_the_record(name)
             }
         return Obs(
-            cameras={
-                name: np.ascontiguousarray(image) for name, image in images.items() if not _for_the_record(name)
-            },
+            cameras={name: np.ascontiguousarray(image) for name, image in images.items() if not _for_the_record(name)},
             gripper=gripper,
             state=state,
             info=info,

@@ -91,7 +91,7 @@ def configure(
     have = config.camera_cfgs or {}
     unknown = sorted(set(cameras or ()) - set(have))
     if unknown:
-        raise ConfigError(f"there is no camera {unknown}: want some of {sorted(have)}")
+        raise ConfigError(f"the scene has no camera {unknown}: want some of {sorted(have)}")
     chosen = {name: have[name] for name in (have if cameras is None else cameras)}
     views = {name: _sized(camera, size) for name, camera in chosen.items()}
     if record_size is not None:

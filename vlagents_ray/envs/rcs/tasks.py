@@ -19,7 +19,7 @@ class Task:
     id: str  # of the scene, Gymnasium's
     module: str | None  # registers it when it is imported; None: the user says which
     protocol: Protocol | None = None  # None: the user sets `max_steps`
-    control_mode: ControlMode = "joints"
+    control_mode: ControlMode = "joints"  # an action's, absolute unless the user says otherwise
     control_hz: float = 30.0
     instruction: str = ""  # where the simulator's info has none
     prepare: Callable[[Any], None] = lambda _config: None  # puts the task into RCS's configuration of a scene without
@@ -38,6 +38,7 @@ RCS_TASKS = {
             source="rcs-core 0.7.3, rcs/envs/tasks.py, for the task; it states neither rate nor step limit: ours",
             max_steps=300,
             control_hz=30.0,
+            control="tquat",
             success="the cuboid's middle is 7.8 cm or more above the robot's base, and the gripper is neither open "
             "nor closed",
             begins="the cuboid's place in a square of 20 cm, 50 cm in front of the robot, and its turn: the seed's",
@@ -54,6 +55,7 @@ _DUOBENCH = Protocol(
     source="DuoBench 0.1.2, README, 'Evaluation Environment' (arXiv 2606.11901); it states no step limit: ours",
     max_steps=900,
     control_hz=30.0,
+    control="joints",
     success="the task's last stage has been reached; stages are not lost again",
     begins="where the objects are: the seed's",
     ends_on_success=True,
