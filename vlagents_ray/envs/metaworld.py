@@ -25,7 +25,7 @@ from vlagents_ray.registry import require
 
 PROTOCOL = Protocol(
     name="Meta-World",
-    source="Meta-World 3.1.1, metaworld.evaluation and MT1; the same in LeRobot 0.4.4 but for its camera's place",
+    source="Meta-World 3.1.1, metaworld.evaluation and MT1",
     max_steps=500,  # the simulator refuses to go further
     control_hz=80.0,
     control="position of the hand, delta",

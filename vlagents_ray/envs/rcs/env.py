@@ -29,7 +29,7 @@ class Rcs(EvalEnv):
     `info["objects"]` is {joint: (7,) float64}, the pose of each loose body in the world's frame, metres
     and quaternion wxyz: for scripted experts only.
 
-    Action: for each arm its command in `control_mode`, then its gripper, which closes below 0.5.
+    Action: for each arm its command in `control_mode`, then its gripper, which closes at 0.5 and below.
 
     Success is the simulator's, and ends the episode. The seed places the objects.
     """

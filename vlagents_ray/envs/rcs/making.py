@@ -6,6 +6,7 @@ import copy
 import importlib.util
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,27 @@ from vlagents_ray.registry import require
 
 RECORD = "record/"  # before a camera's name: its view for the record
 
-# Package -> the variable that names its assets' folder, and where it keeps them without.
-_ASSETS = {"rcs": ("RCS_PREFIX", ".rcs"), "duobench": ("DUOBENCH_PREFIX", ".duobench")}
-# Where this one is not, `import rcs` and `import duobench` download all of them (rcs-core 0.7.3, rcs/__init__.py).
+# Where this one is not, `import rcs` and `import duobench` download all assets (rcs-core 0.7.3, rcs/__init__.py).
 _REQUIRED = Path("assets/scenes/empty_world/scene.xml")
+
+
+@dataclass(frozen=True, slots=True)
+class _Assets:
+    """Where a package keeps its assets, and how they get there."""
+
+    variable: str  # names their folder
+    folder: str  # in the home folder, without it
+    cure: str = ""  # what `import` alone does not do
+
+
+_ASSETS = {
+    "rcs": _Assets("RCS_PREFIX", ".rcs"),
+    "duobench": _Assets(
+        "DUOBENCH_PREFIX",
+        ".duobench",
+        f", then make {_REQUIRED} there, empty: DuoBench 0.1.2 has none, and each import would fetch all again",
+    ),
+}
 
 
 def missing(*packages: str) -> str | None:
@@ -28,14 +46,14 @@ def missing(*packages: str) -> str | None:
         if importlib.util.find_spec(package) is None:
             return (
                 f"{package} is not installed; make an environment, `vlagents-ray env make requirements/rcs.txt`, and "
-                f"have the workers run in it: runtime_env: {{py_executable: .venv-rcs/bin/python}}"
+                f"have the workers run in it: runtime_env: {{py_executable: /path/to/.venv-rcs/bin/python}}"
             )
-        variable, folder = _ASSETS[package]
-        prefix = Path(os.environ.get(variable) or Path.home() / folder).expanduser()
+        assets = _ASSETS[package]
+        prefix = Path(os.environ.get(assets.variable) or Path.home() / assets.folder).expanduser()
         if not (prefix / _REQUIRED).is_file():
             return (
-                f"{package}'s assets are not in {prefix}: there is no {_REQUIRED}; set {variable} to the folder that "
-                f"holds its `assets`, or fetch them once by `python -c 'import {package}'`"
+                f"{package}'s assets are not in {prefix}: there is no {_REQUIRED}; set {assets.variable} to the folder "
+                f"that holds its `assets`, or fetch them once by `python -c 'import {package}'`{assets.cure}"
             )
     return None
 
