@@ -6,12 +6,13 @@ import importlib
 from collections.abc import Iterator
 
 import gymnasium
+import mujoco
 import numpy as np
 import pytest
 
 from vlagents_ray.contract import ActionSpec, Contract, differences
 from vlagents_ray.envs import make_env
-from vlagents_ray.envs.rcs import DuoBench
+from vlagents_ray.envs.rcs import DuoBench, Rcs
 from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.interface import Act
 from vlagents_ray.testing import check_env
@@ -26,7 +27,7 @@ def transfer() -> Iterator[DuoBench]:
 
 
 def test_it_keeps_the_promises_of_an_env() -> None:
-    check_env(make_env("duobench/transfer_cube", width=16, height=16, max_steps=6))
+    check_env(make_env("duobench/transfer_cube", cameras=["head"], width=16, height=16, max_steps=6))
 
 
 def test_it_is_set_up_as_its_authors_evaluate(transfer: DuoBench) -> None:
@@ -62,6 +63,14 @@ def test_all_its_tasks_are_registered_by_its_package() -> None:
     for task in DuoBench.known.values():
         importlib.import_module(str(task.module))
     assert {task.id for task in DuoBench.known.values()} <= set(gymnasium.registry)
+
+
+def test_rcs_own_tasks_keep_their_scene_beside_it() -> None:
+    duobench = importlib.import_module("duobench")
+    with Rcs("pick", cameras=[]) as env:
+        scene = importlib.import_module("rcs").SCENE_PATHS["empty_world"]
+        assert scene != duobench.SCENE_PATHS["empty_world"]
+        assert env._sim.model.geom("floor").type == mujoco.mjtGeom.mjGEOM_PLANE
 
 
 def test_a_policy_for_one_arm_is_refused(transfer: DuoBench) -> None:

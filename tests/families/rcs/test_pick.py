@@ -34,7 +34,7 @@ def led(env: Rcs, command: Sequence[float], steps: int = 40) -> Obs:
 
 
 def test_it_keeps_the_promises_of_an_env() -> None:
-    check_env(Rcs("pick", width=40, height=32, record_size=(48, 64), max_steps=8))
+    check_env(Rcs("pick", cameras=["wrist"], width=40, height=32, record_size=(48, 64), max_steps=8))
 
 
 def test_the_expert_picks_the_cuboid_up_and_that_ends_the_episode(pick: Rcs) -> None:
