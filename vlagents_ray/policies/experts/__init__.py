@@ -20,6 +20,7 @@ EXPERTS: dict[str, str] = {
     "metaworld": "vlagents_ray.policies.experts.metaworld:MetaWorldExpert",
     "rcs/pick": "vlagents_ray.policies.experts.rcs:Pick",
     "gymnasium/FetchReach-v4": "vlagents_ray.policies.experts.fetch:FetchReach",
+    "gymnasium/FetchReachDense-v4": "vlagents_ray.policies.experts.fetch:FetchReach",
 }
 
 
