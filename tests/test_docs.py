@@ -8,6 +8,9 @@ from pathlib import Path
 import pytest
 import yaml
 
+from vlagents_ray.envs import metaworld
+from vlagents_ray.envs.known import known
+from vlagents_ray.envs.protocol import Protocol
 from vlagents_ray.serve.environments.config import EnvironmentArgs
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -25,3 +28,19 @@ def test_an_environment_as_it_is_documented_is_accepted(block: str) -> None:
 
 def test_there_are_such_blocks() -> None:
     assert len(BLOCKS) == 2
+
+
+@pytest.mark.parametrize(
+    ("page", "protocol"),
+    [
+        ("metaworld", metaworld.PROTOCOL),
+        ("pusht", known("gym_pusht/PushT-v0").protocol),
+        ("gymnasium", known("FetchReach-v4").protocol),
+    ],
+)
+def test_a_benchmarks_page_states_the_protocol_that_is_recorded(page: str, protocol: Protocol) -> None:
+    text = (DOCS / "benchmarks" / f"{page}.md").read_text()
+    rows = dict(re.findall(r"^\| (\w+) \| (.*) \|$", text, re.MULTILINE))
+    assert re.match(r"\d+", rows["steps"]).group() == str(protocol.max_steps)  # type: ignore[union-attr]
+    assert rows["rate"] == f"{protocol.control_hz:g} Hz"
+    assert ("ends the episode" in rows["success"]) is protocol.ends_on_success

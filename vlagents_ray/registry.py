@@ -41,6 +41,8 @@ ENVS: dict[str, str] = {
     "maniskill": "vlagents_ray.envs.maniskill:ManiSkill",
     "metaworld": "vlagents_ray.envs.metaworld:MetaWorld",
     "gymnasium": "vlagents_ray.envs.gymnasium:Gymnasium",
+    "rcs": "vlagents_ray.envs.rcs:Rcs",
+    "duobench": "vlagents_ray.envs.rcs:DuoBench",
 }
 
 # import name -> extra of this package that installs it
@@ -63,10 +65,11 @@ _EXTRAS = {
     "torch": "maniskill",
     "metaworld": "metaworld",
     "gym_pusht": "pusht",
+    "gymnasium_robotics": "robotics",
 }
 
 # import name -> its file in requirements/: what runs in a Python environment of its own
-_ENVIRONMENTS = {"lerobot": "lerobot.txt"}
+_ENVIRONMENTS = {"lerobot": "lerobot.txt", "rcs": "rcs.txt", "duobench": "rcs.txt"}
 
 
 def require(module: str) -> ModuleType:

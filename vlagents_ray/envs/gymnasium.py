@@ -16,6 +16,7 @@ import numpy as np
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec, check_action
 from vlagents_ray.envs.base import EvalEnv
 from vlagents_ray.envs.headless import prepare_rendering
+from vlagents_ray.envs.known import known
 from vlagents_ray.envs.mapping import RENDER, Pick, as_image, bounds, parts, plain, uniform
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, MissingDependency, NotReset, UnknownEnv
 from vlagents_ray.interface import Act, Obs
@@ -23,16 +24,6 @@ from vlagents_ray.registry import require
 
 TERMINATED = "terminated"
 _SUCCESS_KEYS = ("is_success", "success")
-
-# What an environment does not say about itself.
-_KNOWN: dict[str, dict[str, Any]] = {
-    "gym_pusht/PushT-v0": {
-        "kwargs": {"obs_type": "pixels_agent_pos"},
-        "cameras": {"front": "pixels"},
-        "instruction": "push the T-shaped block onto the green target",
-        "control_hz": 10.0,
-    },
-}
 
 
 class Gymnasium(EvalEnv):
@@ -78,11 +69,12 @@ class Gymnasium(EvalEnv):
         if task is None:
             raise UnknownEnv("gymnasium: got no id, want one, as in 'gymnasium/Pendulum-v1'")
         prepare_rendering()
-        known = _KNOWN.get(task, {})
+        defaults = known(task)
         self._id = task
-        self._module = module
-        self._kwargs = {"render_mode": "rgb_array", **known.get("kwargs", {}), **(kwargs or {})}
-        self._instruction = instruction if instruction is not None else known.get("instruction", "")
+        self._module = module if module is not None else defaults.module
+        self._kwargs = {"render_mode": "rgb_array", **defaults.kwargs, **(kwargs or {})}
+        self._instruction = instruction if instruction is not None else defaults.instruction
+        self._protocol = defaults.protocol
         self._success = success
         self._unit_actions = unit_actions
         self._size = (height, width)
@@ -97,14 +89,14 @@ class Gymnasium(EvalEnv):
             if unit_actions and not np.isfinite([self._low, self._high]).all():
                 raise ConfigError(f"gymnasium/{task}: unit_actions needs finite bounds, got {self._action_space}")
             seen_cameras, seen_state = parts(self._env.observation_space, self._env.render_mode)
-            self._cameras = _picks(cameras if cameras is not None else known.get("cameras", seen_cameras))
+            self._cameras = _picks(next(c for c in (cameras, defaults.cameras, seen_cameras) if c is not None))
             self._state = _picks(state if state is not None else seen_state)
             self._gripper = Pick.parse(gripper) if gripper is not None else None
             self._gripper_closed, self._gripper_open = gripper_range
             if self._gripper_closed == self._gripper_open:
                 raise ConfigError(f"gymnasium/{task}: gripper_range is {gripper_range}, want two different numbers")
             first, _ = self._call("reset", seed=0)
-            self._contract = self._describe_contract(self._observe(first), control_hz or known.get("control_hz"))
+            self._contract = self._describe_contract(self._observe(first), control_hz or defaults.control_hz)
         except BaseException:
             self.close()
             raise
@@ -126,6 +118,7 @@ class Gymnasium(EvalEnv):
         return self._instruction
 
     def describe(self) -> dict[str, Any]:
+        played = {"max_steps": self.max_steps, "control_hz": self._contract.control_hz}
         return {
             "id": self._id,
             "gymnasium": require("gymnasium").__version__,
@@ -133,6 +126,7 @@ class Gymnasium(EvalEnv):
             "action_space": self._action_space,
             "unit_actions": self._unit_actions,
             "success": self._success or f"info: {' or '.join(_SUCCESS_KEYS)}",
+            "protocol": self._protocol.describe(**played) if self._protocol is not None else played,
         }
 
     def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
