@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from vlagents_ray.envs.libero import Libero
 from vlagents_ray.envs.libero.assets import find_assets
 from vlagents_ray.envs.libero.protocol import SUITES, Protocol
+from vlagents_ray.envs.libero.robot import to_simulator
 from vlagents_ray.errors import EnvFailed, UnknownEnv
 
 
@@ -56,3 +58,22 @@ def test_missing_assets_name_the_command_that_gets_them(tmp_path: Path, monkeypa
         find_assets()
     with pytest.raises(EnvFailed, match=r"lack \['articulated_objects'.*hf download"):
         find_assets(str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("own", "commands"),
+    [
+        ({}, {-1.0: -1, -0.2: -1, 0.0: 0, 0.7: 1}),
+        ({"gripper_open": 1.0, "gripper_closed": 0.0}, {1.0: -1, 0.6: -1, 0.5: 0, 0.0: 1}),
+    ],
+)
+def test_a_gripper_in_a_policys_own_numbers_becomes_the_simulators(
+    own: dict[str, float], commands: dict[float, int]
+) -> None:
+    """LIBERO's own, and OpenVLA's, whose evaluation takes -sign(2 g - 1)."""
+    protocol = Protocol.of("libero_spatial", **own)
+    for said, command in commands.items():
+        action = np.array([0.1, -0.2, 0.3, 0, 0, 0.5, said], np.float32)
+        simulated = to_simulator(action, protocol)
+        assert simulated[6] == command
+        np.testing.assert_array_equal(simulated[:6], action[:6])

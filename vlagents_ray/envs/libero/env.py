@@ -34,7 +34,8 @@ class Libero(EvalEnv):
     the `goal`.
 
     Action: (7,) in [-1, 1]: the end effector's target moves by 0.05 m a unit along the base's axes, and
-    turns by 0.5 rad a unit about them, axis-angle; the last is the gripper, -1 opens, 1 closes.
+    turns by 0.5 rad a unit about them, axis-angle; the last is the gripper, -1 opens, 1 closes, and only
+    its sign counts.
 
     An episode is a pure function of its initial state, `options["init_state"]`; where that is not given,
     the seed chooses it, and otherwise the seed is the policy's alone.
@@ -51,6 +52,8 @@ class Libero(EvalEnv):
         settling_steps: int | None = None,
         simulator_seed: int | None = None,
         stop_at_success: bool = True,
+        gripper_open: float | None = None,
+        gripper_closed: float | None = None,
         instruction: str | None = None,
         assets: str | None = None,
     ) -> None:
@@ -65,14 +68,17 @@ class Libero(EvalEnv):
             settling_steps: None is the protocol's.
             simulator_seed: of what an initial state leaves open; None is the protocol's.
             stop_at_success: report `terminated` when the task is solved.
+            gripper_open: the action's last number that opens the gripper; None is LIBERO's -1. OpenVLA
+                says 1, and 0 to close, which openvla's evaluation turns into LIBERO's as this does.
+            gripper_closed: the one that closes it; None is LIBERO's 1.
             instruction: None is the task's own.
             assets: the folder with LIBERO's meshes and textures; None is what LIBERO_ASSETS names.
         """
-        sizes = {"width": width, "height": height, "max_steps": max_steps}
-        sizes |= {"record_size": min(record_size)} if record_size else {}
-        for name, value in sizes.items():
+        for name, value in (("width", width), ("height", height), ("max_steps", max_steps)):
             if value is not None and value < 1:
                 raise ConfigError(f"libero/{task}: {name} is {value}, want at least 1")
+        if record_size is not None and (len(record_size) != 2 or min(record_size) < 1):
+            raise ConfigError(f"libero/{task}: record_size is {record_size}, want (height, width), pixels")
         if (settling_steps or 0) < 0:
             raise ConfigError(f"libero/{task}: settling_steps is {settling_steps}, want 0 or more")
         self._task = find_task(task)
@@ -84,7 +90,11 @@ class Libero(EvalEnv):
             settling_steps=settling_steps,
             simulator_seed=simulator_seed,
             stop_at_success=stop_at_success,
+            gripper_open=gripper_open,
+            gripper_closed=gripper_closed,
         )
+        if self._protocol.gripper_open == self._protocol.gripper_closed:
+            raise ConfigError(f"libero/{task}: the gripper opens and closes at {gripper_open}; want two numbers")
         self.max_steps = self._protocol.max_steps
         self._instruction = instruction or self._task.language
         self._steps: int | None = None
@@ -119,7 +129,7 @@ class Libero(EvalEnv):
         if action.ndim != 1:
             raise InvalidAction(f"action: got {action.shape}, want (7,); step through a chunk row by row")
         with self._failing("step"):
-            seen = world.step(action)
+            seen = world.step(robot.to_simulator(action, self._protocol))
         self._steps += 1
         ended = seen.success and self._protocol.stop_at_success
         truncated = not ended and self._steps >= self.max_steps

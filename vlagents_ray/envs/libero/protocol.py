@@ -54,7 +54,7 @@ class Protocol:
     begins: tuple[str, ...] = ("seed", "reset", "set_init_state", SETTLE)  # in this order, for every episode
     control_hz: float = CONTROL_HZ
     controller: str = "OSC_POSE"  # LIBERO's default: 0.05 m and 0.5 rad a unit, in the robot base's axes
-    gripper_open: float = -1.0  # robosuite, PandaGripper: only the sign counts
+    gripper_open: float = -1.0  # of a policy's action: robosuite's, openpi's; OpenVLA's are 1 and 0
     gripper_closed: float = 1.0
     success: str = "the goal predicates hold after a step"  # LIBERO's `done`
     stop_at_success: bool = True  # both end the episode there

@@ -49,6 +49,17 @@ def read(raw: Mapping[str, Any]) -> tuple[dict[str, np.ndarray], float]:
     return {name: part.astype(np.float32) for name, part in state.items()}, gripper
 
 
+def to_simulator(action: np.ndarray, protocol: Protocol) -> np.ndarray:
+    """An action under `protocol`, (7,), as robosuite takes it: the gripper -1 to open, 1 to close, 0 to stay.
+
+    Closer to `gripper_open` means open, as in openvla's evaluation, which binarises, and as robosuite's own
+    gripper does, of whose command only the sign counts.
+    """
+    middle = (protocol.gripper_open + protocol.gripper_closed) / 2
+    command = np.sign((action[6] - middle) * (protocol.gripper_closed - protocol.gripper_open))
+    return np.append(action[:6], command).astype(np.float64)
+
+
 def axis_angle(quaternion: np.ndarray) -> np.ndarray:
     """A unit quaternion xyzw to axis times angle, (3,) rad, the angle in [0, 2 pi].
 

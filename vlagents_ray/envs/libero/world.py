@@ -65,8 +65,8 @@ class World:
         return Seen(raw, self._eyes.views, bool(success))
 
     def step(self, action: np.ndarray) -> Seen:
-        """One control step of `action`, (7,), which the controller clips to [-1, 1]."""
-        raw, _, success, _ = self._env.step(action.astype(np.float64))
+        """One control step of `action`, (7,) float64, which the controller clips to [-1, 1]."""
+        raw, _, success, _ = self._env.step(action)
         return Seen(raw, self._eyes.views, bool(success))
 
     @property
