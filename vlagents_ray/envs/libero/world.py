@@ -110,7 +110,7 @@ class World:
 class Eyes:
     """The cameras: closed, they cost nothing and show black.
 
-    robosuite renders each camera whenever an observation is made, which is 13 times from the beginning of
+    robosuite renders each camera whenever an observation is made, which is 14 times from the beginning of
     a reset to the policy's first observation. It samples a step's observation after the first 2 ms of the
     step's 50, images included; the views for the record are of that same moment.
     """
@@ -125,7 +125,9 @@ class Eyes:
 
     def make_current(self) -> None:
         """Render in this simulator's OpenGL context: the process may have others."""
-        self._domain.sim._render_context_offscreen.gl_ctx.make_current()
+        sim = self._domain.sim
+        if sim is not None and sim._render_context_offscreen is not None:  # a reset that failed leaves none
+            sim._render_context_offscreen.gl_ctx.make_current()
 
     def _sensors(self, cam_name: str, cam_w: int, cam_h: int, **rest: Any) -> tuple[list[Any], list[str]]:
         [own], names = self._own(cam_name, cam_w=cam_w, cam_h=cam_h, **rest)

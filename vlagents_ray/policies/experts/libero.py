@@ -1,7 +1,8 @@
 """An expert for LIBERO's two suites of picking one thing up and placing it, from the simulator's state.
 
 It answers (7,) for OSC_POSE: 0.05 m and 0.5 rad a unit, gripper -1 open, 1 closed. The hand keeps the
-orientation that it began with, in which the fingers close along y.
+orientation that it began with, in which the fingers close along y. Bowls in or on the cabinet
+(libero_spatial/4 and /9) are out of its reach so: it acts there, and fails.
 """
 
 from __future__ import annotations
