@@ -40,6 +40,7 @@ ENVS: dict[str, str] = {
     "tabletop": "vlagents_ray.envs.tabletop:Tabletop",
     "maniskill": "vlagents_ray.envs.maniskill:ManiSkill",
     "metaworld": "vlagents_ray.envs.metaworld:MetaWorld",
+    "libero": "vlagents_ray.envs.libero:Libero",
     "gymnasium": "vlagents_ray.envs.gymnasium:Gymnasium",
     "rcs": "vlagents_ray.envs.rcs:Rcs",
     "duobench": "vlagents_ray.envs.rcs:DuoBench",
@@ -64,6 +65,8 @@ _EXTRAS = {
     "sapien": "maniskill",
     "torch": "maniskill",
     "metaworld": "metaworld",
+    "libero": "libero",
+    "robosuite": "libero",
     "gym_pusht": "pusht",
     "gymnasium_robotics": "robotics",
 }

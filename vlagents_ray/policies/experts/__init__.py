@@ -21,6 +21,7 @@ EXPERTS: dict[str, str] = {
     "rcs/pick": "vlagents_ray.policies.experts.rcs:Pick",
     "gymnasium/FetchReach-v4": "vlagents_ray.policies.experts.fetch:FetchReach",
     "gymnasium/FetchReachDense-v4": "vlagents_ray.policies.experts.fetch:FetchReach",
+    "libero": "vlagents_ray.policies.experts.libero:LiberoExpert",
 }
 
 
