@@ -40,6 +40,7 @@ ENVS: dict[str, str] = {
     "tabletop": "vlagents_ray.envs.tabletop:Tabletop",
     "maniskill": "vlagents_ray.envs.maniskill:ManiSkill",
     "metaworld": "vlagents_ray.envs.metaworld:MetaWorld",
+    "simpler": "vlagents_ray.envs.simpler:Simpler",
     "gymnasium": "vlagents_ray.envs.gymnasium:Gymnasium",
 }
 

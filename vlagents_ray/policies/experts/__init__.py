@@ -18,6 +18,7 @@ EXPERTS: dict[str, str] = {
     "maniskill/PushCube-v1": "vlagents_ray.policies.experts.maniskill:PushCube",
     "maniskill/PickCube-v1": "vlagents_ray.policies.experts.maniskill:PickCube",
     "metaworld": "vlagents_ray.policies.experts.metaworld:MetaWorldExpert",
+    "simpler": "vlagents_ray.policies.experts.simpler:SimplerExpert",
 }
 
 
