@@ -7,6 +7,7 @@ simulated robot and objects, and a fixed list of initial configurations.
 
 from __future__ import annotations
 
+import math
 import os
 import sys
 from collections.abc import Mapping, Sequence
@@ -62,9 +63,9 @@ class Simpler(EvalEnv):
 
     Observation: "3rd_view_camera", (480, 640, 3), as the policies of the paper had it and resized it
     themselves; `state`: the arm's `joints` (6,) rad, and `tquat` and `xyzrpy`, the pose of the
-    gripper's link in the robot's base frame; `gripper`; and in `info["sim_state"]`, (12,) float32 m
-    in that frame, the positions of object, target, gripper and of where the gripper is commanded
-    to, for scripted experts only.
+    gripper's link in the robot's base frame; `gripper`; and in `info["sim_state"]`, (13,) float32 in
+    that frame, the positions in m of object, target, gripper and of where the gripper is commanded
+    to, and the object's yaw in rad, for scripted experts only.
 
     Action, (7,), as policies trained on Bridge give it: the gripper's change of position in m along
     the base's axes, its change of roll, pitch and yaw in rad, and the gripper, 1 open, 0 closed. It
@@ -185,8 +186,11 @@ class Simpler(EvalEnv):
         base = env.agent.robot.pose.inv()
         arm = env.agent.controller.controllers["arm"]
         places = [base * env.objs[name].pose for name in (env.source_obj_name, env.target_obj_name)]
+        w, x, y, z = places[0].q[0].tolist()
+        yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
         places += [arm.ee_pose_at_base, arm._target_pose]
-        obs.info["sim_state"] = np.concatenate([place.p[0].cpu().numpy() for place in places]).astype(np.float32)
+        rows = [place.p[0].cpu().numpy() for place in places]
+        obs.info["sim_state"] = np.array([*np.concatenate(rows), yaw], np.float32)
         return obs
 
 
