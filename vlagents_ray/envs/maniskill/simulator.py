@@ -52,6 +52,7 @@ class Simulator:
         """`name` stands in errors. Raises `ConfigError`, or `EnvFailed` with its cure."""
         self.name = name
         self._task = task
+        self._record: RecordCameras | None = None
         self.env: Any = making.make(
             task,
             control_mode,
@@ -69,7 +70,8 @@ class Simulator:
         except BaseException:
             self.close()
             raise
-        self._record = RecordCameras(record_size, self.cameras) if record_size else None
+        if record_size is not None:
+            self._record = RecordCameras(record_size, self.cameras)
 
     @property
     def action(self) -> ActionSpec:
@@ -172,7 +174,7 @@ class Simulator:
 
     def close(self) -> None:
         """Free it; safe to call twice."""
-        env, self.env = self.env, None
+        env, self.env, self._record = self.env, None, None
         if env is not None:
             env.close()
 
