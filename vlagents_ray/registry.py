@@ -41,6 +41,7 @@ ENVS: dict[str, str] = {
     "maniskill": "vlagents_ray.envs.maniskill:ManiSkill",
     "metaworld": "vlagents_ray.envs.metaworld:MetaWorld",
     "libero": "vlagents_ray.envs.libero:Libero",
+    "simpler": "vlagents_ray.envs.simpler:Simpler",
     "gymnasium": "vlagents_ray.envs.gymnasium:Gymnasium",
     "rcs": "vlagents_ray.envs.rcs:Rcs",
     "duobench": "vlagents_ray.envs.rcs:DuoBench",

@@ -8,18 +8,19 @@ rendered. Everything else is an option of `Gymnasium`.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec, check_action
-from vlagents_ray.envs.base import EvalEnv
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.envs.base import EvalEnv, one_row
 from vlagents_ray.envs.headless import prepare_rendering
 from vlagents_ray.envs.known import known
 from vlagents_ray.envs.mapping import RENDER, Pick, as_image, bounds, parts, plain, uniform
-from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, MissingDependency, NotReset, UnknownEnv
-from vlagents_ray.interface import Act, Obs
+from vlagents_ray.envs.recording import record_size_of
+from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, NotReset, UnknownEnv
+from vlagents_ray.interface import HIGH_RES, Act, Obs
 from vlagents_ray.registry import require
 
 TERMINATED = "terminated"
@@ -52,6 +53,7 @@ class Gymnasium(EvalEnv):
         height: int | None = None,
         max_steps: int | None = None,
         remake: bool = False,
+        record_size: Sequence[int] | None = None,
     ) -> None:
         """Make the environment `task`, a Gymnasium id, and look at one observation of it.
 
@@ -65,6 +67,7 @@ class Gymnasium(EvalEnv):
         width, height: stretch every image to this size in pixels.
         max_steps: in place of the registered step limit.
         remake: make the simulator anew in each reset, for one whose reset leaves something behind.
+        record_size: height and width of the same pictures once more, for the record only.
         """
         if task is None:
             raise UnknownEnv("gymnasium: got no id, want one, as in 'gymnasium/Pendulum-v1'")
@@ -78,6 +81,7 @@ class Gymnasium(EvalEnv):
         self._success = success
         self._unit_actions = unit_actions
         self._size = (height, width)
+        self._record_size = record_size_of(record_size, f"gymnasium/{task}")
         self._remake = remake
         self._ready = False
         self._steps = 0
@@ -144,11 +148,7 @@ class Gymnasium(EvalEnv):
     def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
         if not self._ready:
             raise NotReset(f"gymnasium/{self._id}: step before reset; call reset(seed=...) first")
-        action = check_action(act.action, self._contract).astype(np.float64)
-        if action.ndim != 1:
-            raise InvalidAction(
-                f"action: got {action.shape}, want ({len(self._low)},); step through a chunk row by row"
-            )
+        action = one_row(act, self._contract).astype(np.float64)
         if self._unit_actions:
             action = self._low + (action + 1) / 2 * (self._high - self._low)
         action = np.clip(action, self._low, self._high).astype(self._dtype)
@@ -195,15 +195,18 @@ class Gymnasium(EvalEnv):
             raise EnvFailed(f"gymnasium/{self._id}: {method} raised {type(error).__name__}: {error}") from error
 
     def _observe(self, nested: Any) -> Obs:
-        cameras = {}
+        cameras, recorded = {}, {}
         for name, pick in self._cameras.items():
             picture = self._call("render") if pick.text == RENDER else pick.value(nested)
             cameras[name] = as_image(picture, name, self._size)
+            if self._record_size is not None:
+                recorded[name] = as_image(picture, name, self._record_size)
         gripper = None
         if self._gripper is not None:
             share = (self._gripper.number(nested) - self._gripper_closed) / (self._gripper_open - self._gripper_closed)
             gripper = min(max(share, 0.0), 1.0)
-        return Obs(cameras=cameras, gripper=gripper, state={k: pick.vector(nested) for k, pick in self._state.items()})
+        state = {name: pick.vector(nested) for name, pick in self._state.items()}
+        return Obs(cameras, gripper, state, {HIGH_RES: recorded} if recorded else {})
 
     def _succeeded(self, info: Mapping[str, Any], terminated: bool) -> bool:
         if self._success == TERMINATED:

@@ -14,13 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec, check_action
-from vlagents_ray.envs.base import EvalEnv
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.envs.base import EvalEnv, one_row
 from vlagents_ray.envs.headless import prepare_rendering
 from vlagents_ray.envs.probe import EGL_CURE, egl_probe
 from vlagents_ray.envs.protocol import Protocol
-from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset, UnknownEnv
-from vlagents_ray.interface import Act, Obs
+from vlagents_ray.envs.recording import record_size_of
+from vlagents_ray.errors import ConfigError, EnvFailed, NotReset, UnknownEnv
+from vlagents_ray.interface import HIGH_RES, Act, Obs
 from vlagents_ray.registry import require
 
 PROTOCOL = Protocol(
@@ -64,6 +65,7 @@ class MetaWorld(EvalEnv):
         goals_seed: int | None = None,
         ends_on_success: bool = True,
         camera_positions: Mapping[str, Sequence[float]] | None = None,
+        record_size: Sequence[int] | None = None,
     ) -> None:
         """Raises `UnknownEnv`, `ConfigError`, `MissingDependency`, or `EnvFailed` with its cure.
 
@@ -77,6 +79,7 @@ class MetaWorld(EvalEnv):
             goals_seed: of MT1, whose 50 initial states are then the task's; None: each episode's seed draws one.
             ends_on_success: as in Meta-World's own evaluation; False: success at the end can be measured, too.
             camera_positions: name -> (x, y, z) m, of cameras that stand elsewhere than in Meta-World.
+            record_size: height and width of further views by the same cameras, for the record only.
         """
         if not 1 <= max_steps <= PROTOCOL.max_steps:
             raise ConfigError(
@@ -97,8 +100,11 @@ class MetaWorld(EvalEnv):
         self._steps: int | None = None
         self._env: Any = None
         self._renderer: Any = None
+        self._record: Any = None  # the renderer of the views for the record
+        record = record_size_of(record_size, f"metaworld/{task}")
+        tallest, widest = (max(pair) for pair in zip((height, width), record or (0, 0), strict=True))
         with self._failing("make"):
-            self._env = known[task](width=width, height=height)  # the model's frame buffer grows to this size
+            self._env = known[task](width=widest, height=tallest)  # the model's frame buffer grows to this size
             have = [self._env.model.camera(i).name for i in range(self._env.model.ncam)]
             # what Meta-World does for its classes with an observable goal, but drawing from our seed
             self._env._partially_observable = False
@@ -136,6 +142,7 @@ class MetaWorld(EvalEnv):
         try:
             with self._failing("make its renderer"):
                 self._renderer = require("mujoco").Renderer(self._env.model, height, width)
+                self._record = require("mujoco").Renderer(self._env.model, *record) if record else None
         except EnvFailed:
             self.close()
             raise
@@ -164,9 +171,7 @@ class MetaWorld(EvalEnv):
         env = self._alive()
         if self._steps is None:
             raise NotReset(f"metaworld/{self._task}: step before reset; call reset(seed=...) first")
-        action = check_action(act.action, self._contract)
-        if action.ndim != 1:
-            raise InvalidAction(f"action: got {action.shape}, want (4,); step through a chunk row by row")
+        action = one_row(act, self._contract)
         with self._failing("step"):
             raw, reward, _, _, info = env.step(np.clip(action, -1.0, 1.0))
             self._steps += 1
@@ -203,10 +208,11 @@ class MetaWorld(EvalEnv):
         }
 
     def close(self) -> None:
-        renderer, self._renderer = self._renderer, None
+        renderers, self._renderer, self._record = (self._renderer, self._record), None, None
         env, self._env, self._steps = self._env, None, None
-        if renderer is not None:
-            renderer.close()
+        for renderer in renderers:
+            if renderer is not None:
+                renderer.close()
         if env is not None:
             env.close()
 
@@ -222,16 +228,20 @@ class MetaWorld(EvalEnv):
         return self._goals[index]
 
     def _observe(self, raw: np.ndarray) -> Obs:
+        cameras = self._contract.cameras or {}
+        info: dict[str, Any] = {"sim_state": raw}
+        if self._record is not None:
+            info[HIGH_RES] = {name: self._render(self._record, name) for name in cameras}
         return Obs(
-            cameras={name: self._render(name) for name in self._contract.cameras or ()},
+            cameras={name: self._render(self._renderer, name) for name in cameras},
             gripper=float(raw[3]),  # the fingers' distance over 0.1 m, clipped to [0, 1] by Meta-World
             state={"xyz": raw[:3].astype(np.float32)},
-            info={"sim_state": raw},
+            info=info,
         )
 
-    def _render(self, camera: str) -> np.ndarray:
-        self._renderer.update_scene(self._env.data, camera=camera)
-        image: np.ndarray = self._renderer.render()
+    def _render(self, renderer: Any, camera: str) -> np.ndarray:
+        renderer.update_scene(self._env.data, camera=camera)
+        image: np.ndarray = renderer.render()
         return np.ascontiguousarray(image[::-1, ::-1]) if camera in _UPSIDE_DOWN else image
 
     def _alive(self) -> Any:

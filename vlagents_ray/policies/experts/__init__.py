@@ -22,6 +22,7 @@ EXPERTS: dict[str, str] = {
     "gymnasium/FetchReach-v4": "vlagents_ray.policies.experts.fetch:FetchReach",
     "gymnasium/FetchReachDense-v4": "vlagents_ray.policies.experts.fetch:FetchReach",
     "libero": "vlagents_ray.policies.experts.libero:LiberoExpert",
+    "simpler": "vlagents_ray.policies.experts.simpler:SimplerExpert",
 }
 
 
