@@ -23,7 +23,14 @@ from vlagents_ray.policies.random import Random
 from vlagents_ray.policies.scripted import Scripted
 
 SIZE = {"width": 32, "height": 32}
-TIMES = {"seconds": 0.0, "reset_ms": None, "env_step_ms": None, "policy_ms": None, "policy_p95_ms": None}
+TIMES: dict[str, Any] = {
+    "timing_ms": {},
+    "seconds": 0.0,
+    "reset_ms": None,
+    "env_step_ms": None,
+    "policy_ms": None,
+    "policy_p95_ms": None,
+}
 
 
 def keys(env: str, count: int) -> list[EpisodeKey]:

@@ -76,7 +76,8 @@ class Tally:
         """The policy answered, after so long."""
         self.act_ms.append(milliseconds)
         for stage, spent in act.info.get("timing", {}).items():
-            self.timing_ms.setdefault(stage, []).append(float(spent))
+            if stage.endswith("_ms"):  # the size of a batch stands among them
+                self.timing_ms.setdefault(stage, []).append(float(spent))
 
     def stepped(self, reward: float, terminated: bool, truncated: bool, info: Mapping[str, Any], limit: int) -> bool:
         """An action was executed; is the episode over, be it at the `limit` of steps?"""
