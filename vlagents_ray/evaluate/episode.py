@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import Any, Literal
@@ -12,8 +11,11 @@ import numpy as np
 
 from vlagents_ray.contract import check_action
 from vlagents_ray.envs import EvalEnv
-from vlagents_ray.errors import CheckpointFailed, EnvFailed, PolicyFailed, VLAgentsError
+from vlagents_ray.errors import CheckpointFailed, EnvFailed, PolicyFailed
+from vlagents_ray.evaluate.clock import Player
+from vlagents_ray.evaluate.config import ClockConfig
 from vlagents_ray.evaluate.jobs import EpisodeKey
+from vlagents_ray.evaluate.sides import env_side, policy_side
 from vlagents_ray.interface import HIGH_RES, Act, Agent, Obs
 
 Status = Literal["done", "policy_error", "infra_failed"]
@@ -43,6 +45,9 @@ class EpisodeResult:
     acts: int = 0  # answers of the policy; fewer than steps with action chunks
     policy_ms: float | None = None  # median of one act, transport included
     policy_p95_ms: float | None = None
+    latency_ms: float | None = None  # real-time mode: median of what an act counted as
+    ticks_waited: int = 0  # real-time mode: steps between an observation and its answer
+    ticks_held: int = 0  # those of them for which no row of a chunk was left
     timing_ms: dict[str, float] = field(default_factory=dict)  # medians of what `act.info["timing"]` says of one act
     transport: str = "local"
     checkpoint: str | None = None  # that the policy's reset named
@@ -62,6 +67,9 @@ class _Tally:
     reset_ms: float | None = None
     step_ms: list[float] = field(default_factory=list)
     act_ms: list[float] = field(default_factory=list)
+    latency_ms: list[float] = field(default_factory=list)
+    ticks_waited: int = 0
+    ticks_held: int = 0
     timing_ms: dict[str, list[float]] = field(default_factory=dict)
 
 
@@ -71,12 +79,15 @@ def run_episode(
     key: EpisodeKey,
     *,
     execute: int | None = None,
+    clock: ClockConfig | None = None,
     reset_options: Mapping[str, Any] | None = None,
     policy_options: Mapping[str, Any] | None = None,
     watch: Watch = lambda _phase, _steps: None,
     record: Record = lambda _obs: None,
 ) -> EpisodeResult:
     """Play the episode `key`; of each action chunk execute the first `execute` rows, open loop.
+
+    The env waits for the policy, unless there is a `clock` (see `vlagents_ray.evaluate.clock`).
 
     `reset_options` are the env's, `policy_options` the policy's.
 
@@ -95,6 +106,7 @@ def run_episode(
             key,
             tally,
             execute=execute,
+            clock=clock,
             reset_options=reset_options,
             policy_options=policy_options,
             watch=watch,
@@ -122,6 +134,9 @@ def run_episode(
         acts=len(tally.act_ms),
         policy_ms=_quantile(tally.act_ms, 0.5),
         policy_p95_ms=_quantile(tally.act_ms, 0.95),
+        latency_ms=_quantile(tally.latency_ms, 0.5) if clock is not None else None,
+        ticks_waited=tally.ticks_waited,
+        ticks_held=tally.ticks_held,
         timing_ms={stage: float(np.median(spent)) for stage, spent in sorted(tally.timing_ms.items())},
         transport=str(getattr(agent, "transport", "local")),
         checkpoint=tally.checkpoint,
@@ -135,6 +150,7 @@ def _play(
     tally: _Tally,
     *,
     execute: int | None,
+    clock: ClockConfig | None,
     reset_options: Mapping[str, Any] | None,
     policy_options: Mapping[str, Any] | None,
     watch: Watch,
@@ -153,23 +169,29 @@ def _play(
     named = info.get("checkpoint") if isinstance(info, dict) else None
     tally.checkpoint = named if isinstance(named, str) else None
     contract = env.contract
+    player = Player(execute, clock, contract)
     while True:
         watch("policy act", tally.steps)
         begun = perf_counter()
         with policy_side("act"):
             act = agent.act(_for_policy(obs))
-        tally.act_ms.append(1e3 * (perf_counter() - begun))
+        took_s = perf_counter() - begun
+        tally.act_ms.append(1e3 * took_s)
+        latency_s = player.latency_s(took_s)
+        tally.latency_ms.append(1e3 * latency_s)
         for stage, spent in act.info.get("timing", {}).items():
             tally.timing_ms.setdefault(stage, []).append(float(spent))
-        chunk = Act(check_action(act.action, contract)).rows()[:execute]
-        for row in chunk:
+        rows = Act(check_action(act.action, contract)).rows()
+        for tick in player.ticks(rows, latency_s):
             watch("env step", tally.steps)
             begun = perf_counter()
             with env_side("step"):
-                obs, reward, terminated, truncated, info = env.step(Act(row))
+                obs, reward, terminated, truncated, info = env.step(Act(tick.action))
             tally.step_ms.append(1e3 * (perf_counter() - begun))
             record(obs)
             tally.steps += 1
+            tally.ticks_waited += tick.waited
+            tally.ticks_held += tick.held
             tally.episode_return += float(reward)
             tally.success = _success(info)
             if tally.success and tally.first_success is None:
@@ -180,28 +202,6 @@ def _play(
         if act.done:
             tally.ending = "policy_done"
             return
-
-
-@contextmanager
-def env_side(what: str) -> Iterator[None]:
-    """Anything that a simulator raises becomes `EnvFailed`; this package's own errors pass."""
-    try:
-        yield
-    except VLAgentsError:
-        raise
-    except (Exception, SystemExit) as error:  # ManiSkill leaves by SystemExit when an asset is missing
-        raise EnvFailed(f"env {what}: {type(error).__name__}: {error}") from error
-
-
-@contextmanager
-def policy_side(what: str) -> Iterator[None]:
-    """Anything that a policy raises becomes `PolicyFailed`; this package's own errors pass."""
-    try:
-        yield
-    except VLAgentsError:
-        raise
-    except Exception as error:
-        raise PolicyFailed(f"policy {what}: {type(error).__name__}: {error}") from error
 
 
 def is_remote(agent: Agent) -> bool:
