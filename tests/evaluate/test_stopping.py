@@ -127,7 +127,7 @@ def test_a_rule_has_an_end() -> None:
 
 @pytest.mark.usefixtures("cluster")
 class TestOnACluster:
-    STOP = {"target": 0.95, "at_least": 3}  # noqa: RUF012 - never changed
+    STOP = {"target": 0.3, "at_least": 3}  # noqa: RUF012 - never changed
 
     def test_the_result_does_not_depend_on_the_number_of_workers(self, config: Config) -> None:
         out = config().out
@@ -151,7 +151,7 @@ class TestOnACluster:
         [cell] = summary.results.cells
         rate = rate_of([cell], "success_once")
         assert rate.interval == confidence_sequence(rate.successes, rate.episodes)
-        assert rate.interval[1] < 0.95
+        assert rate.interval[0] > 0.3
         [written] = json.loads((settings.out / "summary.json").read_text())["cells"]
         assert written["stopped_at"] == cell.stopped_at == written["success_once"]["episodes"]
         assert written["success_once"]["error_rate"] == 0.05

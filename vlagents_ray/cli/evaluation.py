@@ -189,7 +189,7 @@ def _reached(policy: PolicyConfig, parts: dict[str, ServeDeploySchema], *, ask: 
         return policy.model_copy(update={"url": url, "source": None} | (_found(policy, url) if ask else {}))
     if policy.source is None:
         raise ConfigError(f"policy {policy.name!r}: want `source`, a policy to serve, or the `url` of a server")
-    part = with_settings(read_deployment(policy.source), policy.config, steps=bool(policy.steps))
+    part = deployed(policy, policy.source)
     own = own_settings(part.applications[0])
     name = policy.name if "name" in policy.model_fields_set else str(part.applications[0].args["policy"])
     application = re.sub(r"\W+", "-", name.rpartition(":")[2])
@@ -198,6 +198,12 @@ def _reached(policy: PolicyConfig, parts: dict[str, ServeDeploySchema], *, ask: 
     parts[application] = part
     found = {"name": name, "url": f"serve://{application}", "config": own, "checkpoint": resolved(own)}
     return policy.model_copy(update=found)
+
+
+def deployed(policy: PolicyConfig, source: str) -> ServeDeploySchema:
+    """The deployment of `source` with the settings of `policy`."""
+    of_name = {"config": policy.config} if policy.config and not source.endswith(_FILE) else None
+    return with_settings(read_deployment(source, of_name), policy.config, steps=bool(policy.steps))
 
 
 def _found(policy: PolicyConfig, url: str) -> dict[str, Any]:

@@ -12,7 +12,6 @@ from vlagents_ray.cli.evaluation import reached
 from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.cells import cells
 from vlagents_ray.evaluate.forecast import Forecast, forecasts
-from vlagents_ray.evaluate.runner import ray_cluster
 from vlagents_ray.evaluate.store import FILE
 
 _BASES = {
@@ -26,8 +25,7 @@ def print_plan(config: EvalConfig) -> None:
     config, _ = reached(config, ask=False)
     planned = cells(config)
     results = Results.load(config.out) if (config.out / FILE).is_file() else None
-    with ray_cluster(config):
-        found = forecasts(planned, results, config.make_timeout_s)
+    found = forecasts(config, planned, results)
     out.print(_table(found))
     for line in _sum(config, found):
         out.print(line, markup=False, highlight=False, soft_wrap=True)
@@ -48,7 +46,7 @@ def _table(found: list[Forecast]) -> Table:
             str(one.cell.planned),
             str(one.finished),
             str(one.left),
-            "?" if one.seconds is None else f"{about}{one.seconds:.1f}",
+            "?" if one.seconds is None else f"{about}{one.seconds:.3g}",
             "?" if one.seconds is None else f"{about}{_time(one.left * one.seconds)}",
         )
     return table
@@ -60,15 +58,11 @@ def _sum(config: EvalConfig, found: list[Forecast]) -> list[str]:
     )
     # Workers share one queue; what is short of a worker's turn is a single episode at the end.
     seconds = sum(one.left * (one.seconds or 0.0) for one in found) / max(1, min(config.workers, left))
-    extent = {
-        "policies": len({one.cell.policy.name for one in found}),
-        "policies at their checkpoints": len({one.cell.contender for one in found}),
-        "suites": len(config.suites),
-        "envs": len({one.cell.env for one in found}),
-    }
+    cells = [one.cell for one in found]
+    contenders, envs = len({cell.contender for cell in cells}), len({(cell.suite.name, cell.env) for cell in cells})
     bases = [text for basis, text in _BASES.items() if any(one.basis == basis for one in found)]
     lines = [
-        ", ".join(f"{number} {what}" for what, number in extent.items()),
+        f"{len(found)} cells: {contenders} policies at their checkpoints x {envs} environments of suites",
         f"{planned} episodes, {finished} of them finished in {config.out}, {left} to play",
         f"{_time(seconds)} with {config.workers} workers ({'; '.join(bases) or 'nothing is known of the time'})",
     ]

@@ -7,14 +7,14 @@ from pathlib import Path
 from typing import Any
 
 from vlagents_ray.cli.console import out
-from vlagents_ray.cli.evaluation import evaluate_and_print, served
+from vlagents_ray.cli.evaluation import deployed, evaluate_and_print, served
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.runner import ray_cluster
 from vlagents_ray.evaluate.watching import Watcher, rounds
 from vlagents_ray.policies.base.checkpoint import STEP
 from vlagents_ray.serve.checkpoints import CHOICE
-from vlagents_ray.serve.files import own_settings, read_deployment
+from vlagents_ray.serve.files import own_settings
 
 LOOK_S = 1.0  # between two looks at the folder
 
@@ -28,7 +28,7 @@ def watch_training(
     settle_s: float = 10.0,
     marker: str | None = None,
 ) -> None:
-    """Evaluate each step of the one policy whose checkpoint holds `{step}` once it is whole, together where several are.
+    """Evaluate each step of the one policy whose checkpoint holds `{step}` once it is whole.
 
     All go into one folder, and one server stays up for them. Policies without `{step}` are evaluated in the first
     round. Ends as `rounds` does, or by Ctrl-C; to go on, resume.
@@ -72,8 +72,8 @@ def _watched(config: EvalConfig) -> tuple[int, str]:
 def _pattern(policy: PolicyConfig) -> str | None:
     settings: dict[str, Any] = {CHOICE: policy.checkpoint}
     if policy.source is not None and "://" not in policy.source:
-        settings |= own_settings(read_deployment(policy.source, policy.config or None).applications[0])
-    checkpoint = (settings | policy.config)[CHOICE]
+        settings |= own_settings(deployed(policy, policy.source).applications[0])
+    checkpoint = settings[CHOICE]
     return checkpoint if isinstance(checkpoint, str) and STEP in checkpoint else None
 
 

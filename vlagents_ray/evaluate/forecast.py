@@ -15,9 +15,11 @@ from vlagents_ray.envs import make_env
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.clock import neutral
+from vlagents_ray.evaluate.config import EvalConfig
 from vlagents_ray.evaluate.jobs import plan
 from vlagents_ray.evaluate.pool import runtime_env
 from vlagents_ray.evaluate.results import CellResults, Results
+from vlagents_ray.evaluate.runner import ray_cluster
 from vlagents_ray.evaluate.sides import env_side
 from vlagents_ray.interface import Act
 
@@ -38,12 +40,14 @@ class Forecast:
     why: str = ""  # it is unknown
 
 
-def forecasts(cells: Sequence[Cell], results: Results | None, make_timeout_s: float) -> list[Forecast]:
+def forecasts(config: EvalConfig, cells: Sequence[Cell], results: Results | None) -> list[Forecast]:
     """One for each cell, in their order. An env of which `results` know no time is made and timed, in a Ray task."""
     earlier = results.cells if results is not None else ()
     seconds = {cell.fingerprint: _earlier_seconds(cell, earlier) for cell in cells}
-    unknown = {cell.place: cell for cell in cells if seconds[cell.fingerprint] is None}
-    measured = {place: _measured(cell, make_timeout_s) for place, cell in unknown.items()}
+    measured: dict[str, float | str] = {}
+    if unknown := {cell.place: cell for cell in cells if seconds[cell.fingerprint] is None}:
+        with ray_cluster(config):
+            measured = {place: _measured(cell, config.make_timeout_s) for place, cell in unknown.items()}
     found = []
     for cell in cells:
         finished, left = _progress(cell, earlier)
