@@ -19,15 +19,22 @@ PADDED = 6  # digits to which a step may be filled up with zeros, as `find_check
 Snapshot = frozenset[tuple[str, int, int]]  # (path, size in bytes, time of change in ns) of each file
 
 
+@dataclass(frozen=True, slots=True)
+class _Found:
+    """A step in the folder."""
+
+    entry: Path  # in the folder itself
+    checkpoint: Path  # what the policy loads: the entry, or something in it
+
+
 @dataclass(slots=True)
 class _Seen:
-    """A step that is not known to be whole yet."""
+    """A step that is not known to be whole yet, as it was when it last changed."""
 
-    entry: Path  # in the folder that is watched
-    checkpoint: Path  # what the policy loads: the entry, or something in it
     snapshot: Snapshot
-    since: float  # s, when it was first seen as it is
+    since: float  # s, when it was first seen so
     why: str = ""  # it does not count yet
+    judged: bool = False  # by its files, which say the same until they change
 
 
 class Watcher:
@@ -55,11 +62,8 @@ class Watcher:
     def look(self, now: float) -> list[int]:
         """The steps that have turned out to be whole since the last look, ascending; `now` in s of any clock."""
         found = self._found()
-        for step in self._seen.keys() - found.keys():
-            del self._seen[step]
-        new = [
-            step for step, entry in sorted(found.items()) if step not in self._whole and self._ready(step, entry, now)
-        ]
+        self._seen = {step: seen for step, seen in self._seen.items() if step in found}
+        new = [step for step in sorted(found.keys() - self._whole) if self._is_whole(step, found[step], now)]
         self._whole.update(new)
         for step in new:
             del self._seen[step]
@@ -78,30 +82,32 @@ class Watcher:
         """Steps that do not count as whole, and why."""
         return {step: seen.why for step, seen in sorted(self._seen.items())}
 
-    def _found(self) -> dict[int, Path]:
-        if not self.folder.is_dir():
-            return {}
-        matches = [(self._name.fullmatch(entry.name), entry) for entry in self.folder.iterdir()]
-        found = {
-            int(match[1]): entry for match, entry in matches if match and match[1] == f"{int(match[1]):0{PADDED}d}"
-        }
-        return found | {int(m[1]): entry for m, entry in matches if m and m[1] == str(int(m[1]))}
+    def _found(self) -> dict[int, _Found]:
+        found: dict[int, _Found] = {}
+        for entry in self.folder.iterdir() if self.folder.is_dir() else ():
+            match = self._name.fullmatch(entry.name)
+            step = int(match[1]) if match else -1
+            if match is None or match[1] not in (str(step), f"{step:0{PADDED}d}"):
+                continue
+            if step not in found or match[1] == str(step):  # which is looked for first
+                found[step] = _Found(entry, entry.joinpath(*(at_step(part, match[1]) for part in self._below)))
+        return found
 
-    def _ready(self, step: int, entry: Path, now: float) -> bool:
-        snapshot = _snapshot(entry)
+    def _is_whole(self, step: int, found: _Found, now: float) -> bool:
+        snapshot = _snapshot(found.entry)
         seen = self._seen.get(step)
         if seen is None or seen.snapshot != snapshot:
-            digits = (self._name.fullmatch(entry.name) or [""] * 2)[1]
-            below = [at_step(part, digits) for part in self._below]
-            seen = self._seen[step] = _Seen(entry, entry.joinpath(*below), snapshot, now)
+            seen = self._seen[step] = _Seen(snapshot, now)
+        if seen.judged:
+            return False
         if self._marker is not None:
-            seen.why = "" if (entry / self._marker).exists() else f"has no {self._marker}"
+            seen.why = "" if (found.entry / self._marker).exists() else f"has no {self._marker}"
         else:
             seen.why = "" if now - seen.since >= self._settle_s else "is too new, or changes"
-        if not seen.why:
-            # Looked at last, and compared again: what passes is what stood still.
-            seen.why = unfinished(seen.checkpoint) or ("" if _snapshot(entry) == snapshot else "changes")
-        return not seen.why
+        if seen.why:
+            return False
+        seen.why, seen.judged = unfinished(found.checkpoint) or "", True
+        return not seen.why and _snapshot(found.entry) == snapshot  # what passes stood still while it was looked at
 
 
 def rounds(
