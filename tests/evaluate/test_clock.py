@@ -19,7 +19,7 @@ from vlagents_ray.evaluate.clock import Player, neutral
 from vlagents_ray.evaluate.config import ClockConfig
 from vlagents_ray.evaluate.episode import EpisodeResult, run_episode
 from vlagents_ray.evaluate.jobs import EpisodeKey
-from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.interface import DELAY, LEFTOVER, Act, Agent, Obs
 from vlagents_ray.policies.experts.tabletop import TabletopExpert
 
 RELATIVE = Contract(action=ActionSpec(dim=2, delta=True, gripper_open=1.0), control_hz=10.0)
@@ -102,10 +102,32 @@ def test_a_clock_has_a_rate() -> None:
     assert played(Player(None, clock(hz=5), bare), 0.2) == [0, 2, 3, 4, 5, 6]
 
 
-@pytest.mark.parametrize("wrong", [{"latency": -1}, {"latency": "guessed"}, {"meanwhile": "dance"}, {"hz": 0}])
+@pytest.mark.parametrize(
+    "wrong", [{"latency": -1}, {"latency": float("inf")}, {"latency": "guessed"}, {"meanwhile": "dance"}, {"hz": 0}]
+)
 def test_a_clock_that_cannot_be_is_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(ValidationError):
         ClockConfig(**wrong)
+
+
+def test_a_policy_that_chunks_in_real_time_is_told_what_is_left_and_for_how_long() -> None:
+    class Listening(ToZero):
+        def __init__(self) -> None:
+            super().__init__(chunk=8)
+            self.told: list[tuple[Any, Any]] = []
+
+        def act(self, obs: Obs) -> Act:
+            self.told.append((np.shape(obs.info.get(LEFTOVER)), obs.info.get(DELAY)))
+            return super().act(obs)
+
+    def told(**settings: Any) -> list[tuple[Any, Any]]:
+        agent = Listening()
+        timing = clock(neutral=[0], **settings)
+        run_episode(Line(), agent, EpisodeKey("line", 0, 1, "0"), execute=5, clock=timing)
+        return agent.told
+
+    assert told(real_time_chunking=True) == [((), None), ((3, 1), 2)]
+    assert told() == [((), None)] * 2
 
 
 class Chunked(Agent):

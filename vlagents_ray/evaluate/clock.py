@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,7 @@ from vlagents_ray.client.safe import SafeAction
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidAction
 from vlagents_ray.evaluate.config import ClockConfig
-from vlagents_ray.interface import Obs
+from vlagents_ray.interface import DELAY, LEFTOVER, Obs
 
 _EXACTLY = 1e-9  # ticks: 1.1 s at 10 Hz are 11 of them, though 1.1 * 10 > 11 in floating point
 
@@ -46,6 +47,7 @@ class Player:
             _require_still(clock, env.action)
         self._rest = np.empty((0, 0), np.float32)  # rows of the last chunk that nobody has executed
         self._last: np.ndarray | None = None  # (D,) action
+        self._longest = 0  # ticks that an answer took
 
     def latency_s(self, measured_s: float) -> float:
         """What an answer that took `measured_s` counts as."""
@@ -53,9 +55,16 @@ class Player:
             return 0.0
         return measured_s if self._clock.latency == "measured" else self._clock.latency
 
+    def told(self) -> dict[str, Any]:
+        """What an observation tells a policy that chunks in real time; nothing if no row is left to go on from."""
+        if self._clock is None or not self._clock.real_time_chunking or not len(self._rest):
+            return {}
+        return {LEFTOVER: self._rest, DELAY: self._longest}
+
     def ticks(self, rows: np.ndarray, latency_s: float) -> Iterator[Tick]:
         """The steps until the policy is asked again, where its answer is `rows`, (H, D), and took so long."""
         wait = math.ceil(latency_s * self._hz - _EXACTLY)
+        self._longest = max(self._longest, wait)
         for tick in self._waiting(wait, rows.shape[1]):
             self._last = tick.action
             yield tick

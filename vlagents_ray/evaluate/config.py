@@ -101,16 +101,17 @@ class ClockConfig(_Closed):
     """Real-time mode: the env's clock runs on while the policy thinks (see `vlagents_ray.evaluate.clock`)."""
 
     # s that each answer takes: "measured" as it comes, transport included, or injected, which repeats exactly.
-    latency: Literal["measured"] | NonNegativeFloat = "measured"
+    latency: Literal["measured"] | Annotated[FiniteFloat, Field(ge=0)] = "measured"
     # What is executed between observation and answer. "chunk": what is left of the last chunk, then what stops the
     # robot: "zero" for relative actions, else "hold"; "hold": the last action again; "zero": no motion, the gripper
     # as it was commanded.
     meanwhile: Literal["chunk", "hold", "zero"] = "chunk"
-    hz: PositiveFloat | None = None  # ticks a second; None: the env's control_hz
+    hz: Annotated[FiniteFloat, Field(gt=0)] | None = None  # ticks a second; None: the env's control_hz
     align: bool = True  # drop the rows whose ticks were over when the answer came
-    neutral: list[FiniteFloat] | None = (
-        None  # executed before the first answer, and by "zero"; None: zeros, gripper open
-    )
+    # Tell the policy what is left of the last chunk, and for how many ticks it will be executed (`interface.DELAY`).
+    real_time_chunking: bool = False
+    # The action that is executed before the first answer, and by "zero"; None: zeros, and the gripper open at first.
+    neutral: list[FiniteFloat] | None = None
 
 
 class StopConfig(_Closed):

@@ -174,7 +174,7 @@ def _play(
         watch("policy act", tally.steps)
         begun = perf_counter()
         with policy_side("act"):
-            act = agent.act(_for_policy(obs))
+            act = agent.act(_for_policy(obs, player.told()))
         took_s = perf_counter() - begun
         tally.act_ms.append(1e3 * took_s)
         latency_s = player.latency_s(took_s)
@@ -221,11 +221,11 @@ def _given(env: EvalEnv, agent: Agent, key: EpisodeKey) -> dict[str, Any]:
     return arguments
 
 
-def _for_policy(obs: Obs) -> Obs:
-    """The observation without the views that are for the record only."""
-    if HIGH_RES not in obs.info:
+def _for_policy(obs: Obs, told: Mapping[str, Any] | None = None) -> Obs:
+    """The observation without the views that are for the record only, and with what it is `told` besides."""
+    if HIGH_RES not in obs.info and not told:
         return obs
-    return replace(obs, info={k: v for k, v in obs.info.items() if k != HIGH_RES})
+    return replace(obs, info={k: v for k, v in obs.info.items() if k != HIGH_RES} | dict(told or {}))
 
 
 def _success(info: Mapping[str, Any]) -> bool:
