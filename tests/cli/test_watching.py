@@ -38,3 +38,10 @@ def test_a_training_that_ends_without_a_checkpoint_is_an_error(tmp_path: Path) -
     config = EvalConfig.model_validate({"policies": [SWEPT], "suites": [{"envs": ["tabletop"]}], "out": tmp_path / "o"})
     with pytest.raises(ConfigError, match="ended without a checkpoint"):
         watch_training(config, tmp_path)
+
+
+def test_results_of_before_are_told_before_the_first_checkpoint_is_there(tmp_path: Path) -> None:
+    (tmp_path / "results.db").touch()
+    config = EvalConfig.model_validate({"policies": [SWEPT], "suites": [{"envs": ["tabletop"]}], "out": tmp_path})
+    with pytest.raises(ConfigError, match="resume them"):
+        watch_training(config, tmp_path / "runs")

@@ -11,6 +11,7 @@ from vlagents_ray.cli.evaluation import deployed, evaluate_and_print, served
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.runner import ray_cluster
+from vlagents_ray.evaluate.store import FILE
 from vlagents_ray.evaluate.watching import Watcher, rounds
 from vlagents_ray.policies.base.checkpoint import STEP
 from vlagents_ray.serve.checkpoints import CHOICE
@@ -34,6 +35,8 @@ def watch_training(
     round. Ends as `rounds` does, or by Ctrl-C; to go on, resume.
     """
     place, pattern = _watched(config)
+    if (config.out / FILE).is_file() and not config.resume:  # said now, not when the first checkpoint is there
+        raise ConfigError(f"{config.out} already has results: resume them (--resume), or choose another out folder")
     watcher = Watcher(pattern, folder, settle_s=settle_s, marker=marker)
     told: dict[int, str] = {}
 
