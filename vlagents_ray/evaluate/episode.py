@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import Any, Literal
@@ -13,8 +12,11 @@ import numpy as np
 from vlagents_ray.contract import Contract, check_action
 from vlagents_ray.envs import EvalEnv
 from vlagents_ray.envs.batch import BatchEnv
-from vlagents_ray.errors import CheckpointFailed, EnvFailed, PolicyFailed, VLAgentsError
+from vlagents_ray.errors import CheckpointFailed, EnvFailed, PolicyFailed
+from vlagents_ray.evaluate.clock import Player
+from vlagents_ray.evaluate.config import ClockConfig
 from vlagents_ray.evaluate.jobs import EpisodeKey
+from vlagents_ray.evaluate.sides import env_side, policy_side
 from vlagents_ray.interface import HIGH_RES, Act, Agent, Obs
 
 Status = Literal["done", "policy_error", "infra_failed"]
@@ -44,6 +46,9 @@ class EpisodeResult:
     acts: int = 0  # answers of the policy; fewer than steps with action chunks
     policy_ms: float | None = None  # median of one act, transport included
     policy_p95_ms: float | None = None
+    latency_ms: float | None = None  # real-time mode: median of what an act counted as
+    ticks_waited: int = 0  # real-time mode: steps between an observation and its answer
+    ticks_held: int = 0  # those of them for which no row of a chunk was left
     timing_ms: dict[str, float] = field(default_factory=dict)  # medians of what `act.info["timing"]` says of one act
     transport: str = "local"
     checkpoint: str | None = None  # that the policy's reset named
@@ -65,6 +70,9 @@ class Tally:
     reset_ms: float | None = None
     step_ms: list[float] = field(default_factory=list)
     act_ms: list[float] = field(default_factory=list)
+    latency_ms: list[float] = field(default_factory=list)
+    ticks_waited: int = 0
+    ticks_held: int = 0
     timing_ms: dict[str, list[float]] = field(default_factory=dict)
 
     def began(self, info: object) -> None:
@@ -110,6 +118,9 @@ class Tally:
             acts=len(self.act_ms),
             policy_ms=_quantile(self.act_ms, 0.5),
             policy_p95_ms=_quantile(self.act_ms, 0.95),
+            latency_ms=_quantile(self.latency_ms, 0.5),
+            ticks_waited=self.ticks_waited,
+            ticks_held=self.ticks_held,
             timing_ms={stage: float(np.median(spent)) for stage, spent in sorted(self.timing_ms.items())},
             transport=transport,
             checkpoint=self.checkpoint,
@@ -122,12 +133,15 @@ def run_episode(
     key: EpisodeKey,
     *,
     execute: int | None = None,
+    clock: ClockConfig | None = None,
     reset_options: Mapping[str, Any] | None = None,
     policy_options: Mapping[str, Any] | None = None,
     watch: Watch = lambda _phase, _steps: None,
     record: Record = lambda _obs: None,
 ) -> EpisodeResult:
     """Play the episode `key`; of each action chunk execute the first `execute` rows, open loop.
+
+    The env waits for the policy, unless there is a `clock` (see `vlagents_ray.evaluate.clock`).
 
     `reset_options` are the env's, `policy_options` the policy's.
 
@@ -139,7 +153,7 @@ def run_episode(
     tally = Tally(key)
     error: PolicyFailed | None = None
     try:
-        _play(env, agent, tally, execute, reset_options, policy_options, watch, record)
+        _play(env, agent, tally, execute, clock, reset_options, policy_options, watch, record)
     except CheckpointFailed:
         raise
     except PolicyFailed as failed:
@@ -152,6 +166,7 @@ def _play(
     agent: Agent,
     tally: Tally,
     execute: int | None,
+    clock: ClockConfig | None,
     reset_options: Mapping[str, Any] | None,
     policy_options: Mapping[str, Any] | None,
     watch: Watch,
@@ -170,47 +185,32 @@ def _play(
         given = {**(policy_options or {}), **policy_arguments(env.contract, agent, key)}
         tally.began(agent.reset(for_policy(obs), tally.instruction, **given))
     contract = env.contract
+    player = Player(execute, clock, contract)
     while True:
         watch("policy act", tally.steps)
         begun = perf_counter()
         with policy_side("act"):
-            act = agent.act(for_policy(obs))
-        tally.acted(act, 1e3 * (perf_counter() - begun))
-        chunk = Act(check_action(act.action, contract)).rows()[:execute]
-        for row in chunk:
+            act = agent.act(for_policy(obs, player.told()))
+        took_s = perf_counter() - begun
+        tally.acted(act, 1e3 * took_s)
+        latency_s = player.latency_s(took_s)
+        if clock is not None:
+            tally.latency_ms.append(1e3 * latency_s)
+        rows = Act(check_action(act.action, contract)).rows()
+        for tick in player.ticks(rows, latency_s):
             watch("env step", tally.steps)
             begun = perf_counter()
             with env_side("step"):
-                obs, reward, terminated, truncated, info = env.step(Act(row))
+                obs, reward, terminated, truncated, info = env.step(Act(tick.action))
             tally.step_ms.append(1e3 * (perf_counter() - begun))
             record(obs)
+            tally.ticks_waited += tick.waited
+            tally.ticks_held += tick.held
             if tally.stepped(reward, terminated, truncated, info, env.max_steps):
                 return
         if act.done:
             tally.ending = "policy_done"
             return
-
-
-@contextmanager
-def env_side(what: str) -> Iterator[None]:
-    """Anything that a simulator raises becomes `EnvFailed`; this package's own errors pass."""
-    try:
-        yield
-    except VLAgentsError:
-        raise
-    except (Exception, SystemExit) as error:  # ManiSkill leaves by SystemExit when an asset is missing
-        raise EnvFailed(f"env {what}: {type(error).__name__}: {error}") from error
-
-
-@contextmanager
-def policy_side(what: str) -> Iterator[None]:
-    """Anything that a policy raises becomes `PolicyFailed`; this package's own errors pass."""
-    try:
-        yield
-    except VLAgentsError:
-        raise
-    except Exception as error:
-        raise PolicyFailed(f"policy {what}: {type(error).__name__}: {error}") from error
 
 
 def is_remote(agent: Agent) -> bool:
@@ -237,11 +237,11 @@ def policy_arguments(contract: Contract, agent: Agent, key: EpisodeKey) -> dict[
     return arguments
 
 
-def for_policy(obs: Obs) -> Obs:
-    """The observation without the views that are for the record only."""
-    if HIGH_RES not in obs.info:
+def for_policy(obs: Obs, told: Mapping[str, Any] | None = None) -> Obs:
+    """The observation without the views that are for the record only, and with what it is `told` besides."""
+    if HIGH_RES not in obs.info and not told:
         return obs
-    return replace(obs, info={k: v for k, v in obs.info.items() if k != HIGH_RES})
+    return replace(obs, info={k: v for k, v in obs.info.items() if k != HIGH_RES} | dict(told or {}))
 
 
 def _success(info: Mapping[str, Any]) -> bool:

@@ -20,13 +20,12 @@ from vlagents_ray.evaluate.episode import (
     Tally,
     Watch,
     env_options,
-    env_side,
     for_policy,
     policy_arguments,
-    policy_side,
     transport_of,
 )
 from vlagents_ray.evaluate.jobs import EpisodeKey
+from vlagents_ray.evaluate.sides import env_side, policy_side
 from vlagents_ray.interface import Act, Agent, Obs
 
 Outcome = EpisodeResult | VLAgentsError
