@@ -24,7 +24,7 @@ from typing_extensions import Self
 
 from vlagents_ray.client.ways import TransportName
 
-Video = Literal["none", "failures", "all"]
+EpisodeChoice = Literal["none", "failures", "all"]
 Name = Annotated[str, Field(min_length=1)]
 
 
@@ -133,7 +133,8 @@ class EvalConfig(_Closed):
     suites: list[SuiteConfig] = Field(min_length=1)
     out: Path
     workers: PositiveInt = 1  # environments rolled out in parallel
-    video: Video = "failures"
+    video: EpisodeChoice = "failures"  # of which episodes there are videos
+    record: EpisodeChoice = "none"  # and of which trajectories: states, actions, rewards, and what the policy saw
     resume: bool = False
     worker: WorkerConfig = WorkerConfig()
 

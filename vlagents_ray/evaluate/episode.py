@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from time import perf_counter
 from typing import Any, Literal
 
@@ -21,6 +22,7 @@ Ending = Literal["terminated", "truncated", "policy_done", "error"]
 Phase = Literal["idle", "connect", "make", "env reset", "policy reset", "policy act", "env step"]
 Watch = Callable[[Phase, int], None]  # told the phase and the number of steps so far
 Record = Callable[[Obs], None]  # told every observation, the first one included
+Executed = Callable[[np.ndarray, float, bool], None]  # told every action, (D,), its reward, and whether it succeeded
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +48,15 @@ class EpisodeResult:
     timing_ms: dict[str, float] = field(default_factory=dict)  # medians of what `act.info["timing"]` says of one act
     transport: str = "local"
     checkpoint: str | None = None  # that the policy's reset named
+    actions_sha256: str | None = None  # of the actions as executed, (steps, D) little-endian float32, row by row
+
+    @property
+    def outcome(self) -> dict[str, Any]:
+        """What two runs of one key must have in common: all but how long it took, and the way to the policy."""
+        return {one.name: getattr(self, one.name) for one in fields(self) if one.name not in _CIRCUMSTANCES}
+
+
+_CIRCUMSTANCES = {"seconds", "reset_ms", "env_step_ms", "policy_ms", "policy_p95_ms", "timing_ms", "transport"}
 
 
 @dataclass(slots=True)
@@ -59,6 +70,7 @@ class _Tally:
     ending: Ending = "error"
     instruction: str = ""
     checkpoint: str | None = None
+    actions: Any = field(default_factory=hashlib.sha256)  # that were executed
     reset_ms: float | None = None
     step_ms: list[float] = field(default_factory=list)
     act_ms: list[float] = field(default_factory=list)
@@ -75,6 +87,7 @@ def run_episode(
     policy_options: Mapping[str, Any] | None = None,
     watch: Watch = lambda _phase, _steps: None,
     record: Record = lambda _obs: None,
+    executed: Executed = lambda _action, _reward, _success: None,
 ) -> EpisodeResult:
     """Play the episode `key`; of each action chunk execute the first `execute` rows, open loop.
 
@@ -99,6 +112,7 @@ def run_episode(
             policy_options=policy_options,
             watch=watch,
             record=record,
+            executed=executed,
         )
     except CheckpointFailed:
         raise
@@ -125,6 +139,7 @@ def run_episode(
         timing_ms={stage: float(np.median(spent)) for stage, spent in sorted(tally.timing_ms.items())},
         transport=str(getattr(agent, "transport", "local")),
         checkpoint=tally.checkpoint,
+        actions_sha256=tally.actions.hexdigest(),
     )
 
 
@@ -139,6 +154,7 @@ def _play(
     policy_options: Mapping[str, Any] | None,
     watch: Watch,
     record: Record,
+    executed: Executed,
 ) -> None:
     watch("env reset", 0)
     begun = perf_counter()
@@ -170,8 +186,10 @@ def _play(
             tally.step_ms.append(1e3 * (perf_counter() - begun))
             record(obs)
             tally.steps += 1
+            tally.actions.update(row.astype("<f4").tobytes())
             tally.episode_return += float(reward)
             tally.success = _success(info)
+            executed(row, float(reward), tally.success)
             if tally.success and tally.first_success is None:
                 tally.first_success = tally.steps
             if terminated or truncated or tally.steps >= env.max_steps:

@@ -15,7 +15,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.cells import contender
 from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.jobs import EpisodeKey
-from vlagents_ray.evaluate.store import FILE, require_version
+from vlagents_ray.evaluate.schema import FILE, require_version
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,6 +24,7 @@ class Episode:
 
     result: EpisodeResult
     videos: tuple[str, ...]  # paths relative to the folder
+    trajectory: str | None  # likewise
     attempts: int
     run: int
     finished: float  # seconds since 1970
@@ -47,6 +48,7 @@ class Attempt:
     code: str
     error: str
     traceback: str
+    log: str  # the last of what the worker wrote, if it broke
     retried: bool
 
 
@@ -75,6 +77,7 @@ class CellResults:
     settings: dict[str, Any]
     described: dict[str, Any]  # `EvalEnv.describe()`; {} if no worker has made it
     contract: dict[str, Any]
+    code: dict[str, Any]  # of the env: commit, dirty, diff_sha256; {} if git knows nothing of it
     episodes: tuple[Episode, ...]  # by seed
     attempts: tuple[Attempt, ...]
 
@@ -150,12 +153,13 @@ def _episode(row: dict[str, Any]) -> Episode:
         known[name] = None if known[name] is None else bool(known[name])
     key = EpisodeKey(row["env"], row["episode"], row["seed"], row["cell"])
     result = EpisodeResult(**known | {"key": key, "timing_ms": json.loads(row["timing_ms"])})
-    return Episode(result, tuple(json.loads(row["videos"])), row["attempts"], row["run"], row["finished"])
+    videos = tuple(json.loads(row["videos"]))
+    return Episode(result, videos, row["trajectory"], row["attempts"], row["run"], row["finished"])
 
 
 def _cell(row: dict[str, Any], episodes: tuple[Episode, ...], attempts: tuple[Attempt, ...]) -> CellResults:
     del row["seeds"]
-    parsed = {name: json.loads(row[name] or "{}") for name in ("settings", "described", "contract")}
+    parsed = {name: json.loads(row[name] or "{}") for name in ("settings", "described", "contract", "code")}
     return CellResults(**row | parsed, episodes=episodes, attempts=attempts)
 
 

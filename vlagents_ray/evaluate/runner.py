@@ -6,7 +6,7 @@ import functools
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from math import ceil
 from types import FrameType
@@ -21,12 +21,13 @@ from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.jobs import Job, JobQueue, plan
 from vlagents_ray.evaluate.pool import WorkerPool
 from vlagents_ray.evaluate.progress import Progress, SilentProgress
+from vlagents_ray.evaluate.provenance import driver_code, policy_code, save_diffs, versions
+from vlagents_ray.evaluate.recording import Kept, save
 from vlagents_ray.evaluate.results import Results
 from vlagents_ray.evaluate.rollout import AgentFactory, Failure, Report
 from vlagents_ray.evaluate.statistics import Rate
 from vlagents_ray.evaluate.store import Store
-from vlagents_ray.evaluate.summary import Summary, summarize, versions, write_summary
-from vlagents_ray.evaluate.video import save_videos
+from vlagents_ray.evaluate.summary import Summary, summarize, write_summary
 from vlagents_ray.interface import Agent
 from vlagents_ray.signals import own_sigterm
 
@@ -61,6 +62,7 @@ def evaluate(
         finished = store.finished()
         pending = [job for job in plan(store.cells) if str(job.key) not in finished]
         store.begin_run(config, versions())
+        save_diffs(config.out, driver_code().values())
         state = "stopped"
         try:
             run = _Run(config, store, JobQueue(pending), progress or SilentProgress())
@@ -117,13 +119,15 @@ class _Run:
     def _handle(self, job: Job, report: Report) -> None:
         if report.policy is not None:
             self._store.note_policy(job.cell.policy.name, report.policy)
+            save_diffs(self._config.out, [policy_code(report.policy)])
         if report.made is not None:
             self._store.note_env(job.cell.place, report.made)
+            save_diffs(self._config.out, [report.made.code])
         if report.failure is not None:
             self._failed(job, report.failure)
         elif report.result is not None:
             self._lost_in_a_row = 0
-            self._record(job, report.result, report.videos)
+            self._record(job, report.result, report.kept)
 
     def _failed(self, job: Job, failure: Failure) -> None:
         retried = failure.cause != "user" and job.attempt <= self._config.retries
@@ -135,7 +139,7 @@ class _Run:
             self._progress.retry(job, failure)
             return
         lost = EpisodeResult(job.key, "infra_failed", error=f"{failure.code}: {failure.message}")
-        self._record(job, lost, {})
+        self._record(job, lost, Kept())
         self._lost_in_a_row += 1
         if self._lost_in_a_row == self._config.abort_after:
             raise from_code(
@@ -144,10 +148,10 @@ class _Run:
                 f"(--resume): {failure.message}",
             )
 
-    def _record(self, job: Job, result: EpisodeResult, videos: Mapping[str, bytes]) -> None:
-        # Videos first: a crash in between repeats the episode, and its videos are overwritten.
-        paths = save_videos(self._config.out, job.cell, result, dict(videos))
-        self._store.record(result, job.attempt, paths)
+    def _record(self, job: Job, result: EpisodeResult, kept: Kept) -> None:
+        # Files first: a crash in between repeats the episode, and they are overwritten.
+        videos, trajectory = save(self._config.out, job.cell, result, kept)
+        self._store.record(result, job.attempt, videos, trajectory)
         self._progress.episode(job.cell, result)
 
     def _recorded(self) -> dict[str, Rate]:
