@@ -15,6 +15,7 @@ from vlagents_ray.cli.console import errors as _errors
 from vlagents_ray.cli.console import out
 from vlagents_ray.cli.environments import env
 from vlagents_ray.cli.evaluation import Address, Set, evaluate_command, run_evaluation
+from vlagents_ray.cli.export import export_command
 from vlagents_ray.cli.keys import keys as keys_app
 from vlagents_ray.cli.settings import parse_settings
 from vlagents_ray.errors import ConfigError, VLAgentsError
@@ -97,6 +98,7 @@ def demo(
 
 
 app.command("eval")(evaluate_command)
+app.command("export")(export_command)
 app.add_typer(bench, name="bench")
 app.add_typer(env, name="env")
 app.add_typer(keys_app, name="keys")

@@ -130,6 +130,14 @@ class Results:
         """The cells of one contender."""
         return [cell for cell in self.cells if cell.contender == contender]
 
+    def only(self, contender: str | None = None, env: str | None = None) -> Results:
+        """Without the cells of other contenders and envs; None takes all. `ConfigError` if that leaves nothing."""
+        left = tuple(one for one in self.cells if contender in (None, one.contender) and env in (None, one.env))
+        if not left:
+            have = sorted({f"{one.contender} in {one.env}" for one in self.cells})
+            raise ConfigError(f"{self.out}: has nothing of {contender or 'any policy'} in {env or 'any env'}: {have}")
+        return dataclasses.replace(self, cells=left)
+
 
 @contextmanager
 def _reading(out: Path) -> Iterator[sqlite3.Connection]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,12 +47,13 @@ class Trajectory:
     def load(cls, path: Path) -> Trajectory:
         """The inverse of `to_bytes`; `ConfigError` if the file is not there, or not one of these."""
         try:
-            with np.load(path, allow_pickle=False) as file:
+            # Opened here: np.load leaves the file of a broken archive open.
+            with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
                 state = {name.removeprefix(_STATE): file[name] for name in file.files if name.startswith(_STATE)}
                 gripper = file["gripper"] if "gripper" in file.files else None
                 cameras = tuple(map(str, file["cameras"]))
                 return cls(file["actions"], file["rewards"], file["success"], state, gripper, cameras)
-        except (OSError, ValueError, KeyError) as error:
+        except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise ConfigError(f"{path}: cannot be read as a trajectory ({error})") from error
 
 

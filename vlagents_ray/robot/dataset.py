@@ -26,7 +26,7 @@ VERSION = "v3.0"
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 DATA, VIDEO, EPISODES = f"data/{FILE}.parquet", f"videos/{{video_key}}/{FILE}.mp4", f"meta/episodes/{FILE}.parquet"
 FILES_IN_CHUNK = 1000
-_UNFINISHED = "unfinished"  # folder of the running episode
+UNFINISHED = "unfinished"  # folder of the running episode
 
 
 class Dataset:
@@ -57,7 +57,7 @@ class Dataset:
         self.tasks: list[str] = []
         if (root / "meta/info.json").exists():
             self._open(rate)
-        elif root.is_dir() and any(path.name != _UNFINISHED for path in root.iterdir()):
+        elif root.is_dir() and any(path.name != UNFINISHED for path in root.iterdir()):
             raise ConfigError(f"{root}: is no LeRobotDataset, and not empty; record into a new folder")
         self._sweep()
 
@@ -68,7 +68,7 @@ class Dataset:
 
     def begin(self, instruction: str) -> Episode:
         """An episode to be filled, and then given to `save` or abandoned."""
-        folder = self.root / _UNFINISHED
+        folder = self.root / UNFINISHED
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         return Episode(folder, instruction, self.info["fps"], self.info["features"] or None)
@@ -125,7 +125,7 @@ class Dataset:
 
     def _sweep(self) -> None:
         """Remove what a crash left: the running episode, and one that was about to be counted."""
-        shutil.rmtree(self.root / _UNFINISHED, ignore_errors=True)
+        shutil.rmtree(self.root / UNFINISHED, ignore_errors=True)
         number = self.episodes
         stray = FILE.format(chunk_index=number // FILES_IN_CHUNK, file_index=number % FILES_IN_CHUNK)
         for path in [*self.root.glob(f"data/{stray}.*"), *self.root.glob(f"videos/*/{stray}.*")]:
@@ -137,8 +137,8 @@ class Dataset:
         pa = self._pa
         columns = {}
         for key, values in rows.items():
-            if values.ndim == 1:
-                columns[key] = pa.array(values, getattr(pa, _ARROW[features[key]["dtype"]])())
+            if features[key]["shape"] == [1]:  # one number, which LeRobot reads as no list
+                columns[key] = pa.array(values.reshape(-1), getattr(pa, _ARROW[features[key]["dtype"]])())
             else:
                 flat = pa.array(np.ascontiguousarray(values, np.float32).ravel())
                 columns[key] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
@@ -173,7 +173,7 @@ class Dataset:
         _move(part, self.root / name)
 
     def _part(self, name: str) -> Path:
-        folder = self.root / _UNFINISHED
+        folder = self.root / UNFINISHED
         folder.mkdir(parents=True, exist_ok=True)
         return folder / name.replace("/", "_")
 
