@@ -22,7 +22,7 @@ from vlagents_ray.serve.files import own_settings, read_deployment, together, wi
 if TYPE_CHECKING:
     from ray.serve.schema import ServeDeploySchema
 
-    from vlagents_ray.evaluate import EvalConfig, PolicyConfig
+    from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Summary
 
 Set = Annotated[list[str], typer.Option("--set", metavar="KEY=VALUE", help="A setting of the policy, repeatable.")]
 Address = Annotated[
@@ -111,7 +111,19 @@ def read_run(file: Path) -> dict[str, Any]:
 
 def run_evaluation(config: EvalConfig, address: str | None = None) -> None:
     """Serve the policies that are not at a URL, evaluate them all, print the table."""
-    from vlagents_ray.evaluate import EvaluationInterrupted, check, evaluate, most_cpus, print_summary, progress_for
+    from vlagents_ray.evaluate import EvaluationInterrupted, print_summary
+
+    try:
+        summary = evaluated(config, address)
+    except EvaluationInterrupted as interrupted:
+        print_summary(out, interrupted.summary)
+        raise
+    print_summary(out, summary)
+
+
+def evaluated(config: EvalConfig, address: str | None = None, *, only: tuple[int, int] | None = None) -> Summary:
+    """Serve the policies that are not at a URL, and evaluate them all; `only` as in `evaluate`."""
+    from vlagents_ray.evaluate import check, evaluate, most_cpus, progress_for
 
     parts: dict[str, ServeDeploySchema] = {}
     policies = [_reached(policy, parts) for policy in config.policies]
@@ -122,12 +134,7 @@ def run_evaluation(config: EvalConfig, address: str | None = None) -> None:
             # Ray's CPUs are bookkeeping here: the number of workers that the user asked for must fit.
             cpus = max(os.cpu_count() or 1, math.ceil(config.workers * most_cpus(config)))
             stack.enter_context(running_server(together(parts), address=address, num_cpus=cpus))
-        try:
-            summary = evaluate(config, progress=progress_for(out))
-        except EvaluationInterrupted as interrupted:
-            print_summary(out, interrupted.summary)
-            raise
-    print_summary(out, summary)
+        return evaluate(config, progress=progress_for(out), only=only)
 
 
 def _reached(policy: PolicyConfig, parts: dict[str, ServeDeploySchema]) -> PolicyConfig:

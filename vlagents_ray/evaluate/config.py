@@ -25,6 +25,7 @@ from typing_extensions import Self
 from vlagents_ray.client.ways import TransportName
 
 EpisodeChoice = Literal["none", "failures", "all"]
+Tracker = Literal["wandb", "trackio", "tensorboard"]
 Name = Annotated[str, Field(min_length=1)]
 
 
@@ -126,6 +127,14 @@ class SuiteConfig(_Closed):
         return self
 
 
+class TrackingConfig(_Closed):
+    """Under which names trackers show an evaluation."""
+
+    project: Name = "vlagents-ray"
+    group: str | None = None  # of runs; default: the name of the folder of results
+    videos: NonNegativeInt = 4  # of each cell that are handed over, failures first
+
+
 class EvalConfig(_Closed):
     """Which policies to evaluate, in what, and where the results go."""
 
@@ -137,6 +146,8 @@ class EvalConfig(_Closed):
     record: EpisodeChoice = "none"  # and of which trajectories: states, actions, rewards, and what the policy saw
     resume: bool = False
     worker: WorkerConfig = WorkerConfig()
+    track: list[Tracker] = []  # where rates and videos are shown beside `out`, against the training step
+    tracking: TrackingConfig = TrackingConfig()
 
     # What happens when something breaks.
     retries: NonNegativeInt = 3  # further attempts after an infrastructure failure

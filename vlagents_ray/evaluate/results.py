@@ -104,21 +104,21 @@ class Results:
     @classmethod
     def load(cls, out: Path) -> Results:
         """Read `out`, which an evaluation may be writing to. Raises `ConfigError` if it holds no results."""
-        with _reading(out) as db:
+        with reading(out) as db:
             episodes: dict[str, list[Episode]] = {}
-            for row in _rows(db, "episodes", "seed"):
-                episodes.setdefault(row["cell"], []).append(_episode(row))
+            for row in table(db, "episodes", "seed"):
+                episodes.setdefault(row["cell"], []).append(episode_of(row))
             attempts: dict[str, list[Attempt]] = {}
-            for row in _rows(db, "attempts"):
+            for row in table(db, "attempts"):
                 attempts.setdefault(row["cell"], []).append(Attempt(**row | {"retried": bool(row["retried"])}))
             return cls(
                 out,
                 tuple(
                     _cell(row, tuple(episodes.get(row["cell"], ())), tuple(attempts.get(row["cell"], ())))
-                    for row in _rows(db, "cells")
+                    for row in table(db, "cells")
                 ),
-                tuple(_run(row) for row in _rows(db, "runs")),
-                {row["name"]: json.loads(row["metadata"]) for row in _rows(db, "policies")},
+                tuple(_run(row) for row in table(db, "runs")),
+                {row["name"]: json.loads(row["metadata"]) for row in table(db, "policies")},
             )
 
     @property
@@ -140,21 +140,24 @@ class Results:
 
 
 @contextmanager
-def _reading(out: Path) -> Iterator[sqlite3.Connection]:
+def reading(out: Path) -> Iterator[sqlite3.Connection]:
+    """One state of all tables in `out`, which may be written to meanwhile."""
     if not (out / FILE).is_file():
         raise ConfigError(f"{out}: got no {FILE} there, want a folder that an evaluation wrote its results to")
     with closing(sqlite3.connect(out / FILE)) as db:
         require_version(out, db)
         db.row_factory = sqlite3.Row
-        db.execute("BEGIN")  # one state of all tables
+        db.execute("BEGIN")
         yield db
 
 
-def _rows(db: sqlite3.Connection, table: str, order: str = "rowid") -> Iterator[dict[str, Any]]:
-    return (dict(row) for row in db.execute(f"SELECT * FROM {table} ORDER BY {order}"))  # noqa: S608 (constants)
+def table(db: sqlite3.Connection, name: str, order: str = "rowid") -> Iterator[dict[str, Any]]:
+    """The rows of a table, by its columns' names."""
+    return (dict(row) for row in db.execute(f"SELECT * FROM {name} ORDER BY {order}"))  # noqa: S608 (constants)
 
 
-def _episode(row: dict[str, Any]) -> Episode:
+def episode_of(row: dict[str, Any]) -> Episode:
+    """What a row of the table of episodes says."""
     names = {field.name for field in dataclasses.fields(EpisodeResult)}
     known = {name: value for name, value in row.items() if name in names and name != "key"}
     for name in ("success_once", "success_at_end"):

@@ -44,9 +44,15 @@ class EvaluationInterrupted(KeyboardInterrupt):
 
 
 def evaluate(
-    config: EvalConfig, *, agent_factory: Callable[[], Agent] | None = None, progress: Progress | None = None
+    config: EvalConfig,
+    *,
+    agent_factory: Callable[[], Agent] | None = None,
+    progress: Progress | None = None,
+    only: tuple[int, int] | None = None,
 ) -> Summary:
     """Play every episode of `config` that has no result yet; the results are in `config.out`.
+
+    `only`: of each env the episode with this number and this seed, and no other.
 
     Episodes run in Ray actors: in the cluster that this process is connected to, or else in one
     that `RAY_ADDRESS` names, or in a local one started for the length of the run. Each worker talks to
@@ -60,7 +66,8 @@ def evaluate(
     factory = _remote_agents(config) if agent_factory is None else functools.partial(_own_agent, agent_factory)
     with Store(config) as store:
         finished = store.finished()
-        pending = [job for job in plan(store.cells) if str(job.key) not in finished]
+        wanted = [job for job in plan(store.cells) if only in (None, (job.key.episode, job.key.seed))]
+        pending = [job for job in wanted if str(job.key) not in finished]
         store.begin_run(config, versions())
         save_diffs(config.out, driver_code().values())
         state = "stopped"
