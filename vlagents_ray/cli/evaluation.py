@@ -13,7 +13,7 @@ import typer
 import yaml
 
 from vlagents_ray.cli.console import errors, out
-from vlagents_ray.cli.settings import parse_settings
+from vlagents_ray.cli.settings import parse_list, parse_settings
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.checkpoints import resolved
 from vlagents_ray.serve.cluster import running_server
@@ -47,6 +47,10 @@ def evaluate_command(
     workers: Annotated[int | None, typer.Option(min=1, help="Environments rolled out in parallel; default: 1.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Episode i uses seed + i; default: 0.")] = None,
     video: Annotated[str | None, typer.Option(help="none, failures (default) or all.")] = None,
+    record: Annotated[
+        str | None, typer.Option(help="Trajectories, to export and to replay: none (default), failures or all.")
+    ] = None,
+    track: Annotated[str, typer.Option(help="wandb, trackio, tensorboard, with commas between them.")] = "",
     resume: Annotated[bool, typer.Option(help="Go on with the results in --out.")] = False,
     execute: Annotated[int | None, typer.Option(min=1, help="Rows executed of each chunk; default: all.")] = None,
     retries: Annotated[
@@ -64,13 +68,16 @@ def evaluate_command(
 ) -> None:
     """Evaluate policies: episodes in parallel, success rates with confidence intervals, videos.
 
-    A file holds policies, their checkpoints, suites of environments, seeds; --out, --workers, --video, --retries
-    and --resume win over it.
+    A file holds policies, their checkpoints, suites of environments, seeds; --out, --workers, --video, --record,
+    --track, --retries and --resume win over it.
     """
     from vlagents_ray.evaluate import EvalConfig
 
     with errors():
-        running = _given(out=out_dir, workers=workers, video=video, retries=retries, resume=resume)
+        running = _given(
+            out=out_dir, workers=workers, video=video, record=record, track=parse_list(track), retries=retries,
+            resume=resume,
+        )  # fmt: skip
         of_policy = _given(
             source=policy,
             execute=execute,
@@ -93,7 +100,7 @@ def evaluate_command(
 
 def _given(**options: Any) -> dict[str, Any]:
     """The options that say something."""
-    return {name: value for name, value in options.items() if value not in (None, False, {})}
+    return {name: value for name, value in options.items() if value not in (None, False, {}, [])}
 
 
 def read_run(file: Path) -> dict[str, Any]:
