@@ -63,6 +63,9 @@ _EXTRAS = {
     "torch": "maniskill",
     "metaworld": "metaworld",
     "gym_pusht": "pusht",
+    "wandb": "wandb",
+    "trackio": "trackio",
+    "tensorboard": "tensorboard",
 }
 
 # import name -> its file in requirements/: what runs in a Python environment of its own

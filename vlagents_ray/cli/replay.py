@@ -28,11 +28,11 @@ def replay_command(
 
     with errors():
         recorded = find(Results.load(folder), episode)
-        other: dict[str, Any] = {"source": policy, "url": None, "config": {}, "checkpoint": None}
+        other: dict[str, Any] | None = None
+        if policy is not None:
+            other = {"source": policy, "url": None, "config": {}, "checkpoint": None}
         into = out_dir or fresh(folder / "replays" / "replay")
-        summary = evaluated(
-            recorded.config(into, policy=None if policy is None else other), address, only=recorded.number_and_seed
-        )
+        summary = evaluated(recorded.config(into, policy=other), address, only=recorded.number_and_seed)
         found = compare(recorded, summary.results)
     steps = recorded.episode.result.steps
     lines = found or [f"the same: {steps} actions byte for byte, and what came of them"]

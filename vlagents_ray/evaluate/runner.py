@@ -6,6 +6,7 @@ import functools
 import os
 import signal
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from math import ceil
@@ -28,6 +29,7 @@ from vlagents_ray.evaluate.rollout import AgentFactory, Failure, Report
 from vlagents_ray.evaluate.statistics import Rate
 from vlagents_ray.evaluate.store import Store
 from vlagents_ray.evaluate.summary import Summary, summarize, write_summary
+from vlagents_ray.evaluate.trackers import Tracking
 from vlagents_ray.interface import Agent
 from vlagents_ray.signals import own_sigterm
 
@@ -64,6 +66,7 @@ def evaluate(
     Whatever it raises, each recorded episode is kept and summary.json written.
     """
     factory = _remote_agents(config) if agent_factory is None else functools.partial(_own_agent, agent_factory)
+    tracking = Tracking(config)
     with Store(config) as store:
         finished = store.finished()
         wanted = [job for job in plan(store.cells) if only in (None, (job.key.episode, job.key.seed))]
@@ -72,8 +75,9 @@ def evaluate(
         save_diffs(config.out, driver_code().values())
         state = "stopped"
         try:
-            run = _Run(config, store, JobQueue(pending), progress or SilentProgress())
-            complete = not pending or run.play(factory)
+            with tracking:
+                run = _Run(config, store, pending, progress or SilentProgress(), tracking)
+                complete = not pending or run.play(factory)
             state = "complete" if complete else "interrupted"
         finally:
             store.end_run(state)
@@ -92,11 +96,15 @@ def check(config: EvalConfig) -> None:
 class _Run:
     """The driver's side of one run."""
 
-    def __init__(self, config: EvalConfig, store: Store, queue: JobQueue, progress: Progress) -> None:
+    def __init__(
+        self, config: EvalConfig, store: Store, pending: list[Job], progress: Progress, tracking: Tracking
+    ) -> None:
         self._config = config
         self._store = store
-        self._queue = queue
+        self._queue = JobQueue(pending)
+        self._left = Counter(job.key.settings for job in pending)  # by cell
         self._progress = progress
+        self._tracking = tracking
         self._lost_in_a_row = 0
 
     def play(self, factory: AgentFactory) -> bool:
@@ -160,6 +168,9 @@ class _Run:
         videos, trajectory = save(self._config.out, job.cell, result, kept)
         self._store.record(result, job.attempt, videos, trajectory)
         self._progress.episode(job.cell, result)
+        self._left[job.key.settings] -= 1
+        if not self._left[job.key.settings]:
+            self._tracking.look()
 
     def _recorded(self) -> dict[str, Rate]:
         """By cell, what earlier runs have finished."""
