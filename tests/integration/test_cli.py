@@ -18,6 +18,7 @@ from eval_fakes import wait_for
 from ray_processes import end, processes, ray_folder, wait_for_end
 
 from tests.integration.conftest import serving
+from vlagents_ray.evaluate import Results
 
 COMMAND = str(Path(sys.executable).parent / "vlagents-ray")
 
@@ -163,6 +164,9 @@ def test_parts_are_merged_exported_and_one_episode_is_played_again(ray_home: Pat
             "--record", "all", "--out", str(parts[-1]),
         )  # fmt: skip
         assert done.returncode == 0, done.stdout + done.stderr
+    results = Results.load(parts[0])
+    package = results.runs[0].versions["code"]["vlagents_ray"]
+    assert results.policies["scripted"]["code"] == (results.cells[0].code or None) == package
     out = str(tmp_path / "merged")
     merged = command(ray_home, "merge", out, *map(str, parts))
     assert merged.returncode == 0, merged.stdout + merged.stderr

@@ -28,7 +28,7 @@ def stem(key: EpisodeKey) -> str:
 
 def remove_old(folder: Path, key: EpisodeKey) -> None:
     """Remove what an earlier attempt at the episode left."""
-    for old in [*folder.glob(f"{stem(key)}_*"), *folder.glob(f"{stem(key)}.*")]:
+    for old in folder.glob(f"{stem(key)}[_.]*"):
         old.unlink()
 
 

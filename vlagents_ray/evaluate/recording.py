@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -33,8 +33,10 @@ class Recording:
 
     def see(self, obs: Obs) -> None:
         """An observation, the first one included."""
-        if (self._wants_video, self._wants_trajectory) != ("none", "none"):
+        if self._wants_video != "none":
             self._video.add(obs)
+        elif self._wants_trajectory != "none":
+            self._video.add(replace(obs, info={}))  # without the views for people
         if self._wants_trajectory != "none":
             self._trajectory.see(obs)
 

@@ -8,11 +8,11 @@ from pathlib import Path
 from typing import ClassVar
 
 import pytest
-from eval_fakes import LINE, OTHER_LINE
+from eval_fakes import LINE, OTHER_LINE, ToZero
 from played import play
 
 from vlagents_ray.errors import MissingDependency
-from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.evaluate import EvalConfig, evaluate
 from vlagents_ray.evaluate.trackers import Tracking, tracking
 from vlagents_ray.evaluate.trackers.base import About, TrackerRun
 
@@ -116,6 +116,17 @@ def test_a_tracker_that_fails_is_a_warning_and_the_others_go_on(
     assert len(tell(settings)) == 2
     [record] = caplog.records
     assert record.getMessage() == "tensorboard: RuntimeError: no such project; it is told no more"
+
+
+@pytest.mark.usefixtures("cluster")
+def test_an_evaluation_tells_while_it_runs_and_at_its_end(config: Config) -> None:
+    summary = evaluate(config(envs=[LINE, OTHER_LINE], episodes=2, track=["wandb"]), agent_factory=ToZero)
+    assert summary.state == "complete"
+    assert sorted(min(metrics) for _, _, metrics in Listener.told) == [
+        f"{LINE}/episodes", f"{OTHER_LINE}/episodes", "total/episodes"
+    ]  # fmt: skip
+    assert Listener.finished == ["policy"]
+    assert {"code", "evaluation"} == Listener.begun[0].config.keys()
 
 
 def test_a_missing_package_is_said_before_anything_starts(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
