@@ -13,7 +13,7 @@ from vlagents_ray.errors import ConfigError
 
 def export_command(
     folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the results.")],
-    path: Annotated[Path, typer.Argument(help="File to write; of lerobot, a new folder.")],
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="File to write; of lerobot, a new folder.")],
     to: Annotated[str, typer.Option(help="json, csv, parquet: a row an episode; lerobot: a dataset of what was seen.")],
     policy: Annotated[str | None, typer.Option(help="Only this one: NAME, or NAME@STEP in a sweep.")] = None,
     env: Annotated[str | None, typer.Option(help="Only this one.")] = None,

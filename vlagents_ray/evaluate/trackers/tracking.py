@@ -80,13 +80,9 @@ class Tracking:
                 self._left.remove(name)
 
     def _tell_one(self, name: Tracker, results: Results) -> None:
-        summary = summarize(results)
         with closing(sqlite3.connect(self._config.out / FILE)) as db:
             told = dict(db.execute("SELECT what, episodes FROM tracked WHERE tracker = ?", (name,)))
-            parts = [(cell.cell, [cell], group) for cell, group in zip(results.cells, summary.cells, strict=True)]
-            for contender, group in zip(results.contenders, summary.totals, strict=True):
-                parts.append((contender, results.of(contender), group))
-            for what, cells, group in parts:
+            for what, cells, group in _parts(results):
                 if not all(map(_complete, cells)) or told.get(what) == group.episodes:
                     continue
                 run = self._run(name, results, cells[0].policy)
@@ -116,6 +112,14 @@ class Tracking:
         ordered = sorted(cell.episodes, key=lambda one: bool(one.result.success_once))
         paths = [self._config.out / path for one in ordered for path in one.videos[:1]]
         return paths[: self._config.tracking.videos]
+
+
+def _parts(results: Results) -> list[tuple[str, list[CellResults], Group]]:
+    """What is told as one: each cell, then each contender in all of its cells; first by what name it is noted."""
+    summary = summarize(results)
+    alone = [(cell.cell, [cell], group) for cell, group in zip(results.cells, summary.cells, strict=True)]
+    totals = zip(results.contenders, summary.totals, strict=True)
+    return alone + [(contender, results.of(contender), group) for contender, group in totals]
 
 
 def _complete(cell: CellResults) -> bool:
