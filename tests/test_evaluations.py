@@ -13,15 +13,15 @@ from pydantic_core import PydanticUndefined
 from vlagents_ray.cli.evaluation import read_run
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig
 from vlagents_ray.evaluate.cells import expand
-from vlagents_ray.evaluate.config import ClockConfig, StopConfig
+from vlagents_ray.evaluate.config import ClockConfig, StopConfig, TrackingConfig
 from vlagents_ray.registry import env_suite, names
 from vlagents_ray.serve.files import read_deployment
 
 ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / "evaluations").glob("*.yaml"))
 PAGE = (ROOT / "docs" / "evaluation" / "running.md").read_text()
-MODELS = [EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig, ClockConfig, StopConfig]
-ELSEWHERE = {("EvalConfig", "out"), ("EvalConfig", "worker")}  # defaults that are said in words
+MODELS = [EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig, ClockConfig, StopConfig, TrackingConfig]
+ELSEWHERE = {("EvalConfig", "out"), ("EvalConfig", "worker"), ("EvalConfig", "tracking")}  # defaults that are said in words
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)

@@ -70,6 +70,9 @@ _EXTRAS = {
     "robosuite": "libero",
     "gym_pusht": "pusht",
     "gymnasium_robotics": "robotics",
+    "wandb": "wandb",
+    "trackio": "trackio",
+    "tensorboard": "tensorboard",
 }
 
 # import name -> its file in requirements/: what runs in a Python environment of its own

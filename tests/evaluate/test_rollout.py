@@ -134,7 +134,7 @@ def test_videos_come_as_wanted(config: Config, video: str, seed: int, cameras: l
     worker = rollout_of(config, ToZero, video=video)
     report = worker.run(job(seed, env_options={"camera": [32, 32]}))
     assert report.result is not None
-    assert sorted(report.videos) == cameras
+    assert sorted(report.kept.footage.shown) == cameras
 
 
 def test_failed_episodes_leave_a_video(config: Config) -> None:
@@ -142,8 +142,8 @@ def test_failed_episodes_leave_a_video(config: Config) -> None:
     reports = [worker.run(job(seed, env_options={"camera": [32, 32]})) for seed in range(12)]
     for report in reports:
         assert report.result is not None
-        assert bool(report.videos) != report.result.success_once
-    assert {bool(report.videos) for report in reports} == {True, False}
+        assert bool(report.kept.footage.shown) != report.result.success_once
+    assert {bool(report.kept.footage.shown) for report in reports} == {True, False}
 
 
 def test_progress_tells_phase_age_and_place(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:

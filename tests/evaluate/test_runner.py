@@ -75,9 +75,12 @@ class TestOnACluster:
         evaluate(undisturbed, agent_factory=ToZero)
         assert outcomes(settings) == outcomes(undisturbed)
         assert (summary.total.retries, summary.total.infra_failures) == (1, 0)
-        ((attempt, cause, text, stack),) = query(settings, "SELECT attempt, cause, error, traceback FROM attempts")
+        ((attempt, cause, text, stack, log),) = query(
+            settings, "SELECT attempt, cause, error, traceback, log FROM attempts"
+        )
         assert (attempt, cause) == (1, "worker")
         assert error in text
+        assert f"misbehaving: {kind}" in log
         assert "_misbehave" in stack or kind in ("exit", "freeze"), "a hang shows where"
 
     def test_a_worker_killed_in_an_episode_costs_a_retry_and_no_failure(self, config: Config, tmp_path: Path) -> None:

@@ -14,10 +14,11 @@ from vlagents_ray.evaluate import EvalConfig, Summary, print_summary, synchronou
 from vlagents_ray.evaluate.cells import cells
 from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.jobs import plan
+from vlagents_ray.evaluate.provenance import versions
 from vlagents_ray.evaluate.results import Results
 from vlagents_ray.evaluate.rollout import Failure, Made
 from vlagents_ray.evaluate.store import Store
-from vlagents_ray.evaluate.summary import summarize, versions, write_summary
+from vlagents_ray.evaluate.summary import summarize, write_summary
 
 Config = Callable[..., EvalConfig]
 
@@ -82,7 +83,7 @@ def test_a_summary_is_plain_json_with_all_that_made_it(summary: Summary) -> None
     assert written["config"]["suites"][0]["episodes"] == 3
     assert written["policies"] == {"act": {"policy": "act", "checkpoint": "a"}}
     assert [cell["described"] for cell in written["cells"]] == [{"simulator": "line"}, {}]
-    assert {"python", "ray", "numpy", "vlagents-ray", "git_commit"} <= set(written["versions"])
+    assert {"python", "ray", "numpy", "vlagents-ray", "code"} <= set(written["versions"])
 
 
 def test_a_summary_replaces_the_one_before_whole(summary: Summary) -> None:

@@ -23,7 +23,7 @@ def record(frames: list[np.ndarray], fps: float | None = None) -> dict[str, byte
     with VideoRecorder(fps) as recorder:
         for frame in frames:
             recorder.add(Obs(cameras={"front": frame}))
-        return recorder.finish()
+        return recorder.finish().shown
 
 
 def plain(colour: tuple[int, int, int], height: int = 64, width: int = 96) -> np.ndarray:
@@ -64,7 +64,7 @@ def test_every_camera_has_its_video_and_a_high_resolution_view_replaces_its_came
     )
     with VideoRecorder() as recorder:
         recorder.add(obs)
-        videos = recorder.finish()
+        videos = recorder.finish().shown
     sizes = {}
     for camera, video in videos.items():
         with av.open(io.BytesIO(video)) as container:

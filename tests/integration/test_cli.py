@@ -18,6 +18,7 @@ from eval_fakes import wait_for
 from ray_processes import end, processes, ray_folder, wait_for_end
 
 from tests.integration.conftest import serving
+from vlagents_ray.evaluate import Results
 
 COMMAND = str(Path(sys.executable).parent / "vlagents-ray")
 
@@ -174,3 +175,36 @@ def test_mistakes_are_told_in_a_line(ray_home: Path, tmp_path: Path, words: list
     assert done.returncode == code, done.stdout + done.stderr
     assert text in done.stderr
     assert "Traceback" not in done.stderr + done.stdout
+
+
+def command(ray_home: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [COMMAND, *words], capture_output=True, text=True, timeout=300, check=False,
+        env=os.environ | {"RAY_TMPDIR": str(ray_home), "COLUMNS": "120"},
+    )  # fmt: skip
+
+
+def test_parts_are_merged_exported_and_one_episode_is_played_again(ray_home: Path, tmp_path: Path) -> None:
+    parts = []
+    for seed in ("0", "2"):
+        parts.append(tmp_path / seed)
+        done = evaluate(
+            ray_home, "tabletop", "--policy", "scripted", "--episodes", "2", "--seed", seed, "--video", "none",
+            "--record", "all", "--out", str(parts[-1]),
+        )  # fmt: skip
+        assert done.returncode == 0, done.stdout + done.stderr
+    results = Results.load(parts[0])
+    package = results.runs[0].versions["code"]["vlagents_ray"]
+    assert results.policies["scripted"]["code"] == (results.cells[0].code or None) == package
+    out = str(tmp_path / "merged")
+    merged = command(ray_home, "merge", out, *map(str, parts))
+    assert merged.returncode == 0, merged.stdout + merged.stderr
+    assert "4/4" in merged.stdout
+    exported = command(ray_home, "export", out, str(tmp_path / "dataset"), "--to", "lerobot")
+    assert exported.stdout.startswith("wrote 4 episodes"), exported.stdout + exported.stderr
+    key = rows(tmp_path / "merged")[3][0]
+    same = command(ray_home, "replay", out, key)
+    assert same.returncode == 0, same.stdout + same.stderr
+    assert "the same: " in same.stdout
+    other = command(ray_home, "replay", out, key, "--policy", "noop", "--out", str(tmp_path / "other"))
+    assert other.returncode != 0, "noop gives actions of another size"

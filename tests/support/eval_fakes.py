@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import sys
 import threading
 import time
 from collections.abc import Mapping
@@ -100,6 +101,7 @@ class Line(EvalEnv):
         return True
 
     def _misbehave(self, kind: str) -> None:
+        print(f"misbehaving: {kind}", file=sys.stderr, flush=True)
         if kind == "raise":
             raise RuntimeError("the simulator exploded")
         if kind == "exit":

@@ -6,6 +6,7 @@ import contextlib
 import signal
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 from typing import NoReturn
 
 import typer
@@ -46,3 +47,12 @@ def fail(message: str, code: int) -> NoReturn:
     sys.stdout.flush()
     err.print(f"[bold red]error[/] {escape(message)}", highlight=False, soft_wrap=True)
     raise typer.Exit(code)
+
+
+def fresh(folder: Path) -> Path:
+    """`folder`, or the first of folder-2, folder-3, … that does not exist: nothing mixes with what is older."""
+    candidate, number = folder, 1
+    while candidate.exists():
+        number += 1
+        candidate = folder.with_name(f"{folder.name}-{number}")
+    return candidate

@@ -14,7 +14,7 @@ import typer
 import yaml
 
 from vlagents_ray.cli.console import errors, out
-from vlagents_ray.cli.settings import parse_settings
+from vlagents_ray.cli.settings import parse_list, parse_settings
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.checkpoints import STEP, resolved
 from vlagents_ray.serve.cluster import running_server
@@ -23,7 +23,7 @@ from vlagents_ray.serve.files import own_settings, read_deployment, together, wi
 if TYPE_CHECKING:
     from ray.serve.schema import ServeDeploySchema
 
-    from vlagents_ray.evaluate import EvalConfig, PolicyConfig
+    from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Summary
 
 Set = Annotated[list[str], typer.Option("--set", metavar="KEY=VALUE", help="A setting of the policy, repeatable.")]
 Address = Annotated[
@@ -48,6 +48,10 @@ def evaluate_command(
     workers: Annotated[int | None, typer.Option(min=1, help="Environments rolled out in parallel; default: 1.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Episode i uses seed + i; default: 0.")] = None,
     video: Annotated[str | None, typer.Option(help="none, failures (default) or all.")] = None,
+    record: Annotated[
+        str | None, typer.Option(help="Trajectories, to export and to replay: none (default), failures or all.")
+    ] = None,
+    track: Annotated[str, typer.Option(help="wandb, trackio, tensorboard, with commas between them.")] = "",
     resume: Annotated[bool, typer.Option(help="Go on with the results in --out.")] = False,
     execute: Annotated[int | None, typer.Option(min=1, help="Rows executed of each chunk; default: all.")] = None,
     retries: Annotated[
@@ -79,13 +83,16 @@ def evaluate_command(
 ) -> None:
     """Evaluate policies: episodes in parallel, success rates with confidence intervals, videos.
 
-    A file holds policies, their checkpoints, suites of environments, seeds; --out, --workers, --video, --retries
-    and --resume win over it.
+    A file holds policies, their checkpoints, suites of environments, seeds; --out, --workers, --video, --record,
+    --track, --retries and --resume win over it.
     """
     from vlagents_ray.evaluate import EvalConfig
 
     with errors():
-        running = _given(out=out_dir, workers=workers, video=video, retries=retries, resume=resume)
+        running = _given(
+            out=out_dir, workers=workers, video=video, record=record, track=parse_list(track), retries=retries,
+            resume=resume,
+        )  # fmt: skip
         of_policy = _given(
             source=policy,
             execute=execute,
@@ -123,7 +130,8 @@ def evaluate_command(
 
 def _given(**options: Any) -> dict[str, Any]:
     """The options that say something."""
-    return {name: value for name, value in options.items() if value is not None and value is not False and value != {}}
+    nothing: tuple[Any, ...] = (None, False, {}, [])
+    return {name: value for name, value in options.items() if not any(value is one or value == one for one in nothing)}
 
 
 def read_run(file: Path) -> dict[str, Any]:
@@ -143,6 +151,14 @@ def run_evaluation(config: EvalConfig, address: str | None = None) -> None:
     """Serve the policies that are not at a URL, evaluate them all, print the table."""
     with served(config, address) as ready:
         evaluate_and_print(ready)
+
+
+def evaluated(config: EvalConfig, address: str | None = None, *, only: tuple[int, int] | None = None) -> Summary:
+    """Serve the policies that are not at a URL, and evaluate them all; `only` as in `evaluate`."""
+    from vlagents_ray.evaluate import evaluate, progress_for
+
+    with served(config, address) as ready:
+        return evaluate(ready, progress=progress_for(out), only=only)
 
 
 @contextlib.contextmanager

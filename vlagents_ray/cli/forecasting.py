@@ -12,7 +12,7 @@ from vlagents_ray.cli.evaluation import reached
 from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.cells import cells
 from vlagents_ray.evaluate.forecast import Forecast, forecasts
-from vlagents_ray.evaluate.store import FILE
+from vlagents_ray.evaluate.schema import FILE
 
 _BASES = {
     "results": "from episodes that were played before",

@@ -12,10 +12,13 @@ from rich.table import Table
 
 from vlagents_ray.cli.bench import bench
 from vlagents_ray.cli.console import errors as _errors
-from vlagents_ray.cli.console import out
+from vlagents_ray.cli.console import fresh, out
 from vlagents_ray.cli.environments import env
 from vlagents_ray.cli.evaluation import Address, Set, evaluate_command, run_evaluation
+from vlagents_ray.cli.export import export_command
 from vlagents_ray.cli.keys import keys as keys_app
+from vlagents_ray.cli.merge import merge_command
+from vlagents_ray.cli.replay import replay_command
 from vlagents_ray.cli.settings import parse_settings
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.serve.cluster import running_server
@@ -93,10 +96,13 @@ def demo(
             )
             suite = SuiteConfig(envs=["tabletop"], episodes=20)
         policy = PolicyConfig(name="scripted", source="scripted")
-        run_evaluation(EvalConfig(policies=[policy], suites=[suite], workers=2, video="all", out=_fresh(out_dir)))
+        run_evaluation(EvalConfig(policies=[policy], suites=[suite], workers=2, video="all", out=fresh(out_dir)))
 
 
 app.command("eval")(evaluate_command)
+app.command("export")(export_command)
+app.command("merge")(merge_command)
+app.command("replay")(replay_command)
 app.add_typer(bench, name="bench")
 app.add_typer(env, name="env")
 app.add_typer(keys_app, name="keys")
@@ -154,12 +160,3 @@ def _server_args(settings: list[str], serve_set: list[str]) -> dict[str, Any]:
         raise ConfigError("--serve-set config: the policy's own settings go into --set")
     config = parse_settings(settings, "--set")
     return {**args, **({"config": config} if config else {})}
-
-
-def _fresh(folder: Path) -> Path:
-    """`folder`, or the first of folder-2, folder-3, … that does not exist: a demo never mixes with an older one."""
-    candidate, number = folder, 1
-    while candidate.exists():
-        number += 1
-        candidate = folder.with_name(f"{folder.name}-{number}")
-    return candidate

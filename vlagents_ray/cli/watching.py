@@ -11,7 +11,7 @@ from vlagents_ray.cli.evaluation import deployed, evaluate_and_print, served
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.runner import ray_cluster
-from vlagents_ray.evaluate.store import FILE
+from vlagents_ray.evaluate.schema import FILE
 from vlagents_ray.evaluate.watching import Watcher, rounds
 from vlagents_ray.policies.base.checkpoint import STEP
 from vlagents_ray.serve.checkpoints import CHOICE

@@ -25,7 +25,8 @@ from typing_extensions import Self
 
 from vlagents_ray.client.ways import TransportName
 
-Video = Literal["none", "failures", "all"]
+EpisodeChoice = Literal["none", "failures", "all"]
+Tracker = Literal["wandb", "trackio", "tensorboard"]
 Name = Annotated[str, Field(min_length=1)]
 
 
@@ -160,6 +161,14 @@ class SuiteConfig(_Closed):
         return self
 
 
+class TrackingConfig(_Closed):
+    """Under which names trackers show an evaluation."""
+
+    project: Name = "vlagents-ray"
+    group: str | None = None  # of runs; default: the name of the folder of results
+    videos: NonNegativeInt = 4  # of each cell that are handed over, failures first
+
+
 class EvalConfig(_Closed):
     """Which policies to evaluate, in what, and where the results go."""
 
@@ -167,10 +176,13 @@ class EvalConfig(_Closed):
     suites: list[SuiteConfig] = Field(min_length=1)
     out: Path
     workers: PositiveInt = 1  # environments rolled out in parallel
-    video: Video = "failures"
+    video: EpisodeChoice = "failures"  # of which episodes there are videos
+    record: EpisodeChoice = "none"  # and of which trajectories: states, actions, rewards, and what the policy saw
     resume: bool = False
     worker: WorkerConfig = WorkerConfig()
     stop: StopConfig | None = None  # early stopping; None: every episode is played
+    track: list[Tracker] = []  # where rates and videos are shown beside `out`, against the training step
+    tracking: TrackingConfig = TrackingConfig()
 
     # What happens when something breaks.
     retries: NonNegativeInt = 3  # further attempts after an infrastructure failure

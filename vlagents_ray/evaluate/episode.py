@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from time import perf_counter
 from typing import Any, Literal
 
@@ -24,6 +25,7 @@ Ending = Literal["terminated", "truncated", "policy_done", "error"]
 Phase = Literal["idle", "connect", "make", "env reset", "policy reset", "policy act", "env step"]
 Watch = Callable[[Phase, int], None]  # told the phase and the number of steps so far
 Record = Callable[[Obs], None]  # told every observation, the first one included
+Executed = Callable[[np.ndarray, float, bool], None]  # told every action, (D,), its reward, and whether it succeeded
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,6 +54,15 @@ class EpisodeResult:
     timing_ms: dict[str, float] = field(default_factory=dict)  # medians of what `act.info["timing"]` says of one act
     transport: str = "local"
     checkpoint: str | None = None  # that the policy's reset named
+    actions_sha256: str | None = None  # of the actions as executed, (steps, D) little-endian float32, row by row
+
+    @property
+    def outcome(self) -> dict[str, Any]:
+        """What two runs of one key must have in common: all but how long it took, and the way to the policy."""
+        return {one.name: getattr(self, one.name) for one in fields(self) if one.name not in _CIRCUMSTANCES}
+
+
+_CIRCUMSTANCES = {"seconds", "reset_ms", "env_step_ms", "policy_ms", "policy_p95_ms", "timing_ms", "transport"}
 
 
 @dataclass(slots=True)
@@ -67,6 +78,7 @@ class Tally:
     ending: Ending = "error"
     instruction: str = ""
     checkpoint: str | None = None
+    actions: Any = field(default_factory=hashlib.sha256)  # that were executed
     reset_ms: float | None = None
     step_ms: list[float] = field(default_factory=list)
     act_ms: list[float] = field(default_factory=list)
@@ -87,9 +99,18 @@ class Tally:
             if stage.endswith("_ms"):  # the size of a batch stands among them
                 self.timing_ms.setdefault(stage, []).append(float(spent))
 
-    def stepped(self, reward: float, terminated: bool, truncated: bool, info: Mapping[str, Any], limit: int) -> bool:
-        """An action was executed; is the episode over, be it at the `limit` of steps?"""
+    def stepped(
+        self,
+        action: np.ndarray,
+        reward: float,
+        terminated: bool,
+        truncated: bool,
+        info: Mapping[str, Any],
+        limit: int,
+    ) -> bool:
+        """`action` was executed; is the episode over, be it at the `limit` of steps?"""
         self.steps += 1
+        self.actions.update(action.astype("<f4").tobytes())
         self.episode_return += float(reward)
         self.success = _success(info)
         if self.success and self.first_success is None:
@@ -124,6 +145,7 @@ class Tally:
             timing_ms={stage: float(np.median(spent)) for stage, spent in sorted(self.timing_ms.items())},
             transport=transport,
             checkpoint=self.checkpoint,
+            actions_sha256=self.actions.hexdigest(),
         )
 
 
@@ -138,6 +160,7 @@ def run_episode(
     policy_options: Mapping[str, Any] | None = None,
     watch: Watch = lambda _phase, _steps: None,
     record: Record = lambda _obs: None,
+    executed: Executed = lambda _action, _reward, _success: None,
 ) -> EpisodeResult:
     """Play the episode `key`; of each action chunk execute the first `execute` rows, open loop.
 
@@ -153,7 +176,7 @@ def run_episode(
     tally = Tally(key)
     error: PolicyFailed | None = None
     try:
-        _play(env, agent, tally, execute, clock, reset_options, policy_options, watch, record)
+        _play(env, agent, tally, execute, clock, reset_options, policy_options, watch, record, executed)
     except CheckpointFailed:
         raise
     except PolicyFailed as failed:
@@ -171,6 +194,7 @@ def _play(
     policy_options: Mapping[str, Any] | None,
     watch: Watch,
     record: Record,
+    executed: Executed,
 ) -> None:
     watch("env reset", 0)
     key = tally.key
@@ -206,7 +230,9 @@ def _play(
             record(obs)
             tally.ticks_waited += tick.waited
             tally.ticks_held += tick.held
-            if tally.stepped(reward, terminated, truncated, info, env.max_steps):
+            over = tally.stepped(tick.action, reward, terminated, truncated, info, env.max_steps)
+            executed(tick.action, float(reward), tally.success)
+            if over:
                 return
         if act.done:
             tally.ending = "policy_done"

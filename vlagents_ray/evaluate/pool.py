@@ -6,7 +6,7 @@ import logging
 import os
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from time import monotonic
 from typing import Any
 
@@ -19,6 +19,7 @@ from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.config import EvalConfig, WorkerConfig
 from vlagents_ray.evaluate.episode import Phase
 from vlagents_ray.evaluate.jobs import Job
+from vlagents_ray.evaluate.logs import tail_at
 from vlagents_ray.evaluate.rollout import AgentFactory, Failure, Pulse, Report, Rollout
 
 log = logging.getLogger(__name__)
@@ -55,6 +56,7 @@ class Worker:
     looked: float = 0.0  # when it was asked
     pulse: Pulse = field(default_factory=lambda: Pulse("idle", 0.0, 0))
     heard: float = 0.0  # when it last answered
+    process: dict[str, Any] = field(default_factory=dict)  # what `ready()` said
 
 
 class WorkerPool:
@@ -183,22 +185,25 @@ class WorkerPool:
             try:
                 report = ray.get(ref)
             except RayError as error:
-                report = _lost(f"the worker {'died' if isinstance(error, RayActorError) else 'failed'}: {error}")
+                reason = f"the worker {'died' if isinstance(error, RayActorError) else 'failed'}: {error}"
+                report = Report(failure=Failure("worker", EnvFailed.code, reason))
             if report.made is not None:
                 worker.made = job.cell.place
             if report.failure is not None and report.failure.cause == "worker":
                 self._end(worker)
+                report = replace(report, failure=_with_log(report.failure, worker))
             yield job, report
 
     def _started(self, worker: Worker) -> None:
         try:
-            log.info("worker %s", ray.get(worker.starting))
+            worker.process = ray.get(worker.starting)
         except RayError as error:
             self._failed_starts += 1
             if self._failed_starts >= MOST_FAILED_STARTS:
                 raise EnvFailed(f"workers do not start, {self._failed_starts} in a row: {error}") from error
             self._end(worker)
         else:
+            log.info("worker %s", worker.process)
             self._failed_starts = 0
             worker.starting = None
 
@@ -213,7 +218,8 @@ class WorkerPool:
                 if reason is not None:
                     job = worker.job
                     self._end(worker)
-                    yield job, _lost(reason, worker.pulse.stack)
+                    failure = Failure("worker", EnvFailed.code, reason, worker.pulse.stack)
+                    yield job, Report(failure=_with_log(failure, worker))
                 elif worker.looking is None and now - worker.looked > WATCH_S:
                     worker.looked = now
                     worker.looking = worker.actor.progress.options(concurrency_group="watch").remote()
@@ -243,8 +249,8 @@ def _refs(worker: Worker) -> list[Any]:
     return [ref for ref in (worker.starting, worker.running, worker.looking) if ref is not None]
 
 
-def _lost(reason: str, stack: str = "") -> Report:
-    return Report(failure=Failure("worker", EnvFailed.code, reason, stack))
+def _with_log(failure: Failure, worker: Worker) -> Failure:
+    return replace(failure, log=tail_at(worker.process["host"], worker.process["logs"]))
 
 
 def runtime_env(worker: WorkerConfig) -> dict[str, Any]:

@@ -16,9 +16,9 @@ from vlagents_ray.evaluate.cells import contender
 from vlagents_ray.evaluate.config import StopConfig
 from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.jobs import EpisodeKey
+from vlagents_ray.evaluate.schema import FILE, require_version
 from vlagents_ray.evaluate.statistics import Rate
 from vlagents_ray.evaluate.stopping import Stopping, pooled
-from vlagents_ray.evaluate.store import FILE, require_version
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +27,7 @@ class Episode:
 
     result: EpisodeResult
     videos: tuple[str, ...]  # paths relative to the folder
+    trajectory: str | None  # likewise
     attempts: int
     run: int
     finished: float  # seconds since 1970
@@ -51,6 +52,7 @@ class Attempt:
     code: str
     error: str
     traceback: str
+    log: str  # the last of what the worker wrote, if it broke
     retried: bool
 
 
@@ -79,6 +81,7 @@ class CellResults:
     settings: dict[str, Any]
     described: dict[str, Any]  # `EvalEnv.describe()`; {} if no worker has made it
     contract: dict[str, Any]
+    code: dict[str, Any]  # of the env: commit, dirty, diff_sha256; {} if git knows nothing of it
     episodes: tuple[Episode, ...]  # by seed
     attempts: tuple[Attempt, ...]
     stop: StopConfig | None = None  # the rule by which it could stop early
@@ -107,21 +110,21 @@ class Results:
     @classmethod
     def load(cls, out: Path) -> Results:
         """Read `out`, which an evaluation may be writing to. Raises `ConfigError` if it holds no results."""
-        with _reading(out) as db:
+        with reading(out) as db:
             episodes: dict[str, list[Episode]] = {}
-            for row in _rows(db, "episodes", "seed"):
-                episodes.setdefault(row["cell"], []).append(_episode(row))
+            for row in table(db, "episodes", "seed"):
+                episodes.setdefault(row["cell"], []).append(episode_of(row))
             attempts: dict[str, list[Attempt]] = {}
-            for row in _rows(db, "attempts"):
+            for row in table(db, "attempts"):
                 attempts.setdefault(row["cell"], []).append(Attempt(**row | {"retried": bool(row["retried"])}))
             return cls(
                 out,
                 tuple(
                     _cell(row, tuple(episodes.get(row["cell"], ())), tuple(attempts.get(row["cell"], ())))
-                    for row in _rows(db, "cells")
+                    for row in table(db, "cells")
                 ),
-                tuple(_run(row) for row in _rows(db, "runs")),
-                {row["name"]: json.loads(row["metadata"]) for row in _rows(db, "policies")},
+                tuple(_run(row) for row in table(db, "runs")),
+                {row["name"]: json.loads(row["metadata"]) for row in table(db, "policies")},
             )
 
     @property
@@ -133,35 +136,47 @@ class Results:
         """The cells of one contender."""
         return [cell for cell in self.cells if cell.contender == contender]
 
+    def only(self, contender: str | None = None, env: str | None = None) -> Results:
+        """Without the cells of other contenders and envs; None takes all. `ConfigError` if that leaves nothing."""
+        left = tuple(one for one in self.cells if contender in (None, one.contender) and env in (None, one.env))
+        if not left:
+            have = sorted({f"{one.contender} in {one.env}" for one in self.cells})
+            raise ConfigError(f"{self.out}: has nothing of {contender or 'any policy'} in {env or 'any env'}: {have}")
+        return dataclasses.replace(self, cells=left)
+
 
 @contextmanager
-def _reading(out: Path) -> Iterator[sqlite3.Connection]:
+def reading(out: Path) -> Iterator[sqlite3.Connection]:
+    """One state of all tables in `out`, which may be written to meanwhile."""
     if not (out / FILE).is_file():
         raise ConfigError(f"{out}: got no {FILE} there, want a folder that an evaluation wrote its results to")
     with closing(sqlite3.connect(out / FILE)) as db:
         require_version(out, db)
         db.row_factory = sqlite3.Row
-        db.execute("BEGIN")  # one state of all tables
+        db.execute("BEGIN")
         yield db
 
 
-def _rows(db: sqlite3.Connection, table: str, order: str = "rowid") -> Iterator[dict[str, Any]]:
-    return (dict(row) for row in db.execute(f"SELECT * FROM {table} ORDER BY {order}"))  # noqa: S608 (constants)
+def table(db: sqlite3.Connection, name: str, order: str = "rowid") -> Iterator[dict[str, Any]]:
+    """The rows of a table, by its columns' names."""
+    return (dict(row) for row in db.execute(f"SELECT * FROM {name} ORDER BY {order}"))  # noqa: S608 (constants)
 
 
-def _episode(row: dict[str, Any]) -> Episode:
+def episode_of(row: dict[str, Any]) -> Episode:
+    """What a row of the table of episodes says."""
     names = {field.name for field in dataclasses.fields(EpisodeResult)}
     known = {name: value for name, value in row.items() if name in names and name != "key"}
     for name in ("success_once", "success_at_end"):
         known[name] = None if known[name] is None else bool(known[name])
     key = EpisodeKey(row["env"], row["episode"], row["seed"], row["cell"])
     result = EpisodeResult(**known | {"key": key, "timing_ms": json.loads(row["timing_ms"])})
-    return Episode(result, tuple(json.loads(row["videos"])), row["attempts"], row["run"], row["finished"])
+    videos = tuple(json.loads(row["videos"]))
+    return Episode(result, videos, row["trajectory"], row["attempts"], row["run"], row["finished"])
 
 
 def _cell(row: dict[str, Any], episodes: tuple[Episode, ...], attempts: tuple[Attempt, ...]) -> CellResults:
     seeds, rule = json.loads(row.pop("seeds")), row.pop("stop")
-    parsed = {name: json.loads(row[name] or "{}") for name in ("settings", "described", "contract")}
+    parsed = {name: json.loads(row[name] or "{}") for name in ("settings", "described", "contract", "code")}
     stop, stopped_at = None, None
     if rule is not None:
         stop = StopConfig.model_validate_json(rule)

@@ -17,6 +17,7 @@ from dataclasses import dataclass, field
 from time import monotonic, sleep
 from typing import Any, Literal
 
+from vlagents_ray.code import Code, code_of
 from vlagents_ray.contract import require_match
 from vlagents_ray.envs import EvalEnv, make_env
 from vlagents_ray.errors import (
@@ -42,8 +43,9 @@ from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.config import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.episode import EpisodeResult, Phase, run_episode
 from vlagents_ray.evaluate.jobs import Job
+from vlagents_ray.evaluate.logs import own_logs
+from vlagents_ray.evaluate.recording import Kept, Recording
 from vlagents_ray.evaluate.sides import env_side, policy_side
-from vlagents_ray.evaluate.video import VideoRecorder
 from vlagents_ray.interface import Agent
 from vlagents_ray.registry import env_class
 from vlagents_ray.wire.plain import plain_values
@@ -70,6 +72,7 @@ class Failure:
     code: str  # of `vlagents_ray.errors`
     message: str
     traceback: str = ""
+    log: str = ""  # the last of what the worker wrote, if it broke
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +81,7 @@ class Made:
 
     described: dict[str, Any]  # `EvalEnv.describe()`
     contract: dict[str, Any]
+    code: Code | None = None  # of the env, if git tracks it
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +90,7 @@ class Report:
 
     result: EpisodeResult | None = None
     failure: Failure | None = None
-    videos: dict[str, bytes] = field(default_factory=dict)  # camera -> MP4
+    kept: Kept = field(default_factory=Kept)
     made: Made | None = None  # if an env was made for it
     policy: dict[str, Any] | None = None  # metadata of the policy ({} of a local one), if newly connected
 
@@ -116,8 +120,8 @@ class Rollout:
         self._now: tuple[Phase, float, int] = ("idle", monotonic(), 0)
 
     def ready(self) -> dict[str, Any]:
-        """Answered as soon as the process runs."""
-        return {"pid": os.getpid(), "host": socket.gethostname()}
+        """Answered as soon as the process runs: which it is, and the files that it writes to."""
+        return {"pid": os.getpid(), "host": socket.gethostname(), "logs": own_logs()}
 
     def progress(self) -> Pulse:
         """Called from another thread while `run` is under way."""
@@ -138,11 +142,11 @@ class Rollout:
             if self._env is None or self._place != job.cell.place:
                 self._env = self._make_env(job.cell)
                 # The driver may have another numpy, which cannot read this one's pickles.
-                made = Made(plain_values(self._env.describe()), self._env.contract.to_json())
+                made = Made(plain_values(self._env.describe()), self._env.contract.to_json(), _code(self._env))
             agent, env = self._agent, self._env
             if made is not None or policy is not None:
                 require_match(agent.contract, env.contract)
-            with VideoRecorder(env.contract.control_hz) as recorder:
+            with Recording(self._config, env.contract.control_hz) as recording:
                 result = run_episode(
                     env,
                     agent,
@@ -152,10 +156,10 @@ class Rollout:
                     reset_options=job.cell.suite.reset_options,
                     policy_options=job.cell.policy_options,
                     watch=self._watch,
-                    record=recorder.add if self._config.video != "none" else lambda _obs: None,
+                    record=recording.see,
+                    executed=recording.do,
                 )
-                wanted = self._config.video == "all" or not result.success_once
-                videos = recorder.finish() if wanted else {}
+                kept = recording.finish(result)
         except VLAgentsError as error:
             failure = explain(error)
             if failure.cause == "policy":
@@ -165,7 +169,7 @@ class Rollout:
         finally:
             self._watch("idle", 0)
         self._broken_agents = 0
-        return Report(result=result, videos=videos, made=made, policy=policy)
+        return Report(result=result, kept=kept, made=made, policy=policy)
 
     def close(self) -> None:
         """Free the simulator and the connection."""
@@ -247,6 +251,10 @@ def explain(error: VLAgentsError) -> Failure:
     else:
         cause = "worker"
     return Failure(cause, error.code, str(error), "".join(traceback.format_exception(error)))
+
+
+def _code(env: EvalEnv) -> Code | None:
+    return code_of(type(env).__module__)
 
 
 def _metadata(agent: Agent) -> dict[str, Any]:

@@ -6,7 +6,8 @@ import functools
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from math import ceil
 from types import FrameType
@@ -21,12 +22,14 @@ from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.jobs import Job, JobQueue, plan
 from vlagents_ray.evaluate.pool import WorkerPool
 from vlagents_ray.evaluate.progress import Progress, SilentProgress
+from vlagents_ray.evaluate.provenance import driver_code, policy_code, save_diffs, versions
+from vlagents_ray.evaluate.recording import Kept, save
 from vlagents_ray.evaluate.results import Results, rate_of
 from vlagents_ray.evaluate.rollout import AgentFactory, Failure, Report
 from vlagents_ray.evaluate.stopping import Stopping
 from vlagents_ray.evaluate.store import Store
-from vlagents_ray.evaluate.summary import Summary, summarize, versions, write_summary
-from vlagents_ray.evaluate.video import save_videos
+from vlagents_ray.evaluate.summary import Summary, summarize, write_summary
+from vlagents_ray.evaluate.trackers import Tracking
 from vlagents_ray.interface import Agent
 from vlagents_ray.signals import own_sigterm
 
@@ -43,9 +46,15 @@ class EvaluationInterrupted(KeyboardInterrupt):
 
 
 def evaluate(
-    config: EvalConfig, *, agent_factory: Callable[[], Agent] | None = None, progress: Progress | None = None
+    config: EvalConfig,
+    *,
+    agent_factory: Callable[[], Agent] | None = None,
+    progress: Progress | None = None,
+    only: tuple[int, int] | None = None,
 ) -> Summary:
     """Play every episode of `config` that has no result yet; the results are in `config.out`.
+
+    `only`: of each env the episode with this number and this seed, and no other.
 
     Episodes run in Ray actors: in the cluster that this process is connected to, or else in one
     that `RAY_ADDRESS` names, or in a local one started for the length of the run. Each worker talks to
@@ -57,12 +66,15 @@ def evaluate(
     Whatever it raises, each recorded episode is kept and summary.json written.
     """
     factory = _remote_agents(config) if agent_factory is None else functools.partial(_own_agent, agent_factory)
+    tracking = Tracking(config)
     with Store(config) as store:
         store.begin_run(config, versions())
+        save_diffs(config.out, driver_code().values())
         state = "stopped"
         try:
-            run = _Run(config, store, progress or SilentProgress())
-            complete = run.play(factory)
+            with tracking:
+                run = _Run(config, store, progress or SilentProgress(), tracking, only)
+                complete = run.play(factory)
             state = "complete" if complete else "interrupted"
         finally:
             store.end_run(state)
@@ -81,10 +93,13 @@ def check(config: EvalConfig) -> None:
 class _Run:
     """The driver's side of one run."""
 
-    def __init__(self, config: EvalConfig, store: Store, progress: Progress) -> None:
+    def __init__(
+        self, config: EvalConfig, store: Store, progress: Progress, tracking: Tracking, only: tuple[int, int] | None
+    ) -> None:
         self._config = config
         self._store = store
         self._progress = progress
+        self._tracking = tracking
         self._lost_in_a_row = 0
         earlier = {cell.cell: cell for cell in Results.load(config.out).cells}
         self._recorded = {cell: rate_of([results], "success_once") for cell, results in earlier.items()}
@@ -95,9 +110,10 @@ class _Run:
                 stopping.add_all(episode.result for episode in earlier[cell.fingerprint].episodes)
                 self._stopping[cell.fingerprint] = stopping
         finished = store.finished()
-        self._queue = JobQueue(
-            job for job in plan(store.cells) if str(job.key) not in finished and not self._has_stopped(job)
-        )
+        wanted = [job for job in plan(store.cells) if only in (None, (job.key.episode, job.key.seed))]
+        pending = [job for job in wanted if str(job.key) not in finished and not self._has_stopped(job)]
+        self._queue = JobQueue(pending)
+        self._left = Counter(job.key.settings for job in pending)  # by cell
 
     def play(self, factory: AgentFactory) -> bool:
         """Play all that is queued; False if a signal ended it early."""
@@ -128,13 +144,15 @@ class _Run:
     def _handle(self, job: Job, report: Report) -> None:
         if report.policy is not None:
             self._store.note_policy(job.cell.policy.name, report.policy)
+            save_diffs(self._config.out, [policy_code(report.policy)])
         if report.made is not None:
             self._store.note_env(job.cell.place, report.made)
+            save_diffs(self._config.out, [report.made.code])
         if report.failure is not None:
             self._failed(job, report.failure)
         elif report.result is not None:
             self._lost_in_a_row = 0
-            self._record(job, report.result, report.videos)
+            self._record(job, report.result, report.kept)
 
     def _failed(self, job: Job, failure: Failure) -> None:
         beyond = self._has_stopped(job)  # nobody waits for it
@@ -149,7 +167,7 @@ class _Run:
         if beyond:
             return
         lost = EpisodeResult(job.key, "infra_failed", error=f"{failure.code}: {failure.message}")
-        self._record(job, lost, {})
+        self._record(job, lost, Kept())
         self._lost_in_a_row += 1
         if self._lost_in_a_row == self._config.abort_after:
             raise from_code(
@@ -158,12 +176,15 @@ class _Run:
                 f"(--resume): {failure.message}",
             )
 
-    def _record(self, job: Job, result: EpisodeResult, videos: Mapping[str, bytes]) -> None:
-        # Videos first: a crash in between repeats the episode, and its videos are overwritten.
-        paths = save_videos(self._config.out, job.cell, result, dict(videos))
-        self._store.record(result, job.attempt, paths)
+    def _record(self, job: Job, result: EpisodeResult, kept: Kept) -> None:
+        # Files first: a crash in between repeats the episode, and they are overwritten.
+        videos, trajectory = save(self._config.out, job.cell, result, kept)
+        self._store.record(result, job.attempt, videos, trajectory)
         self._progress.episode(job.cell, result)
+        self._left[job.key.settings] -= 1
         self._stop_if_certain(job, result)
+        if not self._left[job.key.settings]:
+            self._tracking.look()
 
     def _has_stopped(self, job: Job) -> bool:
         stopping = self._stopping.get(job.cell.fingerprint)
@@ -176,7 +197,9 @@ class _Run:
             return
         stopping.add(result)
         if stopping.at is not None:
-            self._progress.stopped(job.cell, stopping.at, self._queue.drop(job.cell.fingerprint))
+            dropped = self._queue.drop(job.cell.fingerprint)
+            self._left[job.key.settings] -= dropped
+            self._progress.stopped(job.cell, stopping.at, dropped)
 
 
 @contextmanager

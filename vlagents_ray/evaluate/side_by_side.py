@@ -108,8 +108,7 @@ class _Player:
 
     def stepped(self, reward: float, terminated: bool, truncated: bool, info: Mapping[str, Any], limit: int) -> None:
         """The env executed the first of `rows`."""
-        self.rows.popleft()
-        over = self.tally.stepped(reward, terminated, truncated, info, limit)
+        over = self.tally.stepped(self.rows.popleft(), reward, terminated, truncated, info, limit)
         if not over and self._last and not self.rows:
             self.tally.ending, over = "policy_done", True
         if over:

@@ -22,38 +22,10 @@ from vlagents_ray.evaluate.config import EvalConfig, canonical
 from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.jobs import Job
 from vlagents_ray.evaluate.rollout import Failure, Made
+from vlagents_ray.evaluate.schema import FILE, SCHEMA, VERSION, require_version
 
-FILE = "results.db"
 LOCK = "results.lock"
-SCHEMA_VERSION = 3
 IDENTITY = ("policy", "checkpoint")  # of a policy's metadata: what must not change between runs
-
-_SCHEMA = """
-CREATE TABLE runs (
-    run INTEGER PRIMARY KEY, started REAL NOT NULL, ended REAL, state TEXT NOT NULL,
-    config TEXT NOT NULL, versions TEXT NOT NULL
-);
-CREATE TABLE policies (name TEXT PRIMARY KEY, metadata TEXT NOT NULL);
-CREATE TABLE cells (
-    cell TEXT PRIMARY KEY, policy TEXT NOT NULL, step INTEGER, suite TEXT NOT NULL, env TEXT NOT NULL,
-    planned INTEGER NOT NULL, seeds TEXT NOT NULL, stop TEXT, settings TEXT NOT NULL, described TEXT, contract TEXT
-);
-CREATE TABLE episodes (
-    key TEXT PRIMARY KEY, cell TEXT NOT NULL REFERENCES cells, env TEXT NOT NULL, episode INTEGER NOT NULL,
-    seed INTEGER NOT NULL, status TEXT NOT NULL, success_once INTEGER, success_at_end INTEGER, first_success INTEGER,
-    steps INTEGER NOT NULL, episode_return REAL NOT NULL, ending TEXT NOT NULL, instruction TEXT NOT NULL,
-    error TEXT, seconds REAL NOT NULL, reset_ms REAL, env_step_ms REAL, acts INTEGER NOT NULL,
-    policy_ms REAL, policy_p95_ms REAL, latency_ms REAL, ticks_waited INTEGER NOT NULL, ticks_held INTEGER NOT NULL,
-    timing_ms TEXT NOT NULL, transport TEXT NOT NULL, checkpoint TEXT,
-    videos TEXT NOT NULL, attempts INTEGER NOT NULL, run INTEGER NOT NULL REFERENCES runs, finished REAL NOT NULL
-);
-CREATE INDEX episodes_of_cells ON episodes (cell, checkpoint);
-CREATE TABLE attempts (
-    key TEXT NOT NULL, cell TEXT NOT NULL REFERENCES cells, attempt INTEGER NOT NULL,
-    run INTEGER NOT NULL REFERENCES runs, at REAL NOT NULL, cause TEXT NOT NULL, code TEXT NOT NULL,
-    error TEXT NOT NULL, traceback TEXT NOT NULL, retried INTEGER NOT NULL
-);
-"""
 
 
 class Store:
@@ -103,7 +75,9 @@ class Store:
         """Keys of the episodes that are not to be played again."""
         return {key for (key,) in self._db.execute("SELECT key FROM episodes WHERE status != 'infra_failed'")}
 
-    def record(self, result: EpisodeResult, attempts: int, videos: Sequence[str] = ()) -> None:
+    def record(
+        self, result: EpisodeResult, attempts: int, videos: Sequence[str] = (), trajectory: str | None = None
+    ) -> None:
         """Add an episode. One that infrastructure failed gives way; any other is there once and for all.
 
         `ConfigError` for one that another checkpoint played, as after a swap: a rate is that of one.
@@ -117,6 +91,7 @@ class Store:
             **key,
             "timing_ms": canonical(result.timing_ms),
             "videos": canonical(list(videos)),
+            "trajectory": trajectory,
             "attempts": attempts,
             "run": self._run,
             "finished": time.time(),
@@ -139,16 +114,17 @@ class Store:
     def record_attempt(self, job: Job, failure: Failure, *, retried: bool) -> None:
         """Note an attempt that infrastructure failed."""
         where = (str(job.key), job.key.settings, job.attempt, self._run, time.time())
-        why = (failure.cause, failure.code, failure.message, failure.traceback, retried)
+        why = (failure.cause, failure.code, failure.message, failure.traceback, failure.log, retried)
         with self._db:
-            self._db.execute("INSERT INTO attempts VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", where + why)
+            self._db.execute("INSERT INTO attempts VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", where + why)
 
     def note_env(self, place: str, made: Made) -> None:
         """Keep what a worker found out about the env of the cells at `place`."""
-        found = (json.dumps(made.described, default=str), canonical(made.contract))
+        code = {} if made.code is None else made.code.to_json()
+        found = (json.dumps(made.described, default=str), canonical(made.contract), canonical(code))
         with self._db:
             self._db.executemany(
-                "UPDATE cells SET described = ?, contract = ? WHERE cell = ?",
+                "UPDATE cells SET described = ?, contract = ?, code = ? WHERE cell = ?",
                 [(*found, cell.fingerprint) for cell in self.cells if cell.place == place],
             )
 
@@ -175,7 +151,7 @@ class Store:
             db.execute("PRAGMA synchronous = NORMAL")  # safe against a killed process, and no fsync an episode
             version = db.execute("PRAGMA user_version").fetchone()[0]
             if version == 0:
-                db.executescript(f"BEGIN; {_SCHEMA} PRAGMA user_version = {SCHEMA_VERSION}; COMMIT;")
+                db.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
             require_version(self._out, db)
             self._require_resumable(db, config)
             self._note_cells(db, config)
@@ -214,15 +190,6 @@ class Store:
                     " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET planned = ?, seeds = ?, stop = ?",
                     (cell.fingerprint, *identity, canonical(cell.settings), *extent, *extent),
                 )
-
-
-def require_version(out: Path, db: sqlite3.Connection) -> None:
-    """`ConfigError` for a results file that this version of the package does not read."""
-    version = db.execute("PRAGMA user_version").fetchone()[0]
-    if version != SCHEMA_VERSION:
-        raise ConfigError(
-            f"{out / FILE}: got version {version} of the results file, want {SCHEMA_VERSION}; choose another out folder"
-        )
 
 
 def _differences(db: sqlite3.Connection, cell: Cell) -> list[str]:

@@ -4,12 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-import platform
-import shutil
-import subprocess
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -99,8 +95,8 @@ class Summary:
         """As plain JSON values."""
         cells = [
             group.to_json() | {"checkpoint": checkpoint_of(cell), "settings": cell.settings, "env": cell.env}
-            | {"described": cell.described, "contract": cell.contract, "stopped_at": cell.stopped_at}
-            | {"gap_to_synchronous": gap_to_synchronous(self.results, cell)}
+            | {"described": cell.described, "contract": cell.contract, "code": cell.code}
+            | {"stopped_at": cell.stopped_at, "gap_to_synchronous": gap_to_synchronous(self.results, cell)}
             for group, cell in zip(self.cells, self.results.cells, strict=True)
         ]  # fmt: skip
         last = self.results.runs[-1]
@@ -151,26 +147,6 @@ def write_summary(summary: Summary) -> Path:
     part.write_text(json.dumps(summary.to_json(), indent=2) + "\n")
     os.replace(part, path)
     return path
-
-
-def versions() -> dict[str, Any]:
-    """What the driver runs on: Python, packages, and the commit of the folder it was started in."""
-    packages = {}
-    for name in ("vlagents-ray", "ray", "numpy", "av"):
-        try:
-            packages[name] = version(name)
-        except PackageNotFoundError:
-            packages[name] = "not installed"
-    return {"python": platform.python_version(), "platform": platform.platform(), **packages, "git_commit": _commit()}
-
-
-def _commit() -> str | None:
-    git = shutil.which("git")
-    if git is None:
-        return None
-    command = [git, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
-    asked = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 (no input)
-    return asked.stdout.strip() or None if asked.returncode == 0 else None
 
 
 def _group(name: tuple[str, str, str], cells: Sequence[CellResults]) -> Group:

@@ -9,53 +9,78 @@ by a worker that dies.
 from __future__ import annotations
 
 import io
-import os
-import re
+from dataclasses import dataclass, field
 from pathlib import Path
+
+import numpy as np
 
 from vlagents_ray.errors import EnvFailed, InvalidObservation
 from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.episode import EpisodeResult
-from vlagents_ray.evaluate.jobs import EpisodeKey
+from vlagents_ray.evaluate.files import VIDEOS, episode_folder, outcome, plain, remove_old, stem, whole
 from vlagents_ray.interface import HIGH_RES, Obs
 from vlagents_ray.mp4 import Mp4
 
 DEFAULT_FPS = 20.0  # of an env whose contract states no control rate
 
 
+@dataclass(frozen=True, slots=True)
+class Footage:
+    """MP4 files by camera, each with a frame for every observation; {} if they are not wanted."""
+
+    shown: dict[str, bytes] = field(default_factory=dict)  # for people: high-resolution views where there are such
+    seen: dict[str, bytes] = field(default_factory=dict)  # what the policy saw
+
+
 class VideoRecorder:
     """Videos of one episode, one a camera. Use as a context manager: leaving it frees the encoders."""
 
-    def __init__(self, fps: float | None = None) -> None:
+    def __init__(self, fps: float | None = None, *, seen: bool = False) -> None:
+        """`seen`: of a camera with a high-resolution view keep, beside that, what the policy saw."""
         self._fps = fps or DEFAULT_FPS
-        self._tracks: dict[str, tuple[io.BytesIO, Mp4]] = {}
+        self._seen = seen
+        self._tracks: dict[tuple[str, bool], tuple[io.BytesIO, Mp4]] = {}  # by camera, and whether it is that view
 
     def add(self, obs: Obs) -> None:
         """Append every camera's image, (H, W, 3) uint8 RGB; a high-resolution view replaces its camera's."""
-        for name, image in (obs.cameras | obs.info.get(HIGH_RES, {})).items():
-            if name not in self._tracks:
-                file = io.BytesIO()
-                self._tracks[name] = file, Mp4(file, image.shape, self._fps)
-            try:
-                self._tracks[name][1].add(image)
-            except InvalidObservation as error:
-                raise EnvFailed(f"camera {name!r}: {error}") from error
+        views: dict[str, np.ndarray] = obs.info.get(HIGH_RES, {})
+        for name, image in obs.cameras.items():
+            if self._seen or name not in views:
+                self._append((name, False), image)
+        for name, image in views.items():
+            self._append((name, True), image)
 
-    def finish(self) -> dict[str, bytes]:
-        """The MP4 files by camera; the recorder is empty afterwards."""
-        videos = {}
+    def finish(self) -> Footage:
+        """What was recorded; the recorder is empty afterwards."""
+        videos: dict[tuple[str, bool], bytes] = {}
         while self._tracks:
-            name, (file, track) = self._tracks.popitem()
+            key, (file, track) = self._tracks.popitem()
             track.finish()
-            videos[name] = file.getvalue()
-        return dict(sorted(videos.items()))
+            videos[key] = file.getvalue()
+        # In this order a high-resolution view takes the place of its camera's.
+        shown = {name: videos[name, high] for name, high in sorted(videos)}
+        seen = {name: data for (name, high), data in sorted(videos.items()) if not high} if self._seen else {}
+        return Footage(shown, seen)
+
+    def close(self) -> None:
+        """Give up what is not finished."""
+        while self._tracks:
+            self._tracks.popitem()[1][1].abandon()
 
     def __enter__(self) -> VideoRecorder:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        while self._tracks:
-            self._tracks.popitem()[1][1].abandon()
+        self.close()
+
+    def _append(self, key: tuple[str, bool], image: np.ndarray) -> None:
+        if key not in self._tracks:
+            file = io.BytesIO()
+            self._tracks[key] = file, Mp4(file, image.shape, self._fps)
+        try:
+            self._tracks[key][1].add(image)
+        except InvalidObservation as error:
+            raise EnvFailed(f"camera {key[0]!r}: {error}") from error
 
 
 def save_videos(out: Path, cell: Cell, result: EpisodeResult, videos: dict[str, bytes]) -> list[str]:
@@ -66,33 +91,12 @@ def save_videos(out: Path, cell: Cell, result: EpisodeResult, videos: dict[str, 
     Each file is whole from the moment it has its name, and what an earlier attempt at the episode
     left is removed.
     """
-    folder = out.joinpath("videos", *(_plain(part) for part in cell.name if part))
-    stem = _stem(result.key)
-    for old in folder.glob(f"{stem}_*"):
-        old.unlink()
-    if not videos:
-        return []
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = episode_folder(out, VIDEOS, cell)
+    remove_old(folder, result.key)
     written = []
     for camera, data in videos.items():
-        path = folder / f"{stem}_{_outcome(result)}_{_plain(camera)}.mp4"
-        part = path.with_suffix(".part")
-        part.write_bytes(data)
-        os.replace(part, path)
+        path = folder / f"{stem(result.key)}_{outcome(result)}_{plain(camera)}.mp4"
+        with whole(path) as part:
+            part.write_bytes(data)
         written.append(str(path.relative_to(out)))
     return written
-
-
-def _stem(key: EpisodeKey) -> str:
-    return f"ep{key.episode:04d}_seed{key.seed}"
-
-
-def _outcome(result: EpisodeResult) -> str:
-    if result.status != "done":
-        return result.status
-    return "success" if result.success_once else "failure"
-
-
-def _plain(name: str) -> str:
-    """`name` as a part of a file's name: "maniskill/PushCube-v1" -> "maniskill_PushCube-v1"."""
-    return re.sub(r"[^\w.-]+", "_", name)

@@ -19,14 +19,14 @@ import numpy as np
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import require
-from vlagents_ray.robot.episode import NUMBERS, Episode
+from vlagents_ray.robot.episode import ACTION, Episode, Finished
 from vlagents_ray.robot.statistics import Stats, joined, of_values
 
 VERSION = "v3.0"
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 DATA, VIDEO, EPISODES = f"data/{FILE}.parquet", f"videos/{{video_key}}/{FILE}.mp4", f"meta/episodes/{FILE}.parquet"
 FILES_IN_CHUNK = 1000
-_UNFINISHED = "unfinished"  # folder of the running episode
+UNFINISHED = "unfinished"  # folder of the running episode
 
 
 class Dataset:
@@ -57,7 +57,7 @@ class Dataset:
         self.tasks: list[str] = []
         if (root / "meta/info.json").exists():
             self._open(rate)
-        elif root.is_dir() and any(path.name != _UNFINISHED for path in root.iterdir()):
+        elif root.is_dir() and any(path.name != UNFINISHED for path in root.iterdir()):
             raise ConfigError(f"{root}: is no LeRobotDataset, and not empty; record into a new folder")
         self._sweep()
 
@@ -68,21 +68,20 @@ class Dataset:
 
     def begin(self, instruction: str) -> Episode:
         """An episode to be filled, and then given to `save` or abandoned."""
-        folder = self.root / _UNFINISHED
+        folder = self.root / UNFINISHED
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
         return Episode(folder, instruction, self.info["fps"], self.info["features"] or None)
 
-    def save(self, episode: Episode) -> None:
-        """Make a finished episode part of the dataset."""
-        number, frames = self.episodes, len(episode.rows["action"])
+    def save(self, episode: Finished) -> None:
+        """Make an episode part of the dataset."""
+        number, frames = self.episodes, len(episode.rows[ACTION])
         place = {"chunk_index": number // FILES_IN_CHUNK, "file_index": number % FILES_IN_CHUNK}
         first = int(self.info["total_frames"])
         if episode.instruction not in self.tasks:
             self.tasks.append(episode.instruction)
-        rows = {key: np.stack(values) for key, values in episode.rows.items()}
         index = np.arange(frames)
-        rows |= {
+        rows = episode.rows | {
             "timestamp": (index / self.info["fps"]).astype(np.float32),
             "frame_index": index,
             "episode_index": np.full(frames, number),
@@ -90,7 +89,7 @@ class Dataset:
             "task_index": np.full(frames, self.tasks.index(episode.instruction)),
         }
         stats = {key: of_values(values.reshape(frames, -1)) for key, values in rows.items()}
-        stats |= {key: images.result() for key, images in episode.images.items()}
+        stats |= episode.images
         about: dict[str, Any] = {"episode_index": number, "tasks": [episode.instruction], "length": frames}
         about |= {f"data/{name}": value for name, value in place.items()}
         about |= {"dataset_from_index": first, "dataset_to_index": first + frames}
@@ -100,10 +99,9 @@ class Dataset:
         about |= {f"meta/episodes/{name}": value for name, value in place.items()}
         about |= {f"stats/{key}/{name}": v.tolist() for key, one in stats.items() for name, v in one.items()}
 
-        for key, (path, video) in episode.videos.items():
-            video.finish()
+        for key, path in episode.videos.items():
             _move(path, self.root / VIDEO.format(video_key=key, **place))
-        self._parquet(self._table(rows), DATA.format(**place))
+        self._parquet(self._table(rows, episode.features), DATA.format(**place))
         self._parquet(self._tasks_table(), "meta/tasks.parquet")
         self._parquet(self._pa.Table.from_pylist([about]), EPISODES.format(**place))
         stats = joined(self._stats, stats)
@@ -127,7 +125,7 @@ class Dataset:
 
     def _sweep(self) -> None:
         """Remove what a crash left: the running episode, and one that was about to be counted."""
-        shutil.rmtree(self.root / _UNFINISHED, ignore_errors=True)
+        shutil.rmtree(self.root / UNFINISHED, ignore_errors=True)
         number = self.episodes
         stray = FILE.format(chunk_index=number // FILES_IN_CHUNK, file_index=number % FILES_IN_CHUNK)
         for path in [*self.root.glob(f"data/{stray}.*"), *self.root.glob(f"videos/*/{stray}.*")]:
@@ -135,12 +133,12 @@ class Dataset:
         for path in self.root.glob(f"meta/episodes/{stray}.*"):
             path.unlink()
 
-    def _table(self, rows: Mapping[str, np.ndarray]) -> Any:
+    def _table(self, rows: Mapping[str, np.ndarray], features: Mapping[str, Any]) -> Any:
         pa = self._pa
         columns = {}
         for key, values in rows.items():
-            if values.ndim == 1:
-                columns[key] = pa.array(values, getattr(pa, _ARROW[NUMBERS[key]])())
+            if features[key]["shape"] == [1]:  # one number, which LeRobot reads as no list
+                columns[key] = pa.array(values.reshape(-1), getattr(pa, _ARROW[features[key]["dtype"]])())
             else:
                 flat = pa.array(np.ascontiguousarray(values, np.float32).ravel())
                 columns[key] = pa.FixedSizeListArray.from_arrays(flat, values.shape[1])
@@ -175,7 +173,7 @@ class Dataset:
         _move(part, self.root / name)
 
     def _part(self, name: str) -> Path:
-        folder = self.root / _UNFINISHED
+        folder = self.root / UNFINISHED
         folder.mkdir(parents=True, exist_ok=True)
         return folder / name.replace("/", "_")
 

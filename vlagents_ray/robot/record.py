@@ -132,7 +132,7 @@ class Recorder:
             episode.add(item.obs, item.action, float(item.obs.info[CAPTURED]), item.tick, item.safe)
             return episode
         if episode.rows:
-            self._dataset.save(episode)
+            self._dataset.save(episode.finish())
         else:
             episode.abandon()
         return None

@@ -15,7 +15,9 @@ from ray import serve
 from ray.serve.config import HTTPOptions
 from starlette.types import ASGIApp
 
+from vlagents_ray.code import code_of
 from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
+from vlagents_ray.registry import names
 from vlagents_ray.serve.auth import Caller, require_access
 from vlagents_ray.serve.autoscaling import SESSIONS, UTILISATION, WAITING
 from vlagents_ray.serve.balance import Balance
@@ -56,6 +58,7 @@ class PolicyReplica:
         """Serve awaits it. `gateway` is a handle that nobody uses: it makes the gateway a part of the application."""
         self._args = ServerArgs(**args)
         self._app = serve.get_replica_context().app_name
+        self._code = code_of(names("policies").get(self._args.policy, self._args.policy))
         self._keys = self._args.access.keys()
         require_access(_http().host or EVERYWHERE, self._keys, self._args.access.insecure)
         self._limits = self._args.limits.limits()
@@ -138,6 +141,7 @@ class PolicyReplica:
             "contract": None if contract is None else contract.to_json(),
             "protocol": PROTOCOL_VERSION,
             "version": importlib.metadata.version("vlagents-ray"),
+            "code": None if self._code is None else self._code.to_json(),
             "dialects": describe(self._args.dialects),
             "local": None if self._local is None else asdict(self._local.address),
             "stream": None if self._stream is None else asdict(self._stream.address),

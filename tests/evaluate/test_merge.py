@@ -1,0 +1,141 @@
+"""Results of several folders in one: each episode once, nothing that contradicts, and a folder like any other."""
+
+from __future__ import annotations
+
+import functools
+import os
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from eval_fakes import LINE, OTHER_LINE, ToZero
+from played import play
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate import EvalConfig, Results
+from vlagents_ray.evaluate.episode import EpisodeResult
+from vlagents_ray.evaluate.jobs import plan
+from vlagents_ray.evaluate.merge import merge
+from vlagents_ray.evaluate.store import Store
+
+Config = Callable[..., EvalConfig]
+
+
+class Served(ToZero):
+    """Says what it is, as one on a server does."""
+
+    def __init__(self, checkpoint: str) -> None:
+        super().__init__()
+        self.metadata = {"policy": "act", "checkpoint": checkpoint}
+
+
+@pytest.fixture
+def part(config: Config, tmp_path: Path) -> Callable[..., Path]:
+    """A folder of results, of the plan's episodes but those that are left out."""
+
+    def make(name: str, *left_out: int, chunk: int = 1, **changes: object) -> Path:
+        settings = config(out=tmp_path / name, **changes)
+        return play(settings, functools.partial(ToZero, chunk=chunk), left_out=left_out).out
+
+    return make
+
+
+def outcomes(results: Results) -> dict[str, object]:
+    return {str(one.result.key): one.result.outcome for cell in results.cells for one in cell.episodes}
+
+
+def test_parts_that_overlap_make_the_whole(part: Callable[..., Path], tmp_path: Path) -> None:
+    whole, a, b = part("whole"), part("a", 3, 4, 5), part("b", 0, 1)
+    summary = merge(tmp_path / "out", [a, b])
+    assert outcomes(Results.load(tmp_path / "out")) == outcomes(Results.load(whole))
+    assert (summary.total.episodes, summary.total.planned) == (6, 6)
+    assert (tmp_path / "out" / "summary.json").is_file()
+
+
+def test_an_episode_of_both_is_as_the_first_has_it(part: Callable[..., Path], tmp_path: Path) -> None:
+    a, b = part("a"), part("b")
+    merge(tmp_path / "out", [a, b])
+    [cell] = Results.load(tmp_path / "out").cells
+    assert [one.finished for one in cell.episodes] == [one.finished for one in Results.load(a).cells[0].episodes]
+    assert {one.run for one in cell.episodes} == {1}
+
+
+def test_a_merged_folder_is_resumed_like_any_other(part: Callable[..., Path], config: Config, tmp_path: Path) -> None:
+    a, b = part("a", 2, 3, 4, 5), part("b", 0, 1, 4, 5)
+    merge(tmp_path / "out", [a, b])
+    results = play(config(out=tmp_path / "out", resume=True))
+    assert [(one.result.key.episode, one.run) for one in results.cells[0].episodes] == [
+        (0, 1), (1, 1), (2, 2), (3, 2), (4, 3), (5, 3)
+    ]  # fmt: skip
+
+
+def test_other_envs_and_seeds_join_the_table(part: Callable[..., Path], tmp_path: Path) -> None:
+    a, b, c = part("a"), part("b", seed=100), part("c", envs=[OTHER_LINE])
+    merge(tmp_path / "out", [a, b, c])
+    cells = Results.load(tmp_path / "out").cells
+    assert [(cell.env, cell.planned, len(cell.episodes)) for cell in cells] == [(LINE, 12, 12), (OTHER_LINE, 6, 6)]
+
+
+def test_seeds_that_would_play_an_episode_twice_are_refused(part: Callable[..., Path], tmp_path: Path) -> None:
+    a, b = part("a"), part("b", seed=3)
+    with pytest.raises(ConfigError, match=r"seeds \[3\]; together they are \[0, 3\].*6 or more apart"):
+        merge(tmp_path / "out", [a, b])
+
+
+def test_different_outcomes_are_listed_and_nothing_is_written(part: Callable[..., Path], tmp_path: Path) -> None:
+    a, b = part("a"), part("b")
+    with closing(sqlite3.connect(b / "results.db")) as db, db:
+        db.execute("UPDATE episodes SET success_once = 1 - success_once, seconds = 99 WHERE episode IN (2, 3)")
+    with pytest.raises(ConfigError, match=r"2 episodes have different outcomes:\n.*Line#2@2.*success_once is") as told:
+        merge(tmp_path / "out", [a, b])
+    assert "seconds" not in str(told.value)
+    assert not (tmp_path / "out").exists()
+    merge(tmp_path / "out", [a, b], keep_first=True)
+    assert outcomes(Results.load(tmp_path / "out")) == outcomes(Results.load(a))
+
+
+def test_a_lost_episode_gives_way_to_one_that_was_played(
+    part: Callable[..., Path], config: Config, tmp_path: Path
+) -> None:
+    a, b = part("a", 5), part("b")
+    with Store(config(out=a, resume=True)) as store:
+        store.begin_run(config(out=a), {})
+        lost = EpisodeResult(plan(store.cells)[5].key, "infra_failed", error="it hung")
+        store.record(lost, attempts=4)
+    for order in ([a, b], [b, a]):
+        out = tmp_path / order[0].name / "merged"
+        merge(out, order)
+        assert [one.result.status for one in Results.load(out).cells[0].episodes] == ["done"] * 6
+
+
+def test_other_settings_are_named(part: Callable[..., Path], tmp_path: Path) -> None:
+    a, b = part("a"), part("b", execute=2)
+    with pytest.raises(ConfigError, match=r"Line has other settings: execute: None and 2"):
+        merge(tmp_path / "out", [a, b])
+
+
+def test_a_policy_with_another_checkpoint_is_named(tmp_path: Path, config: Config) -> None:
+    folders = [tmp_path / checkpoint for checkpoint in ("x", "y")]
+    for folder in folders:
+        play(config(out=folder), functools.partial(Served, folder.name))
+    with pytest.raises(ConfigError, match=r"policy 'policy' has checkpoint 'y'.*before it 'x'"):
+        merge(tmp_path / "out", folders)
+
+
+def test_videos_and_trajectories_go_along_without_taking_room(part: Callable[..., Path], tmp_path: Path) -> None:
+    options = {"env_options": {"camera": [32, 32]}, "record": "all", "video": "all"}
+    a, b = part("a", 1, 2, 3, 4, 5, **options), part("b", 0, 2, 3, 4, 5, **options)
+    merge(tmp_path / "out", [a, b])
+    for episode, home in zip(Results.load(tmp_path / "out").cells[0].episodes, (a, b), strict=True):
+        for path in [*episode.videos, str(episode.trajectory)]:
+            assert os.path.samefile(tmp_path / "out" / path, home / path)
+    names = {path.name for path in (tmp_path / "out" / "trajectories").rglob("*.mp4")}
+    assert names == {"ep0000_seed0_front.mp4", "ep0001_seed1_front.mp4"}
+
+
+def test_results_are_not_merged_into_results(part: Callable[..., Path]) -> None:
+    a, b = part("a"), part("b")
+    with pytest.raises(ConfigError, match="merge into a new folder"):
+        merge(a, [a, b])

@@ -1,0 +1,131 @@
+"""An episode again, from what is recorded of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from eval_fakes import LINE, OTHER_LINE, ToZero
+from played import play
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate import EvalConfig, evaluate
+from vlagents_ray.evaluate.cells import cells
+from vlagents_ray.evaluate.replay import compare, find
+from vlagents_ray.interface import Act, Obs
+
+Config = Callable[..., EvalConfig]
+
+
+class Noisy(ToZero):
+    """Draws from the system's noise from its fourth act on."""
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self._acts = 0
+        return super().reset(obs, instruction, **kwargs)
+
+    def act(self, obs: Obs) -> Act:
+        self._acts += 1
+        act = super().act(obs)
+        return act if self._acts < 4 else Act(act.action + np.float32(np.random.default_rng().uniform(0.01, 0.02)))
+
+
+@pytest.mark.usefixtures("cluster")
+class TestOnACluster:
+    def test_a_deterministic_policy_does_the_same_byte_for_byte(self, config: Config, tmp_path: Path) -> None:
+        results = play(config(episodes=4, seed=20))
+        recorded = find(results, f"{LINE}#2")
+        replayed = evaluate(
+            recorded.config(tmp_path / "again"), agent_factory=ToZero, only=recorded.number_and_seed
+        ).results
+        assert compare(recorded, replayed) == []
+        [episode] = replayed.cells[0].episodes
+        assert episode.result.key == recorded.episode.result.key
+        assert episode.trajectory is not None
+
+
+def again(results: Any, name: str, out: Path, make: Callable[[], ToZero]) -> list[str]:
+    recorded = find(results, name)
+    number, _ = recorded.number_and_seed
+    others = set(range(len(results.cells[0].episodes))) - {number}
+    return compare(recorded, play(recorded.config(out), make, left_out=others))
+
+
+def test_a_noisy_policy_is_told_with_the_step_at_which_it_differs(config: Config, tmp_path: Path) -> None:
+    results = play(config(episodes=2, record="all"), Noisy)
+    first, *others = again(results, f"{LINE}#1", tmp_path / "again", Noisy)
+    assert first.startswith("actions: they differ from step 3 on: [")
+    assert any(line.startswith("episode_return: ") for line in others)
+
+
+def test_without_a_trajectory_it_is_said_that_the_actions_differ(config: Config, tmp_path: Path) -> None:
+    results = play(config(episodes=2), Noisy)
+    first, *_ = again(results, f"{LINE}#1", tmp_path / "again", Noisy)
+    assert first.startswith("actions: they differ; from which step on is not known")
+
+
+def test_fewer_actions_are_told_as_such(config: Config, tmp_path: Path) -> None:
+    results = play(config(episodes=1, record="all"))
+    longer = find(results, f"{LINE}#0")
+
+    class Tired(ToZero):
+        def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+            self._acts = 0
+            return super().reset(obs, instruction, **kwargs)
+
+        def act(self, obs: Obs) -> Act:
+            self._acts += 1
+            return Act(super().act(obs).action, done=self._acts == 6)
+
+    found = compare(longer, play(longer.config(tmp_path / "again"), Tired))
+    assert found[0] == "actions: 10 were recorded, now they are 6; the first 6 are the same"
+
+
+def test_an_episode_is_found_by_its_key_and_by_env_and_number(config: Config) -> None:
+    results = play(config(envs=[LINE, OTHER_LINE], episodes=2))
+    key = results.cells[1].episodes[1].result.key
+    assert find(results, str(key)).episode == find(results, f"{OTHER_LINE}#1").episode == results.cells[1].episodes[1]
+
+
+@pytest.mark.parametrize("name", [LINE, f"{LINE}#7", "tabletop#0", f"{LINE}#0@0"])
+def test_an_unknown_episode_is_said_to_be_unknown(config: Config, name: str) -> None:
+    with pytest.raises(ConfigError, match="has no episode"):
+        find(play(config(episodes=1)), name)
+
+
+def test_a_number_that_several_seeds_have_is_not_guessed(config: Config) -> None:
+    results = play(config(episodes=1, seeds=[0, 10]))
+    with pytest.raises(ConfigError, match=r"stands for 2 episodes; want one of the keys .*@0.*@10"):
+        find(results, f"{LINE}#0")
+
+
+def test_the_settings_are_those_of_the_run_and_of_that_cell_alone(config: Config, tmp_path: Path) -> None:
+    settings = config(envs=[LINE, OTHER_LINE], episodes=1, steps=[10, 20], execute=1, workers=2)
+    results = play(settings)
+    recorded = find(results, str(results.cells[3].episodes[0].result.key))
+    alone = recorded.config(tmp_path / "again")
+    [cell] = cells(alone)
+    assert (cell.env, cell.step, cell.fingerprint) == (OTHER_LINE, 20, recorded.cell.cell)
+    assert (alone.workers, alone.out) == (1, tmp_path / "again")
+
+
+def test_a_policy_that_was_served_for_the_run_is_served_again_and_a_server_is_asked_again(
+    config: Config, tmp_path: Path
+) -> None:
+    for source, url in (("scripted", None), (None, "http://gpu-box:8000")):
+        settings = config(out=tmp_path / str(source), episodes=1)
+        policy = settings.policies[0].model_copy(
+            update={"source": source, "url": url or "serve://scripted", "config": {"a": 1}}
+        )
+        results = play(settings.model_copy(update={"policies": [policy]}))
+        [found] = find(results, f"{LINE}#0").config(tmp_path / "again").policies
+        assert (found.source, found.url, found.config) == (source, url, {"a": 1} if source else {})
+
+
+def test_another_policy_takes_the_place_of_the_runs(config: Config, tmp_path: Path) -> None:
+    recorded = find(play(config(episodes=1)), f"{LINE}#0")
+    [policy] = recorded.config(tmp_path / "again", policy={"source": "noop", "url": None, "config": {}}).policies
+    assert (policy.source, "name" in policy.model_fields_set) == ("noop", False)

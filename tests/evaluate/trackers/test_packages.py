@@ -1,0 +1,147 @@
+"""What the trackers' own readers find of an evaluation, offline."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+from eval_fakes import LINE
+from played import play
+
+from vlagents_ray.evaluate import EvalConfig, Results
+from vlagents_ray.evaluate.trackers import Tracking
+
+Config = Callable[..., EvalConfig]
+
+
+@pytest.fixture
+def told(config: Config) -> Callable[..., Results]:
+    """An evaluation of two checkpoints, told to one tracker, and told again by a run that resumes it."""
+
+    def tell(tracker: str, **changes: Any) -> Results:
+        options = {"episodes": 3, "video": "all", "env_options": {"camera": [32, 32]}} | changes
+        settings = config(track=[tracker], tracking={"project": "tests"}, **options)
+        results = play(settings)
+        for _ in range(2):
+            with Tracking(settings) as tracking:
+                tracking.look()
+        return results
+
+    return tell
+
+
+WANDB_HEADER, LOG_BLOCK = 7, 32768
+
+
+def rates(results: Results) -> list[float]:
+    return [sum(bool(one.success_once) for one in cell.counted) / 3 for cell in results.cells]
+
+
+def test_wandb_keeps_curves_videos_config_and_code(
+    told: Callable[..., Results], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    results = told("wandb", steps=[10, 20])
+    assert caplog.records == []
+    read = read_wandb(results.out)
+    name = f"{LINE}/success_once"
+    points = [(row["training_step"], row[name]) for row in read.rows if name in row]
+    assert points == list(zip([10, 20], rates(results), strict=True))
+    assert [row["training_step"] for row in read.rows if "total/return" in row] == [10, 20]
+    assert read.config["evaluation"]["suites"][0]["episodes"] == 3
+    assert set(read.config["code"]) == {"folder", "vlagents_ray", "policy policy", f"env {LINE}"}
+    assert [len(files) for kind, files in read.artifacts if kind == "videos"] == [3, 3]
+
+
+@dataclass
+class ReadRun:
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    config: dict[str, Any] = field(default_factory=dict)
+    summary: dict[str, Any] = field(default_factory=dict)
+    artifacts: list[tuple[str, list[str]]] = field(default_factory=list)  # type, and files
+
+
+def read_wandb(out: Path) -> ReadRun:
+    from wandb.proto import wandb_internal_pb2
+
+    read = ReadRun()
+    for path in sorted(out.glob("wandb/offline-run-*/*.wandb")):
+        for data in log_records(path.read_bytes()[WANDB_HEADER:]):
+            record = wandb_internal_pb2.Record()
+            record.ParseFromString(data)
+            if record.HasField("history"):
+                items = record.history.item
+                read.rows.append({item.key or "/".join(item.nested_key): json.loads(item.value_json) for item in items})
+            for update in [*record.run.config.update, *record.config.update]:
+                read.config[update.key or update.nested_key[0]] = json.loads(update.value_json)
+            for update in record.summary.update:
+                read.summary[update.key or update.nested_key[0]] = json.loads(update.value_json)
+            for artifact in [record.artifact] if record.HasField("artifact") else []:
+                read.artifacts.append((artifact.type, [entry.path for entry in artifact.manifest.contents]))
+    return read
+
+
+def log_records(log: bytes) -> Iterator[bytes]:
+    """Of a file in LevelDB's log format: records in pieces, none of which crosses the end of a block."""
+    at, record = 0, b""
+    while at + 7 <= len(log):
+        if (left := LOG_BLOCK - (at + WANDB_HEADER) % LOG_BLOCK) < 7:
+            at += left
+            continue
+        length, kind = struct.unpack_from("<HB", log, at + 4)
+        record += log[at + 7 : at + 7 + length]
+        at += 7 + length
+        if kind in (1, 4):  # whole, or its last piece
+            yield record
+            record = b""
+
+
+def test_wandb_keeps_a_policy_without_steps_in_the_summary(
+    told: Callable[..., Results], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("WANDB_MODE", "offline")
+    results = told("wandb")
+    read = read_wandb(results.out)
+    assert read.rows == []
+    assert read.summary["total/success_once"] == rates(results)[0]
+
+
+def test_trackio_keeps_curves_and_videos(
+    told: Callable[..., Results], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("TRACKIO_DIR", str(tmp_path / "trackio"))
+    import trackio
+    from trackio.sqlite_storage import SQLiteStorage
+
+    results = told("trackio", steps=[10, 20])
+    assert caplog.records == []
+    [run] = trackio.Api().runs("tests")
+    logs = SQLiteStorage.get_logs("tests", run.name)
+    points = [(row["step"], row[f"{LINE}/success_once"]) for row in logs if f"{LINE}/success_once" in row]
+    assert points == list(zip([10, 20], rates(results), strict=True))
+    assert [row["step"] for row in logs if "total/return" in row] == [10, 20]
+    assert len(list((tmp_path / "trackio").rglob("*.mp4"))) == 6
+    assert run.config["evaluation"]["suites"][0]["episodes"] == 3
+
+
+def test_tensorboard_reads_the_curves_and_the_config(
+    told: Callable[..., Results], caplog: pytest.LogCaptureFixture
+) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    results = told("tensorboard", steps=[10, 20])
+    assert caplog.records == []
+    found = EventAccumulator(str(results.out / "tensorboard" / "policy"))
+    found.Reload()
+    points = [(one.step, one.value) for one in found.Scalars(f"{LINE}/success_once")]
+    assert points == [(step, pytest.approx(rate)) for step, rate in zip([10, 20], rates(results), strict=True)]
+    assert [one.step for one in found.Scalars("total/return")] == [10, 20]
+    [config] = [one.tensor_proto.string_val[0].decode() for one in found.Tensors("config")]
+    assert '"episodes": 3' in config
+    [first, _] = [one.tensor_proto.string_val[0].decode() for one in found.Tensors(f"{LINE}/videos")]
+    assert len(first.splitlines()) == 3

@@ -1,0 +1,136 @@
+"""Each cell is told once, when it is complete, and trackers never harm the evaluation."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import ClassVar
+
+import pytest
+from eval_fakes import LINE, OTHER_LINE, ToZero
+from played import play
+
+from vlagents_ray.errors import MissingDependency
+from vlagents_ray.evaluate import EvalConfig, evaluate
+from vlagents_ray.evaluate.trackers import Tracking, tracking
+from vlagents_ray.evaluate.trackers.base import About, TrackerRun
+
+Config = Callable[..., EvalConfig]
+
+
+class Listener(TrackerRun):
+    """Keeps what it is told."""
+
+    begun: ClassVar[list[About]] = []
+    told: ClassVar[list[tuple[str, int | None, dict[str, float]]]] = []
+    shown: ClassVar[list[tuple[str, list[str]]]] = []
+    finished: ClassVar[list[str]] = []
+
+    def __init__(self, about: About) -> None:
+        self.about = about
+        self.begun.append(about)
+
+    def log(self, metrics: Mapping[str, float], step: int | None) -> None:
+        self.told.append((self.about.name, step, dict(metrics)))
+
+    def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
+        assert all(path.is_file() for path in paths)
+        self.shown.append((label, [path.name for path in paths]))
+
+    def finish(self) -> None:
+        self.finished.append(self.about.name)
+
+
+class Broken(Listener):
+    def log(self, metrics: Mapping[str, float], step: int | None) -> None:
+        raise RuntimeError("no such project")
+
+
+@pytest.fixture(autouse=True)
+def listening(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tracking, "require", lambda _name: None)
+    runs = {"wandb": f"{__name__}:Listener", "tensorboard": f"{__name__}:Broken"}
+    monkeypatch.setattr(tracking, "_RUNS", runs)
+    for kept in (Listener.begun, Listener.told, Listener.shown, Listener.finished):
+        kept.clear()
+
+
+def tell(config: EvalConfig) -> list[tuple[str, int | None, dict[str, float]]]:
+    """What is told of the results as they are, and nothing of before."""
+    Listener.told.clear()
+    with Tracking(config) as told:
+        told.look()
+    return list(Listener.told)
+
+
+def test_rates_return_and_steps_of_each_task_and_in_total_stand_at_the_training_step(config: Config) -> None:
+    settings = config(envs=[LINE, OTHER_LINE], episodes=4, steps=[10, 20], track=["wandb"])
+    results = play(settings)
+    told = tell(settings)
+    assert [(step, min(metrics).rpartition("/")[0]) for _, step, metrics in told] == [
+        (10, LINE), (10, OTHER_LINE), (20, LINE), (20, OTHER_LINE), (10, "total"), (20, "total")
+    ]  # fmt: skip
+    counted = results.cells[0].counted
+    assert told[0][2] == {
+        f"{LINE}/success_once": sum(bool(one.success_once) for one in counted) / 4,
+        f"{LINE}/success_at_end": sum(bool(one.success_at_end) for one in counted) / 4,
+        f"{LINE}/return": pytest.approx(sum(one.episode_return for one in counted) / 4),
+        f"{LINE}/steps": 10.0,
+        f"{LINE}/episodes": 4.0,
+    }
+    assert told[4][2]["total/episodes"] == 8
+    assert Listener.finished == ["policy"]
+
+
+def test_an_unfinished_cell_is_told_by_the_run_that_completes_it_and_no_other_twice(config: Config) -> None:
+    settings = config(envs=[LINE, OTHER_LINE], episodes=3, track=["wandb"])
+    one_env = {"suites": [settings.suites[0].model_copy(update={"envs": [LINE]})]}
+    play(settings, left_out=[2])
+    assert tell(settings) == []
+    play(settings.model_copy(update={"resume": True} | one_env))
+    assert [min(metrics) for _, _, metrics in tell(settings)] == [f"{LINE}/episodes"]
+    assert tell(settings) == []
+    play(settings.model_copy(update={"resume": True}))
+    assert [min(metrics) for _, _, metrics in tell(settings)] == [f"{OTHER_LINE}/episodes", "total/episodes"]
+    ids = {about.id for about in Listener.begun}
+    assert len(ids) == 1
+
+
+def test_of_the_videos_a_few_are_shown_failures_first(config: Config) -> None:
+    settings = config(
+        episodes=12, video="all", env_options={"camera": [32, 32]}, track=["wandb"], tracking={"videos": 3}
+    )
+    play(settings)
+    tell(settings)
+    [(label, names)] = Listener.shown
+    assert (label, len(names)) == (LINE, 3)
+    assert all("_failure_" in name for name in names)
+
+
+def test_a_tracker_that_fails_is_a_warning_and_the_others_go_on(
+    config: Config, caplog: pytest.LogCaptureFixture
+) -> None:
+    settings = config(episodes=2, steps=[1], track=["tensorboard", "wandb"])
+    play(settings)
+    assert len(tell(settings)) == 2
+    [record] = caplog.records
+    assert record.getMessage() == "tensorboard: RuntimeError: no such project; it is told no more"
+
+
+@pytest.mark.usefixtures("cluster")
+def test_an_evaluation_tells_while_it_runs_and_at_its_end(config: Config) -> None:
+    summary = evaluate(config(envs=[LINE, OTHER_LINE], episodes=2, track=["wandb"]), agent_factory=ToZero)
+    assert summary.state == "complete"
+    assert sorted(min(metrics) for _, _, metrics in Listener.told) == [
+        f"{LINE}/episodes", f"{OTHER_LINE}/episodes", "total/episodes"
+    ]  # fmt: skip
+    assert Listener.finished == ["policy"]
+    assert {"code", "evaluation"} == Listener.begun[0].config.keys()
+
+
+def test_a_missing_package_is_said_before_anything_starts(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.undo()
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    with pytest.raises(MissingDependency, match=r"pip install 'vlagents-ray\[wandb\]'"):
+        Tracking(config(track=["wandb"]))

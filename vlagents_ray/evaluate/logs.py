@@ -1,0 +1,52 @@
+"""What a worker's process wrote to its output, for when it is not there to be asked any more."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import socket
+from collections.abc import Sequence
+from pathlib import Path
+
+import ray
+from ray.exceptions import RayError
+from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+MOST_BYTES = 64_000  # of a log that is kept, all files together
+TIMEOUT_S = 5.0  # for another node to read it
+
+
+def own_logs() -> list[str]:
+    """The files that this process's standard output and error go to: in a Ray worker, Ray's logs of it."""
+    found = []
+    for number in (1, 2):
+        with contextlib.suppress(OSError):  # no /proc
+            found.append(os.readlink(f"/proc/self/fd/{number}"))
+    return [path for path in dict.fromkeys(found) if Path(path).is_file()]
+
+
+def tail(paths: Sequence[str]) -> str:
+    """The last of each file, under its name; nothing of one that is gone."""
+    parts = []
+    for path in paths:
+        with contextlib.suppress(OSError), open(path, "rb") as file:
+            file.seek(max(0, os.fstat(file.fileno()).st_size - MOST_BYTES // len(paths)))
+            parts.append(f"== {Path(path).name}\n{file.read().decode(errors='replace').strip()}")
+    return "\n".join(parts)
+
+
+def tail_at(host: str, paths: Sequence[str]) -> str:
+    """The same of files on any host of the cluster; "" if it does not answer."""
+    if host == socket.gethostname():
+        return tail(paths)
+    nodes = [node["NodeID"] for node in ray.nodes() if node["Alive"] and node["NodeManagerHostname"] == host]
+    if not nodes:
+        return ""
+    there = NodeAffinitySchedulingStrategy(nodes[0], soft=False)
+    try:
+        read: str = ray.get(
+            ray.remote(tail).options(num_cpus=0, scheduling_strategy=there).remote(list(paths)), timeout=TIMEOUT_S
+        )
+    except RayError:  # the node is gone with its files; GetTimeoutError is one of them
+        return ""
+    return read

@@ -1,0 +1,113 @@
+"""The same episode again, from what is recorded of it, compared with that."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate.cells import cells
+from vlagents_ray.evaluate.config import EvalConfig
+from vlagents_ray.evaluate.results import CellResults, Episode, Results
+from vlagents_ray.evaluate.trajectory import Trajectory
+
+_FEW = 5  # names in a message
+
+
+@dataclass(frozen=True, slots=True)
+class Recorded:
+    """An episode that can be played again."""
+
+    results: Results
+    cell: CellResults
+    episode: Episode
+
+    @property
+    def number_and_seed(self) -> tuple[int, int]:
+        """Of the episode, for `evaluate(..., only=...)`."""
+        return self.episode.result.key.episode, self.episode.result.key.seed
+
+    def config(self, out: Path, *, policy: dict[str, Any] | None = None) -> EvalConfig:
+        """Settings of an evaluation of this episode's cell alone, into `out`, which keeps video and trajectory.
+
+        They are those of the run that it was played in. `policy` replaces settings of the policy.
+        """
+        run = next(run for run in self.results.runs if run.run == self.episode.run)
+        config = EvalConfig.model_validate(run.config)
+        where = (self.cell.contender, self.cell.suite, self.cell.env)
+        cell = next(one for one in cells(config) if one.name == where)
+        given = cell.policy.model_dump() | {"steps": [] if cell.step is None else [cell.step]}
+        if cell.policy.source is None:
+            given |= {"config": {}}  # the server's own, which it says again
+        else:
+            given |= {"url": None}  # it was served for that run, and is to be served again
+        if policy is not None:
+            given = {name: value for name, value in given.items() if name != "name"} | policy
+        suite = cell.suite.model_dump() | {"envs": [cell.env], "worker": cell.worker.model_dump()}
+        alone = {"policies": [given], "suites": [suite], "out": out, "workers": 1, "resume": False}
+        return EvalConfig.model_validate(config.model_dump() | alone | {"video": "all", "record": "all", "track": []})
+
+
+def find(results: Results, name: str) -> Recorded:
+    """The episode with that key, or the only one that is number N in an env, as "ENV#N".
+
+    Raises `ConfigError` if there is none, if there are several, or if infrastructure kept it from ending.
+    """
+    found = [
+        Recorded(results, cell, one)
+        for cell in results.cells
+        for one in cell.episodes
+        if name in (str(one.result.key), f"{cell.env}#{one.result.key.episode}")
+    ]
+    if not found:
+        have = [str(one.result.key) for cell in results.cells for one in cell.episodes][:_FEW]
+        raise ConfigError(f"{results.out}: has no episode {name!r}, want a key as {have}, or ENV#NUMBER")
+    if len(found) > 1:
+        keys = [f"{one.episode.result.key} ({one.cell.contender})" for one in found]
+        raise ConfigError(f"{name!r} stands for {len(found)} episodes; want one of the keys {keys}")
+    if not found[0].episode.counts:
+        raise ConfigError(f"{name!r} was never played to its end: {found[0].episode.result.error}")
+    return found[0]
+
+
+def compare(recorded: Recorded, replayed: Results) -> list[str]:
+    """In what the replay differs, a sentence each; nothing if it is the same episode.
+
+    The times that it took are not compared. Actions are, byte for byte.
+    """
+    [[again]] = [cell.episodes for cell in replayed.cells]
+    before, now = recorded.episode.result.outcome, again.result.outcome
+    found = [
+        f"{name}: {before[name]!r} was recorded, now it is {now[name]!r}"
+        for name in before
+        if before[name] != now[name] and name not in ("key", "actions_sha256")
+    ]
+    if before["actions_sha256"] != now["actions_sha256"]:
+        found.insert(0, _actions(recorded, replayed.out / str(again.trajectory)))
+    return found
+
+
+def _actions(recorded: Recorded, replayed: Path) -> str:
+    path = recorded.episode.trajectory
+    if path is None:
+        return "actions: they differ; from which step on is not known, as no trajectory was recorded (record: all)"
+    before = Trajectory.load(recorded.results.out / path).actions
+    now = Trajectory.load(replayed).actions
+    step = _first_difference(before, now)
+    if step is None:
+        same = min(len(before), len(now))
+        return f"actions: {len(before)} were recorded, now they are {len(now)}; the first {same} are the same"
+    return f"actions: they differ from step {step} on: {_row(before[step])} was recorded, now it is {_row(now[step])}"
+
+
+def _first_difference(before: np.ndarray, now: np.ndarray) -> int | None:
+    """The first row that is not the same byte for byte."""
+    rows = zip(before, now, strict=False)
+    return next((i for i, (a, b) in enumerate(rows) if a.tobytes() != b.tobytes()), None)
+
+
+def _row(action: np.ndarray) -> str:
+    return f"[{', '.join(f'{value:.9g}' for value in action)}]"

@@ -1,0 +1,5 @@
+"""Rates and videos of an evaluation where training is watched: wandb, trackio, TensorBoard."""
+
+from vlagents_ray.evaluate.trackers.tracking import Tracking
+
+__all__ = ["Tracking"]

@@ -1,0 +1,141 @@
+"""Tells the trackers of each cell once, when it is complete; never in the way of the evaluation."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import sqlite3
+import threading
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+from vlagents_ray.evaluate.config import EvalConfig, Tracker, fingerprint
+from vlagents_ray.evaluate.files import PROVENANCE
+from vlagents_ray.evaluate.results import CellResults, Results
+from vlagents_ray.evaluate.schema import FILE
+from vlagents_ray.evaluate.summary import Group, summarize
+from vlagents_ray.evaluate.trackers.base import About, TrackerRun
+from vlagents_ray.registry import named_class, require
+
+log = logging.getLogger(__name__)
+
+CLOSE_S = 120.0  # for trackers to send what is left
+_RUNS: dict[str, str] = {
+    "wandb": "vlagents_ray.evaluate.trackers.wandb:WandbRun",
+    "trackio": "vlagents_ray.evaluate.trackers.trackio:TrackioRun",
+    "tensorboard": "vlagents_ray.evaluate.trackers.tensorboard:TensorboardRun",
+}
+
+
+class Tracking:
+    """Has a thread, as a tracker may wait for a network. Use as a context manager around a run.
+
+    A tracker that fails is not asked again in this run: that is a warning, and the results stay. What was told is
+    noted in the results, so that a run that resumes them tells only what is new.
+    """
+
+    def __init__(self, config: EvalConfig) -> None:
+        """`MissingDependency` for a tracker that is not installed."""
+        for name in config.track:
+            require(name)
+        self._config = config
+        self._left: list[Tracker] = list(config.track)  # that have not failed
+        self._runs: dict[tuple[str, str], TrackerRun] = {}  # by tracker and policy
+        self._looks: queue.SimpleQueue[bool] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._go, name="vlagents-ray-trackers", daemon=True)
+
+    def look(self) -> None:
+        """A cell is complete."""
+        self._looks.put(True)
+
+    def __enter__(self) -> Tracking:
+        if self._left:
+            self._thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        if self._config.track:
+            self._looks.put(False)
+            self._thread.join(CLOSE_S)
+            if self._thread.is_alive():
+                log.warning("%s: still sending after %g s; given up", ", ".join(self._left), CLOSE_S)
+
+    def _go(self) -> None:
+        while self._looks.get():
+            self._tell()
+        self._tell()
+        for (name, _), run in self._runs.items():
+            try:
+                run.finish()
+            except Exception as error:  # noqa: BLE001 - whatever a tracker raises
+                log.warning("%s: %s: %s", name, type(error).__name__, error)
+
+    def _tell(self) -> None:
+        for name in list(self._left):
+            try:
+                self._tell_one(name, Results.load(self._config.out))
+            except Exception as error:  # noqa: BLE001 - whatever a tracker raises
+                log.warning("%s: %s: %s; it is told no more", name, type(error).__name__, error)
+                self._left.remove(name)
+
+    def _tell_one(self, name: Tracker, results: Results) -> None:
+        with closing(sqlite3.connect(self._config.out / FILE)) as db:
+            told = dict(db.execute("SELECT what, episodes FROM tracked WHERE tracker = ?", (name,)))
+            for what, cells, group in _parts(results):
+                if not all(map(_complete, cells)) or told.get(what) == group.episodes:
+                    continue
+                run = self._run(name, results, cells[0].policy)
+                run.log(_metrics(group), cells[0].step)
+                if what == cells[0].cell and (videos := self._videos(cells[0])):
+                    run.videos(_label(group), videos, cells[0].step)
+                with db:
+                    db.execute("INSERT OR REPLACE INTO tracked VALUES (?, ?, ?)", (name, what, group.episodes))
+
+    def _run(self, name: Tracker, results: Results, policy: str) -> TrackerRun:
+        if (name, policy) not in self._runs:
+            self._runs[name, policy] = named_class(_RUNS[name], {})(self._about(results, policy))
+        return self._runs[name, policy]
+
+    def _about(self, results: Results, policy: str) -> About:
+        out, names = self._config.out, self._config.tracking
+        code: dict[str, Any] = dict(results.runs[-1].versions.get("code", {}))
+        code[f"policy {policy}"] = results.policies.get(policy, {}).get("code")
+        code |= {f"env {cell.env}": cell.code for cell in results.cells}
+        return About(
+            out, names.project, names.group or out.resolve().name, policy,
+            fingerprint([results.runs[0].started, policy]),
+            {"evaluation": results.runs[-1].config, "code": code}, sorted((out / PROVENANCE).glob("*.diff")),
+        )  # fmt: skip
+
+    def _videos(self, cell: CellResults) -> list[Path]:
+        ordered = sorted(cell.episodes, key=lambda one: bool(one.result.success_once))
+        paths = [self._config.out / path for one in ordered for path in one.videos[:1]]
+        return paths[: self._config.tracking.videos]
+
+
+def _parts(results: Results) -> list[tuple[str, list[CellResults], Group]]:
+    """What is told as one: each cell, then each contender in all of its cells; first by what name it is noted."""
+    summary = summarize(results)
+    alone = [(cell.cell, [cell], group) for cell, group in zip(results.cells, summary.cells, strict=True)]
+    totals = zip(results.contenders, summary.totals, strict=True)
+    return alone + [(contender, results.of(contender), group) for contender, group in totals]
+
+
+def _complete(cell: CellResults) -> bool:
+    return len(cell.episodes) >= cell.planned
+
+
+def _label(group: Group) -> str:
+    return "/".join(filter(None, (group.suite, group.env)))
+
+
+def _metrics(group: Group) -> dict[str, float]:
+    values = {
+        "success_once": group.success_once.rate,
+        "success_at_end": group.success_at_end.rate,
+        "return": group.mean_return,
+        "steps": group.mean_steps,
+        "episodes": group.episodes,
+    }
+    return {f"{_label(group)}/{name}": float(value) for name, value in values.items() if value is not None}
