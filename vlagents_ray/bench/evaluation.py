@@ -86,7 +86,7 @@ def measure_evaluation(
     scripts = {way.peer: SCRIPTS / way.script for way in found}
     rounds: dict[str, list[Played]] = {}
     with tempfile.TemporaryDirectory() as top:
-        runs = {OURS: _ours(plan)} | _theirs(plan, scripts, peers_python, alone(Path(top)))
+        runs = {OURS: _ours(plan)} | their_runs(plan, scripts, peers_python, alone(Path(top)))
         for number in range(plan.rounds):
             for name, run in runs.items():
                 folder = Path(top) / f"{name} {number}"
@@ -162,9 +162,11 @@ def _ours(plan: EvaluationPlan) -> Run:
     return run
 
 
-def _theirs(
+def their_runs(
     plan: EvaluationPlan, scripts: Mapping[str, Path], python: Path, environment: Mapping[str, str]
 ) -> dict[str, Run]:
+    """How each peer in `scripts` plays the plan; vlagents in two ways."""
+
     def way(name: str, peer: str, workers: int) -> Run:
         def run(folder: Path, notes: Path) -> None:
             words = {"folder": str(folder), "episodes": plan.episodes, "workers": workers, "seed": 0}

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import signal
 import sys
 from collections.abc import Iterator
-from typing import NoReturn
+from pathlib import Path
+from typing import Any, NoReturn
 
 import typer
 from pydantic import ValidationError
@@ -46,3 +48,14 @@ def fail(message: str, code: int) -> NoReturn:
     sys.stdout.flush()
     err.print(f"[bold red]error[/] {escape(message)}", highlight=False, soft_wrap=True)
     raise typer.Exit(code)
+
+
+def tell(text: str) -> None:
+    """A line of progress, as it is."""
+    out.print(text, highlight=False, markup=False)
+
+
+def save(found: Any, file: Path | None) -> None:
+    """Write figures as JSON, if a file was asked for."""
+    if file is not None:
+        file.write_text(json.dumps(found, indent=1) + "\n")
