@@ -14,6 +14,7 @@ import signal
 import tempfile
 import threading
 import time
+from array import array
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -94,14 +95,15 @@ class Ledger(SilentProgress):
     """When each episode was recorded, and the CPU time that the driver had used by then."""
 
     def __init__(self, tell: Callable[[str], None]) -> None:
-        self.recorded: list[tuple[float, float]] = []  # s of time.time(), CPU s
+        self.at_s, self.cpu_s = array("d"), array("d")  # of time.time(); small beside what they are to find
         self._tell = tell
 
     def episode(self, cell: Cell, result: EpisodeResult) -> None:
         """Note it."""
-        self.recorded.append((time.time(), time.process_time()))
-        if len(self.recorded) % 1000 == 0:
-            self._tell(f"{len(self.recorded)} of {cell.planned} episodes")
+        self.at_s.append(time.time())
+        self.cpu_s.append(time.process_time())
+        if len(self.at_s) % 1000 == 0:
+            self._tell(f"{len(self.at_s)} of {cell.planned} episodes")
 
 
 class Watcher:
@@ -131,7 +133,7 @@ class Watcher:
             self._seen += [pid for file in self._notes.glob("*.txt") if (pid := int(file.stem)) not in self._seen]
             if not self._seen:
                 continue
-            self.samples.append(Sample(len(self._ledger.recorded), resident(os.getpid()) or 0, resident(self._seen[0])))
+            self.samples.append(Sample(len(self._ledger.at_s), resident(os.getpid()) or 0, resident(self._seen[0])))
             since = since or time.monotonic()
             if self._soak.kill_every_s and time.monotonic() - since >= self._soak.kill_every_s and self._kill():
                 since = time.monotonic()
@@ -174,12 +176,11 @@ def report(
     """What came of it."""
     episodes = [one for cell in results.cells for one in cell.episodes]
     attempts = [one for cell in results.cells for one in cell.attempts]
-    cpu = [used for _, used in ledger.recorded]
-    between, window = gaps(notes.values()), soak.window
-    (first, _), (last, _) = ledger.recorded[0], ledger.recorded[-1]
+    at, cpu, window = ledger.at_s, ledger.cpu_s, soak.window
+    between = gaps(notes.values())
     return {
         "plan": asdict(soak),
-        "episodes_per_minute": 60 * (len(ledger.recorded) - 1) / (last - first),
+        "episodes_per_minute": 60 * (len(at) - 1) / (at[-1] - at[0]),
         "keys_once": sorted(str(one.result.key) for one in episodes) == list(wanted),
         "done": sum(one.result.status == "done" for one in episodes),
         "killed": len(watcher.killed),
