@@ -44,7 +44,7 @@ class SoakPlan:
     episodes: int = 10_000
     workers: int = 2
     kill_every_s: float = 30.0  # 0: never
-    max_steps: int = 5
+    max_steps: int = 20
     size: int = 32  # pixels a side
 
     @property
