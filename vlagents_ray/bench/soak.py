@@ -209,9 +209,10 @@ def gaps(workers: Iterable[Sequence[Note]]) -> list[float]:
 def growth(samples: Sequence[tuple[int, int]], episodes: int) -> dict[str, float] | None:
     """Resident memory, MiB, at the beginning and the end, and its growth in a thousand episodes by least squares.
 
-    `samples` are (episodes, bytes). What the first fifth takes is left out: pools and caches fill. None of too few.
+    `samples` are (episodes, bytes). The first fifth is left out, in which pools and caches fill, and what comes after
+    the last episode, when all results are read. None of too few.
     """
-    settled = [(done, size) for done, size in samples if done >= _SETTLING * episodes]
+    settled = [(done, size) for done, size in samples if _SETTLING * episodes <= done < episodes]
     if len({done for done, _ in settled}) < 2:
         return None
     done, size = zip(*settled, strict=True)
