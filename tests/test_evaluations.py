@@ -21,7 +21,11 @@ ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / "evaluations").glob("*.yaml"))
 PAGE = (ROOT / "docs" / "evaluation" / "running.md").read_text()
 MODELS = [EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig, ClockConfig, StopConfig, TrackingConfig]
-ELSEWHERE = {("EvalConfig", "out"), ("EvalConfig", "worker"), ("EvalConfig", "tracking")}  # defaults that are said in words
+ELSEWHERE = {
+    ("EvalConfig", "out"),
+    ("EvalConfig", "worker"),
+    ("EvalConfig", "tracking"),
+}  # defaults that are said in words
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)

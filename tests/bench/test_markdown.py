@@ -120,3 +120,16 @@ def test_only_what_is_between_the_markers_is_replaced() -> None:
 def test_a_readme_without_a_pair_of_markers_is_refused(text: str) -> None:
     with pytest.raises(ConfigError, match="bench"):
         replaced(text, "new")
+
+
+def test_evaluations_are_judged_where_they_were_measured() -> None:
+    found = {
+        "cores": 2,
+        "plan": {"workers": 2},
+        "ratios": {"vla-eval": {"median": 1.29}},
+        "skipped": {"vlagents": "gone"},
+    }
+    assert not any("evaluations" in one.what for one in outcomes(RESULTS))
+    text = section(RESULTS | {"evaluation": found})
+    assert "| ≥ 1.3 x vla-eval, 2 shards | 1.29 | **no** |" in text
+    assert "vlagents (gone)" in text

@@ -22,6 +22,8 @@ from vlagents_ray.cli.main import app
         (["throughput", "--config", "{"], "JSON"),
         (["throughput", "--config", '{"base_ms": 1}'], "--policy"),
         (["throughput", "--model", "huge"], "size"),
+        (["evaluation", "--episodes", "5"], "multiple of the 2 workers"),
+        (["evaluation", "--peers", "nobody"], "nobody"),
         (["report", "--readme", "nowhere.md"], "nowhere.md"),
     ],
 )

@@ -101,7 +101,7 @@ def _skipped(results: Mapping[str, Any]) -> Iterator[str]:
     for name, reason in (results.get("skipped") or {}).items():
         yield f"{name} ({reason})"
     found: dict[str, str] = {}
-    for part in ("rtt", "link", "throughput"):
+    for part in ("rtt", "link", "throughput", "evaluation"):
         found |= (results.get(part) or {}).get("skipped", {})
     for name, reason in found.items():
         yield f"{name} ({reason})"

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from vlagents_ray.bench import link
+from vlagents_ray.bench.evaluation import EvaluationPlan, measure_evaluation
 from vlagents_ray.bench.markdown import replaced, section
 from vlagents_ray.bench.rtt import measure_rtt
 from vlagents_ray.bench.throughput import Plan, measure_throughput
@@ -28,7 +29,7 @@ def collect(
     plan: Plan | None = None,
     tell: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """Round trips with all peers, the link if this machine can make one, throughput; as plain JSON values."""
+    """Round trips with all peers, the link if this machine can make one, throughput, evaluations; as JSON values."""
     results: dict[str, Any] = {
         "date": datetime.datetime.now(datetime.timezone.utc).date().isoformat(),
         "command": COMMAND,
@@ -45,6 +46,7 @@ def collect(
         tell(str(error))
         results["skipped"]["link"] = str(error)
     results["throughput"] = measure_throughput(plan or Plan(), tell)
+    results["evaluation"] = measure_evaluation(EvaluationPlan(), peers=["all"], peers_python=peers_python, tell=tell)
     return results
 
 

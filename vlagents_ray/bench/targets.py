@@ -12,6 +12,10 @@ ON_NODE = ("plasma, Ray actor", "shm, Ray actor")  # the faster one first
 DEFAULT, JPEG = "websocket, default", "websocket, jpeg"
 LIMIT_P99 = 3.0
 LIMIT_WAIT_MS = 72.0  # two full batches of 20 ms + 16 x 1 ms
+LIMIT_VLA_EVAL = 1.3
+LIMIT_GAP_MS = 5.0
+LIMIT_SLOWDOWN = 1.25  # of the last thousand episodes against the first, noise included
+LIMIT_GROWTH_MIB = 0.5  # of a process in a thousand episodes
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,7 +45,69 @@ def outcomes(results: Results) -> list[Outcome]:
         _ratio(link, "WebSocket, our default, over the link", DEFAULT, "openpi", 0.45),
         *(_tail(rtt, name) for name in dict.fromkeys([actor, "shm"])),
         *_throughput(results.get("throughput") or {}),
+        *(evaluation_outcomes(results["evaluation"]) if "evaluation" in results else []),
     ]
+
+
+def evaluation_outcomes(found: Results) -> list[Outcome]:
+    """Of `vlagents_ray.bench.evaluation.measure_evaluation`: against a peer's one process, all cores must count."""
+    workers = found["plan"]["workers"]
+    cores = min(found["cores"], workers)
+    limits = {"vlagents": float(cores), "vlagents, split": 1.0, "vla-eval": LIMIT_VLA_EVAL}
+    names = {
+        "vlagents": "vlagents run-eval, one process",
+        "vlagents, split": f"vlagents run-eval, {workers} processes and servers",
+        "vla-eval": f"vla-eval, {workers} shards",
+    }
+    return [
+        Outcome(
+            f"episodes a minute of whole evaluations, {workers} workers",
+            f"≥ {limits[name]:g} x {names[name]}",
+            f"{row['median']:.2f}",
+            row["median"] >= limits[name],
+        )
+        for name, row in found["ratios"].items()
+    ]
+
+
+def soak_outcomes(found: Results) -> list[Outcome]:
+    """Of `vlagents_ray.bench.soak.measure_soak`."""
+    episodes, gap, cpu = found["plan"]["episodes"], found["gap_ms"], found["driver_cpu_ms"]
+    first, last = gap["first"]["median"], gap["last"]["median"]
+    slowdown = cpu["last"] / cpu["first"]
+    once = f"{found['done']} done, {'each key once' if found['keys_once'] else 'not each key once'}"
+    return [
+        Outcome(
+            "every episode", f"{episodes} done, each key once", once, found["keys_once"] and found["done"] == episodes
+        ),
+        Outcome(
+            "between two episodes of a worker, at first",
+            f"< {LIMIT_GAP_MS:g} ms",
+            f"{first:.2f} ms",
+            first < LIMIT_GAP_MS,
+        ),
+        Outcome(
+            "between two episodes of a worker, at last", f"< {LIMIT_GAP_MS:g} ms", f"{last:.2f} ms", last < LIMIT_GAP_MS
+        ),
+        Outcome(
+            "the same, last over first", f"≤ {LIMIT_SLOWDOWN}", f"{last / first:.2f}", last <= LIMIT_SLOWDOWN * first
+        ),
+        Outcome(
+            "the driver's CPU time for an episode, last over first",
+            f"≤ {LIMIT_SLOWDOWN}",
+            f"{slowdown:.2f} ({cpu['first']:.2f} ms at first)",
+            slowdown <= LIMIT_SLOWDOWN,
+        ),
+        *(_growth(f"memory of the {name}", row) for name, row in found["memory"].items()),
+    ]
+
+
+def _growth(what: str, row: Results | None) -> Outcome:
+    wanted = f"≤ {LIMIT_GROWTH_MIB:g} MiB in 1,000 episodes"
+    if row is None:
+        return _unmeasured(what, wanted)
+    seen = f"{row['mib_per_1000']:+.3f} MiB, {row['begin_mib']:.0f} to {row['end_mib']:.0f}"
+    return Outcome(what, wanted, seen, row["mib_per_1000"] <= LIMIT_GROWTH_MIB)
 
 
 def _ratio(part: Results, what: str, ours: str, theirs: str, limit: float) -> Outcome:

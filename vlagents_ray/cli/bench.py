@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from vlagents_ray.cli.console import errors, out
+from vlagents_ray.cli.bench_evaluations import bench_eval, bench_evaluation, bench_soak
+from vlagents_ray.cli.console import errors, out, save, tell
+from vlagents_ray.cli.options import DEFAULT_PEERS_PYTHON, PEERS_DIR, Json, PeersPython
 from vlagents_ray.cli.settings import parse_counts, parse_list, parse_settings
-from vlagents_ray.cli.tables import show_overhead, show_policy, show_round_trips, show_throughput
+from vlagents_ray.cli.tables import show_policy, show_round_trips, show_throughput
 from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -19,14 +21,8 @@ if TYPE_CHECKING:
 
 bench = typer.Typer(no_args_is_help=True, help="Measure on this machine what the README claims.")
 
-PEERS_DIR = Path(".venv-peers")
-Json = Annotated[Path | None, typer.Option("--json", help="Write the figures here.")]
 Plot = Annotated[Path | None, typer.Option("--plot", help="Draw the medians here: .png, .svg or .pdf.")]
 Peers = Annotated[str, typer.Option(help="vlagents, openpi, openvla, vla-eval, with commas between them, or 'all'.")]
-PeersPython = Annotated[
-    Path, typer.Option(help="The Python of the peers' environment, which `bench peers-setup` makes.")
-]
-DEFAULT_PEERS_PYTHON = PEERS_DIR / "bin" / "python"
 
 
 @bench.command("rtt")
@@ -45,10 +41,10 @@ def bench_rtt(
     with errors():
         check(plot)
         found = measure_rtt(
-            calls, transports=parse_list(transports), peers=parse_list(peers), peers_python=peers_python, tell=_tell
+            calls, transports=parse_list(transports), peers=parse_list(peers), peers_python=peers_python, tell=tell
         ).to_json()
         show_round_trips(found, "round trip of one act on this machine")
-        _save(found, json_file)
+        save(found, json_file)
         if plot is not None:
             plot_round_trips(found, plot)
 
@@ -70,11 +66,11 @@ def bench_link(
     with errors():
         check(plot)
         found = measure_link(
-            calls, rate=rate, delay=delay, peers=parse_list(peers), peers_python=peers_python, tell=_tell
+            calls, rate=rate, delay=delay, peers=parse_list(peers), peers_python=peers_python, tell=tell
         )  # fmt: skip
         title = f"round trip of one act over {found['link']['measured_mbit_per_s']:.0f} Mbit/s"
         show_round_trips(found, title)
-        _save(found, json_file)
+        save(found, json_file)
         if plot is not None:
             plot_round_trips(found, plot, title)
 
@@ -89,9 +85,9 @@ def bench_hop(
     from vlagents_ray.bench.hop import measure_hop
 
     with errors():
-        found = measure_hop(calls, python, _tell).to_json()
+        found = measure_hop(calls, python, tell).to_json()
     show_round_trips(found, "one act, as the batch queue sees it")
-    _save(found, json_file)
+    save(found, json_file)
 
 
 @bench.command("throughput")
@@ -128,9 +124,9 @@ def bench_throughput(
             **chosen, num_gpus=gpus, batch=batch, clients=counts, seconds=seconds, rounds=rounds,
             robot_seconds=robot_seconds, transports=parse_list(transports),
         )  # fmt: skip
-        found = measure_throughput(plan, _tell)
+        found = measure_throughput(plan, tell)
     show_throughput(found)
-    _save(found, json_file)
+    save(found, json_file)
 
 
 @bench.command("policy")
@@ -155,32 +151,14 @@ def bench_policy(
         if not all(isinstance(number, int) and number > 0 for number in dims.values()):
             raise ConfigError(f"--state: got {dims}, want a number from 1 on for each part")
         args, batches = server_args(file, app), parse_counts(batch, "--batch")
-        found = measure_policy(PolicyPlan(args, batches, seconds, rounds, image, dims), _tell)
+        found = measure_policy(PolicyPlan(args, batches, seconds, rounds, image, dims), tell)
     show_policy(found)
-    _save(found, json_file)
+    save(found, json_file)
 
 
-@bench.command("eval")
-def bench_eval(
-    env: Annotated[str, typer.Argument(help="The environment to step.")] = "tabletop",
-    workers: Annotated[int, typer.Option(min=1)] = 2,
-    episodes: Annotated[int, typer.Option(min=1, help="For each worker and round.")] = 8,
-    rounds: Annotated[int, typer.Option(min=1)] = 3,
-    json_file: Json = None,
-    env_set: Annotated[list[str], typer.Option("--env-set", metavar="KEY=VALUE")] = [],  # noqa: B006
-) -> None:
-    """Steps a second, and CPU time a step, of an evaluation against those of the bare environments."""
-    from vlagents_ray.bench.overhead import measure_overhead
-
-    with errors():
-        options = parse_settings(env_set, "--env-set")
-        found = measure_overhead(
-            env, workers=workers, episodes=episodes, rounds=rounds, env_options=options, tell=_tell
-        )
-    show_overhead(found)
-    data = found.to_json()
-    out.print(f"median ratio {found.ratio:.3f}, CPU time added to a step {data['median_added_cpu_ms_per_step']:.3f} ms")
-    _save(data, json_file)
+bench.command("eval")(bench_eval)
+bench.command("evaluation")(bench_evaluation)
+bench.command("soak")(bench_soak)
 
 
 @bench.command("peers-setup")
@@ -191,7 +169,7 @@ def bench_peers_setup(
     from vlagents_ray.bench.environment import set_up
 
     with errors():
-        python = set_up(folder, _tell)
+        python = set_up(folder, tell)
     used = "" if folder == PEERS_DIR else f" --peers-python {python}"
     out.print(f"ready: vlagents-ray bench rtt --peers all{used}", highlight=False, soft_wrap=True)
 
@@ -221,7 +199,7 @@ def bench_report(
                 raise ConfigError(f"--json {json_file}: cannot be read ({error})") from error
         else:
             results = collect(
-                peers_python, calls=calls, link_calls=calls, plan=Plan(seconds=seconds), tell=_tell
+                peers_python, calls=calls, link_calls=calls, plan=Plan(seconds=seconds), tell=tell
             )  # fmt: skip
         write(results, readme, None if from_json else json_file)
     out.print(f"wrote {readme}", highlight=False)
@@ -246,12 +224,3 @@ def _policy(policy: str | None, config: str, model: str | None, device: str) -> 
     if settings:
         raise ConfigError("--config: is for --policy or --model; name one")
     return {}
-
-
-def _tell(text: str) -> None:
-    out.print(text, highlight=False, markup=False)
-
-
-def _save(found: Any, file: Path | None) -> None:
-    if file is not None:
-        file.write_text(json.dumps(found, indent=1) + "\n")

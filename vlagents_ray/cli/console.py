@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 import typer
 from pydantic import ValidationError
@@ -56,3 +57,14 @@ def fresh(folder: Path) -> Path:
         number += 1
         candidate = folder.with_name(f"{folder.name}-{number}")
     return candidate
+
+
+def tell(text: str) -> None:
+    """A line of progress, as it is."""
+    out.print(text, highlight=False, markup=False)
+
+
+def save(found: Any, file: Path | None) -> None:
+    """Write figures as JSON, if a file was asked for."""
+    if file is not None:
+        file.write_text(json.dumps(found, indent=1) + "\n")

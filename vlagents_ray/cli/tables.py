@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rich.markup import escape
 from rich.table import Table
 
+from vlagents_ray.bench.targets import Outcome, evaluation_outcomes, soak_outcomes
 from vlagents_ray.cli.console import out
 
 if TYPE_CHECKING:
@@ -43,8 +44,7 @@ def show_round_trips(found: Mapping[str, Any], title: str) -> None:
             style="dim" if row["way"] in theirs else None,
         )  # fmt: skip
     out.print(table)
-    for name, reason in found["skipped"].items():
-        out.print(f"[yellow]skipped {escape(name)}[/]: {escape(reason)}", highlight=False, soft_wrap=True)
+    show_skipped(found)
 
 
 def show_policy(found: Mapping[str, Any]) -> None:
@@ -85,5 +85,47 @@ def show_throughput(found: Mapping[str, Any]) -> None:
         out.print(
             f"{name}: {row['actions_per_s']:.1f} actions/s, {row['of_ideal']:.3f} of the ideal{waits}", highlight=False
         )
+    show_skipped(found)
+
+
+def show_evaluation(found: Mapping[str, Any]) -> None:
+    """A row for each system, and the targets."""
+    plan = found["plan"]
+    table = Table("", "episodes/min", "whole command s", "ours / theirs", "wall: theirs / ours")
+    table.title = (
+        f"{plan['episodes']} episodes of {plan['max_steps']} steps, {plan['size']}x{plan['size']}, "
+        f"{plan['workers']} workers on {found['cores']} cores, medians of {plan['rounds']} rounds"
+    )
+    for name, row in found["medians"].items():
+        ratio = found["ratios"].get(name)
+        cells = [f"{ratio['median']:.2f}", f"{ratio['wall_median']:.2f}"] if ratio else ["", ""]
+        table.add_row(name, f"{row['episodes_per_minute']:.0f}", f"{row['wall_s']:.1f}", *cells)
+    out.print(table)
+    show_outcomes(evaluation_outcomes(found))
+    show_skipped(found)
+
+
+def show_soak(found: Mapping[str, Any]) -> None:
+    """What was counted, and the verdict."""
+    out.print(
+        f"{found['plan']['episodes']} episodes, {found['episodes_per_minute']:.0f} a minute; workers killed: "
+        f"{found['killed']}, retries: {found['retries']}, played again: {found['played_again']}",
+        highlight=False,
+    )
+    show_outcomes(soak_outcomes(found))
+
+
+def show_outcomes(lines: Sequence[Outcome]) -> None:
+    """Targets, and whether they are met."""
+    if not lines:
+        return
+    table = Table("", "wanted", "measured", "met")
+    for one in lines:
+        table.add_row(one.what, one.wanted, one.measured, {True: "yes", False: "[red]no[/]", None: ""}[one.met])
+    out.print(table)
+
+
+def show_skipped(found: Mapping[str, Any]) -> None:
+    """What could not be measured, and why."""
     for name, reason in found["skipped"].items():
         out.print(f"[yellow]skipped {escape(name)}[/]: {escape(reason)}", highlight=False, soft_wrap=True)

@@ -98,14 +98,26 @@ def wait_for_port(host: str, port: int) -> None:
             return
 
 
-def run(serve: Callable[[str, int], None], drive: Callable[[str, int, str, str, TextIO], None]) -> None:
-    """The two commands of a script: `serve HOST PORT` and `drive HOST PORT OBS.npz MODE`."""
+def run(
+    serve: Callable[[str, int], None],
+    drive: Callable[[str, int, str, str, TextIO], None],
+    evaluate: Callable[[str, int, dict[str, Any]], None] | None = None,
+) -> None:
+    """The commands of a script: `serve HOST PORT`, `drive HOST PORT OBS.npz MODE`, `evaluate HOST PORT PLAN`.
+
+    PLAN is JSON; `evaluate` says a line when all its episodes are played and everything that it started has ended.
+    """
     die_with_parent()
     out = own_stdout()
     command, host, port = sys.argv[1], sys.argv[2], int(sys.argv[3])
     if command == "serve":
         end_with_stdin()
         serve(host, port)
+    elif command == "evaluate" and evaluate is not None:
+        end_with_stdin()
+        os.register_at_fork(after_in_child=die_with_parent)
+        evaluate(host, port, json.loads(sys.argv[4]))
+        print(json.dumps({}), file=out, flush=True)
     else:
         wait_for_port(host, port)
         drive(host, port, sys.argv[4], sys.argv[5], out)

@@ -3,36 +3,83 @@
 The policy derives from its `Agent` and calls `super().act`, which decodes the cameras, as its documentation asks.
 JPEG is what its client sends: simplejpeg's defaults, quality 85 and 4:4:4. The server is what `vlagents
 start-server` starts. Its client changes the observation that it is given, so each call gets a new one.
+
+An evaluation is its `run-eval` with `same_machine`, images as they are, and no videos. It plays each configuration in
+a process of its own, with a server of its own, so several processes are several configurations of one environment,
+whose seeds follow each other. `start-server ...` is its command of that name, with this file's agent registered.
 """
 
 from __future__ import annotations
 
+import json
 import sys
-from typing import TextIO
+from pathlib import Path
+from typing import Any, TextIO
 
 import numpy as np
 import peer
 import rpyc
-from vlagents import register_agent
+from vlagents import register_agent, register_env
+from vlagents.__main__ import main_app
 from vlagents.client import RemoteAgent
-from vlagents.policies.interface import Act, Agent, Obs, SingleObs
+from vlagents.envs.interface import EvalEnv
+from vlagents.policies.interface import Act, Agent, Obs, SingleAct, SingleObs
 from vlagents.server import AgentService
 
 NAME = "bench_noop"
+ENV = "bench_tabletop"
 
 
 class Noop(Agent):
-    """Decodes the observation and returns seven zeros."""
+    """Decodes the observation and returns seven zeros. `run-eval` names a device, whatever the policy."""
 
-    def __init__(self) -> None:
-        super().__init__(default_checkpoint_path="")
+    def __init__(self, device: str | None = None, checkpoint_step: int | None = None) -> None:
+        super().__init__(default_checkpoint_path="", checkpoint_step=checkpoint_step)
 
     def act(self, obs: Obs) -> Act:
         super().act(obs)
         return self._single_step_act("robot", np.zeros(7, np.float32))
 
 
+class Tabletop(EvalEnv):
+    """The environment that all are measured with."""
+
+    def do_import(self) -> None:
+        from vlagents_ray.bench.noted import Noted
+        from vlagents_ray.interface import Act
+
+        self._make, self._act = Noted, Act
+
+    def make_gym(self) -> Any:
+        return self._make(**self.env_kwargs)
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+        if seed is None:  # after each episode, for nobody to look at: it costs nothing here
+            return self._last, {}
+        obs, info = self.env.reset(seed=seed)
+        return self._translated(obs), info
+
+    def step(self, action: dict[str, SingleAct]) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        obs, *rest = self.env.step(self._act(action["robot"].action[:4]))
+        return self._translated(obs), *rest
+
+    @property
+    def language_instruction(self) -> str:
+        return str(self.env.instruction)
+
+    def _translated(self, obs: Any) -> Obs:
+        robot = SingleObs(
+            cameras=dict(obs.cameras),
+            gripper=obs.gripper,
+            xyzrpy=obs.state["xyzrpy"],
+            info={"high_res_cameras": {}},  # of which it makes the videos; without, of every camera
+        )
+        self._last = Obs(obs={"robot": robot}, language_instruction=self.env.instruction)
+        return self._last
+
+
 register_agent(NAME, Noop)
+register_env(ENV, Tabletop)
 
 
 def serve(host: str, port: int) -> None:
@@ -60,5 +107,39 @@ def drive(host: str, port: int, path: str, mode: str, out: TextIO) -> None:
         agent.close()
 
 
+def evaluate(host: str, port: int, plan: dict[str, Any]) -> None:
+    """Its `run-eval`; processes other than the first take the ports that follow."""
+    folder = Path(plan["folder"])
+    server = folder / "python"  # `run-eval` starts PYTHON -m vlagents start-server ..., which knows no agent of ours
+    server.write_text(f"#!/bin/sh\nshift 2\nexec '{sys.executable}' '{__file__}' \"$@\"\n")
+    server.chmod(0o755)
+    each = plan["episodes"] // plan["workers"]
+    configs = [
+        {
+            "env_id": ENV,
+            "env_kwargs": plan["env"],
+            "max_steps_per_episode": plan["env"]["max_steps"],
+            "seed": plan["seed"] + process * each,
+            "same_machine": True,
+            "image_size": None,
+        }
+        for process in range(plan["workers"])
+    ]
+    agent = {"host": host, "port": port, "agent_name": NAME, "agent_kwargs": {}, "python_path": str(server)}
+    words = [
+        "run-eval",
+        f"--output-path={folder}",
+        f"--episodes={each}",
+        f"--n-processes={plan['workers']}",
+        f"--eval-cfgs={json.dumps(configs)}",
+        f"--agent-cfg={json.dumps(agent)}",
+    ]
+    main_app(words, standalone_mode=False)
+
+
 if __name__ == "__main__":
-    peer.run(serve, drive)
+    if sys.argv[1] == "start-server":
+        peer.die_with_parent()
+        main_app()
+    else:
+        peer.run(serve, drive, evaluate)
