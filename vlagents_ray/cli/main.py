@@ -16,6 +16,7 @@ from vlagents_ray.cli.console import out
 from vlagents_ray.cli.environments import env
 from vlagents_ray.cli.evaluation import Address, Set, evaluate_command, run_evaluation
 from vlagents_ray.cli.keys import keys as keys_app
+from vlagents_ray.cli.report import report_command
 from vlagents_ray.cli.settings import parse_settings
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.serve.cluster import running_server
@@ -97,6 +98,7 @@ def demo(
 
 
 app.command("eval")(evaluate_command)
+app.command("report")(report_command)
 app.add_typer(bench, name="bench")
 app.add_typer(env, name="env")
 app.add_typer(keys_app, name="keys")

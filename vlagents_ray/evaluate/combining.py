@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.results import CellResults, Results, Run
@@ -27,7 +28,7 @@ def combined(folders: Sequence[Results]) -> Results:
     base = Path(os.path.commonpath([each.out.resolve() for each in folders]))
     cells: list[CellResults] = []
     runs: list[Run] = []
-    policies = {}
+    policies: dict[str, dict[str, Any]] = {}
     for each, label in zip(folders, _labels(folders, base), strict=True):
         names = {
             cell.policy: f"{cell.policy} ({label})" if cell.policy in clashing else cell.policy for cell in each.cells
@@ -45,8 +46,8 @@ def _require_apart(folders: Sequence[Results]) -> None:
         for cell in each.cells:
             if (first := seen.setdefault(cell.cell, each.out)) is not each.out:
                 raise ConfigError(
-                    f"report: {first} and {each.out} both have {cell.contender!r} in {cell.env!r} with the same settings: "
-                    f"parts of one evaluation; merge them into a folder first"
+                    f"report: {first} and {each.out} both have {cell.contender!r} in {cell.env!r} with the same "
+                    f"settings: parts of one evaluation; merge them into a folder first"
                 )
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 from vlagents_ray.errors import ConfigError
@@ -19,19 +20,28 @@ ALL = "all"
 Strata = dict[str, Pairs]  # by env
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Line:
     """The comparison on one suite, or on all."""
 
     suite: str  # or "all"
-    pairs: Pairs
-    interval: tuple[float, float]  # 95 %, of the difference A less B
-    p_value: float  # McNemar's
-    adjusted: float  # the same, by Holm's method for all that is compared beside it
+    strata: tuple[Pairs, ...]  # by env
+    adjusted: float  # McNemar's p-value, by Holm's method for all that is compared beside it
+
+    @property
+    def pairs(self) -> Pairs:
+        """All envs together."""
+        return sum(self.strata, Pairs())
+
+    @cached_property
+    def interval(self) -> tuple[float, float]:
+        """95 %, of the difference A less B."""
+        return difference_interval(self.strata)
 
     def to_json(self) -> dict[str, Any]:
         """As plain JSON values."""
-        return {"suite": self.suite} | self.pairs.to_json() | {"interval_95": self.interval, "p_holm": self.adjusted}
+        beside = {"interval_95": list(self.interval), "p_holm": self.adjusted}
+        return {"suite": self.suite} | self.pairs.to_json() | beside
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,21 +66,33 @@ def compare(results: Results, a: str, b: str) -> Comparison:
     return comparisons(results, [(a, b)])[0]
 
 
-def comparisons(results: Results, which: Iterable[tuple[str, str]] | None = None) -> list[Comparison]:
-    """`compare` each of these pairs of contenders, every one with every other if None, with p-values adjusted together.
+def comparisons(results: Results, which: Sequence[tuple[str, str]]) -> list[Comparison]:
+    """`compare` each of these pairs of contenders, with p-values that are adjusted for one another.
 
     Those of one suite are one family for Holm's method, and those of all suites together another.
     """
-    pairs = list(itertools.combinations(results.contenders, 2) if which is None else which)
-    found = [_by_suite(results, a, b) for a, b in pairs]
+    found = [_by_suite(results, a, b) for a, b in which]
     totals = _lines(ALL, [[pairs for strata in suites.values() for pairs in strata.values()] for suites in found])
-    lines: list[list[Line]] = [[] for _ in pairs]
+    lines: list[list[Line]] = [[] for _ in which]
     for suite in dict.fromkeys(suite for suites in found for suite in suites):
         having = [index for index, suites in enumerate(found) if suite in suites and len(suites) > 1]
         family = _lines(suite, [list(found[index][suite].values()) for index in having])
         for index, line in zip(having, family, strict=True):
             lines[index].append(line)
-    return [Comparison(a, b, tuple(lines[i]), totals[i]) for i, (a, b) in enumerate(pairs)]
+    return [Comparison(a, b, tuple(lines[i]), totals[i]) for i, (a, b) in enumerate(which)]
+
+
+def comparable(results: Results) -> tuple[list[tuple[str, str]], list[str]]:
+    """The pairs of contenders that `compare` takes, each once, and why it takes no other."""
+    pairs, reasons = [], []
+    for a, b in itertools.combinations(results.contenders, 2):
+        try:
+            _by_suite(results, a, b)
+        except ConfigError as error:
+            reasons.append(str(error))
+        else:
+            pairs.append((a, b))
+    return pairs, reasons
 
 
 def clock_gaps(results: Results) -> list[Comparison]:
@@ -142,9 +164,5 @@ def _pairs(a: CellResults, b: CellResults) -> Pairs:
 
 
 def _lines(suite: str, family: Sequence[Sequence[Pairs]]) -> list[Line]:
-    pooled = [sum(strata, Pairs()) for strata in family]
-    adjusted = holm([pairs.p_value for pairs in pooled])
-    return [
-        Line(suite, pairs, difference_interval(strata), pairs.p_value, p)
-        for pairs, strata, p in zip(pooled, family, adjusted, strict=True)
-    ]
+    adjusted = holm([sum(strata, Pairs()).p_value for strata in family])
+    return [Line(suite, tuple(strata), p) for strata, p in zip(family, adjusted, strict=True)]

@@ -20,10 +20,10 @@ class SuccessCurve:
 def success_curve(first_successes: Sequence[int | None], horizon: int) -> SuccessCurve:
     """The curve of episodes that were first solved after so many steps, or never (None), up to `horizon` steps.
 
-    E. L. Kaplan, P. Meier, "Nonparametric Estimation from Incomplete Observations", JASA 53 (1958): their estimate where
-    nothing is censored. An episode that ended unsolved, at the step limit, by an error or by the policy's own word, will
-    not be solved any more, so that it stays in the denominator; leaving it out as censored would claim that it might
-    have been. The band is Wilson's interval at each step by itself, and so at the end the interval of the rate.
+    E. L. Kaplan, P. Meier, "Nonparametric Estimation from Incomplete Observations", JASA 53 (1958): their estimate
+    where nothing is censored. An episode that ended unsolved, at the step limit, by an error or by the policy's own
+    word, will not be solved any more, so it stays in the denominator; leaving it out as censored would claim that it
+    might have been. The band is Wilson's interval at each step by itself, and so at the end the interval of the rate.
     """
     known = [step for step in first_successes if step is not None]
     if any(not 0 < step <= horizon for step in known):
