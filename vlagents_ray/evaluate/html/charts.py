@@ -18,7 +18,7 @@ from vlagents_ray.evaluate.statistics import Rate
 COLOURS = 6
 WIDTH, HEIGHT = 460, 280
 LEFT, RIGHT, TOP, BOTTOM = 38, 10, 10, 40  # margins
-GLYPH = 96  # width of a table's interval
+GLYPH, EDGE = 96, 6  # width of a table's interval, and what a dot takes beyond its ends
 _DASHES = (None, "7 3", "2 3", "9 3 2 3", "12 4", "4 4")
 
 
@@ -55,20 +55,20 @@ def rate_chart(series: Sequence[Series], x_label: str, title: str) -> Html:
 
 def interval_glyph(rate: Rate) -> Html:
     """The rate and its interval as a dot on a line from 0 to 100 %; decoration, as the numbers stand beside it."""
-    low, high = (3 + (GLYPH - 6) * bound for bound in rate.interval)
-    shapes = [tag("path", d=f"M3 8H{GLYPH - 3}", class_="rail")]
+    low, high = (EDGE + (GLYPH - 2 * EDGE) * bound for bound in rate.interval)
+    shapes = [tag("path", d=f"M{EDGE} 8H{GLYPH - EDGE}", class_="rail")]
     if rate.rate is not None:
         shapes.append(tag("path", d=f"M{low:.1f} 8H{high:.1f}", class_="range"))
-        shapes.append(tag("circle", cx=3 + (GLYPH - 6) * rate.rate, cy=8, r=3.5, class_="dot"))
+        shapes.append(tag("circle", cx=EDGE + (GLYPH - 2 * EDGE) * rate.rate, cy=8, r=3.5, class_="dot"))
     return tag("svg", shapes, viewbox=f"0 0 {GLYPH} 16", class_="glyph", aria_hidden="true")
 
 
 def difference_glyph(difference: float, low: float, high: float, decided: bool) -> Html:
     """A difference of rates and its interval on a line from -100 to 100 points."""
     middle = GLYPH / 2
-    left, dot, right = (middle + (middle - 3) * value for value in (low, difference, high))
+    left, dot, right = (middle + (middle - EDGE) * value for value in (low, difference, high))
     shapes = [
-        tag("path", d=f"M3 8H{GLYPH - 3}M{middle:.1f} 2V14", class_="rail"),
+        tag("path", d=f"M{EDGE} 8H{GLYPH - EDGE}M{middle:.1f} 2V14", class_="rail"),
         tag("path", d=f"M{left:.1f} 8H{right:.1f}", class_="range"),
         tag("circle", cx=dot, cy=8, r=3.5, class_="dot"),
     ]

@@ -4,27 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from vlagents_ray.evaluate.comparison import ALL, Comparison, Line, clock_gaps, comparable, comparisons
+from vlagents_ray.evaluate.comparison import Comparison, Line, clock_gaps, comparable, comparisons
 from vlagents_ray.evaluate.html.charts import difference_glyph
 from vlagents_ray.evaluate.html.elements import Child, Html, Section, fold, row, section, table, tag
-from vlagents_ray.evaluate.html.numbers import MINUS, NONE, p_value, points
+from vlagents_ray.evaluate.html.numbers import MINUS, NONE, count, p_value, points
 from vlagents_ray.evaluate.statistics.pairs import ERROR_RATE
 from vlagents_ray.evaluate.summary import Summary
 
 MOST_PAIRS = 15  # shown unfolded: those of six contenders
 MOST_REASONS = 10
-_HEAD = [
-    "Episodes",
-    "both solved",
-    "only A",
-    "only B",
-    "neither",
-    f"A {MINUS} B, points",
-    "95 % interval",
-    "",
-    "p",
-    "p (Holm)",
-]
+_COUNTS = ["Episodes", "both", "only A", "only B", "neither"]
+_HEAD = [*_COUNTS, f"A {MINUS} B, points", "95 % interval", "", "p", "p (Holm)"]
 
 
 def comparison(summary: Summary) -> Section | None:
@@ -45,11 +35,12 @@ def comparison(summary: Summary) -> Section | None:
         tag(
             "p",
             "Pairs are episodes of the same task, settings and seed that both finished, by success once. p is of "
-            "McNemar's exact test of “both solve equally many”, (Holm) adjusted for the number of comparisons on "
-            "the page; intervals are of a bootstrap of the pairs, task by task. A hollow dot: not told apart at 5 %.",
+            "McNemar's exact test of “both solve equally many”; p (Holm) allows for the number of pairs compared. "
+            "Intervals are of a bootstrap of the episodes, task by task. A hollow dot: not told apart at 5 %.",
             class_="note",
         ),
-        fold(f"{len(rest)} further pairs", _table(rest)) if rest else None,
+        fold("By suite", _table(first, by_suite=True), printed=True) if any(one.suites for one in first) else None,
+        fold(count(len(rest), "further pair"), _table(rest)) if rest else None,
         _uncompared(reasons),
     )
 
@@ -70,14 +61,21 @@ def real_time(summary: Summary) -> Section | None:
     )
 
 
-def _table(found: Sequence[Comparison]) -> Html:
-    return table(["A", "B", "Suite", *_HEAD], (tag("tbody", list(_rows(one))) for one in found), "Comparison", words=3)
+def _table(found: Sequence[Comparison], *, by_suite: bool = False) -> Html:
+    """A row a pair; or by suite, with the pair's names once."""
+    if by_suite:
+        return table(
+            ["A", "B", "Suite", *_HEAD], [tag("tbody", list(_suites(one))) for one in found], "By suite", words=3
+        )
+    rows = [row(one.a, one.b, *_cells(one.total), words=2) for one in found]
+    return table(["A", "B", *_HEAD], rows, "Comparison of pairs", words=2)
 
 
-def _rows(one: Comparison) -> Iterator[Html]:
-    for line in (*one.suites, one.total):
-        sum_of = line.suite == ALL and bool(one.suites)
-        yield row(one.a, one.b, line.suite or NONE, *_cells(line), words=3, class_="sum" if sum_of else None)
+def _suites(one: Comparison) -> Iterator[Html]:
+    for index, line in enumerate(one.suites):
+        names = [tag("th", name, scope="rowgroup", rowspan=len(one.suites)) for name in (one.a, one.b)]
+        cells = [tag("td", cell, class_="n") for cell in _cells(line)]
+        yield tag("tr", names if index == 0 else None, tag("th", line.suite or NONE, scope="row"), cells)
 
 
 def _cells(line: Line) -> list[Child]:
@@ -95,4 +93,4 @@ def _uncompared(reasons: Sequence[str]) -> Html | None:
     if not reasons:
         return None
     items = [tag("li", reason) for reason in reasons[:MOST_REASONS]]
-    return fold(f"{len(reasons)} pairs cannot be compared", tag("ul", items), printed=True)
+    return fold(f"Not compared: {count(len(reasons), 'pair')}", tag("ul", items), printed=True)

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 from vlagents_ray.evaluate.html.elements import Html, Section, block, fold, row, section, table, tag
-from vlagents_ray.evaluate.html.numbers import moment
+from vlagents_ray.evaluate.html.numbers import count, moment
 from vlagents_ray.evaluate.html.videos import Gallery
 from vlagents_ray.evaluate.results import Attempt, CellResults, Episode, Results
 
@@ -26,18 +26,18 @@ def failures(results: Results, gallery: Gallery) -> Section | None:
     if not found:
         return None
     cards = [card for cell, one in _in_turns(found) if (card := _card(cell, one, gallery)) is not None]
-    shown = f"{len(cards)} of {len(found)} unsolved episodes are shown, taken from the cells in turns."
+    shown = f"Shown: {len(cards)} of {count(len(found), 'unsolved episode')}, taken from tasks and policies in turns."
     if gallery.inlined:
-        shown += f" {gallery.inlined} videos are in this file, {gallery.linked} beside it."
+        shown += f" In this file: {count(gallery.inlined, 'video')}; beside it: {gallery.linked}."
     elif gallery.linked:
         shown += " Videos lie beside this file: keep them together."
+    which = "All of" if len(found) <= MOST_LISTED else f"The first {MOST_LISTED} of"
     return section(
         "Failures",
-        tag("p", shown if cards else f"{len(found)} episodes were not solved; none has a video.", class_="note"),
+        tag("p", shown if cards else f"{count(len(found), 'unsolved episode')}, none with a video.", class_="note"),
         tag("div", cards, class_="gallery") if cards else None,
-        fold(f"All {len(found)} unsolved episodes" if len(found) <= MOST_LISTED else f"The first {MOST_LISTED} of "
-             f"{len(found)} unsolved episodes", _list(found[:MOST_LISTED], gallery)),
-    )  # fmt: skip
+        fold(f"{which} {count(len(found), 'unsolved episode')}", _list(found[:MOST_LISTED], gallery)),
+    )
 
 
 def errors(results: Results) -> Section | None:
@@ -54,8 +54,8 @@ def errors(results: Results) -> Section | None:
         tag("h3", "Of infrastructure"),
         tag(
             "p",
-            f"{len(attempts)} attempts failed, {sum(one.retried for _, one in attempts)} of them were repeated; "
-            f"{lost} episodes are lost and in no rate.",
+            f"Failed: {count(len(attempts), 'attempt')}, of which {sum(one.retried for _, one in attempts)} repeated. "
+            f"Lost, and in no rate: {count(lost, 'episode')}.",
         ),
         [_log(cell, attempt) for cell, attempt in attempts[:MOST_LOGS]],
         tag("p", f"{len(attempts) - MOST_LOGS} more are in results.db, table attempts.", class_="note")

@@ -32,7 +32,7 @@ def latency(summary: Summary) -> Section | None:
     stages = {name: _stages(counted) for name, counted in played.items()}
     bars = {name: found for name, found in list(stages.items())[:MOST_BARS] if found}
     used = [stage for stage in STAGES.values() if any(stage in found for found in stages.values())]
-    head = ["Policy, ms", *used, "one act", "its 95th percentile", "env step", "env reset", "acts"]
+    head = ["Policy, ms", *used, "one act", "its p95", "env step", "env reset", "acts"]
     rows = [
         row(
             name,

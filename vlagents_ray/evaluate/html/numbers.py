@@ -31,15 +31,20 @@ def points(difference: float | None) -> str:
 
 
 def p_value(p: float) -> str:
-    """With two digits that say something; never 0."""
+    """With the digits that say something; never 0."""
     if p < 1e-4:
         return "< 0.0001"
-    return f"{p:.4f}" if p < 0.01 else f"{p:.2f}"
+    return f"{p:.4f}" if p < 0.01 else f"{p:.3f}" if p < 0.1 else f"{p:.2f}"
 
 
 def number(value: float | None, digits: int = 1) -> str:
     """With thousands apart, or a dash."""
     return NONE if value is None else f"{value:,.{digits}f}".replace(",", "\u202f")
+
+
+def count(n: int, thing: str) -> str:
+    """So many of a thing: "1 episode", "2 episodes"."""
+    return f"{number(n, 0)} {thing}" if n == 1 else f"{number(n, 0)} {thing}s"
 
 
 def duration(seconds: float) -> str:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from vlagents_ray.evaluate.html import comparing, failures, latency, origin, success
 from vlagents_ray.evaluate.html.elements import Html, Section, tag
-from vlagents_ray.evaluate.html.numbers import duration, interval, moment, number, percent
+from vlagents_ray.evaluate.html.numbers import count, duration, interval, moment, number, percent
 from vlagents_ray.evaluate.html.videos import Gallery, Videos
 from vlagents_ray.evaluate.results import Results
 from vlagents_ray.evaluate.summary import Summary, summarize
@@ -79,10 +79,10 @@ def _header(summary: Summary) -> Html:
         "header",
         tag("p", "Evaluation", class_="kind"),
         tag("h1", _names(results)),
-        tag("p", f"{about}{envs} {'tasks' if envs > 1 else 'task'}, {moment(results.runs[-1].started)}", class_="note"),
+        tag("p", f"{about}{count(envs, 'task')}, {moment(results.runs[-1].started)}", class_="note"),
         state,
         tag("div", _figures(summary), class_="figures"),
-        tag("p", f"{total.infra_failures} episodes were lost to infrastructure and are in no rate.", class_="bad")
+        tag("p", f"Lost to infrastructure, and in no rate: {count(total.infra_failures, 'episode')}.", class_="bad")
         if total.infra_failures
         else None,
     )
@@ -97,7 +97,7 @@ def _figures(summary: Summary) -> list[Html]:
         _figure(f"{percent(once)} %", name, f"95 % interval {interval(once)} %"),
         _figure(number(total.episodes, 0), "episodes", f"of {number(total.planned, 0)} planned"),
         _figure(number(total.steps, 0), "env steps", f"{number(summary.steps_per_second)} a second"),
-        _figure(duration(summary.wall_seconds), "wall time", f"{total.retries} attempts repeated"),
+        _figure(duration(summary.wall_seconds), "wall time", f"{count(total.retries, 'attempt')} repeated"),
     ]
 
 

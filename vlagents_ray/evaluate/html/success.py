@@ -51,10 +51,11 @@ def success_over_time(summary: Summary) -> Section | None:
     if not shown:
         return None
     order = [group.contender for group in groups if group in shown]
+    played = {name: [one for cell in summary.results.of(name) for one in cell.counted] for name in order}
+    horizon = max(1, *(one.steps for results in played.values() for one in results))
     curves = []
     for index, name in enumerate(order):
-        played = [one for cell in summary.results.of(name) for one in cell.counted]
-        curve = success_curve([one.first_success for one in played], max(1, *(one.steps for one in played)))
+        curve = success_curve([one.first_success for one in played[name]], horizon)
         curves.append(Series(name, index, list(zip(curve.steps, curve.solved, strict=True)), stepped=True))
     left_out = len(groups) - len(shown)
     text = "Bands are Wilson's interval at each step by itself. An episode that ended unsolved stays unsolved."
