@@ -25,7 +25,8 @@ def failures(results: Results, gallery: Gallery) -> Section | None:
     ]
     if not found:
         return None
-    cards = [card for cell, one in _in_turns(found) if (card := _card(cell, one, gallery)) is not None]
+    drawn = (_card(cell, one, gallery) for cell, one in _in_turns(found))
+    cards = list(itertools.islice(filter(None, drawn), MOST_CARDS))
     shown = f"Shown: {len(cards)} of {count(len(found), 'unsolved episode')}, taken from tasks and policies in turns."
     if gallery.inlined:
         shown += f" In this file: {count(gallery.inlined, 'video')}; beside it: {gallery.linked}."
@@ -65,13 +66,13 @@ def errors(results: Results) -> Section | None:
 
 
 def _in_turns(found: Sequence[Found]) -> Iterator[Found]:
-    """One of each cell that has videos, then the second of each, up to what the gallery holds."""
+    """One of each cell that has videos, then the second of each, and so on."""
     by_cell: dict[str, list[Found]] = {}
     for cell, one in found:
         if one.videos:
             by_cell.setdefault(cell.cell, []).append((cell, one))
     rounds = itertools.zip_longest(*by_cell.values())
-    return itertools.islice((one for turn in rounds for one in turn if one is not None), MOST_CARDS)
+    return (one for turn in rounds for one in turn if one is not None)
 
 
 def _card(cell: CellResults, episode: Episode, gallery: Gallery) -> Html | None:
