@@ -35,7 +35,7 @@ def runs(out: Path, *, episodes: int = 12, steps: list[int] | None = None, **cha
         {"name": "one", "envs": [LINE, OTHER_LINE], "episodes": episodes},
         {"name": "two", "envs": [LINE], "env_options": {"camera": [32, 48]}, "episodes": episodes},
     ]
-    return EvalConfig.model_validate({"policies": policies, "suites": suites, "out": out, **changes})
+    return EvalConfig.model_validate({"policies": policies, "suites": suites, "out": out} | changes)
 
 
 def better_later(cell: Cell, seed: int) -> int | None:
