@@ -77,9 +77,10 @@ def difference_glyph(difference: float, low: float, high: float, decided: bool) 
 
 
 def stacked_bars(rows: Mapping[str, Mapping[str, float]], unit: str, title: str) -> Html:
-    """A bar each row, made of its parts; all on one scale."""
+    """A bar each row, made of its parts; all on one scale. There is a row at least."""
     names = list(dict.fromkeys(part for parts in rows.values() for part in parts))
-    scale = (WIDTH - 74) / max((sum(parts.values()) for parts in rows.values()), default=1.0)
+    longest = max(sum(parts.values()) for parts in rows.values())
+    scale = (WIDTH - 74) / longest if longest else 0.0
     shapes = []
     for index, (name, parts) in enumerate(rows.items()):
         top, left = 40 * index, 0.0

@@ -39,7 +39,7 @@ def comparison(summary: Summary) -> Section | None:
             "Intervals are of a bootstrap of the episodes, task by task. A hollow dot: not told apart at 5 %.",
             class_="note",
         ),
-        fold("By suite", _table(first, by_suite=True), printed=True) if any(one.suites for one in first) else None,
+        fold("By suite", _table_by_suite(first), printed=True) if any(one.suites for one in first) else None,
         fold(count(len(rest), "further pair"), _table(rest)) if rest else None,
         _uncompared(reasons),
     )
@@ -61,14 +61,14 @@ def real_time(summary: Summary) -> Section | None:
     )
 
 
-def _table(found: Sequence[Comparison], *, by_suite: bool = False) -> Html:
-    """A row a pair; or by suite, with the pair's names once."""
-    if by_suite:
-        return table(
-            ["A", "B", "Suite", *_HEAD], [tag("tbody", list(_suites(one))) for one in found], "By suite", words=3
-        )
+def _table(found: Sequence[Comparison]) -> Html:
     rows = [row(one.a, one.b, *_cells(one.total), words=2) for one in found]
     return table(["A", "B", *_HEAD], rows, "Comparison of pairs", words=2)
+
+
+def _table_by_suite(found: Sequence[Comparison]) -> Html:
+    bodies = [tag("tbody", list(_suites(one))) for one in found if one.suites]
+    return table(["A", "B", "Suite", *_HEAD], bodies, "Comparison by suite", words=3)
 
 
 def _suites(one: Comparison) -> Iterator[Html]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -30,7 +30,8 @@ def latency(summary: Summary) -> Section | None:
     if not played:
         return None
     stages = {name: _stages(counted) for name, counted in played.items()}
-    bars = {name: found for name, found in list(stages.items())[:MOST_BARS] if found}
+    timed = {name: found for name, found in stages.items() if found}
+    bars = dict(list(timed.items())[:MOST_BARS])
     used = [stage for stage in STAGES.values() if any(stage in found for found in stages.values())]
     head = ["Policy, ms", *used, "one act", "its p95", "env step", "env reset", "acts"]
     rows = [
@@ -53,13 +54,14 @@ def latency(summary: Summary) -> Section | None:
             "p",
             "Medians over the episodes of each episode's median, so that stages need not add up to the whole. Decode, "
             "queue, inference and encode are the server's; wire is what of a round trip was not. "
-            f"Transport: {', '.join(summary.transports)}.",
+            f"Transport: {', '.join(summary.transports)}."
+            + (f" Drawn: the first {MOST_BARS} of {len(timed)}." if len(timed) > MOST_BARS else ""),
             class_="note",
         ),
     )
 
 
-def _stages(results: Iterable[EpisodeResult]) -> dict[str, float]:
+def _stages(results: Sequence[EpisodeResult]) -> dict[str, float]:
     found = {}
     for key, stage in STAGES.items():
         spent = _median(one.timing_ms.get(key) for one in results)

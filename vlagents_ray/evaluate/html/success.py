@@ -12,7 +12,6 @@ from vlagents_ray.evaluate.statistics import Rate, success_curve
 from vlagents_ray.evaluate.summary import TOTAL, Group, Summary, group_of
 
 MOST_CURVES = 6  # that a chart holds and a reader tells apart
-MOST_PANELS = 8
 
 
 def success(summary: Summary) -> Section:
@@ -39,7 +38,7 @@ def learning_curve(summary: Summary) -> Section | None:
     charts = [_learning_chart(summary, None)]
     suites = list(dict.fromkeys(cell.suite for cell in summary.results.cells))
     if len(suites) > 1:
-        charts += [_learning_chart(summary, suite) for suite in suites[:MOST_PANELS]]
+        charts += [_learning_chart(summary, suite) for suite in suites]
     drawn = [chart for chart in charts if chart is not None]
     return section("Learning curve", tag("div", drawn, class_="panels")) if drawn else None
 
