@@ -11,7 +11,7 @@ PYTHONPATH="$PWD${PYTHONPATH:+:$PYTHONPATH}" "${VLAGENTS_RAY:-vlagents-ray}" eva
 # PICTURE SCHEME: Blink's number of a colour scheme, 0 for dark and 1 for light.
 take() {
   "${CHROMIUM:-chromium}" --headless --no-sandbox --disable-gpu --hide-scrollbars --user-data-dir="$scratch/profile" \
-    --blink-settings=preferredColorScheme="$2" --window-size=1200,3300 --screenshot="$PWD/$1" \
+    --blink-settings=preferredColorScheme="$2" --window-size=1200,5400 --screenshot="$PWD/$1" \
     "file://$scratch/picture/report.html"
 }
 take report-light.png 1

@@ -56,9 +56,9 @@ def test_the_interval_covers_the_difference_at_least_about_as_often_as_it_says(
     rng = np.random.default_rng(1)
     true = np.mean([one[1] - one[2] for one in chances])
     covered = 0
-    for repeat in range(200):
+    for _ in range(200):
         strata = [Pairs(*map(int, rng.multinomial(episodes, one))) for one in chances]
-        low, high = difference_interval(strata, seed=repeat)
+        low, high = difference_interval(strata)
         covered += low <= true <= high
     assert covered / 200 > 0.915  # 0.95 less two and a quarter standard deviations of 200 trials
 
@@ -78,10 +78,20 @@ def test_the_interval_holds_the_difference_and_is_never_certain(pairs: Pairs) ->
     assert low < high
 
 
-def test_the_interval_depends_on_its_seed_alone() -> None:
-    strata = [Pairs(10, 8, 3, 9)]
-    assert difference_interval(strata) == difference_interval(strata)
-    assert difference_interval(strata, seed=1) == pytest.approx(difference_interval(strata), abs=0.07)
+def test_the_interval_is_what_drawing_again_comes_to() -> None:
+    strata = [Pairs(10, 8, 3, 9), Pairs(2, 12, 1, 35)]
+    rng, drawn = np.random.default_rng(0), np.zeros(200_000)
+    for one in strata:
+        outcomes = np.array([one.only_a, one.only_b, one.both, one.neither]) + 0.5 * one.total / 80
+        counts = rng.multinomial(one.total, outcomes / outcomes.sum(), len(drawn))
+        drawn += counts[:, 0] - counts[:, 1]
+    assert difference_interval(strata) == pytest.approx(tuple(np.quantile(drawn / 80, [0.025, 0.975])), abs=1e-9)
+
+
+def test_thousands_of_episodes_narrow_the_interval() -> None:
+    few, many = (difference_interval([Pairs(5 * k, 2 * k, k, 2 * k)] * 3) for k in (10, 1000))
+    assert many[0] == pytest.approx(0.1 - 1.96 * (0.29 / 30_000) ** 0.5, abs=5e-4)
+    assert few[0] < many[0] < 0.1 < many[1] < few[1]
 
 
 def test_nothing_is_known_of_the_difference_without_episodes() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 from vlagents_ray.errors import ConfigError
@@ -20,7 +19,7 @@ ALL = "all"
 Strata = dict[str, Pairs]  # by env
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Line:
     """The comparison on one suite, or on all."""
 
@@ -33,7 +32,7 @@ class Line:
         """All envs together."""
         return sum(self.strata, Pairs())
 
-    @cached_property
+    @property
     def interval(self) -> tuple[float, float]:
         """95 %, of the difference A less B."""
         return difference_interval(self.strata)
