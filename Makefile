@@ -3,7 +3,7 @@
 #   make setup [PYTHON=...] [TORCH_INDEX_URL=...] [TORCH_CUDA=1]     the environment, in .venv
 #   make demo                                                       serve a policy, evaluate it, show the table
 #   make test                                                       lint, types, layers, tests
-#   make families [FAMILIES="lerobot hf openvla …"]                 tests of model families, in .venv-NAME each
+#   make families [FAMILIES="lerobot hf rcs libero openvla …"]                 tests of model families, in .venv-NAME each
 #   make bench                                                      measure, and write the README's figures anew
 #
 # Torch comes from wherever pip looks (its settings, PIP_INDEX_URL, PIP_FIND_LINKS). TORCH_INDEX_URL names
@@ -29,7 +29,7 @@ STAMP := $(VENV)/.installed
 # Environments of model families: requirements/NAME.txt, in $(VENV)-NAME. What is tested in each is in tests/families,
 # in folders of the family's name. Those whose code is on no package index want its source, too: OPENPI_SRC, OPENVLA_SRC,
 # OPENVLA_OFT_SRC, OCTO_SRC, DIFFUSION_POLICY_SRC, VJEPA2_SRC.
-FAMILIES ?= lerobot hf
+FAMILIES ?= lerobot hf rcs libero
 TESTED_IN_hf := pi0 arro vjepa2_ac
 TORCH_FROM := $(if $(TORCH_INDEX_URL),--index-url $(TORCH_INDEX_URL))
 

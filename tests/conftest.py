@@ -19,6 +19,8 @@ os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("WANDB_MODE", "offline")
 prepare_rendering()
+if (simpler := assets("simpler")) is not None:
+    os.environ.setdefault("MS_ASSET_DIR", str(simpler))  # ManiSkill reads it once a process
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

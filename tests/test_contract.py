@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -96,8 +97,26 @@ def test_a_contract_survives_json() -> None:
     assert Contract.from_json({}) == Contract()
 
 
+def test_the_order_of_the_arms_survives_json_and_is_compared() -> None:
+    env = Contract(action=ActionSpec(dim=14, arms=("left", "right")))
+    again = Contract.from_json(json.loads(json.dumps(env.to_json())))
+    assert again == env
+    assert differences(Contract(action=ActionSpec(dim=14)), again) == []
+    [found] = differences(Contract(action=ActionSpec(dim=14, arms=("right", "left"))), again)
+    assert "put the arms' commands into the env's order" in found
+
+
 @pytest.mark.parametrize(
-    "data", [3, {"camera": {}}, {"cameras": []}, {"cameras": {"a": {"depth": 1}}}, {"action": {"dims": 1}}]
+    "data",
+    [
+        3,
+        {"camera": {}},
+        {"cameras": []},
+        {"cameras": {"a": {"depth": 1}}},
+        {"action": {"dims": 1}},
+        {"action": {"arms": "left"}},
+        {"action": {"arms": [1, 2]}},
+    ],
 )
 def test_an_unknown_key_in_a_contract_is_malformed(data: object) -> None:
     with pytest.raises(MalformedMessage):

@@ -9,6 +9,9 @@ import pytest
 import yaml
 
 from vlagents_ray.cli.evaluation import read_run
+from vlagents_ray.envs import metaworld
+from vlagents_ray.envs.known import known
+from vlagents_ray.envs.protocol import Protocol
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.serve.environments.config import EnvironmentArgs
 
@@ -32,3 +35,19 @@ def test_there_are_such_blocks() -> None:
 def test_the_file_of_runs_behind_the_reports_picture_is_accepted() -> None:
     config = EvalConfig.model_validate(read_run(DOCS / "evaluation" / "picture.yaml"))
     assert [policy.source for policy in config.policies] == ["learner:Learner", "scripted", "random"]
+
+
+@pytest.mark.parametrize(
+    ("page", "protocol"),
+    [
+        ("metaworld", metaworld.PROTOCOL),
+        ("pusht", known("gym_pusht/PushT-v0").protocol),
+        ("gymnasium", known("FetchReach-v4").protocol),
+    ],
+)
+def test_a_benchmarks_page_states_the_protocol_that_is_recorded(page: str, protocol: Protocol) -> None:
+    text = (DOCS / "benchmarks" / f"{page}.md").read_text()
+    rows = dict(re.findall(r"^\| (\w+) \| (.*) \|$", text, re.MULTILINE))
+    assert re.match(r"\d+", rows["steps"]).group() == str(protocol.max_steps)  # type: ignore[union-attr]
+    assert rows["rate"] == f"{protocol.control_hz:g} Hz"
+    assert ("ends the episode" in rows["success"]) is protocol.ends_on_success

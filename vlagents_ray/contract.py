@@ -55,6 +55,7 @@ class ActionSpec:
     gripper_closed: float | None = None  # and the one that closes it
     low: float | None = None  # bounds of every component
     high: float | None = None
+    arms: tuple[str, ...] | None = None  # of several, in the order of the row: each its command, then its gripper
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,13 +85,21 @@ class Contract:
                     raise MalformedMessage(f"contract.{name}: got {type(top[name]).__name__}, want an object")
                 top[name] = {str(k): spec(**_closed(spec, v, f"contract.{name}.{k}")) for k, v in top[name].items()}
         if "action" in top:
-            top["action"] = ActionSpec(**_closed(ActionSpec, top["action"], "contract.action"))
+            action = _closed(ActionSpec, top["action"], "contract.action")
+            arms = action.get("arms")
+            if isinstance(arms, (list, tuple)) and all(isinstance(name, str) for name in arms):
+                action["arms"] = tuple(arms)
+            elif arms is not None:
+                raise MalformedMessage(f"contract.action.arms: got {arms!r}, want a list of names")
+            top["action"] = ActionSpec(**action)
         return cls(**top)
 
 
 def _plain(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, tuple):
+        return list(value)
     return value.item() if isinstance(value, np.generic) else value
 
 
@@ -175,6 +184,7 @@ _ACTION_CURES = {
     "frame": "choose the control mode of that frame",
     "gripper_open": "map the gripper's command",
     "gripper_closed": "map the gripper's command",
+    "arms": "put the arms' commands into the env's order",
 }
 
 

@@ -40,7 +40,11 @@ ENVS: dict[str, str] = {
     "tabletop": "vlagents_ray.envs.tabletop:Tabletop",
     "maniskill": "vlagents_ray.envs.maniskill:ManiSkill",
     "metaworld": "vlagents_ray.envs.metaworld:MetaWorld",
+    "libero": "vlagents_ray.envs.libero:Libero",
+    "simpler": "vlagents_ray.envs.simpler:Simpler",
     "gymnasium": "vlagents_ray.envs.gymnasium:Gymnasium",
+    "rcs": "vlagents_ray.envs.rcs:Rcs",
+    "duobench": "vlagents_ray.envs.rcs:DuoBench",
 }
 
 # import name -> extra of this package that installs it
@@ -62,11 +66,14 @@ _EXTRAS = {
     "sapien": "maniskill",
     "torch": "maniskill",
     "metaworld": "metaworld",
+    "libero": "libero",
+    "robosuite": "libero",
     "gym_pusht": "pusht",
+    "gymnasium_robotics": "robotics",
 }
 
 # import name -> its file in requirements/: what runs in a Python environment of its own
-_ENVIRONMENTS = {"lerobot": "lerobot.txt"}
+_ENVIRONMENTS = {"lerobot": "lerobot.txt", "rcs": "rcs.txt", "duobench": "rcs.txt"}
 
 
 def require(module: str) -> ModuleType:

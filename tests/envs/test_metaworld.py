@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Iterator
 
+import metaworld
 import numpy as np
 import pytest
+from playing import Always, play
 
 from vlagents_ray.contract import CameraSpec, check_observation
-from vlagents_ray.envs.metaworld import MetaWorld
+from vlagents_ray.envs.metaworld import PROTOCOL, MetaWorld
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset, UnknownEnv
-from vlagents_ray.interface import Act
+from vlagents_ray.interface import HIGH_RES, Act
 from vlagents_ray.testing import check_env
 
 STILL = Act(np.zeros(4, np.float32))
@@ -109,6 +112,47 @@ def test_a_command_moves_the_hand_along_its_axis(reach: MetaWorld) -> None:
         assert np.abs(np.delete(moved, i)).max() < 0.02
 
 
+def test_fifty_initial_states_are_those_of_mt1() -> None:
+    tasks = metaworld.MT1("reach-v3", seed=42).train_tasks
+    with MetaWorld("reach-v3", width=16, height=16, goals_seed=42) as env:
+        assert env.init_states == 50
+        for index in (0, 7, 49):
+            goal = env.reset(seed=index, options={"init_state": index})[0].info["sim_state"][36:39]
+            drawn = pickle.loads(tasks[index].data)["rand_vec"]  # noqa: S301 - Meta-World's own, of this process
+            np.testing.assert_array_equal(goal, drawn[3:])
+        again = env.reset(seed=99, options={"init_state": 7})[0].info["sim_state"]
+        np.testing.assert_array_equal(again, env.reset(seed=7, options={"init_state": 7})[0].info["sim_state"])
+        for options in ({}, {"init_state": 50}, {"init_state": "7"}):
+            with pytest.raises(ConfigError, match="want 0 to 49"):
+                env.reset(seed=0, options=options)
+
+
+@pytest.mark.parametrize("ends", [True, False])
+def test_success_ends_the_episode_unless_told_otherwise(ends: bool) -> None:
+    with MetaWorld("reach-v3", cameras=(), max_steps=120, ends_on_success=ends) as env:
+        solved = play(env, "metaworld/reach-v3")
+        assert solved.success_once
+        assert (solved.ending == "terminated") is ends
+        assert (solved.steps == 120) is not ends
+        assert not play(env, "metaworld/reach-v3", Always(0, 0, 0, 0)).success_once
+        assert len(env.describe()["protocol"]["deviations"]) == (1 if ends else 2)
+
+
+def test_a_camera_stands_where_it_is_told() -> None:
+    seen = []
+    for positions in (None, {"corner2": (0.75, 0.075, 0.7)}, {"corner2": (0.75, 0.075, 0.7)}):
+        with MetaWorld("reach-v3", width=32, height=32, camera_positions=positions) as env:
+            seen.append(env.reset(seed=0)[0].cameras["corner2"])
+    np.testing.assert_array_equal(seen[1], seen[2])
+    assert not np.array_equal(seen[0], seen[1])
+
+
+def test_the_protocols_constants_are_the_simulators(reach: MetaWorld) -> None:
+    assert PROTOCOL.max_steps == reach._env.max_path_length
+    assert pytest.approx(1 / reach._env.dt) == PROTOCOL.control_hz
+    assert reach.describe()["protocol"]["deviations"] == []
+
+
 def test_the_step_limit_truncates_and_nothing_terminates() -> None:
     with MetaWorld("reach-v3", width=16, height=16, max_steps=3) as env:
         env.reset(seed=0)
@@ -157,3 +201,14 @@ def test_a_closed_env_says_so() -> None:
     env.close()
     with pytest.raises(EnvFailed, match="closed"):
         env.reset(seed=0)
+
+
+def test_views_for_the_record_have_a_size_of_their_own(reach: MetaWorld) -> None:
+    with MetaWorld("reach-v3", width=48, height=32, record_size=(128, 96)) as env:
+        obs, _ = env.reset(seed=1)
+        np.testing.assert_array_equal(obs.cameras["corner2"], reach.reset(seed=1)[0].cameras["corner2"])
+        view = obs.info[HIGH_RES]["corner2"]
+        assert (view.shape, view.dtype) == ((128, 96, 3), np.uint8)
+        assert np.abs(view[:64].mean(axis=(0, 1)) - obs.cameras["corner2"][:16].mean(axis=(0, 1))).max() < 40  # upright
+    with pytest.raises(ConfigError, match="want \\(height, width\\)"):
+        MetaWorld("reach-v3", record_size=(0, 96))

@@ -9,7 +9,6 @@ from recorded import record, runs
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import Results
-from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.combining import combined
 from vlagents_ray.evaluate.comparison import clock_gaps, comparable, compare, comparisons
 from vlagents_ray.evaluate.statistics import Pairs
@@ -104,17 +103,9 @@ def test_parts_of_one_evaluation_are_to_be_merged(tmp_path: Path) -> None:
         combined([folder(tmp_path / "a", "pi0"), folder(tmp_path / "b", "pi0")])
 
 
-def test_the_gap_to_the_synchronous_score_pairs_suites_that_differ_in_their_clock(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    settings = Cell.settings.fget  # type: ignore[attr-defined]
-
-    def with_clock(cell: Cell) -> dict[str, Any]:
-        clock = {"latency": 0.1} if cell.suite.name == "live" else None
-        return settings(cell) | {"clock": clock}
-
-    monkeypatch.setattr(Cell, "settings", property(with_clock))
-    suites = [{"name": name, "envs": [LINE], "episodes": 4} for name in ("live", "waiting")]
+def test_the_gap_to_the_synchronous_score_pairs_suites_that_differ_in_their_clock(tmp_path: Path) -> None:
+    suites: list[dict[str, Any]] = [{"name": name, "envs": [LINE], "episodes": 4} for name in ("live", "waiting")]
+    suites[0]["clock"] = {"latency": 0.1, "meanwhile": "hold"}
     config = runs(tmp_path, steps=[], suites=suites)
     gaps = clock_gaps(record(config, lambda cell, seed: 5 if cell.suite.name == "waiting" or seed == 0 else None))
     assert [(gap.a, gap.b) for gap in gaps] == [

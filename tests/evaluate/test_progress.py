@@ -33,7 +33,7 @@ def result(i: int, success: bool | None, status: Status = "done") -> EpisodeResu
 
 
 def shown(progress: Progress, out: StringIO) -> str:
-    progress.begin([TEN], {TEN.fingerprint: Rate(2, 4)})
+    progress.begin([TEN], {TEN.fingerprint: Rate(2, 4)}, 6)
     progress.episode(TEN, result(4, True))
     progress.retry(Job(key(5), TEN), RETRY)
     progress.episode(TEN, result(5, False))
@@ -64,7 +64,7 @@ def test_lines_are_sparse(monkeypatch: pytest.MonkeyPatch) -> None:
     out = StringIO()
     progress = LineProgress(Console(file=out, width=120), every_s=1e9)
     many = planned(100)
-    progress.begin([many], {})
+    progress.begin([many], {}, many.planned)
     for i in range(100):
         progress.episode(many, result(i, True))
     progress.end()

@@ -10,7 +10,7 @@ import pytest
 from eval_fakes import LINE, OTHER_LINE
 from rich.console import Console
 
-from vlagents_ray.evaluate import EvalConfig, Summary, print_summary
+from vlagents_ray.evaluate import EvalConfig, Summary, print_summary, synchronous_twin
 from vlagents_ray.evaluate.cells import cells
 from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.jobs import plan
@@ -100,3 +100,53 @@ def test_the_report_shows_rates_and_what_was_not_the_policys_fault(summary: Summ
     assert "1 attempts lost to infrastructure and repeated" in text
     assert "1 episodes lost to infrastructure" in text
     assert "--resume" in text
+
+
+def recorded(settings: EvalConfig, outcomes: dict[str, list[bool]], **fields: int) -> Summary:
+    """The summary of an evaluation whose suites had these outcomes."""
+    with Store(settings) as store:
+        store.begin_run(settings, versions())
+        for job in plan(store.cells):
+            if job.key.episode < len(outcomes[job.cell.suite.name]):
+                success = outcomes[job.cell.suite.name][job.key.episode]
+                waited = fields if job.cell.suite.clock else {}
+                store.record(EpisodeResult(job.key, "done", success, success, steps=10, **waited), 1)
+        store.end_run("complete")
+    return summarize(Results.load(settings.out))
+
+
+def printed(summary: Summary) -> str:
+    console = Console(file=StringIO(), width=200)
+    print_summary(console, summary)
+    return str(console.file.getvalue())  # type: ignore[attr-defined]
+
+
+def test_a_cell_in_real_time_tells_its_gap_to_the_synchronous_one(tmp_path: Path) -> None:
+    suites = [
+        {"name": "waits", "envs": [LINE], "episodes": 4},
+        {"name": "moves on", "envs": [LINE], "episodes": 4, "clock": {"latency": 0.2}},
+        {"name": "smaller", "envs": [LINE], "episodes": 4, "env_options": {"state_dim": 2}, "clock": {"latency": 0.2}},
+    ]
+    settings = EvalConfig.model_validate({"policies": [{}], "suites": suites, "out": tmp_path / "out"})
+    outcomes = {"waits": [True] * 4, "moves on": [True] + [False] * 3, "smaller": [True] * 4}
+    summary = recorded(settings, outcomes, ticks_waited=5, ticks_held=2)
+    waits, moves, smaller = summary.results.cells
+    assert synchronous_twin(summary.results, moves) is waits
+    assert synchronous_twin(summary.results, waits) is None
+    assert synchronous_twin(summary.results, smaller) is None, "it differs in more than its clock"
+    assert [cell["gap_to_synchronous"] for cell in summary.to_json()["cells"]] == [None, -0.75, None]
+    text = printed(summary)
+    assert "in real time: -75 points to the synchronous score; 50% of its ticks waited for an answer, 20% with" in text
+
+
+def test_a_cell_that_stopped_early_says_after_how_many_and_at_which_error_rate(config: Config) -> None:
+    settings = config(episodes=40, stop={"target": 0.5, "error_rate": 0.01})
+    summary = recorded(settings, {"": [True] * 20})
+    [cell] = summary.to_json()["cells"]
+    at = cell["stopped_at"]
+    assert 5 < at < 20
+    assert cell["success_once"]["confidence_sequence"][0] > 0.5
+    assert (cell["success_once"]["error_rate"], cell["episodes"], cell["planned"]) == (0.01, at, 40)
+    text = printed(summary)
+    assert f"stopped after {at} of 40 (error rate 1 %)" in text
+    assert "Wilson" not in text

@@ -16,6 +16,7 @@ _NEEDS = {
     "openpi": "jax",
     "openvla": "transformers",
     "pi0": "transformers",
+    "rcs": "rcs",
     "vjepa2_ac": "transformers",
 }
 

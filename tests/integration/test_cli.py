@@ -129,11 +129,40 @@ def test_a_running_server_is_evaluated_by_its_url(ray_home: Path, tmp_path: Path
     assert len(list((tmp_path / "o" / "videos").rglob("*.mp4"))) == 6
 
 
+RUNS = """
+policies:
+  - {name: expert, source: scripted}
+  - {name: still, source: noop, config: {action_dim: 4}}
+suites:
+  - {name: easy, envs: [tabletop/lift, tabletop/slide], episodes: 4}
+  - {name: long, envs: [tabletop/lift], episodes: 3, seeds: [0, 100], env_options: {max_steps: 20}}
+workers: 2
+video: none
+"""
+
+
+def test_a_file_of_runs_is_one_evaluation_of_all(ray_home: Path, tmp_path: Path) -> None:
+    file = tmp_path / "nightly.yaml"
+    file.write_text(RUNS)
+    done = evaluate(ray_home, str(file), cwd=tmp_path)
+    assert done.returncode == 0, done.stdout + done.stderr
+    summary = json.loads((tmp_path / "runs" / "nightly" / "summary.json").read_text())
+    cells = {(one["contender"], one["suite"], one["env"]): one["success_once"] for one in summary["cells"]}
+    assert [one["episodes"] for one in cells.values()] == [4, 4, 6] * 2
+    assert cells["expert", "easy", "tabletop/lift"]["successes"] == 4
+    assert cells["still", "easy", "tabletop/slide"]["successes"] == 0
+    refused = evaluate(ray_home, str(file), "--episodes", "9", cwd=tmp_path)
+    assert refused.returncode == 2
+    assert "says what is evaluated; got ['episodes'] beside it" in refused.stderr
+
+
 @pytest.mark.parametrize(
     ("words", "code", "text"),
     [
         (["tabletop", "--policy", "nope", "--out", "x"], 2, "nope"),
         (["nowhere", "--policy", "noop", "--out", "x"], 2, "nowhere"),
+        (["tabletop", "--out", "x"], 2, "want --policy and --out, or a file of runs"),
+        (["absent.yaml"], 2, "'absent.yaml' does not exist"),
         (["tabletop", "--policy", "noop", "--out", "x", "--set", "action_dims=4"], 2, "action_dims"),
         (["tabletop", "--policy", "noop", "--out", "x", "--set", "action_dim"], 2, "KEY=VALUE"),
         (["tabletop", "--policy", "noop", "--out", "x", "--video", "some"], 2, "video"),

@@ -8,13 +8,16 @@ import os
 import threading
 import time
 from collections import deque
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
 
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
+from vlagents_ray.policies.scripted import Scripted
 
 
 class Reacher(Agent):
@@ -203,3 +206,17 @@ class Stored(Agent):
 
     def close(self) -> None:
         Path(f"{self.path}.closed").touch()
+
+
+class Hesitant(Scripted):
+    """The expert, who now and then stays where it is, each session when its own dice say: some run out of time."""
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self.rng = np.random.default_rng(kwargs["seed"])
+        return super().reset(obs, instruction, **kwargs)
+
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        actions = np.stack([act.action for act in super().act_batch(obs, sessions)])  # type: ignore[union-attr]
+        dice = np.array([session.rng.random() for session in sessions])  # type: ignore[attr-defined]
+        actions[dice < 0.4, :3] = 0.0
+        return [Act(row) for row in actions]

@@ -12,7 +12,7 @@ from vlagents_ray.registry import names, policy_class
 from vlagents_ray.testing import check_agent, check_env
 
 # Registered names whose own test modules run the suites, because they need a simulator or a setting.
-CHECKED_ELSEWHERE = {"maniskill", "metaworld", "replay"}
+CHECKED_ELSEWHERE = {"libero", "maniskill", "metaworld", "rcs", "duobench", "replay", "simpler"}
 ENV_NAMES = {
     "tabletop": ["tabletop"],
     "gymnasium": ["gymnasium/Pendulum-v1", "gymnasium/gym_pusht/PushT-v0"],

@@ -6,6 +6,7 @@ import contextlib
 import math
 import os
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -15,7 +16,7 @@ import yaml
 from vlagents_ray.cli.console import errors, out
 from vlagents_ray.cli.settings import parse_settings
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.serve.checkpoints import resolved
+from vlagents_ray.serve.checkpoints import STEP, resolved
 from vlagents_ray.serve.cluster import running_server
 from vlagents_ray.serve.files import own_settings, read_deployment, together, with_settings
 
@@ -60,6 +61,20 @@ def evaluate_command(
         list[str],
         typer.Option("--reset-set", metavar="KEY=VALUE", help="An option of the policy's reset: checkpoint_step=9."),
     ] = [],  # noqa: B006
+    watch: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Evaluate each checkpoint that a training run writes there, until Ctrl-C."),
+    ] = None,
+    until: Annotated[int | None, typer.Option(min=0, metavar="STEP", help="End --watch with this step.")] = None,
+    settle: Annotated[
+        float | None, typer.Option(min=0, help="With --watch: s that a checkpoint must not have changed; default: 10.")
+    ] = None,
+    marker: Annotated[
+        str | None, typer.Option(metavar="NAME", help="With --watch: the file that the trainer writes in it when done.")
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print plan, count and estimated time; play nothing.")
+    ] = False,
     address: Address = None,
 ) -> None:
     """Evaluate policies: episodes in parallel, success rates with confidence intervals, videos.
@@ -88,12 +103,27 @@ def evaluate_command(
             if policy is None or out_dir is None:
                 raise ConfigError("want --policy and --out, or a file of runs (.yaml)")
             fields = {"policies": [of_policy], "suites": [{"envs": what} | of_suite], **running}
-        run_evaluation(EvalConfig.model_validate(fields), address)
+        config = EvalConfig.model_validate(fields)
+        watching = _given(until=until, settle_s=settle, marker=marker)
+        if watching and watch is None:
+            raise ConfigError(f"got {sorted(watching)} without --watch")
+        if dry_run and watch is not None:
+            raise ConfigError("--dry-run and --watch exclude each other: nobody knows yet which steps there will be")
+        if dry_run:
+            from vlagents_ray.cli.forecasting import print_plan
+
+            print_plan(config)
+        elif watch is not None:
+            from vlagents_ray.cli.watching import watch_training
+
+            watch_training(config, watch, address, **watching)
+        else:
+            run_evaluation(config, address)
 
 
 def _given(**options: Any) -> dict[str, Any]:
     """The options that say something."""
-    return {name: value for name, value in options.items() if value not in (None, False, {})}
+    return {name: value for name, value in options.items() if value is not None and value is not False and value != {}}
 
 
 def read_run(file: Path) -> dict[str, Any]:
@@ -111,39 +141,69 @@ def read_run(file: Path) -> dict[str, Any]:
 
 def run_evaluation(config: EvalConfig, address: str | None = None) -> None:
     """Serve the policies that are not at a URL, evaluate them all, print the table."""
-    from vlagents_ray.evaluate import EvaluationInterrupted, check, evaluate, most_cpus, print_summary, progress_for
+    with served(config, address) as ready:
+        evaluate_and_print(ready)
 
-    parts: dict[str, ServeDeploySchema] = {}
-    policies = [_reached(policy, parts) for policy in config.policies]
-    config = type(config).model_validate(config.model_dump(exclude_unset=True) | {"policies": policies})
+
+@contextlib.contextmanager
+def served(config: EvalConfig, address: str | None = None) -> Iterator[EvalConfig]:
+    """`config` with the URLs of its policies, those that are not at one being served for the length of the context."""
+    from vlagents_ray.evaluate import check, most_cpus
+
+    config, parts = reached(config)
     check(config)  # what is wrong is said before anything starts
     with contextlib.ExitStack() as stack:
         if parts:
             # Ray's CPUs are bookkeeping here: the number of workers that the user asked for must fit.
             cpus = max(os.cpu_count() or 1, math.ceil(config.workers * most_cpus(config)))
             stack.enter_context(running_server(together(parts), address=address, num_cpus=cpus))
-        try:
-            summary = evaluate(config, progress=progress_for(out))
-        except EvaluationInterrupted as interrupted:
-            print_summary(out, interrupted.summary)
-            raise
+        yield config
+
+
+def evaluate_and_print(config: EvalConfig) -> None:
+    """Evaluate policies that are at their URLs; an interrupted evaluation prints what it has."""
+    from vlagents_ray.evaluate import EvaluationInterrupted, evaluate, print_summary, progress_for
+
+    try:
+        summary = evaluate(config, progress=progress_for(out))
+    except EvaluationInterrupted as interrupted:
+        print_summary(out, interrupted.summary)
+        raise
     print_summary(out, summary)
 
 
-def _reached(policy: PolicyConfig, parts: dict[str, ServeDeploySchema]) -> PolicyConfig:
+def reached(config: EvalConfig, *, ask: bool = True) -> tuple[EvalConfig, dict[str, ServeDeploySchema]]:
+    """`config` with what its policies are and where; and by application those that are to be served there.
+
+    A server at a URL is asked what it serves, unless `ask` is off.
+    """
+    parts: dict[str, ServeDeploySchema] = {}
+    policies = [_reached(policy, parts, ask=ask) for policy in config.policies]
+    return type(config).model_validate(config.model_dump(exclude_unset=True) | {"policies": policies}), parts
+
+
+def _reached(policy: PolicyConfig, parts: dict[str, ServeDeploySchema], *, ask: bool) -> PolicyConfig:
     """`policy` with its URL and with what it is; one that is to be served joins `parts`."""
     url = policy.source if policy.source is not None and "://" in policy.source else policy.url
     if url is not None:
-        return policy.model_copy(update={"url": url, "source": None} | _found(policy, url))
+        return policy.model_copy(update={"url": url, "source": None} | (_found(policy, url) if ask else {}))
     if policy.source is None:
         raise ConfigError(f"policy {policy.name!r}: want `source`, a policy to serve, or the `url` of a server")
-    part = with_settings(read_deployment(policy.source), policy.config, steps=bool(policy.steps))
+    part = deployed(policy, policy.source)
     own = own_settings(part.applications[0])
     name = policy.name if "name" in policy.model_fields_set else str(part.applications[0].args["policy"])
     application = re.sub(r"\W+", "-", name.rpartition(":")[2])
+    if policy.steps and own.get(STEP) is None:  # the deployment's own is some step; what is recorded is the pattern
+        part = with_settings(part, {STEP: policy.steps[0]}, steps=True)
     parts[application] = part
     found = {"name": name, "url": f"serve://{application}", "config": own, "checkpoint": resolved(own)}
     return policy.model_copy(update=found)
+
+
+def deployed(policy: PolicyConfig, source: str) -> ServeDeploySchema:
+    """The deployment of `source` with the settings of `policy`."""
+    of_name = {"config": policy.config} if policy.config and not source.endswith(_FILE) else None
+    return with_settings(read_deployment(source, of_name), policy.config, steps=bool(policy.steps))
 
 
 def _found(policy: PolicyConfig, url: str) -> dict[str, Any]:

@@ -7,13 +7,17 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from vlagents_ray.contract import Contract
-from vlagents_ray.errors import ConfigError
+import numpy as np
+
+from vlagents_ray.contract import Contract, check_action
+from vlagents_ray.errors import ConfigError, InvalidAction
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.registry import env_class, env_task
 
 if TYPE_CHECKING:
     from typing_extensions import Self
+
+    from vlagents_ray.envs.batch import BatchEnv
 
 
 class EvalEnv(ABC):
@@ -65,6 +69,11 @@ class EvalEnv(ABC):
         """What keeps this simulator from running here, with the cure; None if nothing does."""
         return None
 
+    @classmethod
+    def batched(cls, num_envs: int, **options: Any) -> BatchEnv | None:  # noqa: ARG003 - for those that override it
+        """`num_envs` environments in one simulator, made with the constructor's options; None if that cannot be."""
+        return None
+
     def describe(self) -> dict[str, Any]:
         """What a reader of the results must know: versions, control mode, render backend."""
         return {}
@@ -85,13 +94,28 @@ def make_env(name: str, **options: Any) -> EvalEnv:
 
     Raises `UnknownEnv` for an unknown name and `ConfigError` for an option that the env does not take.
     """
+    cls, arguments = env_arguments(name, options)
+    env: EvalEnv = cls(**arguments)
+    return env
+
+
+def env_arguments(name: str, options: Mapping[str, Any]) -> tuple[type[EvalEnv], dict[str, Any]]:
+    """The class of the env `name` and what its constructor is given; raises as `make_env`."""
     cls = env_class(name)
     task = env_task(name)
-    arguments = {"task": task, **options} if task is not None else options
+    arguments = {"task": task, **options} if task is not None else dict(options)
     try:
         inspect.signature(cls).bind(**arguments)
     except TypeError as error:
         takes = sorted(set(inspect.signature(cls).parameters) - {"self"})
         raise ConfigError(f"env {name!r}: {error}; it takes {takes}") from error
-    env: EvalEnv = cls(**arguments)
-    return env
+    return cls, arguments
+
+
+def one_row(act: Act, contract: Contract) -> np.ndarray:
+    """The action as (D,) float32, for `step`; `InvalidAction` if it is anything else."""
+    action = check_action(act.action, contract)
+    if action.ndim != 1:
+        dim = contract.action.dim
+        raise InvalidAction(f"action: got {action.shape}, want ({dim},); step through a chunk row by row")
+    return action

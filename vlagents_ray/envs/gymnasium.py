@@ -8,31 +8,23 @@ rendered. Everything else is an option of `Gymnasium`.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec, check_action
-from vlagents_ray.envs.base import EvalEnv
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.envs.base import EvalEnv, one_row
 from vlagents_ray.envs.headless import prepare_rendering
+from vlagents_ray.envs.known import known
 from vlagents_ray.envs.mapping import RENDER, Pick, as_image, bounds, parts, plain, uniform
-from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, MissingDependency, NotReset, UnknownEnv
-from vlagents_ray.interface import Act, Obs
+from vlagents_ray.envs.recording import record_size_of
+from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, NotReset, UnknownEnv
+from vlagents_ray.interface import HIGH_RES, Act, Obs
 from vlagents_ray.registry import require
 
 TERMINATED = "terminated"
 _SUCCESS_KEYS = ("is_success", "success")
-
-# What an environment does not say about itself.
-_KNOWN: dict[str, dict[str, Any]] = {
-    "gym_pusht/PushT-v0": {
-        "kwargs": {"obs_type": "pixels_agent_pos"},
-        "cameras": {"front": "pixels"},
-        "instruction": "push the T-shaped block onto the green target",
-        "control_hz": 10.0,
-    },
-}
 
 
 class Gymnasium(EvalEnv):
@@ -61,6 +53,7 @@ class Gymnasium(EvalEnv):
         height: int | None = None,
         max_steps: int | None = None,
         remake: bool = False,
+        record_size: Sequence[int] | None = None,
     ) -> None:
         """Make the environment `task`, a Gymnasium id, and look at one observation of it.
 
@@ -74,18 +67,21 @@ class Gymnasium(EvalEnv):
         width, height: stretch every image to this size in pixels.
         max_steps: in place of the registered step limit.
         remake: make the simulator anew in each reset, for one whose reset leaves something behind.
+        record_size: height and width of the same pictures once more, for the record only.
         """
         if task is None:
             raise UnknownEnv("gymnasium: got no id, want one, as in 'gymnasium/Pendulum-v1'")
         prepare_rendering()
-        known = _KNOWN.get(task, {})
+        defaults = known(task)
         self._id = task
-        self._module = module
-        self._kwargs = {"render_mode": "rgb_array", **known.get("kwargs", {}), **(kwargs or {})}
-        self._instruction = instruction if instruction is not None else known.get("instruction", "")
+        self._module = module if module is not None else defaults.module
+        self._kwargs = {"render_mode": "rgb_array", **defaults.kwargs, **(kwargs or {})}
+        self._instruction = instruction if instruction is not None else defaults.instruction
+        self._protocol = defaults.protocol
         self._success = success
         self._unit_actions = unit_actions
         self._size = (height, width)
+        self._record_size = record_size_of(record_size, f"gymnasium/{task}")
         self._remake = remake
         self._ready = False
         self._steps = 0
@@ -97,14 +93,14 @@ class Gymnasium(EvalEnv):
             if unit_actions and not np.isfinite([self._low, self._high]).all():
                 raise ConfigError(f"gymnasium/{task}: unit_actions needs finite bounds, got {self._action_space}")
             seen_cameras, seen_state = parts(self._env.observation_space, self._env.render_mode)
-            self._cameras = _picks(cameras if cameras is not None else known.get("cameras", seen_cameras))
+            self._cameras = _picks(next(c for c in (cameras, defaults.cameras, seen_cameras) if c is not None))
             self._state = _picks(state if state is not None else seen_state)
             self._gripper = Pick.parse(gripper) if gripper is not None else None
             self._gripper_closed, self._gripper_open = gripper_range
             if self._gripper_closed == self._gripper_open:
                 raise ConfigError(f"gymnasium/{task}: gripper_range is {gripper_range}, want two different numbers")
             first, _ = self._call("reset", seed=0)
-            self._contract = self._describe_contract(self._observe(first), control_hz or known.get("control_hz"))
+            self._contract = self._describe_contract(self._observe(first), control_hz or defaults.control_hz)
         except BaseException:
             self.close()
             raise
@@ -126,6 +122,7 @@ class Gymnasium(EvalEnv):
         return self._instruction
 
     def describe(self) -> dict[str, Any]:
+        played = {"max_steps": self.max_steps, "control_hz": self._contract.control_hz}
         return {
             "id": self._id,
             "gymnasium": require("gymnasium").__version__,
@@ -133,6 +130,7 @@ class Gymnasium(EvalEnv):
             "action_space": self._action_space,
             "unit_actions": self._unit_actions,
             "success": self._success or f"info: {' or '.join(_SUCCESS_KEYS)}",
+            "protocol": self._protocol.describe(**played) if self._protocol is not None else played,
         }
 
     def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
@@ -150,11 +148,7 @@ class Gymnasium(EvalEnv):
     def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
         if not self._ready:
             raise NotReset(f"gymnasium/{self._id}: step before reset; call reset(seed=...) first")
-        action = check_action(act.action, self._contract).astype(np.float64)
-        if action.ndim != 1:
-            raise InvalidAction(
-                f"action: got {action.shape}, want ({len(self._low)},); step through a chunk row by row"
-            )
+        action = one_row(act, self._contract).astype(np.float64)
         if self._unit_actions:
             action = self._low + (action + 1) / 2 * (self._high - self._low)
         action = np.clip(action, self._low, self._high).astype(self._dtype)
@@ -201,15 +195,18 @@ class Gymnasium(EvalEnv):
             raise EnvFailed(f"gymnasium/{self._id}: {method} raised {type(error).__name__}: {error}") from error
 
     def _observe(self, nested: Any) -> Obs:
-        cameras = {}
+        cameras, recorded = {}, {}
         for name, pick in self._cameras.items():
             picture = self._call("render") if pick.text == RENDER else pick.value(nested)
             cameras[name] = as_image(picture, name, self._size)
+            if self._record_size is not None:
+                recorded[name] = as_image(picture, name, self._record_size)
         gripper = None
         if self._gripper is not None:
             share = (self._gripper.number(nested) - self._gripper_closed) / (self._gripper_open - self._gripper_closed)
             gripper = min(max(share, 0.0), 1.0)
-        return Obs(cameras=cameras, gripper=gripper, state={k: pick.vector(nested) for k, pick in self._state.items()})
+        state = {name: pick.vector(nested) for name, pick in self._state.items()}
+        return Obs(cameras, gripper, state, {HIGH_RES: recorded} if recorded else {})
 
     def _succeeded(self, info: Mapping[str, Any], terminated: bool) -> bool:
         if self._success == TERMINATED:

@@ -14,15 +14,27 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec, check_action
-from vlagents_ray.envs.base import EvalEnv
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.envs.base import EvalEnv, one_row
 from vlagents_ray.envs.headless import prepare_rendering
 from vlagents_ray.envs.probe import EGL_CURE, egl_probe
-from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset, UnknownEnv
-from vlagents_ray.interface import Act, Obs
+from vlagents_ray.envs.protocol import Protocol
+from vlagents_ray.envs.recording import record_size_of
+from vlagents_ray.errors import ConfigError, EnvFailed, NotReset, UnknownEnv
+from vlagents_ray.interface import HIGH_RES, Act, Obs
 from vlagents_ray.registry import require
 
-_MAX_STEPS = 500  # the simulator refuses to go further
+PROTOCOL = Protocol(
+    name="Meta-World",
+    source="Meta-World 3.1.1, metaworld.evaluation and MT1",
+    max_steps=500,  # the simulator refuses to go further
+    control_hz=80.0,
+    control="position of the hand, delta",
+    success="the task is solved after any step: success_once",
+    begins="where the object and the goal are: the episode's seed, or one of the 50 states that MT1 draws",
+    ends_on_success=True,
+    episodes=50,
+)
 _UPSIDE_DOWN = ("corner2",)  # cameras that Meta-World mounts so; the others stand upright
 
 
@@ -36,8 +48,9 @@ class MetaWorld(EvalEnv):
     Action: (4,) in [-1, 1]: the hand's target moves by 0.01 m a unit, x, y, z in the world's frame;
     the last is the gripper's effort, -1 opens, 1 closes.
 
-    The seed draws the object's and the goal's position, as Meta-World's own generator of tasks does.
-    The env goes on after success, and never reports `terminated`.
+    The seed draws the object's and the goal's position, as Meta-World's own generator of tasks does;
+    with `goals_seed` they are the 50 that its MT1 draws with that, in order. Success ends the episode
+    unless `ends_on_success` is False.
     """
 
     def __init__(
@@ -48,7 +61,11 @@ class MetaWorld(EvalEnv):
         height: int = 224,
         cameras: Sequence[str] = ("corner2",),
         instruction: str | None = None,
-        max_steps: int = _MAX_STEPS,
+        max_steps: int = PROTOCOL.max_steps,
+        goals_seed: int | None = None,
+        ends_on_success: bool = True,
+        camera_positions: Mapping[str, Sequence[float]] | None = None,
+        record_size: Sequence[int] | None = None,
     ) -> None:
         """Raises `UnknownEnv`, `ConfigError`, `MissingDependency`, or `EnvFailed` with its cure.
 
@@ -59,9 +76,15 @@ class MetaWorld(EvalEnv):
             cameras: by MuJoCo's names, e.g. "corner2", "gripperPOV".
             instruction: None is the task's name in words.
             max_steps: 500 at most.
+            goals_seed: of MT1, whose 50 initial states are then the task's; None: each episode's seed draws one.
+            ends_on_success: as in Meta-World's own evaluation; False: success at the end can be measured, too.
+            camera_positions: name -> (x, y, z) m, of cameras that stand elsewhere than in Meta-World.
+            record_size: height and width of further views by the same cameras, for the record only.
         """
-        if not 1 <= max_steps <= _MAX_STEPS:
-            raise ConfigError(f"metaworld: max_steps is {max_steps}, want 1 to {_MAX_STEPS}, where the simulator stops")
+        if not 1 <= max_steps <= PROTOCOL.max_steps:
+            raise ConfigError(
+                f"metaworld: max_steps is {max_steps}, want 1 to {PROTOCOL.max_steps}, where the simulator stops"
+            )
         for name, value in (("width", width), ("height", height)):
             if value < 1:
                 raise ConfigError(f"metaworld: {name} is {value}, want at least 1")
@@ -72,11 +95,16 @@ class MetaWorld(EvalEnv):
         self.max_steps = max_steps
         self._task = task
         self._instruction = instruction or task.removesuffix("-v3").replace("-", " ")
+        self._ends_on_success = ends_on_success
+        self._goals: list[Any] | None = None
         self._steps: int | None = None
         self._env: Any = None
         self._renderer: Any = None
+        self._record: Any = None  # the renderer of the views for the record
+        record = record_size_of(record_size, f"metaworld/{task}")
+        tallest, widest = (max(pair) for pair in zip((height, width), record or (0, 0), strict=True))
         with self._failing("make"):
-            self._env = known[task](width=width, height=height)  # the model's frame buffer grows to this size
+            self._env = known[task](width=widest, height=tallest)  # the model's frame buffer grows to this size
             have = [self._env.model.camera(i).name for i in range(self._env.model.ncam)]
             # what Meta-World does for its classes with an observable goal, but drawing from our seed
             self._env._partially_observable = False
@@ -84,10 +112,15 @@ class MetaWorld(EvalEnv):
             self._env._freeze_rand_vec = False
             self._env._set_task_called = True
             self._env.seeded_rand_vec = True
-        unknown = sorted(set(cameras) - set(have))
+            if goals_seed is not None:
+                self._goals = require("metaworld").MT1(task, seed=goals_seed).train_tasks
+                self.init_states = len(self._goals)
+        unknown = sorted({*cameras, *(camera_positions or {})} - set(have))
         if unknown:
             self.close()
             raise ConfigError(f"metaworld/{task} has no camera {unknown}: want some of {sorted(have)}")
+        for name, position in (camera_positions or {}).items():
+            self._env.model.camera(name).pos = position
         self._contract = Contract(
             cameras={name: CameraSpec(height, width) for name in cameras},
             state={"xyz": StateSpec(3, "m")},
@@ -109,6 +142,7 @@ class MetaWorld(EvalEnv):
         try:
             with self._failing("make its renderer"):
                 self._renderer = require("mujoco").Renderer(self._env.model, height, width)
+                self._record = require("mujoco").Renderer(self._env.model, *record) if record else None
         except EnvFailed:
             self.close()
             raise
@@ -122,12 +156,13 @@ class MetaWorld(EvalEnv):
         return self._instruction
 
     def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
-        """Begin the episode of `seed`, taken modulo 2^32; there are no options."""
-        if options:
-            raise ConfigError(f"metaworld: unknown reset options {sorted(options)}, want none")
+        """Begin the episode of `seed`, taken modulo 2^32, or with `goals_seed` the one of the option `init_state`."""
         env = self._alive()
+        goal = self._goal(dict(options or {}))
         with self._failing("reset"):
             env.seed(seed % 2**32)
+            if goal is not None:
+                env.set_task(goal)
             raw, _ = env.reset()
             self._steps = 0
             return self._observe(raw), {"success": False}
@@ -136,14 +171,13 @@ class MetaWorld(EvalEnv):
         env = self._alive()
         if self._steps is None:
             raise NotReset(f"metaworld/{self._task}: step before reset; call reset(seed=...) first")
-        action = check_action(act.action, self._contract)
-        if action.ndim != 1:
-            raise InvalidAction(f"action: got {action.shape}, want (4,); step through a chunk row by row")
+        action = one_row(act, self._contract)
         with self._failing("step"):
             raw, reward, _, _, info = env.step(np.clip(action, -1.0, 1.0))
             self._steps += 1
             success = bool(info["success"])
-            return self._observe(raw), float(reward), False, self._steps >= self.max_steps, {"success": success}
+            ended = success and self._ends_on_success
+            return self._observe(raw), float(reward), ended, self._steps >= self.max_steps, {"success": success}
 
     @classmethod
     def tasks(cls) -> list[str]:
@@ -170,27 +204,44 @@ class MetaWorld(EvalEnv):
             "control_mode": "ee_delta_position",
             "metres_per_unit": float(self._alive().action_scale),
             "render_backend": os.environ.get("MUJOCO_GL", "glfw"),
+            "protocol": PROTOCOL.describe(max_steps=self.max_steps, ends_on_success=self._ends_on_success),
         }
 
     def close(self) -> None:
-        renderer, self._renderer = self._renderer, None
+        renderers, self._renderer, self._record = (self._renderer, self._record), None, None
         env, self._env, self._steps = self._env, None, None
-        if renderer is not None:
-            renderer.close()
+        for renderer in renderers:
+            if renderer is not None:
+                renderer.close()
         if env is not None:
             env.close()
 
+    def _goal(self, options: dict[str, Any]) -> Any:
+        """The initial state that the options name, as Meta-World has it; None without `goals_seed`."""
+        index = options.pop("init_state", None) if self._goals is not None else None
+        if options:
+            raise ConfigError(f"metaworld: unknown reset options {sorted(options)}, want init_state, with goals_seed")
+        if self._goals is None:
+            return None
+        if type(index) is not int or not 0 <= index < len(self._goals):
+            raise ConfigError(f"metaworld: init_state is {index!r}, want 0 to {len(self._goals) - 1}")
+        return self._goals[index]
+
     def _observe(self, raw: np.ndarray) -> Obs:
+        cameras = self._contract.cameras or {}
+        info: dict[str, Any] = {"sim_state": raw}
+        if self._record is not None:
+            info[HIGH_RES] = {name: self._render(self._record, name) for name in cameras}
         return Obs(
-            cameras={name: self._render(name) for name in self._contract.cameras or ()},
+            cameras={name: self._render(self._renderer, name) for name in cameras},
             gripper=float(raw[3]),  # the fingers' distance over 0.1 m, clipped to [0, 1] by Meta-World
             state={"xyz": raw[:3].astype(np.float32)},
-            info={"sim_state": raw},
+            info=info,
         )
 
-    def _render(self, camera: str) -> np.ndarray:
-        self._renderer.update_scene(self._env.data, camera=camera)
-        image: np.ndarray = self._renderer.render()
+    def _render(self, renderer: Any, camera: str) -> np.ndarray:
+        renderer.update_scene(self._env.data, camera=camera)
+        image: np.ndarray = renderer.render()
         return np.ascontiguousarray(image[::-1, ::-1]) if camera in _UPSIDE_DOWN else image
 
     def _alive(self) -> Any:

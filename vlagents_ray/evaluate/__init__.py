@@ -5,15 +5,17 @@ summary = evaluate(
 )
 """
 
-from vlagents_ray.evaluate.config import EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig
+from vlagents_ray.evaluate.config import ClockConfig, EvalConfig, PolicyConfig, StopConfig, SuiteConfig, WorkerConfig
 from vlagents_ray.evaluate.progress import Progress, SilentProgress, progress_for
 from vlagents_ray.evaluate.report import print_summary, results_table
-from vlagents_ray.evaluate.results import Results
+from vlagents_ray.evaluate.results import Results, synchronous_twin
 from vlagents_ray.evaluate.runner import EvaluationInterrupted, check, evaluate, most_cpus
 from vlagents_ray.evaluate.statistics import Rate, wilson
+from vlagents_ray.evaluate.stopping import confidence_sequence
 from vlagents_ray.evaluate.summary import Group, Summary
 
 __all__ = [
+    "ClockConfig",
     "EvalConfig",
     "EvaluationInterrupted",
     "Group",
@@ -22,14 +24,17 @@ __all__ = [
     "Rate",
     "Results",
     "SilentProgress",
+    "StopConfig",
     "SuiteConfig",
     "Summary",
     "WorkerConfig",
     "check",
+    "confidence_sequence",
     "evaluate",
     "most_cpus",
     "print_summary",
     "progress_for",
     "results_table",
+    "synchronous_twin",
     "wilson",
 ]

@@ -51,6 +51,7 @@ class Cell:
             "checkpoint": self.policy.checkpoint,
             "execute": self.policy.execute,
             "codec": "jpeg" if self.policy.codec == "jpeg" else "exact",
+            "clock": self.suite.clock.model_dump() if self.suite.clock else None,
         }
 
     @cached_property

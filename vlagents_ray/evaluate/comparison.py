@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate.results import CellResults, Results
+from vlagents_ray.evaluate.results import CellResults, Results, synchronous_twin
 from vlagents_ray.evaluate.statistics import Pairs, difference_interval, holm
 
 # Of a cell's settings, those of the policy: what contenders may differ in. All others are the env's.
 OF_POLICY = frozenset({"policy", "policy_config", "policy_options", "checkpoint", "execute", "codec"})
-CLOCK = "clock"  # the setting of a suite that is played in real time
 ALL = "all"
 
 Strata = dict[str, Pairs]  # by env
@@ -101,22 +100,12 @@ def clock_gaps(results: Results) -> list[Comparison]:
     """
     found: dict[tuple[str, str], Strata] = {}
     for cell in results.cells:
-        twin = _synchronous_twin(results, cell)
+        twin = synchronous_twin(results, cell)
         if twin is not None and (pairs := _pairs(cell, twin)).total:
             name = f"{cell.contender}, {cell.suite} in real time", f"{cell.contender}, {twin.suite}".rstrip(", ")
             found.setdefault(name, {})[cell.env] = pairs
     lines = _lines(ALL, [list(strata.values()) for strata in found.values()])
     return [Comparison(a, b, (), line) for (a, b), line in zip(found, lines, strict=True)]
-
-
-def _synchronous_twin(results: Results, cell: CellResults) -> CellResults | None:
-    if cell.settings.get(CLOCK) is None:
-        return None
-    wanted = _without(cell.settings, CLOCK.__eq__)
-    for other in results.of(cell.contender):
-        if other.settings.get(CLOCK) is None and _without(other.settings, CLOCK.__eq__) == wanted:
-            return other
-    return None
 
 
 def _by_suite(results: Results, a: str, b: str) -> dict[str, Strata]:
@@ -138,7 +127,7 @@ def _by_suite(results: Results, a: str, b: str) -> dict[str, Strata]:
 
 
 def _require_same_env(cell: CellResults, other: CellResults) -> None:
-    one, two = (_without(each.settings, OF_POLICY.__contains__) for each in (cell, other))
+    one, two = _of_env(cell), _of_env(other)
     for name in sorted(one.keys() | two.keys()):
         if one.get(name) != two.get(name):
             raise ConfigError(
@@ -147,8 +136,8 @@ def _require_same_env(cell: CellResults, other: CellResults) -> None:
             )
 
 
-def _without(settings: Mapping[str, Any], left_out: Callable[[str], bool]) -> dict[str, Any]:
-    return {name: value for name, value in settings.items() if not left_out(name)}
+def _of_env(cell: CellResults) -> dict[str, Any]:
+    return {name: value for name, value in cell.settings.items() if name not in OF_POLICY}
 
 
 def _pairs(a: CellResults, b: CellResults) -> Pairs:

@@ -12,6 +12,7 @@ from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    FiniteFloat,
     JsonValue,
     NonNegativeFloat,
     NonNegativeInt,
@@ -96,6 +97,38 @@ class WorkerConfig(_Closed):
     runtime_env: dict[str, JsonValue] = {}
 
 
+class ClockConfig(_Closed):
+    """Real-time mode: the env's clock runs on while the policy thinks (see `vlagents_ray.evaluate.clock`)."""
+
+    # s that each answer takes: "measured" as it comes, transport included, or injected, which repeats exactly.
+    latency: Literal["measured"] | Annotated[FiniteFloat, Field(ge=0)] = "measured"
+    # What is executed between observation and answer. "chunk": what is left of the last chunk, then what stops the
+    # robot: "zero" for relative actions, else "hold"; "hold": the last action again; "zero": no motion, the gripper
+    # as it was commanded.
+    meanwhile: Literal["chunk", "hold", "zero"] = "chunk"
+    hz: Annotated[FiniteFloat, Field(gt=0)] | None = None  # ticks a second; None: the env's control_hz
+    align: bool = True  # drop the rows whose ticks were over when the answer came
+    # Tell the policy what is left of the last chunk, and for how many ticks it will be executed (`interface.DELAY`).
+    real_time_chunking: bool = False
+    # The action that is executed before the first answer, and by "zero"; None: zeros, and the gripper open at first.
+    neutral: list[FiniteFloat] | None = None
+
+
+class StopConfig(_Closed):
+    """When a cell is certain enough to end early (see `vlagents_ray.evaluate.stopping`)."""
+
+    error_rate: float = Field(default=0.05, gt=0, lt=1)  # of each cell's confidence sequence, over all looks together
+    target: float | None = Field(default=None, ge=0, le=1)  # stop when this success rate is excluded
+    width: float | None = Field(default=None, gt=0, lt=1)  # stop when the interval is narrower
+    at_least: PositiveInt = 1  # episodes
+
+    @model_validator(mode="after")
+    def _some_end(self) -> Self:
+        if self.target is None and self.width is None:
+            raise ValueError("got neither target nor width; want one of them, or both: whichever comes first stops")
+        return self
+
+
 class SuiteConfig(_Closed):
     """Environments that are evaluated alike."""
 
@@ -106,6 +139,7 @@ class SuiteConfig(_Closed):
     episodes: PositiveInt = 10  # of each env and seed
     seeds: list[NonNegativeInt] = Field(default=[0], min_length=1)  # episode i uses seed + i
     worker: WorkerConfig | None = None  # in place of the evaluation's
+    clock: ClockConfig | None = None  # real-time mode; None: the env waits for the policy
 
     @field_validator("envs")
     @classmethod
@@ -136,6 +170,7 @@ class EvalConfig(_Closed):
     video: Video = "failures"
     resume: bool = False
     worker: WorkerConfig = WorkerConfig()
+    stop: StopConfig | None = None  # early stopping; None: every episode is played
 
     # What happens when something breaks.
     retries: NonNegativeInt = 3  # further attempts after an infrastructure failure

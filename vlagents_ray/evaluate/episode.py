@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from time import perf_counter
 from typing import Any, Literal
 
 import numpy as np
 
-from vlagents_ray.contract import check_action
+from vlagents_ray.contract import Contract, check_action
 from vlagents_ray.envs import EvalEnv
-from vlagents_ray.errors import CheckpointFailed, EnvFailed, PolicyFailed, VLAgentsError
+from vlagents_ray.envs.batch import BatchEnv
+from vlagents_ray.errors import CheckpointFailed, EnvFailed, PolicyFailed
+from vlagents_ray.evaluate.clock import Player
+from vlagents_ray.evaluate.config import ClockConfig
 from vlagents_ray.evaluate.jobs import EpisodeKey
+from vlagents_ray.evaluate.sides import env_side, policy_side
 from vlagents_ray.interface import HIGH_RES, Act, Agent, Obs
 
 Status = Literal["done", "policy_error", "infra_failed"]
@@ -43,15 +46,20 @@ class EpisodeResult:
     acts: int = 0  # answers of the policy; fewer than steps with action chunks
     policy_ms: float | None = None  # median of one act, transport included
     policy_p95_ms: float | None = None
+    latency_ms: float | None = None  # real-time mode: median of what an act counted as
+    ticks_waited: int = 0  # real-time mode: steps between an observation and its answer
+    ticks_held: int = 0  # those of them for which no row of a chunk was left
     timing_ms: dict[str, float] = field(default_factory=dict)  # medians of what `act.info["timing"]` says of one act
     transport: str = "local"
     checkpoint: str | None = None  # that the policy's reset named
 
 
 @dataclass(slots=True)
-class _Tally:
+class Tally:
     """What is known of an episode so far."""
 
+    key: EpisodeKey
+    started: float = field(default_factory=perf_counter)
     steps: int = 0
     episode_return: float = 0.0
     success: bool = False
@@ -62,7 +70,61 @@ class _Tally:
     reset_ms: float | None = None
     step_ms: list[float] = field(default_factory=list)
     act_ms: list[float] = field(default_factory=list)
+    latency_ms: list[float] = field(default_factory=list)
+    ticks_waited: int = 0
+    ticks_held: int = 0
     timing_ms: dict[str, list[float]] = field(default_factory=dict)
+
+    def began(self, info: object) -> None:
+        """The policy's reset returned `info`."""
+        named = info.get("checkpoint") if isinstance(info, dict) else None
+        self.checkpoint = named if isinstance(named, str) else None
+
+    def acted(self, act: Act, milliseconds: float) -> None:
+        """The policy answered, after so long."""
+        self.act_ms.append(milliseconds)
+        for stage, spent in act.info.get("timing", {}).items():
+            if stage.endswith("_ms"):  # the size of a batch stands among them
+                self.timing_ms.setdefault(stage, []).append(float(spent))
+
+    def stepped(self, reward: float, terminated: bool, truncated: bool, info: Mapping[str, Any], limit: int) -> bool:
+        """An action was executed; is the episode over, be it at the `limit` of steps?"""
+        self.steps += 1
+        self.episode_return += float(reward)
+        self.success = _success(info)
+        if self.success and self.first_success is None:
+            self.first_success = self.steps
+        over = terminated or truncated or self.steps >= limit
+        if over:
+            self.ending = "terminated" if terminated else "truncated"
+        return over
+
+    def result(self, transport: str, failed: PolicyFailed | None = None) -> EpisodeResult:
+        """The episode's, now that it is over; `failed` is what the policy ended it with."""
+        return EpisodeResult(
+            key=self.key,
+            status="done" if failed is None else "policy_error",
+            success_once=self.first_success is not None and failed is None,
+            success_at_end=self.success and failed is None,
+            first_success=self.first_success if failed is None else None,
+            steps=self.steps,
+            episode_return=self.episode_return,
+            ending=self.ending if failed is None else "error",
+            instruction=self.instruction,
+            error=None if failed is None else f"{failed.code}: {failed}",
+            seconds=perf_counter() - self.started,
+            reset_ms=self.reset_ms,
+            env_step_ms=_quantile(self.step_ms, 0.5),
+            acts=len(self.act_ms),
+            policy_ms=_quantile(self.act_ms, 0.5),
+            policy_p95_ms=_quantile(self.act_ms, 0.95),
+            latency_ms=_quantile(self.latency_ms, 0.5),
+            ticks_waited=self.ticks_waited,
+            ticks_held=self.ticks_held,
+            timing_ms={stage: float(np.median(spent)) for stage, spent in sorted(self.timing_ms.items())},
+            transport=transport,
+            checkpoint=self.checkpoint,
+        )
 
 
 def run_episode(
@@ -71,12 +133,15 @@ def run_episode(
     key: EpisodeKey,
     *,
     execute: int | None = None,
+    clock: ClockConfig | None = None,
     reset_options: Mapping[str, Any] | None = None,
     policy_options: Mapping[str, Any] | None = None,
     watch: Watch = lambda _phase, _steps: None,
     record: Record = lambda _obs: None,
 ) -> EpisodeResult:
     """Play the episode `key`; of each action chunk execute the first `execute` rows, open loop.
+
+    The env waits for the policy, unless there is a `clock` (see `vlagents_ray.evaluate.clock`).
 
     `reset_options` are the env's, `policy_options` the policy's.
 
@@ -85,123 +150,67 @@ def run_episode(
     `PolicyUnavailable`, `DeadlineExceeded` and the like for the way to the policy, and
     `CheckpointFailed`, as no episode was played by what did not load.
     """
-    tally = _Tally()
-    started = perf_counter()
-    error: str | None = None
+    tally = Tally(key)
+    error: PolicyFailed | None = None
     try:
-        _play(
-            env,
-            agent,
-            key,
-            tally,
-            execute=execute,
-            reset_options=reset_options,
-            policy_options=policy_options,
-            watch=watch,
-            record=record,
-        )
+        _play(env, agent, tally, execute, clock, reset_options, policy_options, watch, record)
     except CheckpointFailed:
         raise
     except PolicyFailed as failed:
-        error = f"{failed.code}: {failed}"
-        tally.ending = "error"
-    return EpisodeResult(
-        key=key,
-        status="done" if error is None else "policy_error",
-        success_once=tally.first_success is not None and error is None,
-        success_at_end=tally.success and error is None,
-        first_success=tally.first_success if error is None else None,
-        steps=tally.steps,
-        episode_return=tally.episode_return,
-        ending=tally.ending,
-        instruction=tally.instruction,
-        error=error,
-        seconds=perf_counter() - started,
-        reset_ms=tally.reset_ms,
-        env_step_ms=_quantile(tally.step_ms, 0.5),
-        acts=len(tally.act_ms),
-        policy_ms=_quantile(tally.act_ms, 0.5),
-        policy_p95_ms=_quantile(tally.act_ms, 0.95),
-        timing_ms={stage: float(np.median(spent)) for stage, spent in sorted(tally.timing_ms.items())},
-        transport=str(getattr(agent, "transport", "local")),
-        checkpoint=tally.checkpoint,
-    )
+        error = failed
+    return tally.result(transport_of(agent), error)
 
 
 def _play(
     env: EvalEnv,
     agent: Agent,
-    key: EpisodeKey,
-    tally: _Tally,
-    *,
+    tally: Tally,
     execute: int | None,
+    clock: ClockConfig | None,
     reset_options: Mapping[str, Any] | None,
     policy_options: Mapping[str, Any] | None,
     watch: Watch,
     record: Record,
 ) -> None:
     watch("env reset", 0)
+    key = tally.key
     begun = perf_counter()
     with env_side("reset"):
-        obs, _ = env.reset(seed=key.seed, options=_begin(env, key, reset_options))
+        obs, _ = env.reset(seed=key.seed, options=env_options(env, key, reset_options))
         tally.instruction = env.instruction
     tally.reset_ms = 1e3 * (perf_counter() - begun)
     record(obs)
     watch("policy reset", 0)
     with policy_side("reset"):
-        info = agent.reset(_for_policy(obs), tally.instruction, **(policy_options or {}), **_given(env, agent, key))
-    named = info.get("checkpoint") if isinstance(info, dict) else None
-    tally.checkpoint = named if isinstance(named, str) else None
+        given = {**(policy_options or {}), **policy_arguments(env.contract, agent, key)}
+        tally.began(agent.reset(for_policy(obs), tally.instruction, **given))
     contract = env.contract
+    player = Player(execute, clock, contract)
     while True:
         watch("policy act", tally.steps)
         begun = perf_counter()
         with policy_side("act"):
-            act = agent.act(_for_policy(obs))
-        tally.act_ms.append(1e3 * (perf_counter() - begun))
-        for stage, spent in act.info.get("timing", {}).items():
-            tally.timing_ms.setdefault(stage, []).append(float(spent))
-        chunk = Act(check_action(act.action, contract)).rows()[:execute]
-        for row in chunk:
+            act = agent.act(for_policy(obs, player.told()))
+        took_s = perf_counter() - begun
+        tally.acted(act, 1e3 * took_s)
+        latency_s = player.latency_s(took_s)
+        if clock is not None:
+            tally.latency_ms.append(1e3 * latency_s)
+        rows = Act(check_action(act.action, contract)).rows()
+        for tick in player.ticks(rows, latency_s):
             watch("env step", tally.steps)
             begun = perf_counter()
             with env_side("step"):
-                obs, reward, terminated, truncated, info = env.step(Act(row))
+                obs, reward, terminated, truncated, info = env.step(Act(tick.action))
             tally.step_ms.append(1e3 * (perf_counter() - begun))
             record(obs)
-            tally.steps += 1
-            tally.episode_return += float(reward)
-            tally.success = _success(info)
-            if tally.success and tally.first_success is None:
-                tally.first_success = tally.steps
-            if terminated or truncated or tally.steps >= env.max_steps:
-                tally.ending = "terminated" if terminated else "truncated"
+            tally.ticks_waited += tick.waited
+            tally.ticks_held += tick.held
+            if tally.stepped(reward, terminated, truncated, info, env.max_steps):
                 return
         if act.done:
             tally.ending = "policy_done"
             return
-
-
-@contextmanager
-def env_side(what: str) -> Iterator[None]:
-    """Anything that a simulator raises becomes `EnvFailed`; this package's own errors pass."""
-    try:
-        yield
-    except VLAgentsError:
-        raise
-    except (Exception, SystemExit) as error:  # ManiSkill leaves by SystemExit when an asset is missing
-        raise EnvFailed(f"env {what}: {type(error).__name__}: {error}") from error
-
-
-@contextmanager
-def policy_side(what: str) -> Iterator[None]:
-    """Anything that a policy raises becomes `PolicyFailed`; this package's own errors pass."""
-    try:
-        yield
-    except VLAgentsError:
-        raise
-    except Exception as error:
-        raise PolicyFailed(f"policy {what}: {type(error).__name__}: {error}") from error
 
 
 def is_remote(agent: Agent) -> bool:
@@ -209,23 +218,30 @@ def is_remote(agent: Agent) -> bool:
     return hasattr(agent, "metadata")
 
 
-def _begin(env: EvalEnv, key: EpisodeKey, options: Mapping[str, Any] | None) -> dict[str, Any] | None:
+def transport_of(agent: Agent) -> str:
+    """What carries an agent's observations: "local" for one in this process."""
+    return str(getattr(agent, "transport", "local"))
+
+
+def env_options(env: EvalEnv | BatchEnv, key: EpisodeKey, options: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """What the env's reset is given for the episode `key`: the user's `options` go before the benchmark's."""
     begin = {} if env.init_states is None else {"init_state": key.episode % env.init_states}
     return begin | dict(options or {}) or None
 
 
-def _given(env: EvalEnv, agent: Agent, key: EpisodeKey) -> dict[str, Any]:
+def policy_arguments(contract: Contract, agent: Agent, key: EpisodeKey) -> dict[str, Any]:
+    """What the policy's reset is given for the episode `key` of an env with this contract."""
     arguments: dict[str, Any] = {"seed": key.seed, "env": key.env}
     if is_remote(agent):
-        arguments["contract"] = env.contract.to_json()  # the server compares it too, and answers 409
+        arguments["contract"] = contract.to_json()  # the server compares it too, and answers 409
     return arguments
 
 
-def _for_policy(obs: Obs) -> Obs:
-    """The observation without the views that are for the record only."""
-    if HIGH_RES not in obs.info:
+def for_policy(obs: Obs, told: Mapping[str, Any] | None = None) -> Obs:
+    """The observation without the views that are for the record only, and with what it is `told` besides."""
+    if HIGH_RES not in obs.info and not told:
         return obs
-    return replace(obs, info={k: v for k, v in obs.info.items() if k != HIGH_RES})
+    return replace(obs, info={k: v for k, v in obs.info.items() if k != HIGH_RES} | dict(told or {}))
 
 
 def _success(info: Mapping[str, Any]) -> bool:

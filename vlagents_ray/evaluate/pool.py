@@ -126,7 +126,7 @@ class WorkerPool:
             "num_gpus": cell.worker.gpus,
             "max_restarts": 0,
             "scheduling_strategy": "SPREAD",
-            "runtime_env": _runtime_env(cell.worker),
+            "runtime_env": runtime_env(cell.worker),
         }
         actor = self._actor_class.options(**options).remote(self._config, self._agent_factory)
         self._workers.append(Worker(cell.worker, cell.kind, actor, starting=actor.ready.remote(), since=monotonic()))
@@ -247,7 +247,8 @@ def _lost(reason: str, stack: str = "") -> Report:
     return Report(failure=Failure("worker", EnvFailed.code, reason, stack))
 
 
-def _runtime_env(worker: WorkerConfig) -> dict[str, Any]:
+def runtime_env(worker: WorkerConfig) -> dict[str, Any]:
+    """Ray's, with the thread settings of a worker's process."""
     given: dict[str, Any] = dict(worker.runtime_env)
     variables = dict.fromkeys(THREAD_VARIABLES, str(worker.threads))
     if key := os.environ.get(KEY_VARIABLE):  # for the policy's server, on nodes that do not know it

@@ -24,14 +24,17 @@ MOST_ROWS = 12
 class Progress(Protocol):
     """What an evaluation tells while it runs. The calls come from one thread."""
 
-    def begin(self, cells: Sequence[Cell], recorded: Mapping[str, Rate]) -> None:
-        """What is planned, and what earlier runs have finished, by a cell's fingerprint."""
+    def begin(self, cells: Sequence[Cell], recorded: Mapping[str, Rate], left: int) -> None:
+        """What is planned, what earlier runs have finished, by a cell's fingerprint, and how many are to be played."""
 
     def episode(self, cell: Cell, result: EpisodeResult) -> None:
         """An episode is recorded."""
 
     def retry(self, job: Job, failure: Failure) -> None:
         """Infrastructure failed an attempt, and the episode will be tried again."""
+
+    def stopped(self, cell: Cell, at: int, spared: int) -> None:
+        """A cell is certain enough after `at` episodes; `spared` ones that waited will not be played."""
 
     def end(self) -> None:
         """Nothing follows."""
@@ -40,13 +43,16 @@ class Progress(Protocol):
 class SilentProgress:
     """Shows nothing."""
 
-    def begin(self, cells: Sequence[Cell], recorded: Mapping[str, Rate]) -> None:
+    def begin(self, cells: Sequence[Cell], recorded: Mapping[str, Rate], left: int) -> None:
         """Nothing."""
 
     def episode(self, cell: Cell, result: EpisodeResult) -> None:
         """Nothing."""
 
     def retry(self, job: Job, failure: Failure) -> None:
+        """Nothing."""
+
+    def stopped(self, cell: Cell, at: int, spared: int) -> None:
         """Nothing."""
 
     def end(self) -> None:
@@ -56,14 +62,14 @@ class SilentProgress:
 class _Counts:
     """What both displays keep count of."""
 
-    def __init__(self, cells: Sequence[Cell], recorded: Mapping[str, Rate]) -> None:
+    def __init__(self, cells: Sequence[Cell], recorded: Mapping[str, Rate], left: int) -> None:
         self._started = monotonic()
         self._cells = {cell.fingerprint: cell for cell in cells}
         self._rates = {cell: recorded.get(cell, Rate(0, 0)) for cell in self._cells}
         self._infra_failed = dict.fromkeys(self._cells, 0)
         self._steps = 0
         self._played = 0  # in this run
-        self._left = sum(cell.planned for cell in cells) - sum(rate.episodes for rate in self._rates.values())
+        self._left = left
         self._alone = len({cell.contender for cell in cells}) == 1
         self.retries = 0
 
@@ -76,6 +82,9 @@ class _Counts:
             return
         before = self._rates[cell.fingerprint]
         self._rates[cell.fingerprint] = Rate(before.successes + bool(result.success_once), before.episodes + 1)
+
+    def spare(self, episodes: int) -> None:
+        self._left -= episodes
 
     def rows(self) -> list[tuple[str, str, str]]:
         """(name, "done/planned", success so far); of many cells those that are under way."""
@@ -110,12 +119,12 @@ class LiveProgress:
     """A table that is drawn anew, for terminals."""
 
     def __init__(self, console: Console) -> None:
-        self._counts = _Counts([], {})
+        self._counts = _Counts([], {}, 0)
         self._live = Live(console=console, auto_refresh=True, refresh_per_second=4, get_renderable=self._drawing)
 
-    def begin(self, cells: Sequence[Cell], recorded: Mapping[str, Rate]) -> None:
+    def begin(self, cells: Sequence[Cell], recorded: Mapping[str, Rate], left: int) -> None:
         """Start drawing."""
-        self._counts = _Counts(cells, recorded)
+        self._counts = _Counts(cells, recorded, left)
         self._live.start()
 
     def episode(self, cell: Cell, result: EpisodeResult) -> None:
@@ -126,6 +135,11 @@ class LiveProgress:
         """Count it, and say why above the table."""
         self._counts.retries += 1
         self._live.console.print(_retry_line(job, failure), markup=False, highlight=False)
+
+    def stopped(self, cell: Cell, at: int, spared: int) -> None:
+        """Say so above the table."""
+        self._counts.spare(spared)
+        self._live.console.print(_stopped_line(cell, at), markup=False, highlight=False)
 
     def end(self) -> None:
         """Leave the last state standing."""
@@ -147,11 +161,11 @@ class LineProgress:
         self._console = console
         self._every_s = every_s
         self._last = 0.0
-        self._counts = _Counts([], {})
+        self._counts = _Counts([], {}, 0)
 
-    def begin(self, cells: Sequence[Cell], recorded: Mapping[str, Rate]) -> None:
+    def begin(self, cells: Sequence[Cell], recorded: Mapping[str, Rate], left: int) -> None:
         """The first line."""
-        self._counts = _Counts(cells, recorded)
+        self._counts = _Counts(cells, recorded, left)
         self._last = monotonic()
         self._line()
 
@@ -166,6 +180,11 @@ class LineProgress:
         """A line with the reason."""
         self._counts.retries += 1
         self._print(_retry_line(job, failure))
+
+    def stopped(self, cell: Cell, at: int, spared: int) -> None:
+        """A line."""
+        self._counts.spare(spared)
+        self._print(_stopped_line(cell, at))
 
     def end(self) -> None:
         """The last line."""
@@ -187,6 +206,10 @@ def progress_for(console: Console) -> Progress:
 def _retry_line(job: Job, failure: Failure) -> str:
     first_line = failure.message.strip().partition("\n")[0]
     return f"{job.key.env} episode {job.key.episode}: attempt {job.attempt} failed, trying again: {first_line}"
+
+
+def _stopped_line(cell: Cell, at: int) -> str:
+    return f"{' '.join(filter(None, cell.name))}: certain enough, stopped after {at} of {cell.planned} episodes"
 
 
 def _left(episodes: int, played: int, elapsed_s: float) -> str:

@@ -6,14 +6,15 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
-from vlagents_ray.evaluate.summary import Group, Summary
+from vlagents_ray.evaluate.results import CellResults
+from vlagents_ray.evaluate.summary import Group, Summary, gap_to_synchronous
 
 
 def results_table(summary: Summary) -> Table:
     """Success, length and speed: for each policy at its checkpoint a row an env, and one for all."""
     names = summary.results.contenders
     table = Table(
-        title=f"{', '.join(names)}: success in %, with the Wilson 95 % interval",
+        title=f"{', '.join(names)}: success in %, with {_interval(summary.total)}",
         box=SIMPLE_HEAD,
         padding=0,
         pad_edge=False,
@@ -45,6 +46,8 @@ def print_summary(console: Console, summary: Summary) -> None:
         lines.append(f"{total.retries} attempts lost to infrastructure and repeated")
     if total.infra_failures:
         lines.append(f"{total.infra_failures} episodes lost to infrastructure, in no rate; --resume tries them again")
+    lines += [_stopped(group) for group in summary.cells if group.stopped]
+    lines += [line for cell in summary.results.cells if (line := _gap(summary, cell)) is not None]
     if summary.state != "complete":
         lines.append(f"{summary.state}: go on with --resume")
     lines.append(f"results: {summary.out}")
@@ -52,6 +55,31 @@ def print_summary(console: Console, summary: Summary) -> None:
         lines.append(f"videos: {summary.out / 'videos'}")
     for line in lines:
         console.print(line, markup=False, highlight=False, soft_wrap=True)
+
+
+def _interval(total: Group) -> str:
+    error_rate = total.success_once.error_rate
+    if error_rate is None:
+        return "the Wilson 95 % interval"
+    return f"the confidence sequence of early stopping (error rate {error_rate:.2g})"
+
+
+def _stopped(group: Group) -> str:
+    name = " ".join(filter(None, (group.contender, group.suite, group.env)))
+    error_rate = group.success_once.error_rate
+    return f"{name}: stopped after {group.episodes} of {group.planned} (error rate {100 * (error_rate or 0):.2g} %)"
+
+
+def _gap(summary: Summary, cell: CellResults) -> str | None:
+    gap = gap_to_synchronous(summary.results, cell)
+    if gap is None:
+        return None
+    steps = sum(one.steps for one in cell.counted)
+    waited, held = (sum(getattr(one, what) for one in cell.counted) for what in ("ticks_waited", "ticks_held"))
+    return (
+        f"{cell.contender} {cell.suite} {cell.env}, in real time: {100 * gap:+.0f} points to the synchronous score; "
+        f"{waited / steps:.0%} of its ticks waited for an answer, {held / steps:.0%} with nothing to execute"
+    )
 
 
 def _cells(group: Group) -> list[str]:

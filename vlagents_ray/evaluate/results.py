@@ -5,16 +5,19 @@ from __future__ import annotations
 import dataclasses
 import json
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.cells import contender
+from vlagents_ray.evaluate.config import StopConfig
 from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.jobs import EpisodeKey
+from vlagents_ray.evaluate.statistics import Rate
+from vlagents_ray.evaluate.stopping import Stopping, pooled
 from vlagents_ray.evaluate.store import FILE, require_version
 
 
@@ -27,11 +30,12 @@ class Episode:
     attempts: int
     run: int
     finished: float  # seconds since 1970
+    beyond: bool = False  # the point at which its cell stopped
 
     @property
     def counts(self) -> bool:
-        """Is it in the rates? What infrastructure kept from ending is not."""
-        return self.result.status != "infra_failed"
+        """Is it in the rates? What infrastructure kept from ending is not, nor what came after an early stop."""
+        return self.result.status != "infra_failed" and not self.beyond
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +81,8 @@ class CellResults:
     contract: dict[str, Any]
     episodes: tuple[Episode, ...]  # by seed
     attempts: tuple[Attempt, ...]
+    stop: StopConfig | None = None  # the rule by which it could stop early
+    stopped_at: int | None = None  # the number of episodes after which it did; those beyond are kept, and not counted
 
     @property
     def contender(self) -> str:
@@ -154,10 +160,35 @@ def _episode(row: dict[str, Any]) -> Episode:
 
 
 def _cell(row: dict[str, Any], episodes: tuple[Episode, ...], attempts: tuple[Attempt, ...]) -> CellResults:
-    del row["seeds"]
+    seeds, rule = json.loads(row.pop("seeds")), row.pop("stop")
     parsed = {name: json.loads(row[name] or "{}") for name in ("settings", "described", "contract")}
-    return CellResults(**row | parsed, episodes=episodes, attempts=attempts)
+    stop, stopped_at = None, None
+    if rule is not None:
+        stop = StopConfig.model_validate_json(rule)
+        stopping = Stopping(stop, seeds, row["planned"])
+        stopping.add_all(episode.result for episode in episodes)
+        stopped_at = stopping.at
+        episodes = tuple(replace(one, beyond=not stopping.counts(one.result.key)) for one in episodes)
+    return CellResults(**row | parsed, episodes=episodes, attempts=attempts, stop=stop, stopped_at=stopped_at)
 
 
 def _run(row: dict[str, Any]) -> Run:
     return Run(**row | {name: json.loads(row[name]) for name in ("config", "versions")})
+
+
+def rate_of(cells: Sequence[CellResults], what: Literal["success_once", "success_at_end"]) -> Rate:
+    """The success rate of one cell, or of several together, with bounds that hold where cells could stop early."""
+    counts = [(sum(bool(getattr(one, what)) for one in cell.counted), len(cell.counted)) for cell in cells]
+    successes, episodes = (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0)
+    if not (rules := [cell.stop for cell in cells if cell.stop is not None]):
+        return Rate(successes, episodes)
+    error_rate = max(rule.error_rate for rule in rules)
+    return Rate(successes, episodes, pooled(counts, error_rate), error_rate)
+
+
+def synchronous_twin(results: Results, cell: CellResults) -> CellResults | None:
+    """The cell that a real-time one differs from in its clock alone: there the env waited for the policy."""
+    if cell.settings["clock"] is None:
+        return None
+    wanted = cell.settings | {"clock": None}
+    return next((other for other in results.cells if other.settings == wanted), None)

@@ -40,8 +40,9 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.config import EvalConfig, PolicyConfig
-from vlagents_ray.evaluate.episode import EpisodeResult, Phase, env_side, policy_side, run_episode
+from vlagents_ray.evaluate.episode import EpisodeResult, Phase, run_episode
 from vlagents_ray.evaluate.jobs import Job
+from vlagents_ray.evaluate.sides import env_side, policy_side
 from vlagents_ray.evaluate.video import VideoRecorder
 from vlagents_ray.interface import Agent
 from vlagents_ray.registry import env_class
@@ -147,6 +148,7 @@ class Rollout:
                     agent,
                     job.key,
                     execute=job.cell.policy.execute,
+                    clock=job.cell.suite.clock,
                     reset_options=job.cell.suite.reset_options,
                     policy_options=job.cell.policy_options,
                     watch=self._watch,

@@ -23,9 +23,9 @@ from vlagents_ray.evaluate.html import write_report
 from vlagents_ray.evaluate.jobs import Job, JobQueue, plan
 from vlagents_ray.evaluate.pool import WorkerPool
 from vlagents_ray.evaluate.progress import Progress, SilentProgress
-from vlagents_ray.evaluate.results import Results
+from vlagents_ray.evaluate.results import Results, rate_of
 from vlagents_ray.evaluate.rollout import AgentFactory, Failure, Report
-from vlagents_ray.evaluate.statistics import Rate
+from vlagents_ray.evaluate.stopping import Stopping
 from vlagents_ray.evaluate.store import Store
 from vlagents_ray.evaluate.summary import Summary, summarize, versions, write_summary
 from vlagents_ray.evaluate.video import save_videos
@@ -60,13 +60,11 @@ def evaluate(
     """
     factory = _remote_agents(config) if agent_factory is None else functools.partial(_own_agent, agent_factory)
     with Store(config) as store:
-        finished = store.finished()
-        pending = [job for job in plan(store.cells) if str(job.key) not in finished]
         store.begin_run(config, versions())
         state = "stopped"
         try:
-            run = _Run(config, store, JobQueue(pending), progress or SilentProgress())
-            complete = not pending or run.play(factory)
+            run = _Run(config, store, progress or SilentProgress())
+            complete = run.play(factory)
             state = "complete" if complete else "interrupted"
         finally:
             store.end_run(state)
@@ -86,17 +84,30 @@ def check(config: EvalConfig) -> None:
 class _Run:
     """The driver's side of one run."""
 
-    def __init__(self, config: EvalConfig, store: Store, queue: JobQueue, progress: Progress) -> None:
+    def __init__(self, config: EvalConfig, store: Store, progress: Progress) -> None:
         self._config = config
         self._store = store
-        self._queue = queue
         self._progress = progress
         self._lost_in_a_row = 0
+        earlier = {cell.cell: cell for cell in Results.load(config.out).cells}
+        self._recorded = {cell: rate_of([results], "success_once") for cell, results in earlier.items()}
+        self._stopping: dict[str, Stopping] = {}
+        if config.stop is not None:
+            for cell in store.cells:
+                stopping = Stopping(config.stop, cell.suite.seeds, cell.planned)
+                stopping.add_all(episode.result for episode in earlier[cell.fingerprint].episodes)
+                self._stopping[cell.fingerprint] = stopping
+        finished = store.finished()
+        self._queue = JobQueue(
+            job for job in plan(store.cells) if str(job.key) not in finished and not self._has_stopped(job)
+        )
 
     def play(self, factory: AgentFactory) -> bool:
         """Play all that is queued; False if a signal ended it early."""
+        if not len(self._queue):
+            return True
         with ray_cluster(self._config), stop_signals() as stop:
-            self._progress.begin(self._store.cells, self._recorded())
+            self._progress.begin(self._store.cells, self._recorded, len(self._queue))
             try:
                 with WorkerPool(self._config, factory) as pool:
                     while (len(self._queue) or pool.busy) and not stop.is_set():
@@ -129,13 +140,16 @@ class _Run:
             self._record(job, report.result, report.videos)
 
     def _failed(self, job: Job, failure: Failure) -> None:
-        retried = failure.cause != "user" and job.attempt <= self._config.retries
+        beyond = self._has_stopped(job)  # nobody waits for it
+        retried = failure.cause != "user" and job.attempt <= self._config.retries and not beyond
         self._store.record_attempt(job, failure, retried=retried)
         if failure.cause == "user":
             raise from_code(failure.code, failure.message)
         if retried:
             self._queue.put_back(job.again())
             self._progress.retry(job, failure)
+            return
+        if beyond:
             return
         lost = EpisodeResult(job.key, "infra_failed", error=f"{failure.code}: {failure.message}")
         self._record(job, lost, {})
@@ -152,14 +166,20 @@ class _Run:
         paths = save_videos(self._config.out, job.cell, result, dict(videos))
         self._store.record(result, job.attempt, paths)
         self._progress.episode(job.cell, result)
+        self._stop_if_certain(job, result)
 
-    def _recorded(self) -> dict[str, Rate]:
-        """By cell, what earlier runs have finished."""
-        counted = {cell.cell: cell.counted for cell in Results.load(self._config.out).cells}
-        return {
-            cell: Rate(sum(bool(one.success_once) for one in results), len(results))
-            for cell, results in counted.items()
-        }
+    def _has_stopped(self, job: Job) -> bool:
+        stopping = self._stopping.get(job.cell.fingerprint)
+        return stopping is not None and stopping.at is not None
+
+    def _stop_if_certain(self, job: Job, result: EpisodeResult) -> None:
+        """Leave out what waits of the cell once its outcomes are enough; what is being played is played to its end."""
+        stopping = self._stopping.get(job.cell.fingerprint)
+        if stopping is None or self._has_stopped(job):
+            return
+        stopping.add(result)
+        if stopping.at is not None:
+            self._progress.stopped(job.cell, stopping.at, self._queue.drop(job.cell.fingerprint))
 
 
 @contextmanager

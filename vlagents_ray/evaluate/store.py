@@ -36,14 +36,15 @@ CREATE TABLE runs (
 CREATE TABLE policies (name TEXT PRIMARY KEY, metadata TEXT NOT NULL);
 CREATE TABLE cells (
     cell TEXT PRIMARY KEY, policy TEXT NOT NULL, step INTEGER, suite TEXT NOT NULL, env TEXT NOT NULL,
-    planned INTEGER NOT NULL, seeds TEXT NOT NULL, settings TEXT NOT NULL, described TEXT, contract TEXT
+    planned INTEGER NOT NULL, seeds TEXT NOT NULL, stop TEXT, settings TEXT NOT NULL, described TEXT, contract TEXT
 );
 CREATE TABLE episodes (
     key TEXT PRIMARY KEY, cell TEXT NOT NULL REFERENCES cells, env TEXT NOT NULL, episode INTEGER NOT NULL,
     seed INTEGER NOT NULL, status TEXT NOT NULL, success_once INTEGER, success_at_end INTEGER, first_success INTEGER,
     steps INTEGER NOT NULL, episode_return REAL NOT NULL, ending TEXT NOT NULL, instruction TEXT NOT NULL,
     error TEXT, seconds REAL NOT NULL, reset_ms REAL, env_step_ms REAL, acts INTEGER NOT NULL,
-    policy_ms REAL, policy_p95_ms REAL, timing_ms TEXT NOT NULL, transport TEXT NOT NULL, checkpoint TEXT,
+    policy_ms REAL, policy_p95_ms REAL, latency_ms REAL, ticks_waited INTEGER NOT NULL, ticks_held INTEGER NOT NULL,
+    timing_ms TEXT NOT NULL, transport TEXT NOT NULL, checkpoint TEXT,
     videos TEXT NOT NULL, attempts INTEGER NOT NULL, run INTEGER NOT NULL REFERENCES runs, finished REAL NOT NULL
 );
 CREATE INDEX episodes_of_cells ON episodes (cell, checkpoint);
@@ -155,7 +156,9 @@ class Store:
         """Keep what a policy's server says of itself; `ConfigError` if it is not the policy of before."""
         row = self._db.execute("SELECT metadata FROM policies WHERE name = ?", (name,)).fetchone()
         known = None if row is None else json.loads(row[0])
-        for what in IDENTITY:
+        # In a sweep sessions choose their checkpoint, and the server's own may be any.
+        swept = any(cell.step is not None for cell in self.cells if cell.policy.name == name)
+        for what in IDENTITY[:1] if swept else IDENTITY:
             if known is not None and known.get(what) != metadata.get(what):
                 raise ConfigError(
                     f"policy {name!r}: the server has {what} {metadata.get(what)!r}, the results in {self._out} are of "
@@ -175,7 +178,7 @@ class Store:
                 db.executescript(f"BEGIN; {_SCHEMA} PRAGMA user_version = {SCHEMA_VERSION}; COMMIT;")
             require_version(self._out, db)
             self._require_resumable(db, config)
-            self._note_cells(db)
+            self._note_cells(db, config)
         except BaseException:
             db.close()
             raise
@@ -200,15 +203,16 @@ class Store:
                 + "\ntake the old settings, or choose another out folder"
             )
 
-    def _note_cells(self, db: sqlite3.Connection) -> None:
+    def _note_cells(self, db: sqlite3.Connection, config: EvalConfig) -> None:
+        stop = config.stop.model_dump_json() if config.stop else None
         with db:
             for cell in self.cells:
                 identity = (cell.policy.name, cell.step, cell.suite.name, cell.env)
-                extent = (cell.planned, canonical(cell.suite.seeds))
+                extent = (cell.planned, canonical(cell.suite.seeds), stop)
                 db.execute(
-                    "INSERT INTO cells (cell, policy, step, suite, env, planned, seeds, settings)"
-                    " VALUES (?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET planned = ?, seeds = ?",
-                    (cell.fingerprint, *identity, *extent, canonical(cell.settings), *extent),
+                    "INSERT INTO cells (cell, policy, step, suite, env, settings, planned, seeds, stop)"
+                    " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET planned = ?, seeds = ?, stop = ?",
+                    (cell.fingerprint, *identity, canonical(cell.settings), *extent, *extent),
                 )
 
 

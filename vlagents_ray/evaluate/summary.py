@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.evaluate.episode import EpisodeResult
-from vlagents_ray.evaluate.results import CellResults, Results, Run
+from vlagents_ray.evaluate.results import CellResults, Results, Run, rate_of, synchronous_twin
 from vlagents_ray.evaluate.statistics import Rate
 
 FILE = "summary.json"
@@ -31,6 +31,7 @@ class Group:
     suite: str
     env: str  # or "total"
     planned: int
+    stopped: int  # cells that stopped early
     success_once: Rate
     success_at_end: Rate
     policy_errors: int  # episodes that the policy broke off; not successes
@@ -98,7 +99,8 @@ class Summary:
         """As plain JSON values."""
         cells = [
             group.to_json() | {"checkpoint": checkpoint_of(cell), "settings": cell.settings, "env": cell.env}
-            | {"described": cell.described, "contract": cell.contract}
+            | {"described": cell.described, "contract": cell.contract, "stopped_at": cell.stopped_at}
+            | {"gap_to_synchronous": gap_to_synchronous(self.results, cell)}
             for group, cell in zip(self.cells, self.results.cells, strict=True)
         ]  # fmt: skip
         last = self.results.runs[-1]
@@ -133,6 +135,15 @@ def checkpoint_of(cell: CellResults) -> str | None:
     return next((one.checkpoint for one in cell.counted if one.checkpoint is not None), None)
 
 
+def gap_to_synchronous(results: Results, cell: CellResults) -> float | None:
+    """What a real-time cell's success rate is above that of its synchronous twin; None without one, or episodes."""
+    twin = synchronous_twin(results, cell)
+    if twin is None:
+        return None
+    ours, theirs = (rate_of([one], "success_once").rate for one in (cell, twin))
+    return None if ours is None or theirs is None else ours - theirs
+
+
 def write_summary(summary: Summary) -> Path:
     """Write `summary.json`, whole or not at all."""
     path = summary.out / FILE
@@ -165,13 +176,15 @@ def _commit() -> str | None:
 def group_of(name: tuple[str, str, str], cells: Sequence[CellResults]) -> Group:
     """What came of these cells together, under the name (contender, suite, env)."""
     finished: list[EpisodeResult] = [result for cell in cells for result in cell.counted]
+    open_cells = [cell for cell in cells if cell.stopped_at is None]
     return Group(
         *name,
         planned=sum(max(cell.planned, len(cell.episodes)) for cell in cells),
-        success_once=Rate(sum(bool(one.success_once) for one in finished), len(finished)),
-        success_at_end=Rate(sum(bool(one.success_at_end) for one in finished), len(finished)),
+        stopped=len(cells) - len(open_cells),
+        success_once=rate_of(cells, "success_once"),
+        success_at_end=rate_of(cells, "success_at_end"),
         policy_errors=sum(one.status == "policy_error" for one in finished),
-        infra_failures=sum(len(cell.episodes) for cell in cells) - len(finished),
+        infra_failures=sum(not episode.counts for cell in open_cells for episode in cell.episodes),
         retries=sum(attempt.retried for cell in cells for attempt in cell.attempts),
         steps=sum(one.steps for one in finished),
         mean_steps=_mean([one.steps for one in finished]),

@@ -174,3 +174,23 @@ def test_many_checkpoints_are_compared_with_the_best_first(tmp_path: Path) -> No
     words = Read(write_report(results, tmp_path / "report.html")).words
     assert "45 further pairs" in words  # 11 contenders: 55 pairs, 10 of them with the best
     assert "5 are not" in words  # of the curves over time
+
+
+def test_cells_that_stopped_early_have_intervals_of_another_name(tmp_path: Path) -> None:
+    config = runs(tmp_path, steps=[], episodes=60, stop={"width": 0.5, "at_least": 10})
+    results = record(config, lambda _cell, seed: 5 if seed % 2 else None)
+    assert any(cell.stopped_at is not None for cell in results.cells)
+    words = Read(write_report(results, tmp_path / "report.html")).words
+    assert "stopped early, by the rule in the settings" in words
+    assert "95 % confidence sequence" in words
+    assert "Wilson interval" not in words
+
+
+def test_the_gap_to_the_synchronous_score_is_shown(tmp_path: Path) -> None:
+    suites = [
+        {"name": "live", "envs": [LINE], "episodes": 4, "clock": {"latency": 0.1, "meanwhile": "hold"}},
+        {"name": "waiting", "envs": [LINE], "episodes": 4},
+    ]
+    results = record(runs(tmp_path, steps=[], suites=suites), lambda _cell, _seed: 5)
+    words = Read(write_report(results, tmp_path / "report.html")).words
+    assert "learner, live in real time learner, waiting 4 4 0 0 0 0.0" in words

@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
-from collections.abc import Iterator, Mapping, Sequence
-from importlib.metadata import version
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from vlagents_ray.contract import CameraSpec, Contract, check_action
-from vlagents_ray.envs.base import EvalEnv
-from vlagents_ray.envs.maniskill import making
-from vlagents_ray.envs.maniskill.robot import Robot, action_spec
-from vlagents_ray.envs.maniskill.tasks import INSTRUCTIONS, instruction_for
-from vlagents_ray.envs.probe import render_probe, vulkan_device_name
-from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset
+from vlagents_ray.contract import Contract
+from vlagents_ray.envs.base import EvalEnv, one_row
+from vlagents_ray.envs.batch import BatchEnv
+from vlagents_ray.envs.maniskill import making, protocol
+from vlagents_ray.envs.maniskill.simulator import Simulator
+from vlagents_ray.envs.maniskill.tasks import INSTRUCTIONS
+from vlagents_ray.envs.probe import render_probe
+from vlagents_ray.envs.recording import record_size_of
+from vlagents_ray.errors import NotReset
 from vlagents_ray.interface import Act, Obs
 
 
@@ -53,6 +53,7 @@ class ManiSkill(EvalEnv):
         shader: str | None = None,
         reward_mode: str | None = None,
         reconfigure: bool = True,
+        record_size: Sequence[int] | None = None,
     ) -> None:
         """Raises `UnknownEnv`, `ConfigError`, `MissingDependency`, or `EnvFailed` with its cure.
 
@@ -70,37 +71,27 @@ class ManiSkill(EvalEnv):
             reward_mode: ManiSkill's name; None is the task's own.
             reconfigure: rebuild the scene for each episode. Without it some tasks' dynamics
                 (PlugCharger, PushT) depend on the episode before; it saves about 15 ms a reset.
+            record_size: height and width of further views by the same cameras, for the record only.
         """
-        own_limit = making.step_limit(task)
-        limit = own_limit if max_steps is None else max_steps
-        if limit is None:
-            raise ConfigError(f"maniskill/{task} has no step limit of its own; set max_steps")
-        for name, value in (("width", width), ("height", height), ("max_steps", limit)):
-            if value < 1:
-                raise ConfigError(f"maniskill/{task}: {name} is {value}, want at least 1")
-        sensors = {"width": width, "height": height} | ({"shader_pack": shader} if shader else {})
-        self.max_steps = limit
+        self._own_limit = making.registered_limit(task)
+        self.max_steps = making.step_limit(f"maniskill/{task}", max_steps, self._own_limit)
         self._task = task
         self._instruction = instruction
         self._rebuild = {"reconfigure": True} if reconfigure else {}
         self._steps: int | None = None
-        self._env: Any = making.make(
+        self._simulator = Simulator(
+            f"maniskill/{task}",
             task,
-            control_mode,
             obs_mode="rgb+state",
-            reward_mode=reward_mode,
+            cameras=cameras,
+            record_size=record_size_of(record_size, f"maniskill/{task}"),
             sim_backend=sim_backend,
-            render_backend=making.render_backend(render_backend),
-            sensor_configs=sensors,
+            render_backend=render_backend,
+            control_mode=control_mode,
+            reward_mode=reward_mode,
+            sensors=making.sensor_settings(f"maniskill/{task}", width, height, shader),
         )
-        try:
-            self._check_usable()
-            self._cameras = self._choose(cameras)
-            self._robot = Robot(self._env.agent)
-            self._contract = self._state_contract()
-        except BaseException:
-            self.close()
-            raise
+        self._contract = self._simulator.contract(self._simulator.action)
 
     @property
     def contract(self) -> Contract:
@@ -108,35 +99,22 @@ class ManiSkill(EvalEnv):
 
     @property
     def instruction(self) -> str:
-        if self._instruction is not None:
-            return self._instruction
-        own = getattr(self._env, "get_language_instruction", None)
-        return str(own()[0]) if own is not None else instruction_for(self._task)
+        return self._simulator.instructions()[0] if self._instruction is None else self._instruction
 
     def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
         """Begin the episode of `seed`, taken modulo 2^32; `options` go to ManiSkill's own reset."""
-        env = self._alive()
-        with self._failing("reset"):
-            raw, info = env.reset(seed=seed % 2**32, options={**(options or {}), **self._rebuild})
+        now = self._simulator.reset([seed], {**(options or {}), **self._rebuild})
         self._steps = 0
-        for name in set(env.scene.sensors) - set(self._cameras):
-            del env.scene.sensors[name]  # rendering is most of a step: not for a camera that nobody asked for
-        return self._observe(raw), {"success": bool(info["success"])}
+        return now.obs[0], {"success": now.success[0]}
 
     def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-        env = self._alive()
         if self._steps is None:
             raise NotReset(f"maniskill/{self._task}: step before reset; call reset(seed=...) first")
-        action = check_action(act.action, self._contract)
-        if action.ndim != 1:
-            dim = self._contract.action.dim
-            raise InvalidAction(f"action: got {action.shape}, want ({dim},); step through a chunk row by row")
-        with self._failing("step"):
-            # a copy: torch shares the memory, and warns of a read-only array, such as Ray hands out
-            raw, reward, _, _, info = env.step(action.copy())
+        action = one_row(act, self._contract)
+        now = self._simulator.step(action[np.newaxis])
         self._steps += 1
-        outcome = {"success": bool(info["success"])}
-        return self._observe(raw), float(reward), False, self._steps >= self.max_steps, outcome
+        outcome = {"success": now.success[0]}
+        return now.obs[0], now.rewards[0], False, self._steps >= self.max_steps, outcome
 
     @classmethod
     def tasks(cls) -> list[str]:
@@ -151,73 +129,20 @@ class ManiSkill(EvalEnv):
         probe = render_probe()
         return None if probe.ok else f"ManiSkill finds no Vulkan device to render on ({probe.error}); {probe.cure}"
 
+    @classmethod
+    def batched(cls, num_envs: int, **options: Any) -> BatchEnv | None:
+        """All in one simulator, if that is to run on a GPU."""
+        from vlagents_ray.envs.maniskill.batch import ON_GPU, ManiSkillBatch
+
+        if options.get("sim_backend") not in ON_GPU:
+            return None
+        return ManiSkillBatch(num_envs=num_envs, **options)
+
     def describe(self) -> dict[str, Any]:
-        env = self._alive()
-        return {
-            "simulator": "maniskill",
-            "task": self._task,
-            "mani_skill": version("mani-skill"),
-            "sapien": version("sapien"),
-            "robot": env.agent.uid,
-            "control_mode": env.control_mode,
-            "obs_mode": env.obs_mode,
-            "reward_mode": env.reward_mode,
-            "sim_backend": env.backend.sim_backend,
-            "render_backend": env.backend.render_backend,
-            "render_device": vulkan_device_name(on_gpu=env.backend.render_device.is_cuda()),
-            "shaders": {name: env.scene.sensors[name].config.shader_config.shader_pack for name in self._cameras},
-            "reconfigure": bool(self._rebuild),
-        }
+        reconfigure = bool(self._rebuild)
+        rules = protocol.described(reconfigure=reconfigure, max_steps=self.max_steps, own_limit=self._own_limit)
+        return {**self._simulator.describe(), "reconfigure": reconfigure, "protocol": rules}
 
     def close(self) -> None:
-        env, self._env, self._steps = self._env, None, None
-        if env is not None:
-            env.close()
-
-    def _check_usable(self) -> None:
-        if not hasattr(self._env.agent, "robot"):  # none at all, or several
-            raise ConfigError(f"maniskill/{self._task}: want a task with exactly one robot")
-        if "success" not in self._env.get_info():
-            raise ConfigError(f"maniskill/{self._task} does not say what success is: there is nothing to evaluate")
-
-    def _choose(self, cameras: Sequence[str] | None) -> dict[str, CameraSpec]:
-        seen = self._env.single_observation_space["sensor_data"]
-        sizes = {name: textures["rgb"].shape[:2] for name, textures in seen.items() if "rgb" in textures.spaces}
-        unknown = sorted(set(cameras or ()) - set(sizes))
-        if unknown:
-            raise ConfigError(f"maniskill/{self._task} has no camera {unknown}: want some of {sorted(sizes)}")
-        chosen = sizes if cameras is None else cameras
-        return {name: CameraSpec(height=sizes[name][0], width=sizes[name][1]) for name in chosen}
-
-    def _state_contract(self) -> Contract:
-        env, robot = self._env, self._robot
-        return Contract(
-            cameras=self._cameras,
-            state=robot.gives,
-            gripper=robot.has_gripper,
-            instruction=True,
-            action=action_spec(env.control_mode, env.single_action_space, has_gripper=robot.has_gripper),
-            control_hz=float(env.control_freq),
-        )
-
-    def _observe(self, raw: Any) -> Obs:
-        state, gripper = self._robot.read(self._env.agent)
-        images = raw["sensor_data"]
-        return Obs(
-            cameras={name: np.ascontiguousarray(images[name]["rgb"][0].cpu().numpy()) for name in self._cameras},
-            gripper=gripper,
-            state=state,
-            info={"sim_state": raw["state"][0].cpu().numpy()},
-        )
-
-    def _alive(self) -> Any:
-        if self._env is None:
-            raise EnvFailed(f"maniskill/{self._task} is closed; make a new one")
-        return self._env
-
-    @contextlib.contextmanager
-    def _failing(self, doing: str) -> Iterator[None]:
-        try:
-            yield
-        except Exception as error:
-            raise EnvFailed(f"maniskill/{self._task} failed in {doing}: {type(error).__name__}: {error}") from error
+        self._steps = None
+        self._simulator.close()

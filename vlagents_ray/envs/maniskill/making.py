@@ -9,6 +9,7 @@ import io
 import logging
 import re
 import sys
+import warnings
 from collections.abc import Iterator
 from typing import Any
 
@@ -21,7 +22,7 @@ from vlagents_ray.registry import require
 DEFAULT_CONTROL_MODE = "pd_ee_delta_pose"
 
 
-def step_limit(task: str) -> int | None:
+def registered_limit(task: str) -> int | None:
     """The step limit that ManiSkill registers for `task`; imports ManiSkill and readies the process for it."""
     prepare_rendering()
     require("sapien")
@@ -32,6 +33,24 @@ def step_limit(task: str) -> int | None:
         raise UnknownEnv(f"maniskill has no task {task!r}: want one of {sorted(INSTRUCTIONS)}, or another of its ids")
     limit: int | None = registered[task].max_episode_steps
     return limit
+
+
+def step_limit(env: str, wanted: int | None, own: int | None) -> int:
+    """`wanted`, or `own`, which is the task's; `ConfigError` if there is none."""
+    limit = own if wanted is None else wanted
+    if limit is None:
+        raise ConfigError(f"{env} has no step limit of its own; set max_steps")
+    if limit < 1:
+        raise ConfigError(f"{env}: max_steps is {limit}, want at least 1")
+    return limit
+
+
+def sensor_settings(env: str, width: int, height: int, shader: str | None) -> dict[str, Any]:
+    """ManiSkill's settings of all cameras; a shader of None is the task's own."""
+    for name, value in (("width", width), ("height", height)):
+        if value < 1:
+            raise ConfigError(f"{env}: {name} is {value}, want at least 1")
+    return {"width": width, "height": height} | ({"shader_pack": shader} if shader else {})
 
 
 def render_backend(wanted: str) -> str:
@@ -54,7 +73,9 @@ def make(task: str, control_mode: str | None, *, sim_backend: str, render_backen
     given = {name: value for name, value in options.items() if value is not None}
     given |= {"sim_backend": sim_backend, "render_backend": render_backend}
     gymnasium = require("gymnasium")
-    with _no_prompts(task), _named_errors(task):
+    with _no_prompts(task), _named_errors(task), warnings.catch_warnings():
+        # the cubes' twin makes a tensor from a list of arrays: 24 rows, once
+        warnings.filterwarnings("ignore", "Creating a tensor from a list of numpy", UserWarning)
         _keep_renderer(sim_backend, render_backend)
         try:
             return gymnasium.make(task, control_mode=control_mode or DEFAULT_CONTROL_MODE, **given).unwrapped
@@ -100,12 +121,12 @@ def _no_prompts(task: str) -> Iterator[None]:
 
 @functools.cache
 def _prepare_process() -> None:
-    """Once a process: make rebuilding a scene cheap, and keep one repeated warning out of the log."""
+    """Once a process: make rebuilding a scene cheap, and keep repeated warnings out of the log."""
     # ManiSkill collects garbage at each reconfiguration. Most of that time, 150 ms, goes into
     # looking at the modules just imported, which are not garbage.
     gc.collect()
     gc.freeze()
-    logging.getLogger("mani_skill ").addFilter(_not_about_initial_poses)  # the name ends with a space
+    logging.getLogger("mani_skill ").addFilter(_not_about_its_own_code)  # the name ends with a space
 
 
 @functools.cache
@@ -122,6 +143,6 @@ def _keep_renderer(sim_backend: str, render_backend: str) -> object:
     return None if device is None else sapien.render.RenderSystem(device)
 
 
-def _not_about_initial_poses(record: logging.LogRecord) -> bool:
-    """Some tasks warn so in each reconfiguration, about their own code: nothing a user could change."""
-    return not record.getMessage().startswith("No initial pose set for ")
+def _not_about_its_own_code(record: logging.LogRecord) -> bool:
+    """Some tasks and robots warn so in each reconfiguration: nothing a user could change."""
+    return not record.getMessage().startswith(("No initial pose set for ", "Mimic targets dictionary is missing"))

@@ -9,9 +9,15 @@ import numpy as np
 
 from vlagents_ray.contract import ActionSpec, StateSpec
 
-# Finger travel in metres from closed (0) to open, by ManiSkill's name of the robot. In the action,
-# their controllers take the last component as -1 closed, 1 open. Other robots state no gripper.
-_FINGER_TRAVEL_M = {"panda": 0.04, "panda_wristcam": 0.04}
+# Where a finger's joint stands when closed and when open, in metres, by ManiSkill's name of the robot. In the
+# action, their controllers take the last component as -1 closed, 1 open. Other robots state no gripper.
+_FINGER_M = {
+    "panda": (0.0, 0.04),
+    "panda_wristcam": (0.0, 0.04),
+    "widowx250s_bridgedataset_flat_table": (0.015, 0.037),
+    "widowx250s_bridgedataset_sink": (0.015, 0.037),
+}
+_TOOL_LINK = "ee_gripper_link"  # of robots for which ManiSkill names no tool centre point
 
 # The part of the action that moves the arm, as written in mani_skill/agents/controllers. The
 # rotation of "pd_ee_*pose" is intrinsic XYZ Euler in the base frame; see `ManiSkill` for its sign.
@@ -38,9 +44,9 @@ class Robot:
         names = [joint.name for joint in agent.robot.active_joints]
         arm = getattr(agent, "arm_joint_names", names)
         self._arm = np.array([names.index(name) for name in arm])
-        self._travel_m = _FINGER_TRAVEL_M.get(agent.uid)
+        self._finger_m = _FINGER_M.get(agent.uid)
         self._fingers = np.array([names.index(name) for name in getattr(agent, "gripper_joint_names", ())], dtype=int)
-        self._has_tool = getattr(agent, "tcp", None) is not None
+        self._has_tool = _tool(agent) is not None
 
     @property
     def gives(self) -> dict[str, StateSpec]:
@@ -54,20 +60,31 @@ class Robot:
     @property
     def has_gripper(self) -> bool:
         """Whether the opening of the gripper is known."""
-        return self._travel_m is not None
+        return self._finger_m is not None
 
-    def read(self, agent: Any) -> tuple[dict[str, np.ndarray], float | None]:
-        """The state, each part (D,) float32, and the gripper in [0, 1], 1 = open."""
-        qpos = agent.robot.get_qpos()[0].cpu().numpy()
-        state = {"joints": qpos[self._arm]}
+    def read(self, agent: Any) -> list[tuple[dict[str, np.ndarray], float | None]]:
+        """For each environment the state, each part (D,) float32, and the gripper in [0, 1], 1 = open."""
+        rows = agent.robot.get_qpos().cpu().numpy()
+        states = [{"joints": qpos[self._arm]} for qpos in rows]
         if self._has_tool:
-            base = agent.robot.pose.raw_pose[0].cpu().numpy()
-            tool = agent.tcp.pose.raw_pose[0].cpu().numpy()
-            state["tquat"], state["xyzrpy"] = tool_in_base(base, tool)
-        if self._travel_m is None:
-            return state, None
-        opening = float(qpos[self._fingers].mean()) / self._travel_m
-        return state, min(max(opening, 0.0), 1.0)
+            bases = agent.robot.pose.raw_pose.cpu().numpy()
+            tools = _tool(agent).pose.raw_pose.cpu().numpy()
+            for state, base, tool in zip(states, bases, tools, strict=True):
+                state["tquat"], state["xyzrpy"] = tool_in_base(base, tool)
+        return [(state, self._opening(qpos)) for state, qpos in zip(states, rows, strict=True)]
+
+    def _opening(self, qpos: np.ndarray) -> float | None:
+        if self._finger_m is None:
+            return None
+        closed, opened = self._finger_m
+        opening = (float(qpos[self._fingers].mean()) - closed) / (opened - closed)
+        return min(max(opening, 0.0), 1.0)
+
+
+def _tool(agent: Any) -> Any:
+    """The link whose pose is the tool's; None if there is none."""
+    tcp = getattr(agent, "tcp", None)
+    return agent.robot.links_map.get(_TOOL_LINK) if tcp is None else tcp
 
 
 def action_spec(control_mode: str, space: Any, *, has_gripper: bool) -> ActionSpec:

@@ -8,12 +8,12 @@ from typing import Any, get_args
 
 import numpy as np
 
-from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec, check_action
-from vlagents_ray.envs.base import EvalEnv
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.envs.base import EvalEnv, one_row
 from vlagents_ray.envs.tabletop.goals import Goal, Task, draw_episode, goals
 from vlagents_ray.envs.tabletop.render import ELEVATION, VIEW, Renderer
 from vlagents_ray.envs.tabletop.world import STEP_LIMIT, World
-from vlagents_ray.errors import ConfigError, InvalidAction, NotReset, UnknownEnv
+from vlagents_ray.errors import ConfigError, NotReset, UnknownEnv
 from vlagents_ray.interface import Act, Obs
 
 MIXED = "mixed"
@@ -117,9 +117,7 @@ class Tabletop(EvalEnv):
         world, goal = self._world, self._goal
         if world is None or goal is None:
             raise NotReset("tabletop: step before reset; call reset(seed=...) first")
-        action = check_action(act.action, self._contract)
-        if action.ndim != 1:
-            raise InvalidAction(f"action: got {action.shape}, want (4,); step through a chunk row by row")
+        action = one_row(act, self._contract)
         dx, dy, dz, grip = np.clip(action, -1.0, 1.0).tolist()
         world.step(dx * STEP_LIMIT, dy * STEP_LIMIT, dz * STEP_LIMIT, (grip + 1) / 2)
         self._steps += 1

@@ -45,7 +45,7 @@ def errors(results: Results) -> Section | None:
     """Errors of the policies, and what infrastructure did, with the logs; None if there was nothing of either."""
     broken = [(cell, one) for cell in results.cells for one in cell.episodes if one.result.status == "policy_error"]
     attempts = [(cell, attempt) for cell in results.cells for attempt in cell.attempts]
-    lost = sum(not one.counts for cell in results.cells for one in cell.episodes)
+    lost = sum(one.result.status == "infra_failed" for cell in results.cells for one in cell.episodes)
     if not broken and not attempts:
         return None
     return section(

@@ -15,11 +15,20 @@ def percent(rate: Rate) -> str:
 
 
 def interval(rate: Rate) -> str:
-    """Its 95 % interval, in per cent."""
+    """Its interval, in per cent."""
     if rate.rate is None:
         return NONE
     low, high = rate.interval
     return f"{100 * low:.1f} to {100 * high:.1f}"
+
+
+def interval_name(rate: Rate) -> str:
+    """What that interval is: where episodes could stop early, one that holds nevertheless."""
+    return (
+        "95 % Wilson interval"
+        if rate.bounds is None
+        else f"{100 * (1 - (rate.error_rate or 0.0)):g} % confidence sequence"
+    )
 
 
 def points(difference: float | None) -> str:

@@ -10,7 +10,7 @@ import yaml
 
 from vlagents_ray.evaluate.config import EvalConfig
 from vlagents_ray.evaluate.html.elements import Child, Html, Section, block, fold, row, section, table, tag, terms
-from vlagents_ray.evaluate.html.numbers import duration, interval, moment, percent
+from vlagents_ray.evaluate.html.numbers import duration, interval, interval_name, moment, percent
 from vlagents_ray.evaluate.results import CellResults, Results, Run
 from vlagents_ray.evaluate.summary import Group, Summary, checkpoint_of
 
@@ -113,7 +113,7 @@ def _sentence(group: Group, results: Results) -> str:
     once, end = group.success_once, group.success_at_end
     return (
         f"{group.contender} solved {percent(once)} % of {once.episodes} episodes of {what} at some step "
-        f"(95 % Wilson interval {interval(once)} %), and {percent(end)} % at the last one ({interval(end)} %); "
+        f"({interval_name(once)} {interval(once)} %), and {percent(end)} % at the last one ({interval(end)} %); "
         f"evaluated with vlagents-ray {version}, {_seeds(cells)}."
     )
 

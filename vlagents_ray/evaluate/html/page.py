@@ -8,7 +8,7 @@ from pathlib import Path
 
 from vlagents_ray.evaluate.html import comparing, failures, latency, origin, success
 from vlagents_ray.evaluate.html.elements import Html, Section, tag
-from vlagents_ray.evaluate.html.numbers import count, duration, interval, moment, number, percent
+from vlagents_ray.evaluate.html.numbers import count, duration, interval, interval_name, moment, number, percent
 from vlagents_ray.evaluate.html.videos import Gallery, Videos
 from vlagents_ray.evaluate.results import Results
 from vlagents_ray.evaluate.summary import Summary, summarize
@@ -94,7 +94,7 @@ def _figures(summary: Summary) -> list[Html]:
     name = "solved" if len(summary.totals) == 1 else f"solved by the best, {best.contender}"
     once = best.success_once
     return [
-        _figure(f"{percent(once)} %", name, f"95 % interval {interval(once)} %"),
+        _figure(f"{percent(once)} %", name, f"{interval_name(once)} {interval(once)} %"),
         _figure(number(total.episodes, 0), "episodes", f"of {number(total.planned, 0)} planned"),
         _figure(number(total.steps, 0), "env steps", f"{number(summary.steps_per_second)} a second"),
         _figure(duration(summary.wall_seconds), "wall time", f"{count(total.retries, 'attempt')} repeated"),

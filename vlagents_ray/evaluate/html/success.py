@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from vlagents_ray.evaluate.html.charts import Series, interval_glyph, rate_chart
 from vlagents_ray.evaluate.html.elements import Child, Html, Section, fold, row, section, table, tag
-from vlagents_ray.evaluate.html.numbers import interval, number, percent
+from vlagents_ray.evaluate.html.numbers import count, interval, number, percent
 from vlagents_ray.evaluate.results import CellResults
 from vlagents_ray.evaluate.statistics import Rate, success_curve
 from vlagents_ray.evaluate.summary import TOTAL, Group, Summary, group_of
@@ -30,6 +30,7 @@ def success(summary: Summary) -> Section:
             "Steps and return are means.",
             class_="note",
         ),
+        _stopping(summary),
     )
 
 
@@ -67,6 +68,18 @@ def success_over_time(summary: Summary) -> Section | None:
     ]
     numbers = table(["Solved, %, by", "¼ of the steps", "½", "¾", "the last", "steps"], rows, "Success over time")
     return section("Success over time", chart, tag("p", text, class_="note"), fold("As numbers", numbers, printed=True))
+
+
+def _stopping(summary: Summary) -> Html | None:
+    """What early stopping means for the numbers of the page."""
+    if not summary.total.stopped:
+        return None
+    return tag(
+        "p",
+        f"{count(summary.total.stopped, 'cell')} stopped early, by the rule in the settings. Their intervals are confidence "
+        "sequences, which hold whenever one stops. Tests, differences and bands over time below do not allow for that.",
+        class_="note",
+    )
 
 
 def _blocks(summary: Summary) -> Iterator[tuple[str, list[Group], bool]]:

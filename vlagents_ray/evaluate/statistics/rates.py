@@ -34,10 +34,13 @@ def wilson(successes: int, trials: int, z: float = Z_95) -> tuple[float, float]:
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """Successes among episodes, with the Wilson 95 % interval of the true rate."""
+    """Successes among episodes, with an interval of the true rate."""
 
     successes: int
     episodes: int
+    # Where episodes could stop early, bounds that hold nevertheless, and the chance that they ever miss the rate.
+    bounds: tuple[float, float] | None = None
+    error_rate: float | None = None
 
     @property
     def rate(self) -> float | None:
@@ -46,17 +49,15 @@ class Rate:
 
     @property
     def interval(self) -> tuple[float, float]:
-        """The Wilson 95 % interval, (low, high)."""
-        return wilson(self.successes, self.episodes)
+        """(low, high): the Wilson 95 % interval, unless there are other `bounds`."""
+        return wilson(self.successes, self.episodes) if self.bounds is None else self.bounds
 
     def to_json(self) -> dict[str, Any]:
-        """`successes`, `episodes`, `rate` and `wilson_95`."""
-        return {
-            "successes": self.successes,
-            "episodes": self.episodes,
-            "rate": self.rate,
-            "wilson_95": list(self.interval),
-        }
+        """`successes`, `episodes`, `rate` and `wilson_95`, or in its place `confidence_sequence` and `error_rate`."""
+        counts = {"successes": self.successes, "episodes": self.episodes, "rate": self.rate}
+        if self.bounds is None:
+            return counts | {"wilson_95": list(self.interval)}
+        return counts | {"confidence_sequence": list(self.bounds), "error_rate": self.error_rate}
 
     def __str__(self) -> str:
         if self.rate is None:

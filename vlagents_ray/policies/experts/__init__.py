@@ -18,6 +18,11 @@ EXPERTS: dict[str, str] = {
     "maniskill/PushCube-v1": "vlagents_ray.policies.experts.maniskill:PushCube",
     "maniskill/PickCube-v1": "vlagents_ray.policies.experts.maniskill:PickCube",
     "metaworld": "vlagents_ray.policies.experts.metaworld:MetaWorldExpert",
+    "rcs/pick": "vlagents_ray.policies.experts.rcs:Pick",
+    "gymnasium/FetchReach-v4": "vlagents_ray.policies.experts.fetch:FetchReach",
+    "gymnasium/FetchReachDense-v4": "vlagents_ray.policies.experts.fetch:FetchReach",
+    "libero": "vlagents_ray.policies.experts.libero:LiberoExpert",
+    "simpler": "vlagents_ray.policies.experts.simpler:SimplerExpert",
 }
 
 

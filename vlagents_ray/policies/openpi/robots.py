@@ -47,7 +47,7 @@ _ALOHA = Robot(
     {"images.cam_high": "front", "images.cam_left_wrist": "left_wrist", "images.cam_right_wrist": "right_wrist"},
     {"state": {"left/joints": 6, "left/gripper": 1, "right/joints": 6, "right/gripper": 1}},
     "chw",
-    ActionSpec(dim=14),
+    ActionSpec(dim=14, arms=("left", "right")),
     optional=("images.cam_left_wrist", "images.cam_right_wrist"),
 )
 

@@ -1,0 +1,148 @@
+"""Our ManiSkill against ManiSkill's own way of evaluating, and what the results say about it."""
+
+from __future__ import annotations
+
+import gymnasium
+import numpy as np
+import pytest
+
+from vlagents_ray.envs.batch import InTurn, make_batch
+from vlagents_ray.envs.maniskill import ManiSkill
+from vlagents_ray.envs.maniskill.batch import ManiSkillBatch
+from vlagents_ray.errors import ConfigError, NotReset
+from vlagents_ray.interface import HIGH_RES, Act
+from vlagents_ray.policies.experts import expert_for
+
+pytestmark = pytest.mark.vulkan
+
+SMALL = {"width": 16, "height": 16}
+SEEDS = [4, 9]
+
+
+@pytest.mark.parametrize("task", ["PushCube-v1", "PickCube-v1"])
+def test_success_and_return_are_those_of_maniskills_own_wrapper(task: str) -> None:
+    """The set-up of its guide for CPU simulation, given the actions that our env was."""
+    with ManiSkill(task, **SMALL) as env:
+        obs, _ = env.reset(seed=5)
+        expert = expert_for(f"maniskill/{task}")
+        expert.reset(obs, env.instruction)
+        actions, rewards, solved, over = [], [], [], False
+        while not over:
+            actions.append(expert.act(obs).action)
+            obs, reward, terminated, over, info = env.step(Act(actions[-1]))
+            rewards.append(reward)
+            solved.append(info["success"])
+            assert not terminated
+        modes = {name: env.describe()[name] for name in ("control_mode", "obs_mode", "sim_backend", "render_backend")}
+    from mani_skill.utils.wrappers.gymnasium import CPUGymWrapper
+
+    theirs = CPUGymWrapper(
+        gymnasium.make(task, reconfiguration_freq=1, sensor_configs=SMALL, **modes),
+        ignore_terminations=True,
+        record_metrics=True,
+    )
+    theirs.reset(seed=5)
+    for action in actions:
+        *_, truncated, info = theirs.step(action)
+    theirs.close()
+    assert truncated
+    episode = info["episode"]
+    assert bool(episode["success_once"]) is any(solved) is True
+    assert bool(episode["success_at_end"]) is solved[-1]
+    assert float(episode["return"]) == pytest.approx(sum(rewards), rel=1e-5)
+    assert int(episode["episode_len"]) == len(actions)
+
+
+def test_the_scene_is_rebuilt_for_each_episode() -> None:
+    with ManiSkill("PegInsertionSide-v1", **SMALL, cameras=["base_camera"]) as env:
+        scenes, lengths = [], []
+        for seed in SEEDS:
+            env.reset(seed=seed)
+            scenes.append(env._simulator.env.scene)
+            lengths.append(float(env._simulator.env.peg_half_sizes[0, 0]))
+        assert scenes[0] is not scenes[1]
+        assert lengths[0] != lengths[1]  # of the peg, which is drawn when the scene is built
+
+
+def test_results_say_which_protocol_was_followed_and_what_was_not() -> None:
+    with ManiSkill("PushCube-v1", **SMALL) as env:
+        protocol = env.describe()["protocol"]
+    assert protocol["ignore_terminations"] is True
+    assert protocol["reconfiguration_freq"] == 1
+    assert protocol["metrics"] == ["success_once", "success_at_end"]
+    assert protocol["departures"] == []
+    with ManiSkill("PushCube-v1", **SMALL, reconfigure=False, max_steps=7) as env:
+        departures = env.describe()["protocol"]["departures"]
+    assert len(departures) == 2
+    assert departures[0].startswith("reconfigure is False")
+    assert departures[1] == "max_steps is 7, the task's own is 50"
+
+
+def test_views_for_the_record_have_a_size_of_their_own() -> None:
+    with (
+        ManiSkill("StackCube-v1", width=96, height=64) as large,
+        ManiSkill("StackCube-v1", width=32, height=32, record_size=(64, 96)) as env,
+    ):
+        for seed in SEEDS:  # the second scene has cameras of its own
+            seen, expected = env.reset(seed=seed)[0], large.reset(seed=seed)[0]
+            assert set(seen.info[HIGH_RES]) == set(seen.cameras) == {"base_camera", "hand_camera"}
+            for name, view in seen.info[HIGH_RES].items():
+                assert seen.cameras[name].shape == (32, 32, 3)
+                np.testing.assert_array_equal(view, expected.cameras[name])
+        hand = seen.info[HIGH_RES]["hand_camera"]
+        for _ in range(3):
+            seen, *_ = env.step(Act(np.array([0, 0.5, 0, 0, 0, 0, 1], np.float32)))
+        assert np.abs(seen.info[HIGH_RES]["hand_camera"].astype(int) - hand).max() > 20  # it moves with the hand
+
+
+def test_a_batch_of_one_plays_what_a_single_environment_plays() -> None:
+    """All that the CPU can show of it: physics there has one environment."""
+    actions = np.random.default_rng(0).uniform(-1, 1, (5, 7)).astype(np.float32)
+    with (
+        ManiSkill("PegInsertionSide-v1", **SMALL) as alone,
+        ManiSkillBatch("PegInsertionSide-v1", num_envs=1, sim_backend="physx_cpu", **SMALL) as batch,
+    ):
+        assert batch.contract == alone.contract
+        assert batch.max_steps == alone.max_steps
+        with pytest.raises(NotReset):
+            batch.step([None])
+        for seed in SEEDS:
+            expected, [seen] = alone.reset(seed=seed)[0], batch.reset(seeds=[seed])
+            assert batch.instructions == [alone.instruction]
+            np.testing.assert_array_equal(seen.info["sim_state"], expected.info["sim_state"])
+            for action in actions:
+                expected, reward, *flags, info = alone.step(Act(action))
+                [seen], rewards, *rows, infos = batch.step([Act(action)])
+                assert ([reward], [[flag] for flag in flags], [info]) == (rewards, rows, infos)
+                np.testing.assert_array_equal(seen.cameras["base_camera"], expected.cameras["base_camera"])
+                np.testing.assert_array_equal(seen.info["sim_state"], expected.info["sim_state"])
+        assert batch.describe() == alone.describe()
+
+
+def test_several_environments_share_a_simulator_only_on_a_gpu() -> None:
+    with pytest.raises(ConfigError, match="want physx_cuda"):
+        ManiSkillBatch("PushCube-v1", num_envs=2, sim_backend="physx_cpu")
+    with pytest.raises(ConfigError, match="record_size"):
+        ManiSkillBatch("PushCube-v1", num_envs=1, record_size=(64, 64))
+    with make_batch("maniskill/PushCube-v1", 2, **SMALL) as batch:
+        assert isinstance(batch, InTurn)
+        assert len(batch.reset(seeds=SEEDS)) == 2
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("task", ["PickCube-v1", "PegInsertionSide-v1"])
+def test_on_a_gpu_an_episode_does_not_depend_on_its_neighbours(task: str) -> None:
+    with make_batch(f"maniskill/{task}", 4, **SMALL, sim_backend="physx_cuda") as batch:
+        assert isinstance(batch, ManiSkillBatch)
+        first = batch.reset(seeds=[1, 2, 3, 4])
+        base = first[0].cameras["base_camera"].base
+        assert base is not None
+        assert base.shape == (4, 16, 16, 3)
+        other = batch.reset(seeds=[7, 2, 8])
+        assert len(other) == 3
+        np.testing.assert_allclose(other[1].info["sim_state"], first[1].info["sim_state"], atol=1e-5)
+        assert not np.allclose(other[0].info["sim_state"], first[0].info["sim_state"], atol=1e-3)
+        action = Act(np.zeros(7, np.float32))
+        seen, rewards, terminated, truncated, infos = batch.step([action, None, action])
+        assert [len(rows) for rows in (seen, rewards, terminated, truncated, infos)] == [3] * 5
+        assert not any(terminated + truncated)

@@ -1,0 +1,72 @@
+"""PushT by its protocol: what is recorded, and when an episode is solved."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import gym_pusht  # noqa: F401 - registers the environment
+import gymnasium
+import numpy as np
+import pytest
+from playing import Always, play
+
+from vlagents_ray.envs import EvalEnv, make_env
+from vlagents_ray.interface import Act
+
+NAME = "gymnasium/gym_pusht/PushT-v0"
+# Where the agent is and, as `reset_to_state` takes it, the block: 84.6 % of the target is covered.
+BESIDE = [333.0, 236.0, 230.0, 239.0, math.pi / 4]
+PUSHING = Always(270.0, 251.0)  # to the left, with the block
+
+
+@pytest.fixture(scope="module")
+def pusht() -> Iterator[EvalEnv]:
+    with make_env(NAME) as env:
+        yield env
+
+
+def test_the_protocol_is_recorded_with_what_deviates_from_it(pusht: EvalEnv) -> None:
+    protocol = pusht.describe()["protocol"]
+    assert (protocol["name"], protocol["max_steps"], protocol["control_hz"]) == ("PushT", 300, 10.0)
+    assert protocol["deviations"] == []
+    with make_env(NAME, max_steps=50) as shorter:
+        assert shorter.describe()["protocol"]["deviations"] == ["max_steps: 50, the protocol says 300"]
+
+
+def test_the_protocols_constants_are_the_simulators() -> None:
+    simulator = gymnasium.make("gym_pusht/PushT-v0", disable_env_checker=True)
+    assert simulator.spec is not None
+    assert simulator.spec.max_episode_steps == 300
+    assert simulator.unwrapped.control_hz == 10  # type: ignore[attr-defined]
+    assert simulator.unwrapped.success_threshold == 0.95  # type: ignore[attr-defined]
+    simulator.close()
+
+
+def test_a_block_pushed_onto_the_target_is_a_success_and_ends_the_episode(pusht: EvalEnv) -> None:
+    result = play(pusht, NAME, PUSHING, reset_to_state=BESIDE)
+    assert (result.success_once, result.success_at_end, result.ending) == (True, True, "terminated")
+    assert result.steps < 20
+
+
+def test_the_same_push_from_elsewhere_is_none_within_300_steps(pusht: EvalEnv) -> None:
+    result = play(pusht, NAME, PUSHING, seed=0)
+    assert (result.success_once, result.ending, result.steps) == (False, "truncated", 300)
+
+
+def test_success_wants_more_than_95_percent_of_the_target_covered(pusht: EvalEnv) -> None:
+    pusht.reset(seed=0, options={"reset_to_state": BESIDE})
+    covered = []
+    for _ in range(10):
+        *_, terminated, _, info = pusht.step(Act(PUSHING.action))
+        covered.append((info["coverage"] > 0.95, info["success"], terminated))
+        if terminated:
+            break
+    assert (False, False, False) in covered
+    assert covered[-1] == (True, True, True)
+
+
+def test_each_seed_begins_elsewhere_and_always_there(pusht: EvalEnv) -> None:
+    begins = [pusht.reset(seed=seed)[0].state["agent_pos"] for seed in (0, 1, 0)]
+    assert np.array_equal(begins[0], begins[2])
+    assert not np.array_equal(begins[0], begins[1])

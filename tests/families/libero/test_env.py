@@ -1,0 +1,142 @@
+"""LIBERO's environment keeps its promises and the protocol's."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from libero_episodes import STILL, begin, fingerprint, play, world
+
+from vlagents_ray.contract import CameraSpec
+from vlagents_ray.envs.libero import Libero
+from vlagents_ray.envs.libero.protocol import SUITES
+from vlagents_ray.envs.libero.tasks import find_task
+from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset, UnknownEnv
+from vlagents_ray.interface import Act
+from vlagents_ray.testing import check_env
+
+pytestmark = pytest.mark.assets("libero")
+
+
+@pytest.mark.slow
+def test_it_keeps_the_promises_of_an_env(folder: str) -> None:
+    check_env(Libero("libero_object/1", width=32, height=32, max_steps=4, assets=folder), steps=3)
+
+
+def test_an_initial_state_gives_one_episode_whatever_was_played_and_whatever_the_seed(soup: Libero) -> None:
+    first = fingerprint(play(soup, state=5))
+    play(soup, state=6)
+    begin(soup, state=5, seed=1234)
+    assert fingerprint(play(soup, state=5)) == first
+    assert fingerprint(play(soup, state=6)) != first
+
+
+def test_without_an_initial_state_the_seed_chooses_one(bowl: Libero) -> None:
+    _, info = bowl.reset(seed=107)
+    assert info["init_state"] == 7
+
+
+def test_two_envs_of_one_process_do_not_disturb_each_other(bowl: Libero, soup: Libero) -> None:
+    alone = fingerprint(play(bowl))
+    begin(soup)
+    assert fingerprint(play(bowl, between=lambda: soup.step(STILL))) == alone
+    begin(bowl)
+    begin(soup)
+    assert fingerprint(play(bowl)) == alone
+
+
+def test_doing_nothing_solves_no_task_and_ends_at_the_limit(soup: Libero, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert soup.max_steps == 280
+    monkeypatch.setattr(soup, "max_steps", 20)
+    begin(soup)
+    ended = [soup.step(STILL)[1:] for _ in range(20)]
+    assert {(reward, terminated, info["success"]) for reward, terminated, _, info in ended} == {(0.0, False, False)}
+    assert [truncated for _, _, truncated, _ in ended] == [False] * 19 + [True]
+
+
+_CHILD = """
+import sys
+from libero_episodes import Libero, fingerprint, play
+with Libero("libero_object/0", width=32, height=32, assets=sys.argv[1]) as env:
+    print(fingerprint(play(env, 2)))
+"""
+
+
+@pytest.mark.slow
+def test_another_process_plays_the_same_episode_and_leaves_the_home_alone(
+    soup: Libero, folder: str, tmp_path: Path
+) -> None:
+    """In a process such as Ray's without a GPU, and a home in which nobody has used LIBERO yet."""
+    package, support = Path(__file__).parents[3], Path(__file__).parents[2] / "support"
+    variables = {"HOME": str(tmp_path), "PYTHONHASHSEED": "5", "CUDA_VISIBLE_DEVICES": ""}
+    child = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", _CHILD, folder],
+        env={**os.environ, **variables, "PYTHONPATH": f"{package}{os.pathsep}{support}"},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=240,
+    )
+    assert child.returncode == 0, child.stderr
+    assert child.stdout.split()[-1] == fingerprint(play(soup, 2))
+    assert not (tmp_path / ".libero").exists()
+
+
+def test_tasks_go_by_number_and_by_name() -> None:
+    by_number = find_task("libero_object/7")
+    assert find_task(f"libero_object/{by_number.name}") == by_number
+    assert by_number.language == by_number.name.replace("_", " ")
+    assert find_task("libero_90/0").language == "close the top drawer of the cabinet"  # without "KITCHEN_SCENE10"
+    for suite, known in SUITES.items():
+        with pytest.raises(UnknownEnv, match=f"{known.tasks}.*want 0 to {known.tasks - 1}"):
+            find_task(f"{suite}/{known.tasks}")
+
+
+def test_a_description_states_task_versions_and_protocol(bowl: Libero) -> None:
+    facts = bowl.describe()
+    assert facts["task"] == "libero_spatial/0"
+    assert facts["name"] == facts["language"].replace(" ", "_")
+    assert bowl.instruction == facts["language"]
+    assert (facts["hf-libero"], facts["robosuite"], facts["render_backend"]) == ("0.1.4", "1.4.0", "egl")
+    assert facts["protocol"]["changed"] == ["image_size"]
+    assert facts["protocol"]["max_steps"] == bowl.max_steps == 220
+    assert bowl.contract.cameras == {"front": CameraSpec(64, 64), "wrist": CameraSpec(64, 64)}
+
+
+@pytest.mark.parametrize("action", [np.zeros(6), np.zeros((2, 7)), np.full(7, np.nan)])
+def test_an_unusable_action_is_refused(soup: Libero, action: np.ndarray) -> None:
+    begin(soup)
+    with pytest.raises(InvalidAction):
+        soup.step(Act(action.astype(np.float32)))
+
+
+@pytest.mark.parametrize("options", [{"init_state": 50}, {"init_state": "first"}, {"goal": 1}])
+def test_unknown_reset_options_are_refused(soup: Libero, options: dict[str, object]) -> None:
+    with pytest.raises(ConfigError, match="init_state"):
+        soup.reset(seed=0, options=options)
+
+
+def test_a_simulator_error_is_an_infrastructure_failure_and_no_endless_loop(
+    soup: Libero, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken() -> None:
+        raise RuntimeError("mj_step: unstable")
+
+    monkeypatch.setattr(world(soup)._env.env, "reset", broken)
+    with pytest.raises(EnvFailed, match=r"libero_object/0 failed to reset.*unstable"):
+        soup.reset(seed=0)
+
+
+def test_a_closed_env_says_so(folder: str) -> None:
+    env = Libero("libero_object/1", width=16, height=16, assets=folder)
+    with pytest.raises(NotReset, match="reset"):
+        env.step(STILL)
+    env.close()
+    env.close()
+    with pytest.raises(EnvFailed, match="closed"):
+        env.reset(seed=0)

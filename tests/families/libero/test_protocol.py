@@ -1,0 +1,79 @@
+"""The numbers and names that make a result comparable; no simulator is needed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vlagents_ray.envs.libero import Libero
+from vlagents_ray.envs.libero.assets import find_assets
+from vlagents_ray.envs.libero.protocol import SUITES, Protocol
+from vlagents_ray.envs.libero.robot import to_simulator
+from vlagents_ray.errors import EnvFailed, UnknownEnv
+
+
+def test_the_step_limits_are_those_of_openpi_and_openvla() -> None:
+    limits = {name: suite.max_steps for name, suite in SUITES.items()}
+    assert limits == {
+        "libero_spatial": 220,
+        "libero_object": 280,
+        "libero_goal": 300,
+        "libero_10": 520,
+        "libero_90": 400,
+    }
+
+
+def test_the_conventions_of_an_episode_are_theirs_too() -> None:
+    protocol = Protocol.of("libero_10")
+    assert (protocol.settling_steps, protocol.settling_action) == (10, (0, 0, 0, 0, 0, 0, -1))
+    assert protocol.image_size == (256, 256)
+    assert protocol.cameras == {"front": "agentview", "wrist": "robot0_eye_in_hand"}
+    assert (protocol.gripper_open, protocol.gripper_closed) == (-1, 1)
+    assert protocol.begins == ("seed", "reset", "set_init_state", "settle")
+    assert (protocol.simulator_seed, protocol.control_hz, protocol.controller) == (7, 20, "OSC_POSE")
+
+
+def test_what_a_user_changes_is_named_in_the_record() -> None:
+    assert Protocol.of("libero_goal").to_json("libero_goal")["changed"] == []
+    changed = Protocol.of("libero_goal", simulator_seed=0, max_steps=10, settling_steps=None)
+    assert changed.to_json("libero_goal")["changed"] == ["max_steps", "simulator_seed"]
+
+
+def test_all_130_tasks_are_listed_without_the_simulator() -> None:
+    tasks = Libero.tasks()
+    assert len(tasks) == len(set(tasks)) == 130
+    assert {"libero_spatial/0", "libero_10/9", "libero_90/89"} <= set(tasks)
+
+
+def test_an_unknown_suite_is_named() -> None:
+    with pytest.raises(UnknownEnv, match=r"libero_100.*libero_spatial"):
+        Libero("libero_100/0")
+
+
+def test_missing_assets_name_the_command_that_gets_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("LIBERO_ASSETS", str(tmp_path / "nowhere"))
+    with pytest.raises(EnvFailed, match=r"nowhere.*hf download .* --local-dir .*LIBERO_ASSETS"):
+        find_assets()
+    with pytest.raises(EnvFailed, match=r"lack \['articulated_objects'.*hf download"):
+        find_assets(str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("own", "commands"),
+    [
+        ({}, {-1.0: -1, -0.2: -1, 0.0: 0, 0.7: 1}),
+        ({"gripper_open": 1.0, "gripper_closed": 0.0}, {1.0: -1, 0.6: -1, 0.5: 0, 0.0: 1}),
+    ],
+)
+def test_a_gripper_in_a_policys_own_numbers_becomes_the_simulators(
+    own: dict[str, float], commands: dict[float, int]
+) -> None:
+    """LIBERO's own, and OpenVLA's, whose evaluation takes -sign(2 g - 1)."""
+    protocol = Protocol.of("libero_spatial", **own)
+    for said, command in commands.items():
+        action = np.array([0.1, -0.2, 0.3, 0, 0, 0.5, said], np.float32)
+        simulated = to_simulator(action, protocol)
+        assert simulated[6] == command
+        np.testing.assert_array_equal(simulated[:6], action[:6])

@@ -1,0 +1,161 @@
+"""RCS's pick task, in RCS's own environment."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+import pytest
+from playing import Always, play
+
+from vlagents_ray.contract import CameraSpec
+from vlagents_ray.envs.rcs import Rcs
+from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, MissingDependency, NotReset, UnknownEnv
+from vlagents_ray.interface import HIGH_RES, Act, Obs
+from vlagents_ray.testing import check_env
+
+pytestmark = pytest.mark.assets("rcs")
+HOME = (0.307, 0.0, 0.487, 1.0, 0.0, 0.0, 0.0)  # m and xyzw: where the tool is after a reset, pointing down
+
+
+@pytest.fixture(scope="module")
+def pick() -> Iterator[Rcs]:
+    with Rcs("pick", cameras=[]) as env:
+        yield env
+
+
+def led(env: Rcs, command: Sequence[float], steps: int = 40) -> Obs:
+    """The observation after a reset and so many steps of one command."""
+    env.reset(seed=0)
+    for _ in range(steps):
+        obs, *_ = env.step(Act(np.array(command, np.float32)))
+    return obs
+
+
+def test_it_keeps_the_promises_of_an_env() -> None:
+    check_env(Rcs("pick", cameras=["wrist"], width=40, height=32, record_size=(48, 64), max_steps=8))
+
+
+def test_the_expert_picks_the_cuboid_up_and_that_ends_the_episode(pick: Rcs) -> None:
+    for seed in range(4):
+        result = play(pick, "rcs/pick", seed=seed)
+        assert (result.success_once, result.success_at_end, result.ending) == (True, True, "terminated")
+        assert result.steps < 100
+
+
+@pytest.mark.parametrize("gripper", [0.0, 1.0])
+def test_an_arm_that_stays_where_it_is_does_not_succeed(pick: Rcs, gripper: float) -> None:
+    result = play(pick, "rcs/pick", Always(*HOME, gripper))
+    assert (result.success_once, result.ending, result.steps) == (False, "truncated", 300)
+
+
+def test_the_gripper_opens_at_one_and_closes_at_zero(pick: Rcs) -> None:
+    assert led(pick, (*HOME, 1.0)).gripper == pytest.approx(1.0, abs=0.05)
+    assert led(pick, (*HOME, 0.0)).gripper == pytest.approx(0.0, abs=0.05)
+    with Rcs("pick", cameras=[], binary_gripper=False) as half_way:
+        assert led(half_way, (*HOME, 0.5)).gripper == pytest.approx(0.5, abs=0.1)
+
+
+def test_a_tquat_command_is_where_the_tool_goes(pick: Rcs) -> None:
+    turned = (0.45, 0.1, 0.3, math.cos(0.3), math.sin(0.3), 0.0, 0.0)  # by 0.6 rad about the vertical
+    np.testing.assert_allclose(led(pick, (*turned, 1.0)).state["tquat"], turned, atol=0.01)
+
+
+def test_an_xyzrpy_command_is_where_the_tool_goes() -> None:
+    pose = (0.45, 0.1, 0.3, math.pi - 0.1, 0.05, 0.4)
+    with Rcs("pick", cameras=[], control_mode="xyzrpy") as env:
+        assert (env.contract.action.dim, env.contract.action.rotation) == (7, "euler_xyz")
+        np.testing.assert_allclose(led(env, (*pose, 1.0)).state["xyzrpy"], pose, atol=0.01)
+        assert "control: xyzrpy, the protocol says tquat" in env.describe()["protocol"]["deviations"]
+
+
+def test_a_joints_command_is_where_the_joints_go() -> None:
+    joints = (0.2, -0.6, 0.1, -2.2, 0.0, 1.6, 0.9)
+    with Rcs("pick", cameras=[], control_mode="joints") as env:
+        np.testing.assert_allclose(led(env, (*joints, 1.0)).state["joints"], joints, atol=0.01)
+
+
+def test_a_delta_command_moves_on_from_where_the_arm_is() -> None:
+    with Rcs("pick", cameras=[], control_mode="xyzrpy", delta=True) as env:
+        assert env.contract.action.delta is True
+        y = [led(env, (0.0, 0.01, 0.0, 0.0, 0.0, 0.0, 1.0), steps).state["xyzrpy"][1] for steps in (10, 20)]
+    assert 0.01 < y[0] < y[1] - 0.01
+
+
+def test_a_single_arms_parts_have_plain_names(pick: Rcs) -> None:
+    contract = pick.contract
+    assert {name: part.dim for name, part in (contract.state or {}).items()} == {"joints": 7, "tquat": 7, "xyzrpy": 6}
+    assert (contract.cameras, contract.gripper, contract.action.arms, contract.control_hz) == ({}, True, None, 30.0)
+
+
+def test_the_image_shows_the_cuboid_where_mujoco_projects_it() -> None:
+    """MuJoCo's cameras look along their -z, with x to the right and y up."""
+    with Rcs("pick", width=160, height=120, cameras=["bird_eye"]) as env:
+        for seed in range(3):
+            env.reset(seed=seed)
+            obs, *_ = env.step(Act(np.array([*HOME, 1.0], np.float32)))
+            red, green, blue = (obs.cameras["bird_eye"][..., i].astype(int) for i in range(3))
+            rows, columns = np.nonzero((green > red + 60) & (green > blue + 40))
+            data, [place] = env._sim.data, list(obs.info["objects"].values())
+            x, y, z = data.camera("bird_eye").xmat.reshape(3, 3).T @ (place[:3] - data.camera("bird_eye").xpos)
+            focal = 60 / math.tan(math.radians(env._sim.model.camera("bird_eye").fovy[0]) / 2)
+            assert columns.mean() == pytest.approx(80 + focal * x / -z, abs=2)
+            assert rows.mean() == pytest.approx(60 - focal * y / -z, abs=2)
+
+
+def test_views_for_the_record_are_apart_from_what_the_policy_sees() -> None:
+    with Rcs("pick", width=40, height=32, cameras=["wrist"], record_size=(64, 80)) as env:
+        obs, _ = env.reset(seed=0)
+        assert env.contract.cameras == {"wrist": CameraSpec(32, 40)}
+        assert {name: image.shape for name, image in obs.cameras.items()} == {"wrist": (32, 40, 3)}
+        assert {name: image.shape for name, image in obs.info[HIGH_RES].items()} == {"wrist": (64, 80, 3)}
+        smaller = obs.info[HIGH_RES]["wrist"].reshape(32, 2, 40, 2, 3).mean(axis=(1, 3))
+        assert np.abs(smaller - obs.cameras["wrist"]).mean() < 8
+    with Rcs("pick", width=40, height=32) as env:
+        assert HIGH_RES not in env.reset(seed=0)[0].info
+
+
+def test_a_description_names_versions_robot_and_protocol(pick: Rcs) -> None:
+    facts = pick.describe()
+    assert (facts["rcs-core"], facts["robots"]) == ("0.7.3", {"right": "FR3"})
+    assert (facts["protocol"]["name"], facts["protocol"]["deviations"]) == ("RCS pick", [])
+
+
+def test_without_assets_nothing_is_downloaded_but_the_cure_told(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: object
+) -> None:
+    assert Rcs.missing() is None
+    monkeypatch.setenv("RCS_PREFIX", str(tmp_path))
+    assert "set RCS_PREFIX" in (Rcs.missing() or "")
+    with pytest.raises(MissingDependency, match=r"rcs/pick: rcs's assets are not in .*set RCS_PREFIX"):
+        Rcs("pick")
+
+
+def test_what_cannot_be_evaluated_is_refused() -> None:
+    with pytest.raises(UnknownEnv, match=r"no task 'fr3': want one of \['pick'\]"):
+        Rcs("fr3")
+    with pytest.raises(UnknownEnv, match=r"knows no 'rcs/crane'"):
+        Rcs("rcs/crane", module="rcs.envs.configs", max_steps=5)
+    with pytest.raises(ConfigError, match="set max_steps"):
+        Rcs("rcs/fr3", module="rcs.envs.configs")
+    with pytest.raises(ConfigError, match=r"no camera \['top'\].*bird_eye"):
+        Rcs("pick", cameras=["top"])
+    with Rcs("rcs/fr3", module="rcs.envs.configs", max_steps=5, cameras=[], instruction="wave") as env:
+        env.reset(seed=0)
+        with pytest.raises(ConfigError, match="what success is"):
+            env.step(Act(np.array([*HOME, 1.0], np.float32)))
+
+
+def test_an_env_that_is_not_ready_says_so(pick: Rcs) -> None:
+    fresh = Rcs("pick", cameras=[])
+    with pytest.raises(NotReset, match="reset"):
+        fresh.step(Act(np.array([*HOME, 1.0], np.float32)))
+    with pytest.raises(ConfigError, match="options"):
+        fresh.reset(seed=0, options={"place": 1})
+    fresh.close()
+    with pytest.raises(EnvFailed, match="closed"):
+        fresh.reset(seed=0)
+    pick.reset(seed=0)
+    with pytest.raises(InvalidAction, match=r"\(8,\)"):
+        pick.step(Act(np.zeros((2, 8), np.float32)))

@@ -1,0 +1,94 @@
+"""An evaluation's results depend on its plan, and on nothing of how it was played."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from flat_config import flat_config
+
+from tests.integration.conftest import serving
+from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, Results, SilentProgress, evaluate
+from vlagents_ray.evaluate.cells import Cell
+from vlagents_ray.evaluate.episode import EpisodeResult
+
+pytestmark = pytest.mark.slow
+
+EPISODES = 16
+
+
+def plan(out: Path, url: str, **running: Any) -> EvalConfig:
+    return flat_config(
+        envs=["tabletop/slide", "tabletop/lift"],
+        env_options={"width": 64, "height": 64, "max_steps": 29},
+        episodes=EPISODES,
+        policy="hesitant",
+        policy_url=url,
+        out=out,
+        video="none",
+        **running,
+    )
+
+
+def outcomes(out: Path) -> dict[str, tuple[Any, ...]]:
+    """All of each episode but times and ways."""
+    found = [one.result for cell in Results.load(out).cells for one in cell.episodes]
+    assert len({str(one.key) for one in found}) == len(found) == 2 * EPISODES
+    return {
+        str(one.key): (
+            one.status, one.success_once, one.success_at_end, one.first_success, one.steps, one.episode_return,
+            one.ending, one.instruction,
+        )
+        for one in found
+    }  # fmt: skip
+
+
+class Disaster(SilentProgress):
+    """Kills all workers after each fifth episode, and has the evaluation interrupted after so many."""
+
+    def __init__(self, interrupted_after: int | None = None) -> None:
+        self.played = 0
+        self.interrupted_after = interrupted_after
+
+    def episode(self, cell: Cell, result: EpisodeResult) -> None:
+        self.played += 1
+        if self.played % 5 == 0:
+            for process in psutil.Process().children(recursive=True):
+                with contextlib.suppress(psutil.NoSuchProcess):
+                    if "Rollout" in process.cmdline()[0]:
+                        process.kill()
+        if self.played == self.interrupted_after:
+            signal.raise_signal(signal.SIGINT)
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Any, ...]]:
+    """By one worker, from one replica that batches nothing."""
+    out = tmp_path_factory.mktemp("alone")
+    with serving("served_agents:Hesitant", batch={"max_size": 1}) as server:
+        evaluate(plan(out, server.url, workers=1))
+    found = outcomes(out)
+    assert {row[1] for row in found.values()} == {True, False}, "both outcomes occur, or the test shows nothing"
+    return found
+
+
+@pytest.mark.parametrize(("workers", "batch", "replicas"), [(2, 8, 1), (4, 8, 2)])
+def test_workers_batches_and_replicas_change_no_result(
+    alone: dict[str, Any], tmp_path: Path, workers: int, batch: int, replicas: int
+) -> None:
+    with serving("served_agents:Hesitant", batch={"max_size": batch}, replicas=replicas) as server:
+        evaluate(plan(tmp_path, server.url, workers=workers))
+    assert outcomes(tmp_path) == alone
+
+
+def test_killed_workers_and_a_resumption_change_no_result(alone: dict[str, Any], tmp_path: Path) -> None:
+    with serving("served_agents:Hesitant") as server:
+        with pytest.raises(EvaluationInterrupted):
+            evaluate(plan(tmp_path, server.url, workers=2, retries=20), progress=Disaster(EPISODES))
+        summary = evaluate(plan(tmp_path, server.url, workers=2, retries=20, resume=True), progress=Disaster())
+    assert summary.total.retries > 0
+    assert outcomes(tmp_path) == alone

@@ -1,0 +1,217 @@
+"""A LIBERO task as an environment for evaluations."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import os
+from collections.abc import Iterator, Mapping
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.contract import Contract, check_action
+from vlagents_ray.envs.base import EvalEnv
+from vlagents_ray.envs.libero import assets as asset_files
+from vlagents_ray.envs.libero import robot
+from vlagents_ray.envs.libero.protocol import Protocol
+from vlagents_ray.envs.libero.tasks import find_task, read_states, task_names
+from vlagents_ray.envs.libero.world import Seen, World
+from vlagents_ray.envs.probe import EGL_CURE, egl_probe
+from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset, VLAgentsError
+from vlagents_ray.interface import HIGH_RES, Act, Obs
+
+
+class Libero(EvalEnv):
+    """One environment of one LIBERO task, e.g. "libero_spatial/0".
+
+    Observation: cameras "front" (LIBERO's agentview) and "wrist" (its eye in hand), turned as policies
+    expect it, see `Protocol`; in `state` what policies for LIBERO take: `xyz_axis_angle` (6,), the end
+    effector in the world's frame, whose axes are the robot base's, m and rad, the angle in [0, 2 pi] as
+    robosuite's quaternion gives it; `gripper_qpos` (2,) m, of the fingers; and `joints` (7,) rad. In
+    `info["sim_state"]`, for scripted experts only: `positions` of objects (3,) m in the world's frame, and
+    the `goal`.
+
+    Action: (7,) in [-1, 1]: the end effector's target moves by 0.05 m a unit along the base's axes, and
+    turns by 0.5 rad a unit about them, axis-angle; the last is the gripper, -1 opens, 1 closes, and only
+    its sign counts.
+
+    An episode is a pure function of its initial state, `options["init_state"]`; where that is not given,
+    the seed chooses it, and otherwise the seed is the policy's alone.
+    """
+
+    def __init__(
+        self,
+        task: str = "libero_spatial/0",
+        *,
+        width: int = 256,
+        height: int = 256,
+        record_size: tuple[int, int] | None = None,
+        max_steps: int | None = None,
+        settling_steps: int | None = None,
+        simulator_seed: int | None = None,
+        stop_at_success: bool = True,
+        gripper_open: float | None = None,
+        gripper_closed: float | None = None,
+        instruction: str | None = None,
+        assets: str | None = None,
+    ) -> None:
+        """Raises `UnknownEnv`, `ConfigError`, `MissingDependency`, or `EnvFailed` with its cure.
+
+        Args:
+            task: "SUITE/NUMBER", or "SUITE/NAME" with LIBERO's name.
+            width: of each image, pixels.
+            height: of each image, pixels.
+            record_size: (height, width) of further views of each camera, for the record alone.
+            max_steps: None is the protocol's for the suite.
+            settling_steps: None is the protocol's.
+            simulator_seed: of what an initial state leaves open; None is the protocol's.
+            stop_at_success: report `terminated` when the task is solved.
+            gripper_open: the action's last number that opens the gripper; None is LIBERO's -1. OpenVLA
+                says 1, and 0 to close, which openvla's evaluation turns into LIBERO's as this does.
+            gripper_closed: the one that closes it; None is LIBERO's 1.
+            instruction: None is the task's own.
+            assets: the folder with LIBERO's meshes and textures; None is what LIBERO_ASSETS names.
+        """
+        for name, value in (("width", width), ("height", height), ("max_steps", max_steps)):
+            if value is not None and value < 1:
+                raise ConfigError(f"libero/{task}: {name} is {value}, want at least 1")
+        if record_size is not None and (len(record_size) != 2 or min(record_size) < 1):
+            raise ConfigError(f"libero/{task}: record_size is {record_size}, want (height, width), pixels")
+        if (settling_steps or 0) < 0:
+            raise ConfigError(f"libero/{task}: settling_steps is {settling_steps}, want 0 or more")
+        self._task = find_task(task)
+        self._assets = asset_files.find_assets(assets)
+        self._protocol = Protocol.of(
+            self._task.suite,
+            image_size=(height, width),
+            max_steps=max_steps,
+            settling_steps=settling_steps,
+            simulator_seed=simulator_seed,
+            stop_at_success=stop_at_success,
+            gripper_open=gripper_open,
+            gripper_closed=gripper_closed,
+        )
+        if self._protocol.gripper_open == self._protocol.gripper_closed:
+            raise ConfigError(f"libero/{task}: the gripper opens and closes at {gripper_open}; want two numbers")
+        self.max_steps = self._protocol.max_steps
+        self._instruction = instruction or self._task.language
+        self._steps: int | None = None
+        self._world: World | None = None
+        self._contract = robot.contract(self._protocol)
+        with self._failing("make"):
+            self._states = read_states(self._task.states)
+            self._world = World(self._task, self._protocol, self._assets, record_size)
+        self.init_states = len(self._states)
+
+    @property
+    def contract(self) -> Contract:
+        return self._contract
+
+    @property
+    def instruction(self) -> str:
+        return self._instruction
+
+    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+        """Begin in the initial state `options["init_state"]`, or the one that the seed chooses."""
+        world, state = self._alive(), self._initial(seed, options or {})
+        with self._failing("reset"):
+            seen = world.begin(self._states[state])
+        self._steps = 0
+        return self._observe(seen), {"success": seen.success, "init_state": state}
+
+    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        world = self._alive()
+        if self._steps is None:
+            raise NotReset(f"{self._name}: step before reset; call reset(seed=...) first")
+        action = check_action(act.action, self._contract)
+        if action.ndim != 1:
+            raise InvalidAction(f"action: got {action.shape}, want (7,); step through a chunk row by row")
+        with self._failing("step"):
+            seen = world.step(robot.to_simulator(action, self._protocol))
+        self._steps += 1
+        ended = seen.success and self._protocol.stop_at_success
+        truncated = not ended and self._steps >= self.max_steps
+        return self._observe(seen), float(seen.success), ended, truncated, {"success": seen.success}
+
+    @classmethod
+    def tasks(cls) -> list[str]:
+        return task_names()
+
+    @classmethod
+    def missing(cls) -> str | None:
+        """The first call in a process renders one frame in a child."""
+        for module in ("libero", "robosuite", "mujoco"):
+            if importlib.util.find_spec(module) is None:
+                return f"{module} is not installed; pip install 'vlagents-ray[libero]'"
+        try:
+            asset_files.find_assets()
+        except EnvFailed as error:
+            return str(error)
+        probe = egl_probe()
+        return None if probe.ok else f"LIBERO cannot render without a display ({probe.error}); {probe.cure}"
+
+    def describe(self) -> dict[str, Any]:
+        return {
+            "simulator": "libero",
+            "task": self._task.full_name,
+            "name": self._task.name,
+            "language": self._task.language,
+            "init_states": self.init_states,
+            "protocol": self._protocol.to_json(self._task.suite),
+            "hf-libero": version("hf-libero"),
+            "robosuite": version("robosuite"),
+            "mujoco": version("mujoco"),
+            "assets": asset_files.digest(self._assets),
+            "render_backend": os.environ.get("MUJOCO_GL", "glfw"),
+        }
+
+    def close(self) -> None:
+        world, self._world, self._steps = self._world, None, None
+        if world is not None:
+            world.close()
+
+    def _initial(self, seed: int, options: Mapping[str, Any]) -> int:
+        """The number of the initial state."""
+        unknown = sorted(set(options) - {"init_state"})
+        if unknown:
+            raise ConfigError(f"{self._name}: unknown reset options {unknown}, want init_state or none")
+        count = len(self._states)
+        state = options.get("init_state", seed % count)
+        if not isinstance(state, int) or not 0 <= state < count:
+            raise ConfigError(f"{self._name}: init_state is {state!r}, want 0 to {count - 1}")
+        return state
+
+    def _observe(self, seen: Seen) -> Obs:
+        world, cameras = self._alive(), self._protocol.cameras
+        info: dict[str, Any] = {"sim_state": {"positions": world.positions(), "goal": world.goal}}
+        if seen.views:
+            info[HIGH_RES] = {name: _turned(seen.views[own]) for name, own in cameras.items()}
+        state, gripper = robot.read(seen.raw)
+        images = {name: _turned(seen.raw[f"{own}_image"]) for name, own in cameras.items()}
+        return Obs(cameras=images, gripper=gripper, state=state, info=info)
+
+    @property
+    def _name(self) -> str:
+        return f"libero/{self._task.full_name}"
+
+    def _alive(self) -> World:
+        if self._world is None:
+            raise EnvFailed(f"{self._name} is closed; make a new one")
+        return self._world
+
+    @contextlib.contextmanager
+    def _failing(self, doing: str) -> Iterator[None]:
+        try:
+            yield
+        except VLAgentsError:
+            raise
+        except Exception as error:
+            about_egl = any(word in str(error) for word in ("EGL", "OpenGL", "GLContext", "mjr_makeContext"))
+            cure = f"; {EGL_CURE}" if about_egl else ""
+            raise EnvFailed(f"{self._name} failed to {doing}: {type(error).__name__}: {error}{cure}") from error
+
+
+def _turned(image: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(image[::-1, ::-1])

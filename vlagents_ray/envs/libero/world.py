@@ -1,0 +1,159 @@
+"""LIBERO's simulator of one task, and the eyes of its robot."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.envs.libero.protocol import Protocol
+from vlagents_ray.envs.libero.tasks import Task
+from vlagents_ray.errors import EnvFailed
+from vlagents_ray.registry import require
+
+_ATTEMPTS = 1000  # to place the scene's objects; one is enough nearly always
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """What the simulator shows after a step."""
+
+    raw: Mapping[str, Any]  # robosuite's observation
+    views: Mapping[str, np.ndarray]  # MuJoCo's camera -> (H, W, 3) uint8, upside down, in the size for the record
+    success: bool
+
+
+class World:
+    """Steps the simulator as the protocol says; renders only what somebody sees."""
+
+    def __init__(self, task: Task, protocol: Protocol, assets: Path, record_size: tuple[int, int] | None) -> None:
+        self._package: Any = require("libero.libero")
+        self._assets = assets
+        self._protocol = protocol
+        self._use_assets()
+        self._env: Any = require("libero.libero.envs").OffScreenRenderEnv(
+            bddl_file_name=str(task.problem),
+            controller=protocol.controller,
+            control_freq=protocol.control_hz,
+            camera_names=list(protocol.cameras.values()),
+            camera_heights=protocol.image_size[0],
+            camera_widths=protocol.image_size[1],
+            horizon=protocol.settling_steps + protocol.max_steps + 1,  # robosuite's own limit stays out of the way
+        )
+        self._eyes = Eyes(self._env.env, record_size)
+
+    def begin(self, state: np.ndarray) -> Seen:
+        """Seed, reset, set the initial `state`, (D,) float64, and let the objects settle."""
+        settling = self._protocol.settling_steps
+        self._use_assets()
+        self._eyes.make_current()  # what the last episode's rendering holds is given back in its own context
+        self._eyes.open = False
+        with _seeded(self._protocol.simulator_seed):
+            self._reset()
+            self._eyes.open = settling == 0
+            raw = self._env.set_init_state(state)
+            success = bool(self._env.check_success())
+            for i in range(settling):
+                self._eyes.open = i == settling - 1
+                raw, _, success, _ = self._env.step(list(self._protocol.settling_action))
+        self._eyes.open = True
+        return Seen(raw, self._eyes.views, bool(success))
+
+    def step(self, action: np.ndarray) -> Seen:
+        """One control step of `action`, (7,) float64, which the controller clips to [-1, 1]."""
+        raw, _, success, _ = self._env.step(action)
+        return Seen(raw, self._eyes.views, bool(success))
+
+    @property
+    def goal(self) -> list[list[str]]:
+        """The goal's predicates, all of which must hold, e.g. [["on", "akita_black_bowl_1", "plate_1"]]."""
+        return [[str(word) for word in predicate] for predicate in self._env.env.parsed_problem["goal_state"]]
+
+    def positions(self) -> dict[str, np.ndarray]:
+        """Where every object is, and what else the goal names, (3,) float64, m in the world's frame."""
+        domain = self._env.env
+        states = domain.object_states_dict
+        named = {*domain.objects_dict, *(name for _, *names in self.goal for name in names)}
+        return {
+            name: np.array(states[name].get_geom_state()["pos"], np.float64) for name in sorted(named & set(states))
+        }
+
+    def flat_state(self) -> np.ndarray:
+        """MuJoCo's time, qpos and qvel, (D,) float64, as the initial states are written."""
+        state: np.ndarray = self._env.get_sim_state()
+        return state
+
+    def close(self) -> None:
+        self._eyes.make_current()
+        self._env.close()
+
+    def _reset(self) -> None:
+        """What `OffScreenRenderEnv.reset` does, which tries again after any error, without end."""
+        crowded = require("robosuite.utils.errors").RandomizationError
+        for _ in range(_ATTEMPTS):
+            try:
+                self._env.env.reset()
+            except crowded:  # the drawn places overlap: draw again
+                continue
+            return
+        raise EnvFailed(f"the scene's objects found no place in {_ATTEMPTS} draws")
+
+    def _use_assets(self) -> None:
+        self._package._assets_path_cache = str(self._assets)  # the process's one: another env may have set its own
+
+
+class Eyes:
+    """The cameras: closed, they cost nothing and show black.
+
+    robosuite renders each camera whenever an observation is made, which is 14 times from the beginning of
+    a reset to the policy's first observation. It samples a step's observation after the first 2 ms of the
+    step's 50, images included; the views for the record are of that same moment.
+    """
+
+    def __init__(self, domain: Any, record_size: tuple[int, int] | None) -> None:
+        self.open = True
+        self.views: dict[str, np.ndarray] = {}
+        self._domain = domain
+        self._record_size = record_size
+        self._own = domain._create_camera_sensors
+        domain._create_camera_sensors = self._sensors  # asked for anew in each reset
+
+    def make_current(self) -> None:
+        """Render in this simulator's OpenGL context: the process may have others."""
+        sim = self._domain.sim
+        if sim is not None and sim._render_context_offscreen is not None:  # a reset that failed leaves none
+            sim._render_context_offscreen.gl_ctx.make_current()
+
+    def _sensors(self, cam_name: str, cam_w: int, cam_h: int, **rest: Any) -> tuple[list[Any], list[str]]:
+        [own], names = self._own(cam_name, cam_w=cam_w, cam_h=cam_h, **rest)
+        return [self._lidded(own, cam_name, (cam_h, cam_w))], names
+
+    def _lidded(self, own: Callable[[Any], np.ndarray], camera: str, size: tuple[int, int]) -> Callable[[Any], Any]:
+        @functools.wraps(own)  # with robosuite's marks on it
+        def look(cache: Any) -> np.ndarray:
+            if not self.open:
+                return np.zeros((*size, 3), np.uint8)
+            self.make_current()
+            if self._record_size is not None:
+                height, width = self._record_size
+                view = self._domain.sim.render(camera_name=camera, height=height, width=width)
+                self.views = self.views | {camera: view}
+            return own(cache)
+
+        return look
+
+
+@contextmanager
+def _seeded(seed: int) -> Iterator[None]:
+    """robosuite and LIBERO draw from numpy's global generator, which is left as it was found."""
+    before = np.random.get_state()  # noqa: NPY002
+    np.random.seed(seed)  # noqa: NPY002
+    try:
+        yield
+    finally:
+        np.random.set_state(before)  # noqa: NPY002

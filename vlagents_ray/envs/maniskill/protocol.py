@@ -1,0 +1,29 @@
+"""How ManiSkill 3 wants policies evaluated, so that results compare."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+
+@dataclass(frozen=True, slots=True)
+class Protocol:
+    """The section "Evaluation" of ManiSkill 3's guide to its set-up for reinforcement learning."""
+
+    ignore_terminations: bool = True  # an episode goes on to the step limit, whatever succeeds or fails before
+    reconfiguration_freq: int = 1  # the scene is rebuilt for each episode, with other objects where a task draws them
+    metrics: tuple[str, ...] = ("success_once", "success_at_end")
+    seeds: str = "one an environment"  # each episode has one of its own, by which everything random in it is drawn
+
+
+PROTOCOL = Protocol()
+
+
+def described(*, reconfigure: bool, max_steps: int, own_limit: int | None) -> dict[str, Any]:
+    """The protocol for the record, and in `departures` what of these settings is not as it says."""
+    departures = []
+    if not reconfigure:
+        departures.append("reconfigure is False: scenes are kept from episode to episode")
+    if max_steps != own_limit:
+        departures.append(f"max_steps is {max_steps}, the task's own is {own_limit}")
+    return {**asdict(PROTOCOL), "metrics": list(PROTOCOL.metrics), "departures": departures}

@@ -1,0 +1,201 @@
+"""One ManiSkill simulator with one environment in it or several: what the envs made of it have in common."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract
+from vlagents_ray.envs.maniskill import making
+from vlagents_ray.envs.maniskill.recording import RecordCameras
+from vlagents_ray.envs.maniskill.robot import Robot, action_spec
+from vlagents_ray.envs.maniskill.tasks import instruction_for
+from vlagents_ray.envs.probe import vulkan_device_name
+from vlagents_ray.envs.recording import Size
+from vlagents_ray.errors import ConfigError, EnvFailed
+from vlagents_ray.interface import HIGH_RES, Obs
+from vlagents_ray.registry import require
+
+
+@dataclass(frozen=True, slots=True)
+class Moment:
+    """After a reset or step: one row an environment."""
+
+    obs: list[Obs]
+    success: list[bool]
+    rewards: list[float]
+
+
+class Simulator:
+    """The task's `num_envs` environments, each of which goes on after success."""
+
+    def __init__(
+        self,
+        name: str,
+        task: str,
+        *,
+        obs_mode: str,
+        num_envs: int = 1,
+        cameras: Sequence[str] | None = None,
+        record_size: Size | None = None,
+        sim_backend: str,
+        render_backend: str,
+        control_mode: str | None,
+        reward_mode: str | None = None,
+        sensors: Mapping[str, Any],
+    ) -> None:
+        """`name` stands in errors. Raises `ConfigError`, or `EnvFailed` with its cure."""
+        self.name = name
+        self._task = task
+        self._record: RecordCameras | None = None
+        self.env: Any = making.make(
+            task,
+            control_mode,
+            num_envs=num_envs,
+            obs_mode=obs_mode,
+            reward_mode=reward_mode,
+            sim_backend=sim_backend,
+            render_backend=making.render_backend(render_backend),
+            sensor_configs=dict(sensors),
+        )
+        try:
+            self._check_usable()
+            self.cameras = self._choose(cameras)
+            self._robot = Robot(self.env.agent)
+        except BaseException:
+            self.close()
+            raise
+        if record_size is not None:
+            self._record = RecordCameras(record_size, self.cameras)
+
+    @property
+    def action(self) -> ActionSpec:
+        """Of the control mode."""
+        env = self.alive()
+        return action_spec(env.control_mode, env.single_action_space, has_gripper=self._robot.has_gripper)
+
+    def contract(self, action: ActionSpec) -> Contract:
+        """Of each environment, which takes `action`."""
+        return Contract(
+            cameras=self.cameras,
+            state=self._robot.gives,
+            gripper=self._robot.has_gripper,
+            instruction=True,
+            action=action,
+            control_hz=float(self.alive().control_freq),
+        )
+
+    def instructions(self) -> list[str]:
+        """The task in words, for each environment."""
+        env = self.alive()
+        own = getattr(env, "get_language_instruction", None)
+        return [str(text) for text in own()] if own is not None else [instruction_for(self._task)] * env.num_envs
+
+    def reset(self, seeds: Sequence[int], options: Mapping[str, Any]) -> Moment:
+        """Begin an episode in each environment; seeds are taken modulo 2^32."""
+        env = self.alive()
+        with self._failing("reset"):
+            raw, info = env.reset(seed=[seed % 2**32 for seed in seeds], options=dict(options))
+            if env.num_envs == 1:  # rendering is most of a step: not for a camera that nobody asked for
+                for name in set(env.scene.sensors) - set(self.cameras):
+                    del env.scene.sensors[name]
+            return self.moment(raw, info)
+
+    def reset_each(self, seeds: Sequence[int], options: Sequence[Mapping[str, Any]]) -> Moment:
+        """Begin each environment's episode by itself, in the scenes that there are.
+
+        ManiSkill seeds torch once for all that it resets together, from the first one's seed: what a
+        task draws by torch would depend on its neighbours.
+        """
+        env = self.alive()
+        with self._failing("reset"):
+            mode, env._obs_mode = env._obs_mode, "none"  # nothing is rendered before all have begun
+            try:
+                for i, (seed, option) in enumerate(zip(seeds, options, strict=True)):
+                    only = require("torch").tensor([i], device=env.device)
+                    env.reset(seed=[seed % 2**32] * env.num_envs, options={**option, "env_idx": only})
+            finally:
+                env._obs_mode = mode
+            info = env.get_info()
+            return self.moment(env.get_obs(info), info)
+
+    def step(self, actions: np.ndarray) -> Moment:
+        """Execute one action in each environment, (N, D) float32."""
+        env = self.alive()
+        with self._failing("step"):
+            # a copy: torch shares the memory, and warns of a read-only array, such as Ray hands out
+            raw, rewards, _, _, info = env.step(actions.copy())
+            return replace(self.moment(raw, info), rewards=rewards.cpu().numpy().astype(float).tolist())
+
+    def moment(self, raw: Mapping[str, Any], info: Mapping[str, Any]) -> Moment:
+        """What ManiSkill's own observation and info say. The images of a camera share one array, (N, H, W, 3)."""
+        env = self.alive()
+        sensors = raw["sensor_data"]
+        images = {name: np.ascontiguousarray(sensors[name]["rgb"].cpu().numpy()) for name in self.cameras}
+        states = raw["state"].cpu().numpy() if "state" in raw else None
+        seen = []
+        for i, (state, gripper) in enumerate(self._robot.read(env.agent)):
+            extra = {} if states is None else {"sim_state": states[i]}
+            seen.append(Obs({name: rows[i] for name, rows in images.items()}, gripper, state, extra))
+        if self._record is not None:
+            seen[0].info[HIGH_RES] = self._record.views(env)
+        success = [bool(value) for value in info["success"]]
+        return Moment(seen, success, [0.0] * len(seen))
+
+    def describe(self) -> dict[str, Any]:
+        """Versions, backends and modes, for the record."""
+        env = self.alive()
+        return {
+            "simulator": "maniskill",
+            "task": self._task,
+            "mani_skill": version("mani-skill"),
+            "sapien": version("sapien"),
+            "robot": env.agent.uid,
+            "control_mode": env.control_mode,
+            "obs_mode": env.obs_mode,
+            "reward_mode": env.reward_mode,
+            "sim_backend": env.backend.sim_backend,
+            "render_backend": env.backend.render_backend,
+            "render_device": vulkan_device_name(on_gpu=env.backend.render_device.is_cuda()),
+            "shaders": {name: env.scene.sensors[name].config.shader_config.shader_pack for name in self.cameras},
+            "num_envs": env.num_envs,
+        }
+
+    def alive(self) -> Any:
+        """ManiSkill's environment; `EnvFailed` after `close`."""
+        if self.env is None:
+            raise EnvFailed(f"{self.name} is closed; make a new one")
+        return self.env
+
+    def close(self) -> None:
+        """Free it; safe to call twice."""
+        env, self.env, self._record = self.env, None, None
+        if env is not None:
+            env.close()
+
+    def _check_usable(self) -> None:
+        if not hasattr(self.env.agent, "robot"):  # none at all, or several
+            raise ConfigError(f"{self.name}: want a task with exactly one robot")
+        if "success" not in self.env.get_info():
+            raise ConfigError(f"{self.name} does not say what success is: there is nothing to evaluate")
+
+    def _choose(self, cameras: Sequence[str] | None) -> dict[str, CameraSpec]:
+        seen = self.env.single_observation_space["sensor_data"]
+        sizes = {name: textures["rgb"].shape[:2] for name, textures in seen.items() if "rgb" in textures.spaces}
+        unknown = sorted(set(cameras or ()) - set(sizes))
+        if unknown:
+            raise ConfigError(f"{self.name} has no camera {unknown}: want some of {sorted(sizes)}")
+        chosen = sizes if cameras is None else cameras
+        return {name: CameraSpec(height=sizes[name][0], width=sizes[name][1]) for name in chosen}
+
+    @contextlib.contextmanager
+    def _failing(self, doing: str) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:
+            raise EnvFailed(f"{self.name} failed in {doing}: {type(error).__name__}: {error}") from error

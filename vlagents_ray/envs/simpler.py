@@ -1,0 +1,244 @@
+"""SIMPLER's Bridge tasks: digital twins of a real WidowX table, as ManiSkill 3 has them.
+
+Li et al. 2024, "Evaluating Real-World Robot Manipulation Policies in Simulation",
+https://arxiv.org/abs/2405.05941: visual matching, that is photographs of the real scene behind the
+simulated robot and objects, and a fixed list of initial configurations.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.envs.base import EvalEnv, one_row
+from vlagents_ray.envs.headless import prepare_rendering
+from vlagents_ray.envs.maniskill import ManiSkill, making
+from vlagents_ray.envs.maniskill.simulator import Moment, Simulator
+from vlagents_ray.envs.recording import record_size_of
+from vlagents_ray.errors import ConfigError, EnvFailed, NotReset, UnknownEnv
+from vlagents_ray.interface import Act, Obs
+from vlagents_ray.registry import require
+
+_TOUCHING = "the object lies on its target and touches it"
+_WITHIN = "the object lies within its target's outline, at most {} m above it"
+
+# What ManiSkill 3 counts as success in each task.
+TWINS: dict[str, str] = {
+    "PutCarrotOnPlateInScene-v1": _TOUCHING,
+    "PutEggplantInBasketScene-v1": _WITHIN.format(0.06),
+    "PutSpoonOnTableClothInScene-v1": _WITHIN.format(0.02),
+    "StackGreenCubeOnYellowCubeBakedTexInScene-v1": _TOUCHING,
+}
+_DATA = {"bridge_v2_real2sim": "tasks/bridge_v2_real2sim_dataset", "widowx250s": "robots/widowx"}
+_DOWNLOADS = " && ".join(f"python -m mani_skill.utils.download_asset {name}" for name in _DATA)
+
+
+@dataclass(frozen=True, slots=True)
+class Protocol:
+    """How SIMPLER's own script for ManiSkill 3 evaluates, real2sim_eval_maniskill3.py."""
+
+    setting: str = "visual matching"
+    success: str = "at the end"  # of the last state; success once is reported beside it
+    initial_states: str = "by episode id"
+    control_mode: str = "arm_pd_ee_target_delta_pose_align2_gripper_pd_joint_pos"
+    obs_mode: str = "rgb+segmentation"
+    shader: str = "default"
+    gripper_open_above: float = 0.5  # the command is made open or closed, nothing between
+    sticky_gripper_steps: int = 1  # 15 only for the Google robot, whose scenes ManiSkill 3 does not have
+
+
+PROTOCOL = Protocol()
+
+
+class Simpler(EvalEnv):
+    """One Bridge task with its WidowX 250 S, at 5 Hz.
+
+    Observation: "3rd_view_camera", (480, 640, 3), as the policies of the paper had it and resized it
+    themselves; `state`: the arm's `joints` (6,) rad, and `tquat` and `xyzrpy`, the pose of the
+    gripper's link in the robot's base frame; `gripper`; and in `info["sim_state"]`, (13,) float32 in
+    that frame, the positions in m of object, target, gripper and of where the gripper is commanded
+    to, and the object's yaw in rad, for scripted experts only.
+
+    Action, (7,), as policies trained on Bridge give it: the gripper's change of position in m along
+    the base's axes, its change of roll, pitch and yaw in rad, and the gripper, 1 open, 0 closed. It
+    changes what was commanded before, not where the arm has come to. Rotations reach the
+    controller as SIMPLER's script hands them over: as the numbers of a rotation vector.
+
+    The initial state is `options["init_state"]`, SIMPLER's episode id; without it the seed modulo
+    `init_states`. The seed draws nothing else. The env goes on after success, and never reports
+    `terminated`.
+    """
+
+    def __init__(
+        self,
+        task: str = "PutCarrotOnPlateInScene-v1",
+        *,
+        assets: str | None = None,
+        instruction: str | None = None,
+        max_steps: int | None = None,
+        sim_backend: str = "physx_cpu",
+        render_backend: str = "auto",
+        shader: str = PROTOCOL.shader,
+        record_size: Sequence[int] | None = None,
+    ) -> None:
+        """Raises `UnknownEnv`, `ConfigError`, `MissingDependency`, or `EnvFailed` with its cure.
+
+        Args:
+            task: ManiSkill's id, one of `Simpler.tasks()`.
+            assets: the folder that holds `data/`; None is `MS_ASSET_DIR`, or ~/.maniskill. ManiSkill
+                reads it once, so a process has one.
+            instruction: None is the task's.
+            max_steps: None is the task's own limit, 60, or 120 for the eggplant.
+            sim_backend: "physx_cpu" or "physx_cuda".
+            render_backend: "cpu", "gpu", or "auto": the GPU if both SAPIEN and torch can use it.
+            shader: ManiSkill's name; the protocol wants "default".
+            record_size: height and width of a further view by the same camera, for the record only.
+        """
+        if task not in TWINS:
+            raise UnknownEnv(f"simpler has no task {task!r}: want one of {self.tasks()}")
+        self._name = f"simpler/{task}"
+        record = record_size_of(record_size, self._name)
+        prepare_rendering()
+        _find_assets(assets)
+        own_limit = making.registered_limit(task)
+        self.max_steps = making.step_limit(self._name, max_steps, own_limit)
+        self._departures = [] if self.max_steps == own_limit else [f"max_steps is {max_steps}, not {own_limit}"]
+        if shader != PROTOCOL.shader:
+            self._departures.append(f"shader is {shader}, not {PROTOCOL.shader}")
+        self._task = task
+        self._instruction = instruction
+        self._steps: int | None = None
+        twins = _own_lists()
+        self._simulator = Simulator(
+            self._name,
+            task,
+            obs_mode=PROTOCOL.obs_mode,
+            record_size=record,
+            sim_backend=sim_backend,
+            render_backend=render_backend,
+            control_mode=PROTOCOL.control_mode,
+            sensors={"shader_pack": shader},
+        )
+        env = self._simulator.alive()
+        env._rgb_overlay_images = twins._rgb_overlay_images
+        self.init_states = len(env.xyz_configs) * len(env.quat_configs)
+        self._contract = self._simulator.contract(_ACTION)
+
+    @property
+    def contract(self) -> Contract:
+        return self._contract
+
+    @property
+    def instruction(self) -> str:
+        return self._simulator.instructions()[0] if self._instruction is None else self._instruction
+
+    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+        """Begin in the initial state `options["init_state"]`, which is the only option."""
+        unknown = sorted(set(options or {}) - {"init_state"})
+        if unknown:
+            raise ConfigError(f"{self._name}: unknown reset options {unknown}, want none or 'init_state'")
+        count = self.init_states or 1
+        state = (options or {}).get("init_state", seed % count)
+        if not isinstance(state, int) or not 0 <= state < count:
+            raise ConfigError(f"{self._name}: init_state is {state!r}, want 0 to {count - 1}")
+        now = self._simulator.reset([seed], {"episode_id": require("torch").tensor([state]), "reconfigure": True})
+        self._steps = 0
+        return self._seen(now), {"success": now.success[0], "init_state": state}
+
+    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        if self._steps is None:
+            raise NotReset(f"{self._name}: step before reset; call reset(seed=...) first")
+        now = self._simulator.step(_command(one_row(act, self._contract))[np.newaxis])
+        self._steps += 1
+        return self._seen(now), now.rewards[0], False, self._steps >= self.max_steps, {"success": now.success[0]}
+
+    @classmethod
+    def tasks(cls) -> list[str]:
+        return sorted(TWINS)
+
+    @classmethod
+    def missing(cls) -> str | None:
+        """As `ManiSkill.missing`; and the assets, which no package brings."""
+        return ManiSkill.missing() or _missing_assets(_asset_folder())
+
+    def describe(self) -> dict[str, Any]:
+        return {
+            **self._simulator.describe(),
+            "success": TWINS[self._task],
+            "assets": str(require("mani_skill").ASSET_DIR.parent),
+            "protocol": {**asdict(PROTOCOL), "departures": self._departures},
+        }
+
+    def close(self) -> None:
+        self._steps = None
+        self._simulator.close()
+
+    def _seen(self, now: Moment) -> Obs:
+        env, [obs] = self._simulator.alive(), now.obs
+        base = env.agent.robot.pose.inv()
+        arm = env.agent.controller.controllers["arm"]
+        places = [base * env.objs[name].pose for name in (env.source_obj_name, env.target_obj_name)]
+        w, x, y, z = places[0].q[0].tolist()
+        yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        places += [arm.ee_pose_at_base, arm._target_pose]
+        rows = [place.p[0].cpu().numpy() for place in places]
+        obs.info["sim_state"] = np.array([*np.concatenate(rows), yaw], np.float32)
+        return obs
+
+
+_ACTION = ActionSpec(
+    dim=7, space="ee_pose", delta=True, rotation="euler_xyz", frame="base", gripper_open=1.0, gripper_closed=0.0
+)
+
+
+def _command(action: np.ndarray) -> np.ndarray:
+    """What ManiSkill's controller is given for an action, (7,) each: rotation vector, gripper -1 closed, 1 open."""
+    roll, pitch, yaw = action[3:6].tolist()
+    axis, angle = require("transforms3d.euler").euler2axangle(roll, pitch, yaw)
+    gripper = 1.0 if action[6] > PROTOCOL.gripper_open_above else -1.0
+    return np.concatenate([action[:3], np.asarray(axis) * angle, [gripper]]).astype(np.float32)
+
+
+def _own_lists() -> Any:
+    """The twins' base class, with lists that hold nothing of another twin of this process.
+
+    ManiSkill keeps on the class which objects the photograph must not hide, and the photographs: a
+    second twin would hide and show what belongs to the first.
+    """
+    twins = require("mani_skill.envs.tasks.digital_twins.base_env").BaseDigitalTwinEnv
+    twins._objects_to_remove_from_greenscreen, twins._rgb_overlay_images = [], {}
+    return twins
+
+
+def _asset_folder() -> Path:
+    return Path(os.environ.get("MS_ASSET_DIR", Path.home() / ".maniskill"))
+
+
+def _missing_assets(folder: Path) -> str | None:
+    lacks = [place for place in _DATA.values() if not (folder / "data" / place).is_dir()]
+    if not lacks:
+        return None
+    return f"SIMPLER's assets are not in {folder} (no data/{lacks[0]}); set MS_ASSET_DIR, or get them: {_DOWNLOADS}"
+
+
+def _find_assets(wanted: str | None) -> None:
+    """See that ManiSkill looks in `wanted`, and that the assets are there."""
+    if wanted is not None and "mani_skill" not in sys.modules:
+        os.environ["MS_ASSET_DIR"] = wanted
+    used = require("mani_skill").ASSET_DIR.parent
+    if wanted is not None and used.resolve() != Path(wanted).resolve():
+        raise ConfigError(
+            f"simpler: assets is {wanted!r}, but this process has read ManiSkill's from {str(used)!r}; "
+            f"set MS_ASSET_DIR before it starts"
+        )
+    missing = _missing_assets(used)
+    if missing:
+        raise EnvFailed(missing)

@@ -1,0 +1,157 @@
+"""An expert for LIBERO's two suites of picking one thing up and placing it, from the simulator's state.
+
+It answers (7,) for OSC_POSE: 0.05 m and 0.5 rad a unit, gripper -1 open, 1 closed. The hand keeps the
+orientation that it began with, in which the fingers close along y. Bowls in or on the cabinet
+(libero_spatial/4 and /9) are out of its reach so: it acts there, and fails.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import ContractMismatch, InvalidObservation, NotReset
+from vlagents_ray.interface import Act, Obs
+from vlagents_ray.registry import env_task
+
+_SUITES = ("libero_spatial", "libero_object")
+_OPEN, _CLOSED = -1.0, 1.0
+_PER_M, _PER_RAD = 10.0, 2.0  # units of the action: half of the way that is left, and all of the turn
+_MOST_TURN = 0.3
+_ARRIVED_M = 0.008
+_OVER_M = 0.12  # height over the grasp, on the way to it
+_LIFT_M = 0.2
+_LEAVE_M = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class Grip:
+    """How a kind of thing is held and let go."""
+
+    offset: tuple[float, float, float]  # of the hand from the thing's origin when it closes, m
+    release_m: float  # height of the thing over its place when the hand opens
+
+
+_RIM = Grip((0.0, 0.048, 0.035), 0.02)  # bowls are wider than the hand: a finger goes inside
+_MIDDLE = Grip((0.0, 0.0, 0.0), 0.1)
+
+
+@dataclass(frozen=True, slots=True)
+class Phase:
+    """A stretch of the way, over when the hand has arrived, or after `steps`."""
+
+    name: str
+    gripper: float
+    steps: int
+    waits: bool = False  # for the fingers: as long as `steps`, wherever the hand is
+
+
+_PHASES = (
+    Phase("over", _OPEN, 80),
+    Phase("down", _OPEN, 60),
+    Phase("grasp", _CLOSED, 15, waits=True),
+    Phase("lift", _CLOSED, 60),
+    Phase("carry", _CLOSED, 120),
+    Phase("lower", _CLOSED, 60),
+    Phase("release", _OPEN, 12, waits=True),
+    Phase("leave", _OPEN, 25),
+)
+
+
+class LiberoExpert:
+    """Takes the thing that the goal names from above, and puts it where the goal says."""
+
+    def __init__(self, env_name: str) -> None:
+        suite = (env_task(env_name) or _SUITES[0]).partition("/")[0]
+        if suite not in _SUITES:
+            raise ContractMismatch(f"no scripted expert for env {env_name!r}: in LIBERO there are those for {_SUITES}")
+        self._name = env_name
+        self._upright: np.ndarray | None = None  # (3, 3), the hand's first orientation
+        self._thing, self._place = "", ""
+        self._phase, self._spent = 0, 0
+        self._target = np.zeros(3)  # m, of the hand in this phase
+
+    def reset(self, obs: Obs, instruction: str) -> None:
+        """Raises `InvalidObservation` without LIBERO's simulator state, `ContractMismatch` for another goal."""
+        goal, positions = self._sim_state(obs)
+        if len(goal) != 1 or len(goal[0]) != 3 or goal[0][0] not in ("on", "in"):
+            raise ContractMismatch(f"{self._name}: the expert brings one thing to one place, the goal is {goal}")
+        _, self._thing, self._place = goal[0]
+        if missing := {self._thing, self._place} - set(positions):
+            raise InvalidObservation(f"info['sim_state']: no position of {sorted(missing)}, got {sorted(positions)}")
+        hand, self._upright = _hand(obs)
+        self._phase, self._spent = 0, 0
+        self._target = self._aim(hand, positions)
+
+    def act(self, obs: Obs) -> Act:
+        """The next action, (7,) float32."""
+        if self._upright is None:
+            raise NotReset(f"{self._name}: act before reset; call reset(obs, instruction) first")
+        _, positions = self._sim_state(obs)
+        hand, orientation = _hand(obs)
+        phase = _PHASES[self._phase]
+        arrived = not phase.waits and float(np.linalg.norm(hand - self._target)) < _ARRIVED_M
+        if (arrived or self._spent >= phase.steps) and self._phase < len(_PHASES) - 1:
+            self._phase, self._spent = self._phase + 1, 0
+            self._target = self._aim(hand, positions)
+            phase = _PHASES[self._phase]
+        self._spent += 1
+        turn = _rotation_vector(self._upright @ orientation.T)
+        move = np.clip((self._target - hand) * _PER_M, -1.0, 1.0)
+        back = np.clip(turn * _PER_RAD, -_MOST_TURN, _MOST_TURN)
+        return Act(np.concatenate([move, back, [phase.gripper]]).astype(np.float32))
+
+    def _aim(self, hand: np.ndarray, positions: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Where the hand goes in the phase that begins, (3,) m."""
+        grip = _RIM if "bowl" in self._thing else _MIDDLE
+        thing, up = positions[self._thing], np.array([0.0, 0.0, 1.0])
+        grasp = thing + np.array(grip.offset)
+        above = positions[self._place] + hand - thing  # where the thing would be over its place
+        targets: dict[str, np.ndarray] = {
+            "over": grasp + _OVER_M * up,
+            "down": grasp,
+            "lift": hand + _LIFT_M * up,
+            "carry": np.array([above[0], above[1], hand[2]]),
+            "lower": above + grip.release_m * up,
+            "leave": hand + _LEAVE_M * up,
+        }
+        return targets.get(_PHASES[self._phase].name, self._target)  # else the fingers move, and the hand stays
+
+    def _sim_state(self, obs: Obs) -> tuple[list[list[str]], dict[str, np.ndarray]]:
+        """The goal's predicates, and where things are, (3,) m."""
+        state = obs.info.get("sim_state")
+        if not isinstance(state, dict) or not {"goal", "positions"} <= set(state):
+            got: Any = sorted(state) if isinstance(state, dict) else type(state).__name__
+            raise InvalidObservation(
+                f"info['sim_state']: got {got}, want the goal and the positions, as the env {self._name} gives "
+                f"them; this expert cannot act on images"
+            )
+        return state["goal"], state["positions"]
+
+
+def _hand(obs: Obs) -> tuple[np.ndarray, np.ndarray]:
+    """Position (3,) m and orientation (3, 3) of the hand in the world."""
+    pose = obs.state.get("xyz_axis_angle")
+    if pose is None or pose.shape != (6,):
+        raise InvalidObservation("state 'xyz_axis_angle': want (6,), m and rad, as LIBERO's env gives it")
+    return pose[:3].astype(np.float64), _matrix(pose[3:].astype(np.float64))
+
+
+def _matrix(rotation_vector: np.ndarray) -> np.ndarray:
+    """(3,) rad to (3, 3), by Rodrigues' formula."""
+    angle = float(np.linalg.norm(rotation_vector))
+    if angle == 0.0:
+        return np.eye(3)
+    x, y, z = rotation_vector / angle
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    matrix: np.ndarray = np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)
+    return matrix
+
+
+def _rotation_vector(matrix: np.ndarray) -> np.ndarray:
+    """(3, 3) to (3,) rad, for the small turns that the hand is off by: the sines stand for the angles."""
+    return np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]) / 2

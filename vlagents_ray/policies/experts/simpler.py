@@ -1,0 +1,98 @@
+"""An expert for SIMPLER's Bridge tasks: grasps the object from above and sets it down on its target."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from vlagents_ray.errors import InvalidObservation
+from vlagents_ray.interface import Act, Obs
+
+_OPEN, _CLOSED = 1.0, 0.0
+_STEP_M = 0.04  # commanded along an axis, at most
+_STEP_RAD = 0.2  # commanded about the vertical, at most
+_OVER_M = 0.08  # of the gripper over the object before it goes down, and over the target after it let go
+_LIFT_M = 0.10
+_LOWEST_M = 0.0135  # of the gripper, over the robot's foot: lower, the fingers press on the table and do not close
+_DROP_M = 0.04  # of the object's middle over the target's, when it is let go
+
+
+class _Stage(NamedTuple):
+    name: str
+    gripper: float
+    steps: int  # after so many the next begins
+    near_m: float  # or when the gripper is so near to the goal
+
+
+_STAGES = (
+    _Stage("over", _OPEN, 12, 0.012),
+    _Stage("down", _OPEN, 6, 0.006),
+    _Stage("grasp", _CLOSED, 4, 0.0),
+    _Stage("lift", _CLOSED, 5, 0.01),
+    _Stage("across", _CLOSED, 9, 0.006),
+    _Stage("lower", _CLOSED, 6, 0.006),
+    _Stage("release", _OPEN, 3, 0.0),
+    _Stage("away", _OPEN, 5, 0.01),
+)
+
+
+class SimplerExpert:
+    """Needs `info["sim_state"]`, as `vlagents_ray.envs.simpler` gives it."""
+
+    def __init__(self, env_name: str) -> None:
+        self._name = env_name
+        self._stage = self._steps = 0
+        self._goal = np.zeros(3)  # of the gripper in this stage, m in the base's frame
+        self._turn = 0.0  # still to be commanded, rad
+
+    def reset(self, obs: Obs, instruction: str) -> None:
+        """Begin an episode; raises `InvalidObservation` without the simulator's state."""
+        places, yaw = self._state(obs)
+        self._begin(0, places)
+        self._turn = (yaw + np.pi / 2) % np.pi - np.pi / 2  # the fingers open across the object, either way round
+
+    def act(self, obs: Obs) -> Act:
+        """The next action, (7,) float32."""
+        places, _ = self._state(obs)
+        _, _, gripper, commanded = places
+        stage = _STAGES[self._stage]
+        arrived = float(np.linalg.norm(gripper - self._goal)) < stage.near_m and not self._turn
+        if self._stage + 1 < len(_STAGES) and self._steps and (arrived or self._steps >= stage.steps):
+            self._begin(self._stage + 1, places)
+            stage = _STAGES[self._stage]
+        self._steps += 1
+        action = np.zeros(7, dtype=np.float32)
+        action[:3] = np.clip(self._goal - commanded, -_STEP_M, _STEP_M)
+        action[5] = np.clip(self._turn, -_STEP_RAD, _STEP_RAD)
+        action[6] = stage.gripper
+        self._turn -= float(action[5]) if abs(self._turn) > _STEP_RAD else self._turn
+        return Act(action=action)
+
+    def _begin(self, stage: int, places: np.ndarray) -> None:
+        self._stage, self._steps = stage, 0
+        thing, target, gripper, _ = places
+        up = np.array([0.0, 0.0, 1.0])
+        held = gripper - thing  # from the object to the gripper, once it is grasped
+        name = _STAGES[stage].name
+        if name == "over":
+            self._goal = np.maximum(thing, [-np.inf, -np.inf, _LOWEST_M]) + _OVER_M * up
+        elif name == "down":
+            self._goal = self._goal - _OVER_M * up
+        elif name == "lift":
+            self._goal = self._goal + _LIFT_M * up
+        elif name == "across":
+            self._goal = np.array([*(target + held)[:2], gripper[2]])
+        elif name == "lower":
+            self._goal = target + held + _DROP_M * up
+        elif name == "away":
+            self._goal = self._goal + _OVER_M * up
+
+    def _state(self, obs: Obs) -> tuple[np.ndarray, float]:
+        """Where object, target and gripper are and the gripper is commanded to, (4, 3) m; and the object's yaw, rad."""
+        state = obs.info.get("sim_state")
+        if not isinstance(state, np.ndarray) or state.shape != (13,):
+            got = f"shape {state.shape}" if isinstance(state, np.ndarray) else type(state).__name__
+            raise InvalidObservation(f"info['sim_state']: got {got}, want (13,) float32, as {self._name} gives it")
+        exact = state.astype(np.float64)
+        return exact[:12].reshape(4, 3), float(exact[12])
