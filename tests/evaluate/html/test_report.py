@@ -181,7 +181,7 @@ def test_cells_that_stopped_early_have_intervals_of_another_name(tmp_path: Path)
     results = record(config, lambda _cell, seed: 5 if seed % 2 else None)
     assert any(cell.stopped_at is not None for cell in results.cells)
     words = Read(write_report(results, tmp_path / "report.html")).words
-    assert "stopped early, by the rule in the settings" in words
+    assert "the intervals of this table are confidence sequences" in words
     assert "95 % confidence sequence" in words
     assert "Wilson interval" not in words
 

@@ -24,11 +24,9 @@ def interval(rate: Rate) -> str:
 
 def interval_name(rate: Rate) -> str:
     """What that interval is: where episodes could stop early, one that holds nevertheless."""
-    return (
-        "95 % Wilson interval"
-        if rate.bounds is None
-        else f"{100 * (1 - (rate.error_rate or 0.0)):g} % confidence sequence"
-    )
+    if rate.error_rate is None:
+        return "95 % Wilson interval"
+    return f"{100 * (1 - rate.error_rate):g} % confidence sequence"
 
 
 def points(difference: float | None) -> str:

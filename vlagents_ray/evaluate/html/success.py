@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 from vlagents_ray.evaluate.html.charts import Series, interval_glyph, rate_chart
 from vlagents_ray.evaluate.html.elements import Child, Html, Section, fold, row, section, table, tag
-from vlagents_ray.evaluate.html.numbers import count, interval, number, percent
+from vlagents_ray.evaluate.html.numbers import interval, number, percent
 from vlagents_ray.evaluate.results import CellResults
 from vlagents_ray.evaluate.statistics import Rate, success_curve
 from vlagents_ray.evaluate.summary import TOTAL, Group, Summary, group_of
@@ -25,8 +25,8 @@ def success(summary: Summary) -> Section:
         table(head, bodies, "Success by task", words=2 if several else 1),
         tag(
             "p",
-            "Solved once: after some step; at end: after the last one. Intervals are Wilson's, of the true rate. "
-            "Errors of the policy count as not solved; what infrastructure kept from ending is in no rate. "
+            "Solved once: after some step; at end: after the last one. Intervals are of the true rate, by Wilson's "
+            "method. Errors of the policy count as not solved; what infrastructure kept from ending is in no rate. "
             "Steps and return are means.",
             class_="note",
         ),
@@ -72,12 +72,13 @@ def success_over_time(summary: Summary) -> Section | None:
 
 def _stopping(summary: Summary) -> Html | None:
     """What early stopping means for the numbers of the page."""
-    if not summary.total.stopped:
+    if summary.total.success_once.bounds is None:
         return None
     return tag(
         "p",
-        f"{count(summary.total.stopped, 'cell')} stopped early, by the rule in the settings. Their intervals are confidence "
-        "sequences, which hold whenever one stops. Tests, differences and bands over time below do not allow for that.",
+        f"Cells could stop early, by the rule in the settings; {summary.total.stopped} did. So the intervals of this "
+        "table are confidence sequences, which hold whenever one stops. Tests, differences and bands over time do not "
+        "allow for that.",
         class_="note",
     )
 
