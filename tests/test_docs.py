@@ -8,9 +8,11 @@ from pathlib import Path
 import pytest
 import yaml
 
+from vlagents_ray.cli.evaluation import read_run
 from vlagents_ray.envs import metaworld
 from vlagents_ray.envs.known import known
 from vlagents_ray.envs.protocol import Protocol
+from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.serve.environments.config import EnvironmentArgs
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -28,6 +30,11 @@ def test_an_environment_as_it_is_documented_is_accepted(block: str) -> None:
 
 def test_there_are_such_blocks() -> None:
     assert len(BLOCKS) == 2
+
+
+def test_the_file_of_runs_behind_the_reports_picture_is_accepted() -> None:
+    config = EvalConfig.model_validate(read_run(DOCS / "evaluation" / "picture.yaml"))
+    assert [policy.source for policy in config.policies] == ["learner:Learner", "scripted", "random"]
 
 
 @pytest.mark.parametrize(

@@ -62,6 +62,7 @@ def test_the_wheel_holds_every_module_and_the_licence_and_no_tests(wheel: Path) 
     modules = {str(path.relative_to(ROOT)) for path in (ROOT / "vlagents_ray").rglob("*.py")}
     assert modules - names == set()
     assert {"vlagents_ray/py.typed", "vlagents_ray/bench/peers/requirements.txt"} <= names
+    assert {f"vlagents_ray/evaluate/html/{name}" for name in ("style.css", "script.js")} <= names
     assert [name for name in names if name.endswith(".dist-info/licenses/LICENSE")]
     assert [name for name in names if name.startswith(("tests/", "deployments/"))] == []
 

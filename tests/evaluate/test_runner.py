@@ -54,6 +54,10 @@ class TestOnACluster:
         assert {row[4] for row in outcomes(one)} == {0, 1}, "both outcomes occur, or the test shows nothing"
         assert (summary.state, summary.total.episodes, summary.total.steps) == ("complete", 16, 160)
         assert json.loads((one.out / "summary.json").read_text()) == json.loads(json.dumps(summary.to_json()))
+        assert (
+            f"{summary.total.success_once.successes / 16:.1%}".replace("%", " %")
+            in (one.out / "report.html").read_text()
+        )
 
     @pytest.mark.parametrize(
         ("kind", "error"),
@@ -123,6 +127,7 @@ class TestOnACluster:
             evaluate(settings, agent_factory=functools.partial(ToZero, lost_on=EVERY))
         assert len(outcomes(settings)) == 3
         assert json.loads((settings.out / "summary.json").read_text())["state"] == "stopped"
+        assert "Not complete: stopped" in (settings.out / "report.html").read_text()
 
     def test_a_contract_mismatch_stops_the_evaluation_before_any_step(self, config: Config) -> None:
         settings = config(env_options={"state_dim": 3})

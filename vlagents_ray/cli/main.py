@@ -19,6 +19,7 @@ from vlagents_ray.cli.export import export_command
 from vlagents_ray.cli.keys import keys as keys_app
 from vlagents_ray.cli.merge import merge_command
 from vlagents_ray.cli.replay import replay_command
+from vlagents_ray.cli.report import report_command
 from vlagents_ray.cli.settings import parse_settings
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.serve.cluster import running_server
@@ -103,6 +104,7 @@ app.command("eval")(evaluate_command)
 app.command("export")(export_command)
 app.command("merge")(merge_command)
 app.command("replay")(replay_command)
+app.command("report")(report_command)
 app.add_typer(bench, name="bench")
 app.add_typer(env, name="env")
 app.add_typer(keys_app, name="keys")

@@ -19,6 +19,8 @@ from vlagents_ray.client import RemoteAgent
 from vlagents_ray.errors import ConfigError, from_code
 from vlagents_ray.evaluate.config import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.episode import EpisodeResult
+from vlagents_ray.evaluate.html import FILE as REPORT
+from vlagents_ray.evaluate.html import write_report
 from vlagents_ray.evaluate.jobs import Job, JobQueue, plan
 from vlagents_ray.evaluate.pool import WorkerPool
 from vlagents_ray.evaluate.progress import Progress, SilentProgress
@@ -63,7 +65,7 @@ def evaluate(
     Raises `ConfigError` for settings that cannot be, or that contradict the results in `config.out`;
     `ContractMismatch` if policy and env do not fit; the last infrastructure error after
     `config.abort_after` lost episodes in a row; `EvaluationInterrupted` on Ctrl-C or SIGTERM.
-    Whatever it raises, each recorded episode is kept and summary.json written.
+    Whatever it raises, each recorded episode is kept, and summary.json and report.html written.
     """
     factory = _remote_agents(config) if agent_factory is None else functools.partial(_own_agent, agent_factory)
     tracking = Tracking(config)
@@ -80,6 +82,7 @@ def evaluate(
             store.end_run(state)
             summary = summarize(Results.load(config.out))
             write_summary(summary)
+            write_report(summary.results, config.out / REPORT)
     if state == "interrupted":
         raise EvaluationInterrupted(summary)
     return summary

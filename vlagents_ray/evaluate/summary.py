@@ -74,7 +74,7 @@ class Summary:
     @property
     def total(self) -> Group:
         """All episodes together, of whichever contender."""
-        return _group((TOTAL, "", TOTAL), self.results.cells)
+        return group_of((TOTAL, "", TOTAL), self.results.cells)
 
     @property
     def transports(self) -> list[str]:
@@ -119,8 +119,8 @@ def summarize(results: Results) -> Summary:
     """What the results say, those of earlier runs included."""
     return Summary(
         results,
-        tuple(_group((cell.contender, cell.suite, cell.env), [cell]) for cell in results.cells),
-        tuple(_group((name, "", TOTAL), results.of(name)) for name in results.contenders),
+        tuple(group_of((cell.contender, cell.suite, cell.env), [cell]) for cell in results.cells),
+        tuple(group_of((name, "", TOTAL), results.of(name)) for name in results.contenders),
         wall_seconds=sum(_wall_seconds(results, run) for run in results.runs),
         rollout_seconds=sum(_rollout_seconds(results, run) for run in results.runs),
     )
@@ -149,7 +149,8 @@ def write_summary(summary: Summary) -> Path:
     return path
 
 
-def _group(name: tuple[str, str, str], cells: Sequence[CellResults]) -> Group:
+def group_of(name: tuple[str, str, str], cells: Sequence[CellResults]) -> Group:
+    """What came of these cells together, under the name (contender, suite, env)."""
     finished: list[EpisodeResult] = [result for cell in cells for result in cell.counted]
     open_cells = [cell for cell in cells if cell.stopped_at is None]
     return Group(

@@ -1,0 +1,72 @@
+"""Several folders of results, read as one: for a report that sets them side by side."""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate.results import CellResults, Results, Run
+
+
+def combined(folders: Sequence[Results]) -> Results:
+    """All of them. A policy of whose cells two folders have one each is told apart by its folder: "pi0 (second)".
+
+    Raises `ConfigError` for none, and for parts of one evaluation, which are merged, not compared.
+    """
+    if not folders:
+        raise ConfigError("report: got no folder, want one or more that evaluations wrote their results to")
+    if len(folders) == 1:
+        return folders[0]
+    _require_apart(folders)
+    counts = Counter((cell.contender, cell.suite, cell.env) for each in folders for cell in each.cells)
+    clashing = {cell.policy for each in folders for cell in each.cells if counts[_name(cell)] > 1}
+    base = Path(os.path.commonpath([each.out.resolve() for each in folders]))
+    cells: list[CellResults] = []
+    runs: list[Run] = []
+    policies: dict[str, dict[str, Any]] = {}
+    for each, label in zip(folders, _labels(folders, base), strict=True):
+        names = {
+            cell.policy: f"{cell.policy} ({label})" if cell.policy in clashing else cell.policy for cell in each.cells
+        }
+        prefix = each.out.resolve().relative_to(base)
+        cells += [_moved(cell, names[cell.policy], prefix, len(runs)) for cell in each.cells]
+        policies |= {names.get(name, name): said for name, said in each.policies.items()}
+        runs += [replace(run, run=run.run + len(runs)) for run in each.runs]
+    return Results(base, tuple(cells), tuple(runs), policies)
+
+
+def _require_apart(folders: Sequence[Results]) -> None:
+    seen: dict[str, Path] = {}
+    for each in folders:
+        for cell in each.cells:
+            if (first := seen.setdefault(cell.cell, each.out)) is not each.out:
+                raise ConfigError(
+                    f"report: {first} and {each.out} both have {cell.contender!r} in {cell.env!r} with the same "
+                    f"settings: parts of one evaluation; merge them into a folder first"
+                )
+
+
+def _labels(folders: Sequence[Results], base: Path) -> list[str]:
+    """What tells the folders apart: their last parts, or if these are the same their paths under `base`."""
+    names = [each.out.resolve().name for each in folders]
+    if len(set(names)) == len(names):
+        return names
+    return [str(each.out.resolve().relative_to(base)) for each in folders]
+
+
+def _name(cell: CellResults) -> tuple[str, str, str]:
+    return cell.contender, cell.suite, cell.env
+
+
+def _moved(cell: CellResults, policy: str, prefix: Path, runs_before: int) -> CellResults:
+    episodes = tuple(
+        replace(one, run=one.run + runs_before, videos=tuple(str(prefix / video) for video in one.videos))
+        for one in cell.episodes
+    )
+    attempts = tuple(replace(one, run=one.run + runs_before) for one in cell.attempts)
+    return replace(cell, policy=policy, episodes=episodes, attempts=attempts)
