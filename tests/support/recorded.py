@@ -13,9 +13,9 @@ from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.jobs import Job, plan
+from vlagents_ray.evaluate.provenance import versions
 from vlagents_ray.evaluate.rollout import Failure, Made
 from vlagents_ray.evaluate.store import Store
-from vlagents_ray.evaluate.summary import versions
 from vlagents_ray.evaluate.video import VideoRecorder, save_videos
 from vlagents_ray.interface import Obs
 
@@ -89,4 +89,4 @@ def _video() -> dict[str, bytes]:
     with VideoRecorder(10.0) as recorder:
         for shade in range(0, 250, 50):
             recorder.add(Obs(cameras={"front": np.full((32, 48, 3), shade, np.uint8)}))
-        return recorder.finish()
+        return recorder.finish().shown
