@@ -229,3 +229,17 @@ def test_the_policys_options_reach_its_reset_and_the_result_says_what_checkpoint
     assert agent.began["checkpoint_step"] == 20
     assert result.checkpoint == "runs/20"
     assert run_episode(Script(), Chunks(*[np.zeros(2)] * 6), KEY).checkpoint is None
+
+
+@pytest.mark.parametrize(("images", "looked_at"), [(True, [True] * 6), (False, [False, False, True] * 2)])
+def test_an_env_is_told_whether_anybody_looks(images: bool, looked_at: list[bool]) -> None:
+    class Told(Script):
+        def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+            told.append(self.looked_at)
+            return super().step(act)
+
+    told: list[bool] = []
+    chunk = np.zeros((3, 2), np.float32)
+    result = run_episode(Told(), Chunks(chunk, chunk), KEY, images=images)
+    assert result.steps == 6
+    assert told == looked_at

@@ -125,7 +125,7 @@ def test_a_worker_stays_with_the_env_it_has_made() -> None:
     queue = JobQueue(first + other)
     kind, made = first[0].cell.kind, first[0].cell.place
     taken = [queue.take(kind, made, Counter()) for _ in range(3)]
-    assert [job.key.env for job in taken if job] == [LINE, LINE, OTHER_LINE]
+    assert [job.key.env for [job] in taken] == [LINE, LINE, OTHER_LINE]
 
 
 def test_workers_without_an_env_spread_over_the_envs() -> None:
@@ -133,8 +133,7 @@ def test_workers_without_an_env_spread_over_the_envs() -> None:
     queue = JobQueue(jobs)
     working: Counter[str] = Counter()
     for _ in range(4):
-        job = queue.take(jobs[0].cell.kind, None, working)
-        assert job is not None
+        [job] = queue.take(jobs[0].cell.kind, None, working)
         working[job.cell.place] += 1
     assert sorted(working.values()) == [2, 2]
 
@@ -142,9 +141,9 @@ def test_workers_without_an_env_spread_over_the_envs() -> None:
 def test_no_worker_idles_while_any_episode_of_its_kind_waits() -> None:
     [only] = jobs_of(LINE, 1)
     queue = JobQueue([only])
-    assert queue.take("another kind", None, Counter()) is None
-    assert queue.take(only.cell.kind, "elsewhere", Counter({only.cell.place: 5})) == only
-    assert queue.take(only.cell.kind, only.cell.place, Counter()) is None
+    assert queue.take("another kind", None, Counter()) == ()
+    assert queue.take(only.cell.kind, "elsewhere", Counter({only.cell.place: 5})) == (only,)
+    assert queue.take(only.cell.kind, only.cell.place, Counter()) == ()
     assert len(queue) == 0
 
 
@@ -152,10 +151,9 @@ def test_a_further_attempt_comes_before_new_episodes() -> None:
     jobs = jobs_of(LINE, 3)
     queue = JobQueue(jobs)
     kind, made = jobs[0].cell.kind, jobs[0].cell.place
-    first = queue.take(kind, made, Counter())
-    assert first is not None
+    [first] = queue.take(kind, made, Counter())
     queue.put_back(first.again())
-    assert queue.take(kind, made, Counter()) == first.again()
+    assert queue.take(kind, made, Counter()) == (first.again(),)
     assert first.again().attempt == 2
 
 
@@ -174,6 +172,15 @@ def test_a_cell_that_is_dropped_leaves_the_others() -> None:
     queue = JobQueue(jobs)
     assert queue.drop(jobs[0].cell.fingerprint) == 6
     assert len(queue) == 6
-    job = queue.take(jobs[0].cell.kind, None, Counter())
-    assert job is not None
+    [job] = queue.take(jobs[0].cell.kind, None, Counter())
     assert job.cell.step == 2
+
+
+def test_episodes_side_by_side_are_of_one_cell() -> None:
+    jobs = jobs_of(LINE, 5, steps=[1, 2], num_envs=3)
+    queue = JobQueue(jobs)
+    kind = jobs[0].cell.kind
+    assert queue.wants({}, {kind: 3}) is not None, "ten episodes, three at a time, are for four workers"
+    assert queue.wants({}, {kind: 4}) is None
+    taken = [queue.take(kind, None, Counter()) for _ in range(4)]
+    assert [[job.cell.step for job in some] for some in taken] == [[1, 1, 1], [1, 1], [2, 2, 2], [2, 2]]

@@ -24,7 +24,7 @@ from vlagents_ray.errors import (
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, rollout
 from vlagents_ray.evaluate.cells import cells
 from vlagents_ray.evaluate.jobs import EpisodeKey, Job
-from vlagents_ray.evaluate.rollout import Rollout, explain
+from vlagents_ray.evaluate.rollout import Report, Rollout, explain
 from vlagents_ray.interface import Agent
 
 Config = Callable[..., EvalConfig]
@@ -39,13 +39,18 @@ def rollout_of(config: Config, make: Callable[[], Agent], **changes: Any) -> Rol
     return Rollout(config(**changes), lambda _policy: make())
 
 
+def played(worker: Rollout, job: Job) -> Report:
+    [report] = worker.run((job,))
+    return report
+
+
 def test_the_env_is_made_once_and_closed_when_another_is_needed(
     config: Config, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     closed = []
     monkeypatch.setattr(Line, "close", lambda self: closed.append(type(self).__name__))
     worker = rollout_of(config, ToZero)
-    reports = [worker.run(one) for one in (job(0), job(1), job(0, OTHER_LINE), job(2))]
+    reports = [played(worker, one) for one in (job(0), job(1), job(0, OTHER_LINE), job(2))]
     assert [report.made is not None for report in reports] == [True, False, True, True]
     assert closed == ["Line", "OtherLine"]
     worker.close()
@@ -57,7 +62,7 @@ def test_a_worker_reports_what_it_found_out_about_env_and_policy(config: Config)
         metadata: ClassVar[dict[str, Any]] = {"policy": "to-zero", "checkpoint": "a"}
 
     worker = rollout_of(config, Remote)
-    first, second = worker.run(job(0)), worker.run(job(1))
+    first, second = played(worker, job(0)), played(worker, job(1))
     assert first.policy == {"policy": "to-zero", "checkpoint": "a"}
     assert first.made is not None
     assert first.made.described == {"simulator": "line", "version": 1}
@@ -75,7 +80,7 @@ def test_a_contract_mismatch_is_reported_before_any_step_with_every_difference(c
         def reset(self, *args: Any, **kwargs: Any) -> Any:
             raise AssertionError
 
-    failure = rollout_of(config, Picky).run(job()).failure
+    failure = played(rollout_of(config, Picky), job()).failure
     assert failure is not None
     assert (failure.cause, failure.code) == ("user", ContractMismatch.code)
     assert "camera 'wrist'" in failure.message
@@ -95,11 +100,11 @@ def test_after_a_lost_connection_the_next_attempt_has_a_new_agent(
         return agents[-1]
 
     worker = Rollout(config(), connect)
-    failure = worker.run(job(3)).failure
+    failure = played(worker, job(3)).failure
     assert failure is not None
     assert (failure.cause, failure.code) == ("policy", "connection_lost")
     assert closed == agents[:1]
-    assert worker.run(job(3).again()).result is not None
+    assert played(worker, job(3).again()).result is not None
     assert len(agents) == 2
 
 
@@ -108,14 +113,14 @@ def test_a_policy_that_cannot_start_stops_the_evaluation(config: Config) -> None
         def initialize(self) -> None:
             raise OSError("no such checkpoint")
 
-    failure = rollout_of(config, Unloadable).run(job()).failure
+    failure = played(rollout_of(config, Unloadable), job()).failure
     assert failure is not None
     assert failure.cause == "user"
     assert "no such checkpoint" in failure.message
 
 
 def test_an_env_that_cannot_be_made_is_an_infrastructure_failure(config: Config) -> None:
-    failure = rollout_of(config, ToZero).run(job(env_options={"broken": "GPU lost"})).failure
+    failure = played(rollout_of(config, ToZero), job(env_options={"broken": "GPU lost"})).failure
     assert failure is not None
     assert (failure.cause, failure.code) == ("worker", EnvFailed.code)
     assert "GPU lost" in failure.message
@@ -123,7 +128,7 @@ def test_an_env_that_cannot_be_made_is_an_infrastructure_failure(config: Config)
 
 def test_an_env_that_says_what_it_misses_stops_the_evaluation(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Line, "missing", classmethod(lambda _cls: "no Vulkan device; install mesa-vulkan-drivers"))
-    failure = rollout_of(config, ToZero).run(job(env_options={"broken": "no device"})).failure
+    failure = played(rollout_of(config, ToZero), job(env_options={"broken": "no device"})).failure
     assert failure is not None
     assert (failure.cause, failure.code) == ("user", MissingDependency.code)
     assert "install mesa-vulkan-drivers" in failure.message
@@ -132,14 +137,14 @@ def test_an_env_that_says_what_it_misses_stops_the_evaluation(config: Config, mo
 @pytest.mark.parametrize(("video", "seed", "cameras"), [("none", 0, []), ("failures", 2, []), ("all", 2, ["front"])])
 def test_videos_come_as_wanted(config: Config, video: str, seed: int, cameras: list[str]) -> None:
     worker = rollout_of(config, ToZero, video=video)
-    report = worker.run(job(seed, env_options={"camera": [32, 32]}))
+    report = played(worker, job(seed, env_options={"camera": [32, 32]}))
     assert report.result is not None
     assert sorted(report.kept.footage.shown) == cameras
 
 
 def test_failed_episodes_leave_a_video(config: Config) -> None:
     worker = rollout_of(config, ToZero, video="failures")
-    reports = [worker.run(job(seed, env_options={"camera": [32, 32]})) for seed in range(12)]
+    reports = [played(worker, job(seed, env_options={"camera": [32, 32]})) for seed in range(12)]
     for report in reports:
         assert report.result is not None
         assert bool(report.kept.footage.shown) != report.result.success_once
@@ -157,7 +162,7 @@ def test_progress_tells_phase_age_and_place(config: Config, monkeypatch: pytest.
 
     worker = rollout_of(config, Watched)
     assert worker.progress().phase == "idle"
-    worker.run(job())
+    played(worker, job())
     assert [(pulse.phase, pulse.steps) for pulse in pulses[:3]] == [
         ("policy act", 0),
         ("policy act", 1),

@@ -34,14 +34,14 @@ def plan(out: Path, url: str, **running: Any) -> EvalConfig:
     )
 
 
-def outcomes(out: Path) -> dict[str, tuple[Any, ...]]:
-    """All of each episode but times and ways."""
+def outcomes(out: Path) -> dict[tuple[str, int], tuple[Any, ...]]:
+    """All of each episode but times and ways, by env and number."""
     found = [one.result for cell in Results.load(out).cells for one in cell.episodes]
-    assert len({str(one.key) for one in found}) == len(found) == 2 * EPISODES
+    assert len({(one.key.env, one.key.episode) for one in found}) == len(found) == 2 * EPISODES
     return {
-        str(one.key): (
+        (one.key.env, one.key.episode): (
             one.status, one.success_once, one.success_at_end, one.first_success, one.steps, one.episode_return,
-            one.ending, one.instruction,
+            one.ending, one.instruction, one.actions_sha256,
         )
         for one in found
     }  # fmt: skip
@@ -66,7 +66,7 @@ class Disaster(SilentProgress):
 
 
 @pytest.fixture(scope="module")
-def alone(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Any, ...]]:
+def alone(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], tuple[Any, ...]]:
     """By one worker, from one replica that batches nothing."""
     out = tmp_path_factory.mktemp("alone")
     with serving("served_agents:Hesitant", batch={"max_size": 1}) as server:
@@ -76,16 +76,16 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Any, ...]
     return found
 
 
-@pytest.mark.parametrize(("workers", "batch", "replicas"), [(2, 8, 1), (4, 8, 2)])
-def test_workers_batches_and_replicas_change_no_result(
-    alone: dict[str, Any], tmp_path: Path, workers: int, batch: int, replicas: int
+@pytest.mark.parametrize(("workers", "batch", "replicas", "num_envs"), [(2, 8, 1, 1), (4, 8, 2, 1), (2, 8, 1, 5)])
+def test_workers_batches_replicas_and_envs_side_by_side_change_no_result(
+    alone: dict[Any, Any], tmp_path: Path, workers: int, batch: int, replicas: int, num_envs: int
 ) -> None:
     with serving("served_agents:Hesitant", batch={"max_size": batch}, replicas=replicas) as server:
-        evaluate(plan(tmp_path, server.url, workers=workers))
+        evaluate(plan(tmp_path, server.url, workers=workers, num_envs=num_envs))
     assert outcomes(tmp_path) == alone
 
 
-def test_killed_workers_and_a_resumption_change_no_result(alone: dict[str, Any], tmp_path: Path) -> None:
+def test_killed_workers_and_a_resumption_change_no_result(alone: dict[Any, Any], tmp_path: Path) -> None:
     with serving("served_agents:Hesitant") as server:
         with pytest.raises(EvaluationInterrupted):
             evaluate(plan(tmp_path, server.url, workers=2, retries=20), progress=Disaster(EPISODES))

@@ -10,7 +10,7 @@ _POLICY = {
     "policy": "name", "policy_url": "url", "policy_config": "config", "policy_options": "options",
     "checkpoint": "checkpoint", "steps": "steps", "execute": "execute", "codec": "codec", "transport": "transport",
 }  # fmt: skip
-_SUITE = {name: name for name in ("envs", "env_options", "reset_options", "episodes", "seeds")}
+_SUITE = {name: name for name in ("envs", "env_options", "reset_options", "episodes", "seeds", "num_envs")}
 _WORKER = {"cpus_per_worker": "cpus", "gpus_per_worker": "gpus", "threads": "threads", "runtime_env": "runtime_env"}
 
 

@@ -24,7 +24,7 @@ def play(config: EvalConfig, make: Callable[[], Agent] = ToZero, *, left_out: It
         for job in plan(store.cells):
             if str(job.key) in finished or job.key.episode in left_out:
                 continue
-            report = worker.run(job)
+            [report] = worker.run((job,))
             assert report.result is not None, report.failure
             if report.policy is not None:
                 store.note_policy(job.cell.policy.name, report.policy)

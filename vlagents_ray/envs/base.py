@@ -36,6 +36,12 @@ class EvalEnv(ABC):
     Episode i of an evaluation begins in state i modulo this, handed to `reset` as `options["init_state"]`.
     """
 
+    looked_at: bool = True
+    """Will anybody see what the next `step` returns? If not, an env may leave the images out, and save rendering them.
+
+    Nobody does between two rows of a chunk, unless videos are made. Nothing else may depend on it.
+    """
+
     @property
     @abstractmethod
     def contract(self) -> Contract:

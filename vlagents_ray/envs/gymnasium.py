@@ -156,6 +156,7 @@ class Gymnasium(EvalEnv):
         self._steps += 1
         success = self._succeeded(info, bool(terminated))
         stopped = bool(truncated) or self._steps >= self.max_steps
+        # Images too if nobody looks: rendering changes what follows in some (the Fetch tasks' target is moved for it).
         return self._observe(nested), float(reward), bool(terminated), stopped, {**plain(info), "success": success}
 
     def close(self) -> None:

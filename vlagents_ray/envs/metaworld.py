@@ -177,7 +177,8 @@ class MetaWorld(EvalEnv):
             self._steps += 1
             success = bool(info["success"])
             ended = success and self._ends_on_success
-            return self._observe(raw), float(reward), ended, self._steps >= self.max_steps, {"success": success}
+            obs = self._observe(raw, look=self.looked_at)
+            return obs, float(reward), ended, self._steps >= self.max_steps, {"success": success}
 
     @classmethod
     def tasks(cls) -> list[str]:
@@ -227,10 +228,10 @@ class MetaWorld(EvalEnv):
             raise ConfigError(f"metaworld: init_state is {index!r}, want 0 to {len(self._goals) - 1}")
         return self._goals[index]
 
-    def _observe(self, raw: np.ndarray) -> Obs:
-        cameras = self._contract.cameras or {}
+    def _observe(self, raw: np.ndarray, *, look: bool = True) -> Obs:
+        cameras = self._contract.cameras or {} if look else {}
         info: dict[str, Any] = {"sim_state": raw}
-        if self._record is not None:
+        if self._record is not None and look:
             info[HIGH_RES] = {name: self._render(self._record, name) for name in cameras}
         return Obs(
             cameras={name: self._render(self._renderer, name) for name in cameras},

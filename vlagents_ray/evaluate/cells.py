@@ -51,6 +51,7 @@ class Cell:
             "checkpoint": self.policy.checkpoint,
             "execute": self.policy.execute,
             "codec": "jpeg" if self.policy.codec == "jpeg" else "exact",
+            "num_envs": self.suite.num_envs,
             "clock": self.suite.clock.model_dump() if self.suite.clock else None,
         }
 
@@ -67,7 +68,7 @@ class Cell:
     @cached_property
     def place(self) -> str:
         """Stands for the environment that a worker must have made to play it."""
-        return fingerprint([self.env, self.suite.env_options, self.kind])
+        return fingerprint([self.env, self.suite.env_options, self.suite.num_envs, self.kind])
 
     @property
     def planned(self) -> int:

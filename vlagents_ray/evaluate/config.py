@@ -139,6 +139,7 @@ class SuiteConfig(_Closed):
     reset_options: dict[str, JsonValue] = {}  # handed to every `reset` of the env
     episodes: PositiveInt = 10  # of each env and seed
     seeds: list[NonNegativeInt] = Field(default=[0], min_length=1)  # episode i uses seed + i
+    num_envs: PositiveInt = 1  # that one worker steps together, in one simulator where that can be (ManiSkill on a GPU)
     worker: WorkerConfig | None = None  # in place of the evaluation's
     clock: ClockConfig | None = None  # real-time mode; None: the env waits for the policy
 
@@ -148,6 +149,12 @@ class SuiteConfig(_Closed):
         if repeated := sorted({name for name in envs if envs.count(name) > 1}):
             raise ValueError(f"{repeated} named twice; name each env once and raise `episodes`")
         return envs
+
+    @model_validator(mode="after")
+    def _alone_in_real_time(self) -> Self:
+        if self.clock is not None and self.num_envs > 1:
+            raise ValueError(f"num_envs: got {self.num_envs} with a clock, want 1: each env's time runs by itself")
+        return self
 
     @model_validator(mode="after")
     def _apart(self) -> Self:

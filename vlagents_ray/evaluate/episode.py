@@ -160,13 +160,15 @@ def run_episode(
     policy_options: Mapping[str, Any] | None = None,
     watch: Watch = lambda _phase, _steps: None,
     record: Record = lambda _obs: None,
+    images: bool = True,
     executed: Executed = lambda _action, _reward, _success: None,
 ) -> EpisodeResult:
     """Play the episode `key`; of each action chunk execute the first `execute` rows, open loop.
 
     The env waits for the policy, unless there is a `clock` (see `vlagents_ray.evaluate.clock`).
 
-    `reset_options` are the env's, `policy_options` the policy's.
+    `reset_options` are the env's, `policy_options` the policy's. Without `images`, `record` wants none, and the env is
+    spared those between two questions.
 
     A policy that raises or returns an unusable action ends its episode with status
     "policy_error". Whatever is not the policy's doing is raised: `EnvFailed` for the simulator,
@@ -176,7 +178,7 @@ def run_episode(
     tally = Tally(key)
     error: PolicyFailed | None = None
     try:
-        _play(env, agent, tally, execute, clock, reset_options, policy_options, watch, record, executed)
+        _play(env, agent, tally, execute, clock, reset_options, policy_options, watch, record, images, executed)
     except CheckpointFailed:
         raise
     except PolicyFailed as failed:
@@ -194,6 +196,7 @@ def _play(
     policy_options: Mapping[str, Any] | None,
     watch: Watch,
     record: Record,
+    images: bool,
     executed: Executed,
 ) -> None:
     watch("env reset", 0)
@@ -221,8 +224,10 @@ def _play(
         if clock is not None:
             tally.latency_ms.append(1e3 * latency_s)
         rows = Act(check_action(act.action, contract)).rows()
-        for tick in player.ticks(rows, latency_s):
+        ticks = list(player.ticks(rows, latency_s))
+        for i, tick in enumerate(ticks):
             watch("env step", tally.steps)
+            env.looked_at = images or i == len(ticks) - 1
             begun = perf_counter()
             with env_side("step"):
                 obs, reward, terminated, truncated, info = env.step(Act(tick.action))

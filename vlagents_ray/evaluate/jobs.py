@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -61,19 +62,18 @@ class JobQueue:
         """Queue a further attempt, ahead of the episodes that have not been tried."""
         self._of(job).appendleft(job)
 
-    def take(self, kind: str, made: str | None, working: Mapping[str, int]) -> Job | None:
-        """The next job for a worker of `kind` that has made the env at place `made`; None if none of its kind waits.
+    def take(self, kind: str, made: str | None, working: Mapping[str, int]) -> tuple[Job, ...]:
+        """The next jobs for a worker of `kind` that has made the env at place `made`; none if none of its kind waits.
 
-        A worker stays with its env while that has episodes; then it goes where most wait for each
-        worker, counting `working`: how many workers are busy at which place.
+        They are of one cell, as many as it plays at once. A worker stays with its env while that has episodes; then
+        it goes where most wait for each worker, counting `working`: how many workers are busy at which place.
         """
         if made is not None and self._waiting.get(made):
-            return self._waiting[made].popleft()
+            return self._first(made)
         waiting = {place: len(jobs) for place, jobs in self._waiting.items() if jobs and self._kinds[place] == kind}
         if not waiting:
-            return None
-        place = max(waiting, key=lambda one: waiting[one] / (1 + working.get(one, 0)))
-        return self._waiting[place].popleft()
+            return ()
+        return self._first(max(waiting, key=lambda one: waiting[one] / (1 + working.get(one, 0))))
 
     def wants(self, workers: Mapping[str, int], unoccupied: Mapping[str, int]) -> Cell | None:
         """A cell that one more worker would be for; None if those that are `unoccupied` suffice.
@@ -82,7 +82,8 @@ class JobQueue:
         """
         waiting: Counter[str] = Counter()
         for place, jobs in self._waiting.items():
-            waiting[self._kinds[place]] += len(jobs)
+            if jobs:
+                waiting[self._kinds[place]] += math.ceil(len(jobs) / jobs[0].cell.suite.num_envs)
         short = [kind for kind, number in waiting.items() if number > unoccupied.get(kind, 0)]
         if not short:
             return None
@@ -95,6 +96,14 @@ class JobQueue:
         for place, jobs in self._waiting.items():
             self._waiting[place] = deque(job for job in jobs if job.key.settings != settings)
         return before - len(self)
+
+    def _first(self, place: str) -> tuple[Job, ...]:
+        jobs = self._waiting[place]
+        taken = [jobs.popleft()]
+        cell = taken[0].cell
+        while jobs and len(taken) < cell.suite.num_envs and jobs[0].cell.fingerprint == cell.fingerprint:
+            taken.append(jobs.popleft())
+        return tuple(taken)
 
     def _of(self, job: Job) -> deque[Job]:
         self._kinds[job.cell.place] = job.cell.kind

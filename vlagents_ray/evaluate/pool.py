@@ -49,8 +49,8 @@ class Worker:
     actor: Any
     starting: Any  # ref of `ready()`; None once it runs
     since: float  # when it was started
-    job: Job | None = None
-    running: Any = None  # ref of `run(job)`
+    jobs: tuple[Job, ...] = ()  # that it plays, of one cell
+    running: Any = None  # ref of `run(jobs)`
     made: str | None = None  # the place of the env it holds
     looking: Any = None  # ref of `progress()`
     looked: float = 0.0  # when it was asked
@@ -90,11 +90,11 @@ class WorkerPool:
     @property
     def busy(self) -> bool:
         """Is an episode being played?"""
-        return any(worker.job is not None for worker in self._workers)
+        return any(worker.jobs for worker in self._workers)
 
     def working(self) -> Counter[str]:
         """How many workers are busy at which place."""
-        return Counter(worker.job.cell.place for worker in self._workers if worker.job is not None)
+        return Counter(worker.jobs[0].cell.place for worker in self._workers if worker.jobs)
 
     def kinds(self) -> Counter[str]:
         """How many workers there are of which kind."""
@@ -102,11 +102,11 @@ class WorkerPool:
 
     def unoccupied(self) -> Counter[str]:
         """How many of them play nothing; some may still be starting."""
-        return Counter(worker.kind for worker in self._workers if worker.job is None)
+        return Counter(worker.kind for worker in self._workers if not worker.jobs)
 
     def idle(self) -> list[Worker]:
         """Workers that can take a job."""
-        return [worker for worker in self._workers if worker.starting is None and worker.job is None]
+        return [worker for worker in self._workers if worker.starting is None and not worker.jobs]
 
     def make_room(self) -> bool:
         """Is there room for one more worker? An idle one leaves if there is none."""
@@ -133,13 +133,13 @@ class WorkerPool:
         actor = self._actor_class.options(**options).remote(self._config, self._agent_factory)
         self._workers.append(Worker(cell.worker, cell.kind, actor, starting=actor.ready.remote(), since=monotonic()))
 
-    def dispatch(self, worker: Worker, job: Job) -> None:
-        """Have `worker` play `job`."""
-        phase: Phase = "env reset" if worker.made == job.cell.place else "make"
-        worker.job = job
+    def dispatch(self, worker: Worker, jobs: tuple[Job, ...]) -> None:
+        """Have `worker` play `jobs`, side by side."""
+        phase: Phase = "env reset" if worker.made == jobs[0].cell.place else "make"
+        worker.jobs = jobs
         worker.pulse, worker.heard = Pulse(phase, 0.0, 0), monotonic()
         worker.looked, worker.looking = monotonic(), None
-        worker.running = worker.actor.run.remote(job)
+        worker.running = worker.actor.run.remote(jobs)
 
     def wait(self, timeout_s: float) -> Iterator[tuple[Job, Report]]:
         """Reports that arrive within `timeout_s`, those of workers that died or hung included.
@@ -180,19 +180,21 @@ class WorkerPool:
                 worker.pulse, worker.heard = ray.get(ref), monotonic()
             except RayActorError as error:  # the answer to its job says the same
                 log.debug("a worker did not answer: %s", error)
-        elif worker.job is not None:
-            job, worker.job, worker.running = worker.job, None, None
+        elif worker.jobs:
+            jobs, worker.jobs, worker.running = worker.jobs, (), None
             try:
-                report = ray.get(ref)
+                reports: list[Report] = ray.get(ref)
             except RayError as error:
                 reason = f"the worker {'died' if isinstance(error, RayActorError) else 'failed'}: {error}"
-                report = Report(failure=Failure("worker", EnvFailed.code, reason))
-            if report.made is not None:
-                worker.made = job.cell.place
-            if report.failure is not None and report.failure.cause == "worker":
+                reports = [Report(failure=Failure("worker", EnvFailed.code, reason))] * len(jobs)
+            if reports[0].made is not None:
+                worker.made = jobs[0].cell.place
+            broken = [one.failure for one in reports if one.failure is not None and one.failure.cause == "worker"]
+            if broken:
                 self._end(worker)
-                report = replace(report, failure=_with_log(report.failure, worker))
-            yield job, report
+                with_log = _with_log(broken[0], worker)
+                reports = [replace(one, failure=with_log) if one.failure in broken else one for one in reports]
+            yield from zip(jobs, reports, strict=True)
 
     def _started(self, worker: Worker) -> None:
         try:
@@ -213,13 +215,12 @@ class WorkerPool:
             if worker.starting is not None:
                 if now - worker.since > self._config.place_timeout_s:
                     raise ConfigError(self._no_room(worker.config))
-            elif worker.job is not None:
+            elif worker.jobs:
                 reason = self._overdue(worker, now)
                 if reason is not None:
-                    job = worker.job
                     self._end(worker)
-                    failure = Failure("worker", EnvFailed.code, reason, worker.pulse.stack)
-                    yield job, Report(failure=_with_log(failure, worker))
+                    failure = _with_log(Failure("worker", EnvFailed.code, reason, worker.pulse.stack), worker)
+                    yield from ((job, Report(failure=failure)) for job in worker.jobs)
                 elif worker.looking is None and now - worker.looked > WATCH_S:
                     worker.looked = now
                     worker.looking = worker.actor.progress.options(concurrency_group="watch").remote()

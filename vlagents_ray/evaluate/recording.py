@@ -31,6 +31,11 @@ class Recording:
         self._video = VideoRecorder(fps, seen=config.record != "none")
         self._trajectory = TrajectoryRecorder()
 
+    @property
+    def wants_images(self) -> bool:
+        """Are the images of every step kept, for a while at least?"""
+        return {self._wants_video, self._wants_trajectory} != {"none"}
+
     def see(self, obs: Obs) -> None:
         """An observation, the first one included."""
         if self._wants_video != "none":

@@ -1,4 +1,4 @@
-"""What runs in a worker process: one env, one agent, one episode after another.
+"""What runs in a worker process: one env or a batch of them, one agent, one episode after another.
 
 `Rollout` is plain Python; `vlagents_ray.evaluate.pool` makes a Ray actor of it. It never raises for
 what an episode may run into: it reports it, so that no exception has to survive pickling.
@@ -6,6 +6,7 @@ what an episode may run into: it reports it, so that no exception has to survive
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import socket
@@ -13,13 +14,15 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from time import monotonic, sleep
 from typing import Any, Literal
 
+from vlagents_ray.client import RemoteAgent
 from vlagents_ray.code import Code, code_of
 from vlagents_ray.contract import require_match
 from vlagents_ray.envs import EvalEnv, make_env
+from vlagents_ray.envs.batch import BatchEnv, make_batch
 from vlagents_ray.errors import (
     ConfigError,
     ContractMismatch,
@@ -45,6 +48,7 @@ from vlagents_ray.evaluate.episode import EpisodeResult, Phase, run_episode
 from vlagents_ray.evaluate.jobs import Job
 from vlagents_ray.evaluate.logs import own_logs
 from vlagents_ray.evaluate.recording import Kept, Recording
+from vlagents_ray.evaluate.side_by_side import Outcome, run_episodes
 from vlagents_ray.evaluate.sides import env_side, policy_side
 from vlagents_ray.interface import Agent
 from vlagents_ray.registry import env_class
@@ -95,6 +99,14 @@ class Report:
     policy: dict[str, Any] | None = None  # metadata of the policy ({} of a local one), if newly connected
 
 
+@dataclass(slots=True)
+class _Found:
+    """What a worker found out on the way to an episode, whatever comes of that."""
+
+    made: Made | None = None
+    policy: dict[str, Any] | None = None
+
+
 @dataclass(frozen=True, slots=True)
 class Pulse:
     """What a worker is doing, for how long."""
@@ -114,7 +126,8 @@ class Rollout:
         self._agent: Agent | None = None
         self._policy: str | None = None  # whose agent it is
         self._broken_agents = 0  # in a row
-        self._env: EvalEnv | None = None
+        self._sessions: list[Agent] = []  # further ones of the agent, for episodes side by side
+        self._env: EvalEnv | BatchEnv | None = None
         self._place: str | None = None  # of the env
         self._thread = 0  # the one that plays
         self._now: tuple[Phase, float, int] = ("idle", monotonic(), 0)
@@ -130,51 +143,88 @@ class Rollout:
         frame = sys._current_frames().get(self._thread) if age_s > LONG_S else None
         return Pulse(phase, age_s, steps, "".join(traceback.format_stack(frame)) if frame else "")
 
-    def run(self, job: Job) -> Report:
-        """Play one episode."""
+    def run(self, jobs: tuple[Job, ...]) -> list[Report]:
+        """Play the episodes of one cell, side by side if there are several; a report for each."""
         self._thread = threading.get_ident()
-        made: Made | None = None
-        policy: dict[str, Any] | None = None
+        found = _Found()
         try:
-            if self._agent is None or self._policy != job.cell.policy.name:
-                self._agent = self._connect(job.cell.policy)
-                policy = _metadata(self._agent)
-            if self._env is None or self._place != job.cell.place:
-                self._env = self._make_env(job.cell)
-                # The driver may have another numpy, which cannot read this one's pickles.
-                made = Made(plain_values(self._env.describe()), self._env.contract.to_json(), _code(self._env))
-            agent, env = self._agent, self._env
-            if made is not None or policy is not None:
-                require_match(agent.contract, env.contract)
-            with Recording(self._config, env.contract.control_hz) as recording:
-                result = run_episode(
-                    env,
-                    agent,
-                    job.key,
-                    execute=job.cell.policy.execute,
-                    clock=job.cell.suite.clock,
-                    reset_options=job.cell.suite.reset_options,
-                    policy_options=job.cell.policy_options,
-                    watch=self._watch,
-                    record=recording.see,
-                    executed=recording.do,
-                )
-                kept = recording.finish(result)
+            reports = self._played(jobs, found)
         except VLAgentsError as error:
-            failure = explain(error)
-            if failure.cause == "policy":
-                self._broken_agents += 1
-                self._drop_agent()
-            return Report(failure=failure, made=made, policy=policy)
+            reports = [Report(failure=explain(error))] * len(jobs)
         finally:
             self._watch("idle", 0)
-        self._broken_agents = 0
-        return Report(result=result, kept=kept, made=made, policy=policy)
+        if any(report.failure is not None and report.failure.cause == "policy" for report in reports):
+            self._broken_agents += 1
+            self._drop_agent()
+        elif any(report.result is not None for report in reports):
+            self._broken_agents = 0
+        return [replace(reports[0], made=found.made, policy=found.policy), *reports[1:]]
 
     def close(self) -> None:
         """Free the simulator and the connection."""
         self._drop_agent()
         self._drop_env()
+
+    def _played(self, jobs: tuple[Job, ...], found: _Found) -> list[Report]:
+        cell = jobs[0].cell
+        if self._agent is None or self._policy != cell.policy.name:
+            self._agent = self._connect(cell.policy)
+            found.policy = _metadata(self._agent)
+        if self._env is None or self._place != cell.place:
+            self._env = self._make_env(cell)
+            # The driver may have another numpy, which cannot read this one's pickles.
+            found.made = Made(plain_values(self._env.describe()), self._env.contract.to_json(), _code(cell))
+        agent, env = self._agent, self._env
+        if found.made is not None or found.policy is not None:
+            require_match(agent.contract, env.contract)
+        with contextlib.ExitStack() as stack:
+            recordings = [stack.enter_context(Recording(self._config, env.contract.control_hz)) for _ in jobs]
+            return [
+                Report(result=one, kept=recording.finish(one))
+                if isinstance(one, EpisodeResult)
+                else Report(failure=explain(one))
+                for one, recording in zip(self._play(agent, env, jobs, recordings), recordings, strict=True)
+            ]
+
+    def _play(
+        self, agent: Agent, env: EvalEnv | BatchEnv, jobs: tuple[Job, ...], recordings: list[Recording]
+    ) -> list[Outcome]:
+        cell = jobs[0].cell
+        if isinstance(env, BatchEnv):
+            return run_episodes(
+                env,
+                agent,
+                self._sessions_of(agent, len(jobs)),
+                [job.key for job in jobs],
+                execute=cell.policy.execute,
+                reset_options=cell.suite.reset_options,
+                policy_options=cell.policy_options,
+                watch=self._watch,
+                record=lambda i, obs: recordings[i].see(obs),
+                executed=lambda i, *done: recordings[i].do(*done),
+            )
+        [job], [recording] = jobs, recordings
+        result = run_episode(
+            env,
+            agent,
+            job.key,
+            execute=cell.policy.execute,
+            clock=cell.suite.clock,
+            reset_options=cell.suite.reset_options,
+            policy_options=cell.policy_options,
+            watch=self._watch,
+            record=recording.see,
+            images=recording.wants_images,
+            executed=recording.do,
+        )
+        return [result]
+
+    def _sessions_of(self, agent: Agent, number: int) -> list[Agent]:
+        if not isinstance(agent, RemoteAgent):
+            raise ConfigError("num_envs: got more than 1 for a policy in the worker's own process; give it a `url`")
+        if number > len(self._sessions):
+            self._sessions += agent.sessions(number - len(self._sessions))
+        return self._sessions[:number]
 
     def _watch(self, phase: Phase, steps: int) -> None:
         self._now = (phase, monotonic(), steps)
@@ -196,12 +246,13 @@ class Rollout:
         self._policy = policy.name
         return agent
 
-    def _make_env(self, cell: Cell) -> EvalEnv:
+    def _make_env(self, cell: Cell) -> EvalEnv | BatchEnv:
         self._watch("make", 0)
         self._drop_env()  # first, so that a worker never holds two simulators
         try:
             with env_side(f"{cell.env!r}: make"):
-                env = make_env(cell.env, **cell.suite.env_options)
+                options, number = cell.suite.env_options, cell.suite.num_envs
+                env = make_env(cell.env, **options) if number == 1 else make_batch(cell.env, number, **options)
         except EnvFailed as error:
             reason = env_class(cell.env).missing()
             if reason is None:
@@ -211,8 +262,9 @@ class Rollout:
         return env
 
     def _drop_agent(self) -> None:
-        agent, self._agent = self._agent, None
-        if agent is not None:
+        agents = [*self._sessions, *([] if self._agent is None else [self._agent])]
+        self._agent, self._sessions = None, []
+        for agent in agents:
             try:
                 agent.close()
             except VLAgentsError as error:  # the way to it is broken: nothing is left to close
@@ -253,8 +305,8 @@ def explain(error: VLAgentsError) -> Failure:
     return Failure(cause, error.code, str(error), "".join(traceback.format_exception(error)))
 
 
-def _code(env: EvalEnv) -> Code | None:
-    return code_of(type(env).__module__)
+def _code(cell: Cell) -> Code | None:
+    return code_of(env_class(cell.env).__module__)
 
 
 def _metadata(agent: Agent) -> dict[str, Any]:

@@ -136,9 +136,8 @@ class _Run:
 
     def _turn(self, pool: WorkerPool) -> None:
         for worker in pool.idle():
-            job = self._queue.take(worker.kind, worker.made, pool.working())
-            if job is not None:
-                pool.dispatch(worker, job)
+            if jobs := self._queue.take(worker.kind, worker.made, pool.working()):
+                pool.dispatch(worker, jobs)
         while (cell := self._queue.wants(pool.kinds(), pool.unoccupied())) is not None and pool.make_room():
             pool.start(cell)
         for job, report in pool.wait(POLL_S):

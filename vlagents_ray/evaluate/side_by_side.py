@@ -30,6 +30,7 @@ from vlagents_ray.interface import Act, Agent, Obs
 
 Outcome = EpisodeResult | VLAgentsError
 Record = Callable[[int, Obs], None]  # told the number of the key and each of its observations
+Executed = Callable[[int, np.ndarray, float, bool], None]  # and each action, its reward, and whether that solved it
 
 
 def run_episodes(
@@ -43,6 +44,7 @@ def run_episodes(
     policy_options: Mapping[str, Any] | None = None,
     watch: Watch = lambda _phase, _steps: None,
     record: Record = lambda _i, _obs: None,
+    executed: Executed = lambda _i, _action, _reward, _success: None,
 ) -> list[Outcome]:
     """Play the episodes `keys` together, at most `env.num_envs`, each with a session of its own.
 
@@ -69,7 +71,7 @@ def run_episodes(
         if not playing:
             break
         watch("env step", steps)
-        _step(env, players, record)
+        _step(env, players, record, executed)
         steps += 1
     return [player.outcome for player in players if player.outcome is not None]
 
@@ -158,7 +160,7 @@ def _ask(agent: Agent, players: Sequence[_Player], env: BatchEnv) -> None:
         player.answered(answer, env, took_ms)
 
 
-def _step(env: BatchEnv, players: Sequence[_Player], record: Record) -> None:
+def _step(env: BatchEnv, players: Sequence[_Player], record: Record, executed: Executed) -> None:
     acts = [Act(player.rows[0]) if player.outcome is None else None for player in players]
     begun = perf_counter()
     with env_side("step"):
@@ -169,4 +171,6 @@ def _step(env: BatchEnv, players: Sequence[_Player], record: Record) -> None:
             player.obs = obs
             player.tally.step_ms.append(took_ms)
             record(player.number, obs)
+            action = player.rows[0]
             player.stepped(reward, terminated, truncated, info, env.max_steps)
+            executed(player.number, action, float(reward), player.tally.success)

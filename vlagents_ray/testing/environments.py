@@ -50,6 +50,7 @@ def check_env(
         for i, (a, b) in enumerate(zip(first.seen, again.seen, strict=False)):
             require_same(a, b, f"the observation after step {i}", because)
         require_same(first.outcomes, again.outcomes, "[reward, terminated, truncated, success] of the steps", because)
+        _check_unseen(env, contract, seeds[0], options, actions, first)
     for rollout in (first, other, again):
         for i, (given, kept) in enumerate(zip(rollout.given, rollout.seen, strict=True)):
             require_same(
@@ -170,6 +171,27 @@ def _check_obs(obs: object, contract: Contract, where: str) -> None:
     if contract.gripper is False and obs.gripper is not None:
         raise ContractViolation(f"{where}: gripper is {obs.gripper}, the contract states that there is none")
     require_wireable(obs.info, f"{where}: Obs.info")
+
+
+def _check_unseen(
+    env: EvalEnv,
+    contract: Contract,
+    seed: int,
+    options: Mapping[str, Any] | None,
+    actions: list[np.ndarray],
+    seen: _Rollout,
+) -> None:
+    """Play what was `seen` again, with nobody looking before its last step."""
+    _reset(env, contract, seed, options)
+    last = len(seen.outcomes) - 1
+    for i, (action, expected) in enumerate(zip(actions, seen.seen[1:], strict=False)):
+        env.looked_at = i == last
+        obs, reward, terminated, truncated, info = env.step(Act(action.copy()))
+        shown = [expected, obs] if i == last else [Obs({}, one.gripper, one.state) for one in (expected, obs)]
+        because = "whether anybody looks may spare images and change nothing else"
+        require_same(*shown, f"the observation after step {i}", because)
+        outcome = [reward, terminated, truncated, info["success"]]
+        require_same(seen.outcomes[i], outcome, f"[reward, terminated, truncated, success] of step {i}", because)
 
 
 def _check_invalid_actions(env: EvalEnv, contract: Contract, seed: int, options: Mapping[str, Any] | None) -> None:

@@ -129,11 +129,12 @@ class Libero(EvalEnv):
         if action.ndim != 1:
             raise InvalidAction(f"action: got {action.shape}, want (7,); step through a chunk row by row")
         with self._failing("step"):
-            seen = world.step(robot.to_simulator(action, self._protocol))
+            seen = world.step(robot.to_simulator(action, self._protocol), look=self.looked_at)
         self._steps += 1
         ended = seen.success and self._protocol.stop_at_success
         truncated = not ended and self._steps >= self.max_steps
-        return self._observe(seen), float(seen.success), ended, truncated, {"success": seen.success}
+        obs = self._observe(seen, look=self.looked_at)
+        return obs, float(seen.success), ended, truncated, {"success": seen.success}
 
     @classmethod
     def tasks(cls) -> list[str]:
@@ -183,10 +184,10 @@ class Libero(EvalEnv):
             raise ConfigError(f"{self._name}: init_state is {state!r}, want 0 to {count - 1}")
         return state
 
-    def _observe(self, seen: Seen) -> Obs:
-        world, cameras = self._alive(), self._protocol.cameras
+    def _observe(self, seen: Seen, *, look: bool = True) -> Obs:
+        world, cameras = self._alive(), self._protocol.cameras if look else {}
         info: dict[str, Any] = {"sim_state": {"positions": world.positions(), "goal": world.goal}}
-        if seen.views:
+        if seen.views and look:
             info[HIGH_RES] = {name: _turned(seen.views[own]) for name, own in cameras.items()}
         state, gripper = robot.read(seen.raw)
         images = {name: _turned(seen.raw[f"{own}_image"]) for name, own in cameras.items()}

@@ -64,8 +64,9 @@ class World:
         self._eyes.open = True
         return Seen(raw, self._eyes.views, bool(success))
 
-    def step(self, action: np.ndarray) -> Seen:
-        """One control step of `action`, (7,) float64, which the controller clips to [-1, 1]."""
+    def step(self, action: np.ndarray, *, look: bool = True) -> Seen:
+        """One control step of `action`, (7,) float64, which the controller clips to [-1, 1]; without `look`, unseen."""
+        self._eyes.open = look
         raw, _, success, _ = self._env.step(action)
         return Seen(raw, self._eyes.views, bool(success))
 
