@@ -187,9 +187,9 @@ def _check_unseen(
     for i, (action, expected) in enumerate(zip(actions, seen.seen[1:], strict=False)):
         env.looked_at = i == last
         obs, reward, terminated, truncated, info = env.step(Act(action.copy()))
-        shown = [expected, obs] if i == last else [Obs({}, one.gripper, one.state) for one in (expected, obs)]
         because = "whether anybody looks may spare images and change nothing else"
-        require_same(*shown, f"the observation after step {i}", because)
+        a, b = (one if i == last else Obs({}, one.gripper, one.state) for one in (expected, obs))
+        require_same(a, b, f"the observation after step {i}", because)
         outcome = [reward, terminated, truncated, info["success"]]
         require_same(seen.outcomes[i], outcome, f"[reward, terminated, truncated, success] of step {i}", because)
 
