@@ -7,6 +7,7 @@ import re
 from pathlib import Path
 
 import pytest
+import yaml
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
@@ -21,6 +22,9 @@ ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / "evaluations").glob("*.yaml"))
 PAGE = (ROOT / "docs" / "evaluation" / "running.md").read_text()
 MODELS = [EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig, ClockConfig, StopConfig, TrackingConfig]
+CAMERAS = {"libero": {"front", "wrist"}, "simpler": {"3rd_view_camera"}, "tabletop": {"front"}}
+# Of models that are not told which camera is which.
+WITHOUT_WORDS = {"openpi": {"image": "front", "wrist_image": "wrist"}, "openvla": {"image": "front"}, "lerobot": {}}
 ELSEWHERE = {
     ("EvalConfig", "out"),
     ("EvalConfig", "worker"),
@@ -42,6 +46,23 @@ def test_an_example_is_accepted(file: Path, monkeypatch: pytest.MonkeyPatch) -> 
             assert Path(policy.source).is_file()
         else:
             read_deployment(policy.source, {"config": policy.config} if policy.config else None)
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_a_model_of_an_example_looks_through_cameras_that_its_envs_have(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(ROOT)
+    config = EvalConfig.model_validate(read_run(file))
+    have = [CAMERAS[env.partition("/")[0]] for suite in config.suites for env in suite.envs]
+    for policy in config.policies:
+        if policy.source is None or not policy.source.endswith(".yaml"):
+            continue
+        [application] = yaml.safe_load((ROOT / policy.source).read_text())["applications"]
+        served = application["args"]["policy"]
+        assert served != "noop"
+        needs = ({**application["args"]["config"], **policy.config}.get("cameras") or WITHOUT_WORDS[served]).values()
+        assert all(set(needs) <= cameras for cameras in have)
 
 
 def test_there_are_examples() -> None:

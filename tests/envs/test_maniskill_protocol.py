@@ -70,12 +70,12 @@ def test_results_say_which_protocol_was_followed_and_what_was_not() -> None:
     assert protocol["ignore_terminations"] is True
     assert protocol["reconfiguration_freq"] == 1
     assert protocol["metrics"] == ["success_once", "success_at_end"]
-    assert protocol["departures"] == []
+    assert protocol["deviations"] == []
     with ManiSkill("PushCube-v1", **SMALL, reconfigure=False, max_steps=7) as env:
-        departures = env.describe()["protocol"]["departures"]
-    assert len(departures) == 2
-    assert departures[0].startswith("reconfigure is False")
-    assert departures[1] == "max_steps is 7, the task's own is 50"
+        deviations = env.describe()["protocol"]["deviations"]
+    assert len(deviations) == 2
+    assert deviations[0].startswith("reconfigure is False")
+    assert deviations[1] == "max_steps is 7, the task's own is 50"
 
 
 def test_views_for_the_record_have_a_size_of_their_own() -> None:

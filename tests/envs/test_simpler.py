@@ -63,7 +63,7 @@ def test_each_task_keeps_to_simplers_constants(task: str) -> None:
         assert facts["success"].startswith("the object lies")
         assert facts["protocol"]["setting"] == "visual matching"
         assert facts["protocol"]["success"] == "at the end"
-        assert facts["protocol"]["departures"] == []
+        assert facts["protocol"]["deviations"] == []
 
 
 def test_it_keeps_the_promises_of_an_env() -> None:
@@ -177,9 +177,9 @@ def test_the_view_for_the_record_shows_the_same_in_another_size(carrot: Simpler)
     assert np.abs(view - small).mean() < 6
 
 
-def test_what_departs_from_the_protocol_is_said() -> None:
+def test_what_deviates_from_the_protocol_is_said() -> None:
     with Simpler(CARROT, max_steps=3, shader="minimal") as env:
-        assert env.describe()["protocol"]["departures"] == ["max_steps is 3, not 60", "shader is minimal, not default"]
+        assert env.describe()["protocol"]["deviations"] == ["max_steps is 3, not 60", "shader is minimal, not default"]
 
 
 def test_what_is_wrong_is_named(carrot: Simpler) -> None:

@@ -12,6 +12,7 @@ from vlagents_ray.evaluate.episode import EpisodeResult, Status
 from vlagents_ray.evaluate.jobs import EpisodeKey, Job
 from vlagents_ray.evaluate.progress import LineProgress, LiveProgress, Progress
 from vlagents_ray.evaluate.rollout import Failure
+from vlagents_ray.evaluate.stopping import confidence_sequence
 
 RETRY = Failure("worker", "env_failed", "the simulator exploded\nwith a long story")
 
@@ -58,6 +59,16 @@ def test_progress_tells_success_so_far_and_what_infrastructure_cost(terminal: bo
     assert "tabletop episode 5: attempt 1 failed, trying again: the simulator exploded" in last
     assert "long story" not in last
     assert " left" in last
+
+
+def test_a_cell_that_may_stop_early_shows_its_confidence_sequence() -> None:
+    out = StringIO()
+    progress = LineProgress(Console(file=out, width=120))
+    progress.begin([TEN], {TEN.fingerprint: Rate(7, 7, confidence_sequence(7, 7), 0.05)}, 3)
+    progress.episode(TEN, result(7, True))
+    progress.end()
+    assert str(Rate(8, 8, confidence_sequence(8, 8), 0.05)) in out.getvalue()
+    assert str(Rate(8, 8)) not in out.getvalue()
 
 
 def test_lines_are_sparse(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -189,3 +189,7 @@ def test_progress_tells_phase_age_and_place(config: Config, monkeypatch: pytest.
 )
 def test_blame_goes_where_something_can_be_done(error: VLAgentsError, cause: str) -> None:
     assert explain(error).cause == cause
+
+
+def test_what_is_not_installed_is_told_with_the_python_that_lacks_it() -> None:
+    assert sys.executable in explain(MissingDependency("'av' is not installed")).message

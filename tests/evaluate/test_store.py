@@ -103,6 +103,17 @@ def test_a_folder_that_was_opened_and_not_used_needs_no_resume(config: Config) -
     Store(config(seed=5)).close()
 
 
+def test_a_run_that_a_wrong_setting_ended_before_its_first_episode_leaves_nothing_to_resume(config: Config) -> None:
+    with Store(config()) as store:
+        store.begin_run(config(), {})
+        store.record_attempt(planned(config())[0], Failure("user", "unknown_env", "no such task"), retried=False)
+    with Store(config(seed=5)) as store:
+        store.begin_run(config(seed=5), {})
+        found = Results.load(config().out)
+    assert [run.config["suites"][0]["seeds"] for run in found.runs] == [[5]]
+    assert [cell.attempts for cell in found.cells] == [()]
+
+
 @pytest.mark.parametrize(
     ("change", "differing"),
     [

@@ -13,6 +13,7 @@ from rich.console import Console
 from vlagents_ray.evaluate import EvalConfig, Summary, print_summary, synchronous_twin
 from vlagents_ray.evaluate.cells import cells
 from vlagents_ray.evaluate.episode import EpisodeResult
+from vlagents_ray.evaluate.html import write_report
 from vlagents_ray.evaluate.jobs import plan
 from vlagents_ray.evaluate.provenance import versions
 from vlagents_ray.evaluate.results import Results
@@ -101,6 +102,14 @@ def test_the_report_shows_rates_and_what_was_not_the_policys_fault(summary: Summ
     assert "1 attempts lost to infrastructure and repeated" in text
     assert "1 episodes lost to infrastructure" in text
     assert "--resume" in text
+    assert "report:" not in text  # there is none
+
+
+def test_the_page_is_named_where_there_is_one(summary: Summary) -> None:
+    page = write_report(summary.results, Path(summary.out) / "report.html")
+    console = Console(file=StringIO(), width=100)
+    print_summary(console, summary)
+    assert f"report: {page}" in console.file.getvalue()  # type: ignore[attr-defined]
 
 
 def recorded(settings: EvalConfig, outcomes: dict[str, list[bool]], **fields: int) -> Summary:

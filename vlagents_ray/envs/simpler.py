@@ -110,9 +110,9 @@ class Simpler(EvalEnv):
         _find_assets(assets)
         own_limit = making.registered_limit(task)
         self.max_steps = making.step_limit(self._name, max_steps, own_limit)
-        self._departures = [] if self.max_steps == own_limit else [f"max_steps is {max_steps}, not {own_limit}"]
+        self._deviations = [] if self.max_steps == own_limit else [f"max_steps is {max_steps}, not {own_limit}"]
         if shader != PROTOCOL.shader:
-            self._departures.append(f"shader is {shader}, not {PROTOCOL.shader}")
+            self._deviations.append(f"shader is {shader}, not {PROTOCOL.shader}")
         self._task = task
         self._instruction = instruction
         self._steps: int | None = None
@@ -174,7 +174,7 @@ class Simpler(EvalEnv):
             **self._simulator.describe(),
             "success": TWINS[self._task],
             "assets": str(require("mani_skill").ASSET_DIR.parent),
-            "protocol": {**asdict(PROTOCOL), "departures": self._departures},
+            "protocol": {**asdict(PROTOCOL), "deviations": self._deviations},
         }
 
     def close(self) -> None:

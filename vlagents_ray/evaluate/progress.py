@@ -16,6 +16,7 @@ from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.jobs import Job
 from vlagents_ray.evaluate.rollout import Failure
 from vlagents_ray.evaluate.statistics import Rate
+from vlagents_ray.evaluate.stopping import confidence_sequence
 
 LINE_EVERY_S = 5.0
 MOST_ROWS = 12
@@ -81,7 +82,10 @@ class _Counts:
             self._infra_failed[cell.fingerprint] += 1
             return
         before = self._rates[cell.fingerprint]
-        self._rates[cell.fingerprint] = Rate(before.successes + bool(result.success_once), before.episodes + 1)
+        successes, episodes = before.successes + bool(result.success_once), before.episodes + 1
+        error_rate = before.error_rate  # of a cell that may stop early
+        bounds = None if error_rate is None else confidence_sequence(successes, episodes, error_rate)
+        self._rates[cell.fingerprint] = Rate(successes, episodes, bounds, error_rate)
 
     def spare(self, episodes: int) -> None:
         self._left -= episodes

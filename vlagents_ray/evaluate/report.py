@@ -6,6 +6,7 @@ from rich.box import SIMPLE_HEAD
 from rich.console import Console
 from rich.table import Table
 
+from vlagents_ray.evaluate.html import FILE as REPORT
 from vlagents_ray.evaluate.results import CellResults
 from vlagents_ray.evaluate.summary import Group, Summary, gap_to_synchronous
 
@@ -51,6 +52,8 @@ def print_summary(console: Console, summary: Summary) -> None:
     if summary.state != "complete":
         lines.append(f"{summary.state}: go on with --resume")
     lines.append(f"results: {summary.out}")
+    if (summary.out / REPORT).is_file():
+        lines.append(f"report: {summary.out / REPORT}")
     if (summary.out / "videos").is_dir():
         lines.append(f"videos: {summary.out / 'videos'}")
     for line in lines:

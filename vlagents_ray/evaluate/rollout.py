@@ -302,7 +302,8 @@ def explain(error: VLAgentsError) -> Failure:
         cause = "policy"
     else:
         cause = "worker"
-    return Failure(cause, error.code, str(error), "".join(traceback.format_exception(error)))
+    message = f"{error} (worker's Python: {sys.executable})" if isinstance(error, MissingDependency) else str(error)
+    return Failure(cause, error.code, message, "".join(traceback.format_exception(error)))
 
 
 def _code(cell: Cell) -> Code | None:

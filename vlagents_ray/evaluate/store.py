@@ -162,9 +162,11 @@ class Store:
 
     def _require_resumable(self, db: sqlite3.Connection, config: EvalConfig) -> None:
         runs, episodes = (db.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0] for table in ("runs", "episodes"))  # noqa: S608
-        if not runs:
+        causes = {cause for (cause,) in db.execute("SELECT DISTINCT cause FROM attempts")}
+        if not runs or (not episodes and causes == {"user"}):
             with db:
-                db.execute("DELETE FROM cells")  # of a plan that was given up before it began
+                for table in ("attempts", "cells", "policies", "runs"):
+                    db.execute(f"DELETE FROM {table}")  # noqa: S608 - of a plan that could not begin
             return
         if not config.resume:
             raise ConfigError(

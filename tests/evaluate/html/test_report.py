@@ -184,6 +184,7 @@ def test_cells_that_stopped_early_have_intervals_of_another_name(tmp_path: Path)
     assert "the intervals of this table are confidence sequences" in words
     assert "95 % confidence sequence" in words
     assert "Wilson interval" not in words
+    assert "Wilson's method" not in words
 
 
 def test_the_gap_to_the_synchronous_score_is_shown(tmp_path: Path) -> None:

@@ -103,7 +103,7 @@ def test_a_description_states_task_versions_and_protocol(bowl: Libero) -> None:
     assert facts["name"] == facts["language"].replace(" ", "_")
     assert bowl.instruction == facts["language"]
     assert (facts["hf-libero"], facts["robosuite"], facts["render_backend"]) == ("0.1.4", "1.4.0", "egl")
-    assert facts["protocol"]["changed"] == ["image_size"]
+    assert facts["protocol"]["deviations"] == ["image_size: (64, 64), the protocol says (256, 256)"]
     assert facts["protocol"]["max_steps"] == bowl.max_steps == 220
     assert bowl.contract.cameras == {"front": CameraSpec(64, 64), "wrist": CameraSpec(64, 64)}
 

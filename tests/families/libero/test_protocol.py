@@ -36,9 +36,12 @@ def test_the_conventions_of_an_episode_are_theirs_too() -> None:
 
 
 def test_what_a_user_changes_is_named_in_the_record() -> None:
-    assert Protocol.of("libero_goal").to_json("libero_goal")["changed"] == []
+    assert Protocol.of("libero_goal").to_json("libero_goal")["deviations"] == []
     changed = Protocol.of("libero_goal", simulator_seed=0, max_steps=10, settling_steps=None)
-    assert changed.to_json("libero_goal")["changed"] == ["max_steps", "simulator_seed"]
+    assert changed.to_json("libero_goal")["deviations"] == [
+        "max_steps: 10, the protocol says 300",
+        "simulator_seed: 0, the protocol says 7",
+    ]
 
 
 def test_all_130_tasks_are_listed_without_the_simulator() -> None:

@@ -66,8 +66,12 @@ class Protocol:
         return cls(**{"max_steps": SUITES[suite].max_steps} | changed)
 
     def to_json(self, suite: str) -> dict[str, Any]:
-        """As plain JSON values, with the names of what differs from the published protocol of `suite` in `changed`."""
+        """As plain JSON values, and in `deviations` what differs from the published protocol of `suite`."""
         published = Protocol.of(suite)
-        changed = [f.name for f in fields(self) if getattr(self, f.name) != getattr(published, f.name)]
-        plain: dict[str, Any] = json.loads(json.dumps(asdict(self) | {"changed": changed}))
+        deviations = [
+            f"{f.name}: {getattr(self, f.name)}, the protocol says {getattr(published, f.name)}"
+            for f in fields(self)
+            if getattr(self, f.name) != getattr(published, f.name)
+        ]
+        plain: dict[str, Any] = json.loads(json.dumps(asdict(self) | {"deviations": deviations}))
         return plain

@@ -20,10 +20,10 @@ PROTOCOL = Protocol()
 
 
 def described(*, reconfigure: bool, max_steps: int, own_limit: int | None) -> dict[str, Any]:
-    """The protocol for the record, and in `departures` what of these settings is not as it says."""
-    departures = []
+    """The protocol for the record, and in `deviations` what of these settings is not as it says."""
+    deviations = []
     if not reconfigure:
-        departures.append("reconfigure is False: scenes are kept from episode to episode")
+        deviations.append("reconfigure is False: scenes are kept from episode to episode")
     if max_steps != own_limit:
-        departures.append(f"max_steps is {max_steps}, the task's own is {own_limit}")
-    return {**asdict(PROTOCOL), "metrics": list(PROTOCOL.metrics), "departures": departures}
+        deviations.append(f"max_steps is {max_steps}, the task's own is {own_limit}")
+    return {**asdict(PROTOCOL), "metrics": list(PROTOCOL.metrics), "deviations": deviations}

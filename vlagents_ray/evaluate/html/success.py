@@ -25,9 +25,9 @@ def success(summary: Summary) -> Section:
         table(head, bodies, "Success by task", words=2 if several else 1),
         tag(
             "p",
-            "Solved once: after some step; at end: after the last one. Intervals are of the true rate, by Wilson's "
-            "method. Errors of the policy count as not solved; what infrastructure kept from ending is in no rate. "
-            "Steps and return are means.",
+            "Solved once: after some step; at end: after the last one. "
+            f"Intervals are of the true rate{_method(summary)}. Errors of the policy count as not solved; "
+            "what infrastructure kept from ending is in no rate. Steps and return are means.",
             class_="note",
         ),
         _stopping(summary),
@@ -68,6 +68,11 @@ def success_over_time(summary: Summary) -> Section | None:
     ]
     numbers = table(["Solved, %, by", "¼ of the steps", "½", "¾", "the last", "steps"], rows, "Success over time")
     return section("Success over time", chart, tag("p", text, class_="note"), fold("As numbers", numbers, printed=True))
+
+
+def _method(summary: Summary) -> str:
+    """Of the table's intervals, unless `_stopping` says it."""
+    return ", by Wilson's method" if summary.total.success_once.bounds is None else ""
 
 
 def _stopping(summary: Summary) -> Html | None:
