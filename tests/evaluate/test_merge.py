@@ -124,6 +124,14 @@ def test_a_policy_with_another_checkpoint_is_named(tmp_path: Path, config: Confi
         merge(tmp_path / "out", folders)
 
 
+def test_in_a_sweep_each_server_may_have_begun_with_another_checkpoint(tmp_path: Path, config: Config) -> None:
+    folders = [tmp_path / step for step in ("10", "20")]
+    for folder in folders:
+        play(config(out=folder, steps=[int(folder.name)]), functools.partial(Served, folder.name))
+    merge(tmp_path / "out", folders)
+    assert [cell.step for cell in Results.load(tmp_path / "out").cells] == [10, 20]
+
+
 def test_videos_and_trajectories_go_along_without_taking_room(part: Callable[..., Path], tmp_path: Path) -> None:
     options = {"env_options": {"camera": [32, 32]}, "record": "all", "video": "all"}
     a, b = part("a", 1, 2, 3, 4, 5, **options), part("b", 0, 2, 3, 4, 5, **options)

@@ -67,10 +67,13 @@ def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False) -> Su
 
 
 def _add_policies(merged: _Merged, folder: Path, db: sqlite3.Connection) -> None:
+    # As in `Store.note_policy`: in a sweep the server's own checkpoint may be any.
+    swept = {name for (name,) in db.execute("SELECT DISTINCT policy FROM cells WHERE step IS NOT NULL")}
     for row in table(db, "policies"):
         known = merged.policies.setdefault(row["name"], row)
         before, now = json.loads(known["metadata"]), json.loads(row["metadata"])
-        if differing := [what for what in IDENTITY if before.get(what) != now.get(what)]:
+        identity = IDENTITY[:1] if row["name"] in swept else IDENTITY
+        if differing := [what for what in identity if before.get(what) != now.get(what)]:
             raise ConfigError(
                 f"{folder}: policy {row['name']!r} has {differing[0]} {now.get(differing[0])!r}, that of the folders "
                 f"before it {before.get(differing[0])!r}; give one of them another name in its evaluation"
