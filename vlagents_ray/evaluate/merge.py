@@ -83,7 +83,7 @@ def _add_policies(merged: _Merged, folder: Path, db: sqlite3.Connection) -> None
 def _add_cells(merged: _Merged, folder: Path, db: sqlite3.Connection) -> None:
     names = {_name(row): row for row in merged.cells.values()}
     for row in table(db, "cells"):
-        known = names.setdefault(_name(row), row)
+        known = merged.cells.get(row["cell"]) or names.setdefault(_name(row), row)  # a suite may have a new name
         if known["cell"] != row["cell"]:
             before, now = json.loads(known["settings"]), json.loads(row["settings"])
             odd = [f"{k}: {before.get(k)!r} and {now.get(k)!r}" for k in now if before.get(k) != now.get(k)]
