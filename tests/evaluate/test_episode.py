@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
@@ -184,6 +185,17 @@ def test_an_env_that_does_not_say_whether_it_is_solved_is_an_env_failure() -> No
 
     with pytest.raises(EnvFailed, match="want 'success'"):
         run_episode(Silent(), Chunks(ROW), KEY)
+
+
+@pytest.mark.parametrize("reward", [math.nan, math.inf])
+def test_a_reward_that_is_no_number_is_an_env_failure(reward: float) -> None:
+    class Diverged(Script):
+        def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+            obs, _, *rest = super().step(act)
+            return obs, reward, *rest
+
+    with pytest.raises(EnvFailed, match=f"got the reward {reward}, want a finite number"):
+        run_episode(Diverged(), Chunks(ROW), KEY)
 
 
 def test_views_for_the_record_are_recorded_and_never_reach_the_policy() -> None:

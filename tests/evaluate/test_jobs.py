@@ -113,6 +113,12 @@ def test_an_env_in_two_suites_of_one_name_is_refused() -> None:
         cells(EvalConfig(policies=[PolicyConfig()], suites=suites, out=Path("out")))
 
 
+def test_an_env_in_two_suites_that_do_not_differ_is_refused() -> None:
+    suites = [SuiteConfig(name="few", envs=[LINE]), SuiteConfig(name="all", envs=[LINE, OTHER_LINE], seeds=[100])]
+    with pytest.raises(ConfigError, match=r"\['eval_fakes:Line'\] stand in two suites with the same settings"):
+        cells(EvalConfig(policies=[PolicyConfig()], suites=suites, out=Path("out")))
+
+
 def test_a_pattern_stands_for_the_tasks_that_match() -> None:
     assert expand("tabletop/*") == [f"tabletop/{task}" for task in Tabletop.tasks()]
     assert expand("tabletop") == ["tabletop"]

@@ -78,6 +78,16 @@ def test_other_envs_and_seeds_join_the_table(part: Callable[..., Path], tmp_path
     assert [(cell.env, cell.planned, len(cell.episodes)) for cell in cells] == [(LINE, 12, 12), (OTHER_LINE, 6, 6)]
 
 
+def test_a_suite_that_was_renamed_is_still_the_same_cell(config: Config, tmp_path: Path) -> None:
+    for name, seed in (("a", 0), ("b", 100)):
+        settings = config(out=tmp_path / name, seed=seed)
+        suite = settings.suites[0].model_copy(update={"name": name})
+        play(settings.model_copy(update={"suites": [suite]}))
+    merge(tmp_path / "out", [tmp_path / "a", tmp_path / "b"])
+    [cell] = Results.load(tmp_path / "out").cells
+    assert (cell.suite, cell.planned, len(cell.counted)) == ("a", 12, 12)
+
+
 def test_seeds_that_would_play_an_episode_twice_are_refused(part: Callable[..., Path], tmp_path: Path) -> None:
     a, b = part("a"), part("b", seed=3)
     with pytest.raises(ConfigError, match=r"seeds \[3\]; together they are \[0, 3\].*6 or more apart"):
@@ -122,6 +132,14 @@ def test_a_policy_with_another_checkpoint_is_named(tmp_path: Path, config: Confi
         play(config(out=folder), functools.partial(Served, folder.name))
     with pytest.raises(ConfigError, match=r"policy 'policy' has checkpoint 'y'.*before it 'x'"):
         merge(tmp_path / "out", folders)
+
+
+def test_in_a_sweep_each_server_may_have_begun_with_another_checkpoint(tmp_path: Path, config: Config) -> None:
+    folders = [tmp_path / step for step in ("10", "20")]
+    for folder in folders:
+        play(config(out=folder, steps=[int(folder.name)]), functools.partial(Served, folder.name))
+    merge(tmp_path / "out", folders)
+    assert [cell.step for cell in Results.load(tmp_path / "out").cells] == [10, 20]
 
 
 def test_videos_and_trajectories_go_along_without_taking_room(part: Callable[..., Path], tmp_path: Path) -> None:

@@ -51,6 +51,14 @@ def test_trajectories_are_kept_of_the_episodes_that_are_wanted(config: Config, r
     assert stored == {one.trajectory for one in results.cells[0].episodes} - {None}
 
 
+def test_a_checkpoint_of_a_sweep_has_not_the_files_of_a_policy_named_almost_like_it(config: Config) -> None:
+    settings = config(episodes=1, record="all", policy="pi0", steps=[2])
+    other = settings.policies[0].model_copy(update={"name": "pi0_2", "steps": []})
+    results = play(settings.model_copy(update={"policies": [*settings.policies, other]}))
+    paths = [episode.trajectory for cell in results.cells for episode in cell.episodes]
+    assert len(set(paths)) == 2
+
+
 def test_a_video_that_is_also_the_trajectorys_is_there_once(config: Config) -> None:
     results = play(config(episodes=1, record="all", video="all", env_options=CAMERA))
     [episode] = results.cells[0].episodes

@@ -12,9 +12,11 @@ from eval_fakes import LINE, OTHER_LINE, ToZero
 from played import play
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate import EvalConfig, evaluate
+from vlagents_ray.evaluate import EvalConfig, Results, evaluate
 from vlagents_ray.evaluate.cells import cells
+from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.replay import compare, find
+from vlagents_ray.evaluate.store import Store
 from vlagents_ray.interface import Act, Obs
 
 Config = Callable[..., EvalConfig]
@@ -82,6 +84,22 @@ def test_fewer_actions_are_told_as_such(config: Config, tmp_path: Path) -> None:
 
     found = compare(longer, play(longer.config(tmp_path / "again"), Tired))
     assert found[0] == "actions: 10 were recorded, now they are 6; the first 6 are the same"
+
+
+def test_a_replay_that_infrastructure_kept_from_ending_is_no_difference(config: Config, tmp_path: Path) -> None:
+    recorded = find(play(config(episodes=1, record="all")), f"{LINE}#0")
+    settings = recorded.config(tmp_path / "again")
+    with Store(settings) as store:
+        store.begin_run(settings, {})
+        store.record(EpisodeResult(recorded.episode.result.key, "infra_failed", error="it hung"), attempts=4)
+    with pytest.raises(ConfigError, match=r"the replay did not end.*: it hung"):
+        compare(recorded, Results.load(settings.out))
+
+
+def test_an_episode_beyond_the_point_at_which_its_cell_stopped_was_played_and_is_found(config: Config) -> None:
+    results = play(config(episodes=30, stop={"target": 0.3}))
+    assert not (last := results.cells[0].episodes[-1]).counts
+    assert find(results, f"{LINE}#29").episode == last
 
 
 def test_an_episode_is_found_by_its_key_and_by_env_and_number(config: Config) -> None:

@@ -13,10 +13,10 @@ from typing import Any
 
 import av
 import pytest
-from eval_fakes import EVERY, LINE, OTHER_LINE, Silent, Teller, ToZero, wait_for
+from eval_fakes import CLINGING, EVERY, LINE, OTHER_LINE, Silent, Teller, ToZero, wait_for
 
 from vlagents_ray.errors import ConfigError, ConnectionLost, ContractMismatch, UnknownEnv
-from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, SilentProgress, check, evaluate, pool
+from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, SilentProgress, SuiteConfig, check, evaluate, pool
 from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.store import Store
@@ -190,6 +190,18 @@ class TestOnACluster:
     def test_a_cluster_without_room_is_told_so(self, config: Config) -> None:
         with pytest.raises(ConfigError, match=r"no room for a worker in 0\.5 s.*lower `workers`"):
             evaluate(config(cpus_per_worker=64, place_timeout_s=0.5), agent_factory=ToZero)
+
+    def test_a_worker_that_does_not_leave_makes_room_for_one_of_another_kind(
+        self, config: Config, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(pool, "CLOSE_S", 0.5)
+        base = config(workers=1, cpus_per_worker=3, place_timeout_s=30)
+        suites = [
+            SuiteConfig(envs=[CLINGING], episodes=2),
+            SuiteConfig(envs=[LINE], episodes=1, worker=base.worker.model_copy(update={"threads": 2})),
+        ]
+        summary = evaluate(base.model_copy(update={"suites": suites}), agent_factory=ToZero)
+        assert (summary.state, summary.total.episodes) == ("complete", 3)
 
 
 def test_an_unknown_env_is_refused_before_anything_starts(config: Config) -> None:

@@ -120,7 +120,7 @@ def recorded(settings: EvalConfig, outcomes: dict[str, list[bool]], **fields: in
             if job.key.episode < len(outcomes[job.cell.suite.name]):
                 success = outcomes[job.cell.suite.name][job.key.episode]
                 waited = fields if job.cell.suite.clock else {}
-                store.record(EpisodeResult(job.key, "done", success, success, steps=10, **waited), 1)
+                store.record(EpisodeResult(job.key, "done", success, success, **{"steps": 10} | waited), 1)
         store.end_run("complete")
     return summarize(Results.load(settings.out))
 
@@ -147,6 +147,16 @@ def test_a_cell_in_real_time_tells_its_gap_to_the_synchronous_one(tmp_path: Path
     assert [cell["gap_to_synchronous"] for cell in summary.to_json()["cells"]] == [None, -0.75, None]
     text = printed(summary)
     assert "in real time: -75 points to the synchronous score; 50% of its ticks waited for an answer, 20% with" in text
+
+
+def test_a_cell_in_real_time_without_a_single_step_has_no_ticks_that_waited(tmp_path: Path) -> None:
+    suites = [
+        {"name": "waits", "envs": [LINE], "episodes": 2},
+        {"name": "moves on", "envs": [LINE], "episodes": 2, "clock": {"latency": 0.2}},
+    ]
+    settings = EvalConfig.model_validate({"policies": [{}], "suites": suites, "out": tmp_path / "out"})
+    summary = recorded(settings, {"waits": [True] * 2, "moves on": [False] * 2}, steps=0)
+    assert "in real time: -100 points to the synchronous score; 0% of its ticks" in printed(summary)
 
 
 def test_a_cell_that_stopped_early_says_after_how_many_and_at_which_error_rate(config: Config) -> None:

@@ -88,15 +88,15 @@ def result(success: bool, status: str = "done") -> EpisodeResult:
 def test_a_video_is_named_by_env_episode_outcome_and_camera(tmp_path: Path) -> None:
     paths = save_videos(tmp_path, CELL, result(True), {"base_camera": b"1", "left/wrist": b"2"})
     assert paths == [
-        "videos/act_20/unseen/maniskill_PushCube-v1/ep0003_seed3_success_base_camera.mp4",
-        "videos/act_20/unseen/maniskill_PushCube-v1/ep0003_seed3_success_left_wrist.mp4",
+        "videos/act@20/unseen/maniskill_PushCube-v1/ep0003_seed3_success_base_camera.mp4",
+        "videos/act@20/unseen/maniskill_PushCube-v1/ep0003_seed3_success_left_wrist.mp4",
     ]
     assert (tmp_path / paths[0]).read_bytes() == b"1"
 
 
 def test_a_repeated_episode_replaces_its_videos(tmp_path: Path) -> None:
     save_videos(tmp_path, CELL, result(True), {"front": b"old", "wrist": b"old"})
-    folder = tmp_path / "videos" / "act_20" / "unseen" / "maniskill_PushCube-v1"
+    folder = tmp_path / "videos" / "act@20" / "unseen" / "maniskill_PushCube-v1"
     (folder / "ep0003_seed3_success_side.part").write_bytes(b"cut off by a crash")
     (folder / "ep0003_seed33_success_front.mp4").write_bytes(b"another episode")
     save_videos(tmp_path, CELL, result(False), {"front": b"new"})

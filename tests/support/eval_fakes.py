@@ -20,6 +20,7 @@ from vlagents_ray.interface import Act, Agent, Obs
 
 LINE = "eval_fakes:Line"
 OTHER_LINE = "eval_fakes:OtherLine"
+CLINGING = "eval_fakes:Clinging"
 EVERY = -1  # seed
 
 
@@ -112,6 +113,13 @@ class Line(EvalEnv):
             ctypes.PyDLL(None).pause()
         if kind == "gate" and self._folder is not None:
             wait_for((self._folder / "open").exists)
+
+
+class Clinging(Line):
+    """Never closes."""
+
+    def close(self) -> None:
+        threading.Event().wait()
 
 
 class OtherLine(Line):

@@ -130,8 +130,8 @@ def evaluate_command(
 
 def _given(**options: Any) -> dict[str, Any]:
     """The options that say something."""
-    nothing: tuple[Any, ...] = (None, False, {}, [])
-    return {name: value for name, value in options.items() if not any(value is one or value == one for one in nothing)}
+    # 0 does, though it equals False.
+    return {name: value for name, value in options.items() if value not in (None, {}, []) and value is not False}
 
 
 def read_run(file: Path) -> dict[str, Any]:

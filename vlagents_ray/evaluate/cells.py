@@ -85,7 +85,8 @@ def cells(config: EvalConfig) -> list[Cell]:
     """Every cell that `config` asks for, in the order in which they are played.
 
     Suite by suite and env by env within a checkpoint: replicas that hold few checkpoints load each once.
-    Raises `UnknownEnv` for an env that nobody knows, `ConfigError` for one that stands twice under one name.
+    Raises `UnknownEnv` for an env that nobody knows, `ConfigError` for one that stands twice under one name, or
+    in two suites that do not differ: their episodes would have the same keys.
     """
     envs = [(suite, env) for suite in config.suites for pattern in suite.envs for env in expand(pattern)]
     contenders: list[tuple[PolicyConfig, int | None]] = []
@@ -99,6 +100,12 @@ def cells(config: EvalConfig) -> list[Cell]:
     names = Counter(cell.name for cell in found)
     if twice := sorted({env for (_, _, env), number in names.items() if number > 1}):
         raise ConfigError(f"suites: {twice} stand in two suites of one name; give each a `name` of its own")
+    prints = Counter(cell.fingerprint for cell in found)
+    if twice := sorted({cell.env for cell in found if prints[cell.fingerprint] > 1}):
+        raise ConfigError(
+            f"suites: {twice} stand in two suites with the same settings, so that these are the same episodes; "
+            f"leave them out of one of the two"
+        )
     return found
 
 

@@ -133,7 +133,7 @@ class StopConfig(_Closed):
 class SuiteConfig(_Closed):
     """Environments that are evaluated alike."""
 
-    name: str = ""  # for the record; an env that stands in two suites needs two names
+    name: str = ""  # for the record; an env that stands in two suites needs two names, and other settings
     envs: list[Name] = Field(min_length=1)  # registered names, "maniskill/PushCube-v1", or patterns, "libero/*"
     env_options: dict[str, JsonValue] = {}  # for the constructor
     reset_options: dict[str, JsonValue] = {}  # handed to every `reset` of the env

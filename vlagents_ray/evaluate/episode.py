@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from time import perf_counter
@@ -108,9 +109,14 @@ class Tally:
         info: Mapping[str, Any],
         limit: int,
     ) -> bool:
-        """`action` was executed; is the episode over, be it at the `limit` of steps?"""
+        """`action` was executed; is the episode over, be it at the `limit` of steps?
+
+        `EnvFailed` for a reward that is no number.
+        """
         self.steps += 1
         self.actions.update(action.astype("<f4").tobytes())
+        if not math.isfinite(reward):  # a simulation that blew up; neither the results file nor JSON has a NaN
+            raise EnvFailed(f"env step: got the reward {reward}, want a finite number")
         self.episode_return += float(reward)
         self.success = _success(info)
         if self.success and self.first_success is None:

@@ -40,8 +40,8 @@ def outcome(result: EpisodeResult) -> str:
 
 
 def plain(name: str) -> str:
-    """`name` as a part of a file's name: "maniskill/PushCube-v1" -> "maniskill_PushCube-v1"."""
-    return re.sub(r"[^\w.-]+", "_", name)
+    """`name` as a part of a file's name: "maniskill/PushCube-v1" -> "maniskill_PushCube-v1", "pi0@20" as it is."""
+    return re.sub(r"[^\w.@-]+", "_", name)
 
 
 @contextmanager

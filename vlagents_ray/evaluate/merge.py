@@ -67,10 +67,13 @@ def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False) -> Su
 
 
 def _add_policies(merged: _Merged, folder: Path, db: sqlite3.Connection) -> None:
+    # As in `Store.note_policy`: in a sweep the server's own checkpoint may be any.
+    swept = {name for (name,) in db.execute("SELECT DISTINCT policy FROM cells WHERE step IS NOT NULL")}
     for row in table(db, "policies"):
         known = merged.policies.setdefault(row["name"], row)
         before, now = json.loads(known["metadata"]), json.loads(row["metadata"])
-        if differing := [what for what in IDENTITY if before.get(what) != now.get(what)]:
+        identity = IDENTITY[:1] if row["name"] in swept else IDENTITY
+        if differing := [what for what in identity if before.get(what) != now.get(what)]:
             raise ConfigError(
                 f"{folder}: policy {row['name']!r} has {differing[0]} {now.get(differing[0])!r}, that of the folders "
                 f"before it {before.get(differing[0])!r}; give one of them another name in its evaluation"
@@ -80,7 +83,7 @@ def _add_policies(merged: _Merged, folder: Path, db: sqlite3.Connection) -> None
 def _add_cells(merged: _Merged, folder: Path, db: sqlite3.Connection) -> None:
     names = {_name(row): row for row in merged.cells.values()}
     for row in table(db, "cells"):
-        known = names.setdefault(_name(row), row)
+        known = merged.cells.get(row["cell"]) or names.setdefault(_name(row), row)  # a suite may have a new name
         if known["cell"] != row["cell"]:
             before, now = json.loads(known["settings"]), json.loads(row["settings"])
             odd = [f"{k}: {before.get(k)!r} and {now.get(k)!r}" for k in now if before.get(k) != now.get(k)]

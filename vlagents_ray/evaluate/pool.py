@@ -26,7 +26,7 @@ log = logging.getLogger(__name__)
 
 WATCH_S = 1.0  # between two looks at a busy worker
 GRACE_S = 5.0  # a call past its deadline gets this long to fail by itself
-CLOSE_S = 10.0  # for workers to close their simulators at the end
+CLOSE_S = 10.0  # for workers to close their simulators when they leave
 MOST_FAILED_STARTS = 3  # in a row
 
 # Pinned before any import in the worker: several workers share a machine.
@@ -76,13 +76,13 @@ class WorkerPool:
             "policy act": config.policy_timeout_s,
         }
         self._workers: list[Worker] = []
-        self._leaving: list[Any] = []  # actors on their way out
+        self._leaving: list[tuple[Any, float]] = []  # actors on their way out, and since when
 
     def __enter__(self) -> WorkerPool:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        for actor in [worker.actor for worker in self._workers] + self._leaving:
+        for actor in [worker.actor for worker in self._workers] + [actor for actor, _ in self._leaving]:
             ray.kill(actor)
         self._workers.clear()
         self._leaving.clear()
@@ -118,7 +118,7 @@ class WorkerPool:
         self._workers.remove(idle[0])
         idle[0].actor.close.remote()  # frees its simulator; some need that for a clean exit
         idle[0].actor.__ray_terminate__.remote()
-        self._leaving.append(idle[0].actor)
+        self._leaving.append((idle[0].actor, monotonic()))
         return True
 
     def start(self, cell: Cell) -> None:
@@ -211,6 +211,7 @@ class WorkerPool:
 
     def _look(self) -> Iterator[tuple[Job, Report]]:
         now = monotonic()
+        self._see_off(now)
         for worker in list(self._workers):
             if worker.starting is not None:
                 if now - worker.since > self._config.place_timeout_s:
@@ -224,6 +225,13 @@ class WorkerPool:
                 elif worker.looking is None and now - worker.looked > WATCH_S:
                     worker.looked = now
                     worker.looking = worker.actor.progress.options(concurrency_group="watch").remote()
+
+    def _see_off(self, now: float) -> None:
+        """Kill what does not leave by itself: it holds what the worker in its place waits for."""
+        for actor, since in self._leaving:
+            if now - since > CLOSE_S:
+                ray.kill(actor)
+        self._leaving = [one for one in self._leaving if now - one[1] <= CLOSE_S]
 
     def _overdue(self, worker: Worker, now: float) -> str | None:
         """Why `worker` must be replaced, if it must."""

@@ -68,7 +68,7 @@ def find(results: Results, name: str) -> Recorded:
     if len(found) > 1:
         keys = [f"{one.episode.result.key} ({one.cell.contender})" for one in found]
         raise ConfigError(f"{name!r} stands for {len(found)} episodes; want one of the keys {keys}")
-    if not found[0].episode.counts:
+    if found[0].episode.result.status == "infra_failed":
         raise ConfigError(f"{name!r} was never played to its end: {found[0].episode.result.error}")
     return found[0]
 
@@ -76,9 +76,12 @@ def find(results: Results, name: str) -> Recorded:
 def compare(recorded: Recorded, replayed: Results) -> list[str]:
     """In what the replay differs, a sentence each; nothing if it is the same episode.
 
-    The times that it took are not compared. Actions are, byte for byte.
+    The times that it took are not compared. Actions are, byte for byte. Raises `ConfigError` if infrastructure kept
+    the replay from ending, which says nothing of the episode.
     """
     [[again]] = [cell.episodes for cell in replayed.cells]
+    if again.result.status == "infra_failed":
+        raise ConfigError(f"the replay did not end, so that there is nothing to compare: {again.result.error}")
     before, now = recorded.episode.result.outcome, again.result.outcome
     found = [
         f"{name}: {before[name]!r} was recorded, now it is {now[name]!r}"

@@ -77,7 +77,7 @@ def _gap(summary: Summary, cell: CellResults) -> str | None:
     gap = gap_to_synchronous(summary.results, cell)
     if gap is None:
         return None
-    steps = sum(one.steps for one in cell.counted)
+    steps = max(1, sum(one.steps for one in cell.counted))  # none if the policy broke off each before its first
     waited, held = (sum(getattr(one, what) for one in cell.counted) for what in ("ticks_waited", "ticks_held"))
     return (
         f"{cell.contender} {cell.suite} {cell.env}, in real time: {100 * gap:+.0f} points to the synchronous score; "

@@ -3,6 +3,7 @@ from __future__ import annotations
 import re
 from html.parser import HTMLParser
 from pathlib import Path
+from urllib.parse import unquote
 
 import pytest
 import yaml
@@ -118,7 +119,7 @@ def test_a_policy_that_was_served_is_served_again(tmp_path: Path) -> None:
 def test_videos_are_linked_from_where_the_page_is(results: Results, tmp_path: Path) -> None:
     path = results.out / "pages" / "report.html"
     for video in Read(write_report(results, path)).all("video"):
-        assert (path.parent / str(video["src"])).is_file()
+        assert (path.parent / unquote(str(video["src"]))).is_file()
 
 
 def test_videos_are_in_the_page_up_to_a_budget(results: Results) -> None:

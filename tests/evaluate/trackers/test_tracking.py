@@ -97,6 +97,13 @@ def test_an_unfinished_cell_is_told_by_the_run_that_completes_it_and_no_other_tw
     assert len(ids) == 1
 
 
+def test_a_cell_that_stopped_early_is_complete(config: Config) -> None:
+    settings = config(episodes=40, stop={"target": 0.3}, track=["wandb"])
+    [cell] = play(settings, left_out=range(30, 40)).cells
+    assert cell.stopped_at is not None
+    assert [metrics[min(metrics)] for _, _, metrics in tell(settings)] == [cell.stopped_at] * 2
+
+
 def test_of_the_videos_a_few_are_shown_failures_first(config: Config) -> None:
     settings = config(
         episodes=12, video="all", env_options={"camera": [32, 32]}, track=["wandb"], tracking={"videos": 3}

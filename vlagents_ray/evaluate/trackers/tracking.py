@@ -123,7 +123,7 @@ def _parts(results: Results) -> list[tuple[str, list[CellResults], Group]]:
 
 
 def _complete(cell: CellResults) -> bool:
-    return len(cell.episodes) >= cell.planned
+    return cell.stopped_at is not None or len(cell.episodes) >= cell.planned
 
 
 def _label(group: Group) -> str:
