@@ -17,6 +17,7 @@ from vlagents_ray.evaluate.jobs import EpisodeKey, Job, plan
 from vlagents_ray.evaluate.results import Results
 from vlagents_ray.evaluate.rollout import Failure, Made
 from vlagents_ray.evaluate.store import Store
+from vlagents_ray.evaluate.summary import summarize
 
 
 def planned(config: EvalConfig) -> list[Job]:
@@ -223,3 +224,32 @@ def test_an_episode_of_another_checkpoint_is_not_added(config: Config) -> None:
         with pytest.raises(ConfigError, match=r"played by checkpoint 'runs/2'.* are of 'runs/1'"):
             store.record(replace(done(third), checkpoint="runs/2"), attempts=1)
         assert [one.checkpoint for one in recorded(config())] == ["runs/1", "runs/1"]
+
+
+def test_an_env_that_has_changed_between_runs_is_noticed(config: Config) -> None:
+    place = cells(config())[0].place
+    with Store(config()) as store:
+        store.begin_run(config(), {})
+        store.note_env(place, Made({"simulator": "line", "version": 1}, {}))
+        store.note_env(place, Made({"simulator": "line", "version": 1, "node": "b"}, {}))
+        store.record(done(planned(config())[0].key), attempts=1)
+    with (
+        Store(config(resume=True)) as store,
+        pytest.raises(ConfigError, match=r"has changed since the results in .*: version: 1, now 2; go on with"),
+    ):
+        store.note_env(place, Made({"simulator": "line", "version": 2}, {}))
+
+
+def test_what_is_not_planned_any_more_is_kept_and_not_counted(config: Config) -> None:
+    with Store(config()) as store:
+        store.begin_run(config(), {})
+        for job in planned(config())[::2]:  # those that happened to come back first
+            store.record(done(job.key), attempts=1)
+    with Store(config(episodes=3, resume=True)) as store:
+        store.begin_run(config(episodes=3), {})
+        [cell] = Results.load(config().out).cells
+        assert [(one.result.key.episode, one.counts) for one in cell.episodes] == [(0, True), (2, True), (4, False)]
+        [group] = summarize(Results.load(config().out)).cells
+        assert (group.episodes, group.planned) == (2, 3)
+    with Store(config(resume=True)):
+        assert [one.counts for one in Results.load(config().out).cells[0].episodes] == [True] * 3

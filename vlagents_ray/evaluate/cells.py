@@ -82,9 +82,8 @@ def contender(policy: str, step: int | None) -> str:
 
 
 def cells(config: EvalConfig) -> list[Cell]:
-    """Every cell that `config` asks for, in the order in which they are played.
+    """Every cell that `config` asks for: checkpoint by checkpoint, in each suite by suite and env by env.
 
-    Suite by suite and env by env within a checkpoint: replicas that hold few checkpoints load each once.
     Raises `UnknownEnv` for an env that nobody knows, `ConfigError` for one that stands twice under one name, or
     in two suites that do not differ: their episodes would have the same keys.
     """

@@ -110,6 +110,8 @@ def _progress(cell: Cell, earlier: Sequence[CellResults]) -> tuple[int, int]:
     same = next((one for one in earlier if (one.contender, one.suite, one.env) == cell.name), None)
     if same is None:
         return 0, cell.planned
-    done = {(one.key.episode, one.key.seed) for one in same.counted}
+    done = {
+        (one.result.key.episode, one.result.key.seed) for one in same.episodes if one.result.status != "infra_failed"
+    }
     finished = sum((job.key.episode, job.key.seed) in done for job in plan([cell]))
     return finished, 0 if same.stopped_at is not None else cell.planned - finished

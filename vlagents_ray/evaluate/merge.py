@@ -14,6 +14,8 @@ from typing import Any
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.config import canonical
 from vlagents_ray.evaluate.files import PROVENANCE, link_or_copy, whole
+from vlagents_ray.evaluate.html import FILE as REPORT
+from vlagents_ray.evaluate.html import write_report
 from vlagents_ray.evaluate.results import Results, episode_of, reading, table
 from vlagents_ray.evaluate.schema import FILE, SCHEMA, VERSION
 from vlagents_ray.evaluate.store import IDENTITY
@@ -63,6 +65,7 @@ def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False) -> Su
         _write(merged, part)
     summary = summarize(Results.load(out))
     write_summary(summary)
+    write_report(summary.results, out / REPORT)
     return summary
 
 

@@ -31,11 +31,11 @@ class Episode:
     attempts: int
     run: int
     finished: float  # seconds since 1970
-    beyond: bool = False  # the point at which its cell stopped
+    beyond: bool = False  # the point at which its cell stopped, or what is planned by now
 
     @property
     def counts(self) -> bool:
-        """Is it in the rates? What infrastructure kept from ending is not, nor what came after an early stop."""
+        """Is it in the rates? What infrastructure kept from ending is not, nor what is beyond the plan."""
         return self.result.status != "infra_failed" and not self.beyond
 
 
@@ -177,14 +177,21 @@ def episode_of(row: dict[str, Any]) -> Episode:
 def _cell(row: dict[str, Any], episodes: tuple[Episode, ...], attempts: tuple[Attempt, ...]) -> CellResults:
     seeds, rule = json.loads(row.pop("seeds")), row.pop("stop")
     parsed = {name: json.loads(row[name] or "{}") for name in ("settings", "described", "contract", "code")}
+    each = row["planned"] // len(seeds)
+    episodes = tuple(replace(one, beyond=not _is_planned(one.result.key, seeds, each)) for one in episodes)
     stop, stopped_at = None, None
     if rule is not None:
         stop = StopConfig.model_validate_json(rule)
         stopping = Stopping(stop, seeds, row["planned"])
         stopping.add_all(episode.result for episode in episodes)
         stopped_at = stopping.at
-        episodes = tuple(replace(one, beyond=not stopping.counts(one.result.key)) for one in episodes)
+        episodes = tuple(replace(one, beyond=one.beyond or not stopping.counts(one.result.key)) for one in episodes)
     return CellResults(**row | parsed, episodes=episodes, attempts=attempts, stop=stop, stopped_at=stopped_at)
+
+
+def _is_planned(key: EpisodeKey, seeds: Sequence[int], each: int) -> bool:
+    """Is it still? After a resumption with fewer episodes, counting what happened to be played would be a selection."""
+    return key.episode < each and key.seed - key.episode in seeds
 
 
 def _run(row: dict[str, Any]) -> Run:

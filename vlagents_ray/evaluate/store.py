@@ -42,6 +42,7 @@ class Store:
         self._out.mkdir(parents=True, exist_ok=True)
         self._lock = _lock(self._out)
         self._run = 0
+        self._made: set[str] = set()  # places whose env is known to be that of earlier runs
         try:
             self._db = self._open(config)
         except BaseException:
@@ -119,7 +120,11 @@ class Store:
             self._db.execute("INSERT INTO attempts VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", where + why)
 
     def note_env(self, place: str, made: Made) -> None:
-        """Keep what a worker found out about the env of the cells at `place`."""
+        """Keep what a worker found out about the env of the cells at `place`.
+
+        `ConfigError` if it is not what it was in an earlier run, as after an update of the simulator.
+        """
+        self._require_same_env(place, made)
         code = {} if made.code is None else made.code.to_json()
         found = (json.dumps(made.described, default=str), canonical(made.contract), canonical(code))
         with self._db:
@@ -127,6 +132,27 @@ class Store:
                 "UPDATE cells SET described = ?, contract = ?, code = ? WHERE cell = ?",
                 [(*found, cell.fingerprint) for cell in self.cells if cell.place == place],
             )
+
+    def _require_same_env(self, place: str, made: Made) -> None:
+        if place in self._made:  # by another worker of this run; nodes may differ in what they describe
+            return
+        self._made.add(place)
+        [cell, *_] = [cell for cell in self.cells if cell.place == place]
+        query = "SELECT described, contract FROM cells WHERE cell = ? AND described IS NOT NULL"
+        known = self._db.execute(query, (cell.fingerprint,)).fetchone()
+        if known is None:
+            return
+        now = (json.loads(json.dumps(made.described, default=str)), json.loads(canonical(made.contract)))
+        for what, old, new in zip(
+            ("says of itself", "states in its contract"), map(json.loads, known), now, strict=True
+        ):
+            if odd := [
+                f"{name}: {old.get(name)!r}, now {new.get(name)!r}" for name in new if old.get(name) != new[name]
+            ]:
+                raise ConfigError(
+                    f"env {cell.env}: what it {what} has changed since the results in {self._out}: {'; '.join(odd)}; "
+                    f"go on with what they were made with, or choose another out folder"
+                )
 
     def note_policy(self, name: str, metadata: dict[str, Any]) -> None:
         """Keep what a policy's server says of itself; `ConfigError` if it is not the policy of before."""

@@ -152,15 +152,16 @@ def write_summary(summary: Summary) -> Path:
 def group_of(name: tuple[str, str, str], cells: Sequence[CellResults]) -> Group:
     """What came of these cells together, under the name (contender, suite, env)."""
     finished: list[EpisodeResult] = [result for cell in cells for result in cell.counted]
-    open_cells = [cell for cell in cells if cell.stopped_at is None]
     return Group(
         *name,
-        planned=sum(max(cell.planned, len(cell.episodes)) for cell in cells),
-        stopped=len(cells) - len(open_cells),
+        planned=sum(cell.planned for cell in cells),
+        stopped=sum(cell.stopped_at is not None for cell in cells),
         success_once=rate_of(cells, "success_once"),
         success_at_end=rate_of(cells, "success_at_end"),
         policy_errors=sum(one.status == "policy_error" for one in finished),
-        infra_failures=sum(not episode.counts for cell in open_cells for episode in cell.episodes),
+        infra_failures=sum(
+            one.result.status == "infra_failed" and not one.beyond for cell in cells for one in cell.episodes
+        ),
         retries=sum(attempt.retried for cell in cells for attempt in cell.attempts),
         steps=sum(one.steps for one in finished),
         mean_steps=_mean([one.steps for one in finished]),

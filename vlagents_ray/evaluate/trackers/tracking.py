@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import queue
 import sqlite3
 import threading
 from contextlib import closing
@@ -42,12 +41,13 @@ class Tracking:
         self._config = config
         self._left: list[Tracker] = list(config.track)  # that have not failed
         self._runs: dict[tuple[str, str], TrackerRun] = {}  # by tracker and policy
-        self._looks: queue.SimpleQueue[bool] = queue.SimpleQueue()
+        self._news = threading.Event()
+        self._over = False
         self._thread = threading.Thread(target=self._go, name="vlagents-ray-trackers", daemon=True)
 
     def look(self) -> None:
-        """A cell is complete."""
-        self._looks.put(True)
+        """A cell is complete. Several that are, while trackers are told of others, are one look."""
+        self._news.set()
 
     def __enter__(self) -> Tracking:
         if self._left:
@@ -56,15 +56,19 @@ class Tracking:
 
     def __exit__(self, *exc: object) -> None:
         if self._config.track:
-            self._looks.put(False)
+            self._over = True
+            self._news.set()
             self._thread.join(CLOSE_S)
             if self._thread.is_alive():
                 log.warning("%s: still sending after %g s; given up", ", ".join(self._left), CLOSE_S)
 
     def _go(self) -> None:
-        while self._looks.get():
+        over = False
+        while not over:
+            self._news.wait()
+            self._news.clear()
+            over = self._over  # before looking: what is complete by then is told
             self._tell()
-        self._tell()
         for (name, _), run in self._runs.items():
             try:
                 run.finish()
@@ -123,7 +127,7 @@ def _parts(results: Results) -> list[tuple[str, list[CellResults], Group]]:
 
 
 def _complete(cell: CellResults) -> bool:
-    return cell.stopped_at is not None or len(cell.episodes) >= cell.planned
+    return cell.stopped_at is not None or sum(not one.beyond for one in cell.episodes) >= cell.planned
 
 
 def _label(group: Group) -> str:
