@@ -15,8 +15,8 @@ import pytest
 import ray
 import yaml
 from environment_folders import ended, layered
-from eval_fakes import LINE
-from flat_config import flat_config, wait_for
+from eval_fakes import LINE, wait_for
+from flat_config import flat_config
 
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.client.ways import TransportName
