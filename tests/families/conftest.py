@@ -12,6 +12,7 @@ _NEEDS = {
     "arro": "transformers",
     "diffusion_policy": "diffusers",
     "lerobot": "lerobot",
+    "libero": "libero",
     "octo": "jax",
     "openpi": "jax",
     "openvla": "transformers",

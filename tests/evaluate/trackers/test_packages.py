@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 from eval_fakes import LINE
 from played import play
@@ -42,6 +43,17 @@ def rates(results: Results) -> list[float]:
     return [sum(bool(one.success_once) for one in cell.counted) / 3 for cell in results.cells]
 
 
+@pytest.fixture
+def _no_service_left() -> Iterator[None]:
+    """wandb's own process lives as long as the one that wanted it, which here goes on with other tests."""
+    import wandb
+
+    yield
+    wandb.teardown()
+    assert not [child for child in psutil.Process().children() if "wandb" in child.name()]
+
+
+@pytest.mark.usefixtures("_no_service_left")
 def test_wandb_keeps_curves_videos_config_and_code(
     told: Callable[..., Results], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
