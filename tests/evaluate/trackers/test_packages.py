@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
@@ -46,9 +47,9 @@ def rates(results: Results) -> list[float]:
 @pytest.fixture
 def _no_service_left() -> Iterator[None]:
     """wandb's own process lives as long as the one that wanted it, which here goes on with other tests."""
+    yield
     import wandb
 
-    yield
     wandb.teardown()
     assert not [child for child in psutil.Process().children() if "wandb" in child.name()]
 
@@ -59,7 +60,7 @@ def test_wandb_keeps_curves_videos_config_and_code(
 ) -> None:
     monkeypatch.setenv("WANDB_MODE", "offline")
     results = told("wandb", steps=[10, 20])
-    assert caplog.records == []
+    assert not [one for one in caplog.records if one.levelno >= logging.WARNING]
     read = read_wandb(results.out)
     name = f"{LINE}/success_once"
     points = [(row["training_step"], row[name]) for row in read.rows if name in row]
@@ -131,7 +132,7 @@ def test_trackio_keeps_curves_and_videos(
     from trackio.sqlite_storage import SQLiteStorage
 
     results = told("trackio", steps=[10, 20])
-    assert caplog.records == []
+    assert not [one for one in caplog.records if one.levelno >= logging.WARNING]
     [run] = trackio.Api().runs("tests")
     logs = SQLiteStorage.get_logs("tests", run.name)
     points = [(row["step"], row[f"{LINE}/success_once"]) for row in logs if f"{LINE}/success_once" in row]
@@ -147,7 +148,7 @@ def test_tensorboard_reads_the_curves_and_the_config(
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     results = told("tensorboard", steps=[10, 20])
-    assert caplog.records == []
+    assert not [one for one in caplog.records if one.levelno >= logging.WARNING]
     found = EventAccumulator(str(results.out / "tensorboard" / "policy"))
     found.Reload()
     points = [(one.step, one.value) for one in found.Scalars(f"{LINE}/success_once")]
