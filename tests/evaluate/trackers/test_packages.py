@@ -44,7 +44,7 @@ def rates(results: Results) -> list[float]:
     return [sum(bool(one.success_once) for one in cell.counted) / 3 for cell in results.cells]
 
 
-@pytest.fixture
+@pytest.fixture(scope="module", autouse=True)
 def _no_service_left() -> Iterator[None]:
     """wandb's own process lives as long as the one that wanted it, which here goes on with other tests."""
     yield
@@ -54,7 +54,6 @@ def _no_service_left() -> Iterator[None]:
     assert not [child for child in psutil.Process().children() if "wandb" in child.name()]
 
 
-@pytest.mark.usefixtures("_no_service_left")
 def test_wandb_keeps_curves_videos_config_and_code(
     told: Callable[..., Results], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
