@@ -5,10 +5,9 @@ Images need OpenGL without a display: EGL, which Mesa also provides in software.
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from typing import Any
 
@@ -17,7 +16,7 @@ import numpy as np
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import EvalEnv, one_row
 from vlagents_ray.envs.headless import prepare_rendering
-from vlagents_ray.envs.probe import EGL_CURE, egl_probe
+from vlagents_ray.envs.probe import egl_probe, failing
 from vlagents_ray.envs.protocol import Protocol
 from vlagents_ray.envs.recording import record_size_of
 from vlagents_ray.errors import ConfigError, EnvFailed, NotReset, UnknownEnv
@@ -103,7 +102,7 @@ class MetaWorld(EvalEnv):
         self._record: Any = None  # the renderer of the views for the record
         record = record_size_of(record_size, f"metaworld/{task}")
         tallest, widest = (max(pair) for pair in zip((height, width), record or (0, 0), strict=True))
-        with self._failing("make"):
+        with failing(f"metaworld/{self._task}", "make"):
             self._env = known[task](width=widest, height=tallest)  # the model's frame buffer grows to this size
             have = [self._env.model.camera(i).name for i in range(self._env.model.ncam)]
             # what Meta-World does for its classes with an observable goal, but drawing from our seed
@@ -140,7 +139,7 @@ class MetaWorld(EvalEnv):
             control_hz=1.0 / self._env.dt,
         )
         try:
-            with self._failing("make its renderer"):
+            with failing(f"metaworld/{self._task}", "make its renderer"):
                 self._renderer = require("mujoco").Renderer(self._env.model, height, width)
                 self._record = require("mujoco").Renderer(self._env.model, *record) if record else None
         except EnvFailed:
@@ -159,7 +158,7 @@ class MetaWorld(EvalEnv):
         """Begin the episode of `seed`, taken modulo 2^32, or with `goals_seed` the one of the option `init_state`."""
         env = self._alive()
         goal = self._goal(dict(options or {}))
-        with self._failing("reset"):
+        with failing(f"metaworld/{self._task}", "reset"):
             env.seed(seed % 2**32)
             if goal is not None:
                 env.set_task(goal)
@@ -172,7 +171,7 @@ class MetaWorld(EvalEnv):
         if self._steps is None:
             raise NotReset(f"metaworld/{self._task}: step before reset; call reset(seed=...) first")
         action = one_row(act, self._contract)
-        with self._failing("step"):
+        with failing(f"metaworld/{self._task}", "step"):
             raw, reward, _, _, info = env.step(np.clip(action, -1.0, 1.0))
             self._steps += 1
             success = bool(info["success"])
@@ -249,12 +248,3 @@ class MetaWorld(EvalEnv):
         if self._env is None:
             raise EnvFailed(f"metaworld/{self._task} is closed; make a new one")
         return self._env
-
-    @contextlib.contextmanager
-    def _failing(self, doing: str) -> Iterator[None]:
-        try:
-            yield
-        except Exception as error:
-            about_egl = any(word in str(error) for word in ("EGL", "OpenGL", "GLContext", "mjr_makeContext"))
-            cure = f"; {EGL_CURE}" if about_egl else ""
-            raise EnvFailed(f"metaworld/{self._task} failed to {doing}: {error!r}{cure}") from error

@@ -9,6 +9,7 @@ time-out, and only once: the answers are cached for the life of the process.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import importlib.util
 import json
@@ -17,11 +18,13 @@ import shutil
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import vlagents_ray
+from vlagents_ray.errors import EnvFailed, VLAgentsError
 
 TIMEOUT_S = 60.0  # a software driver compiles its shaders in 3 to 10 s
 
@@ -84,6 +87,19 @@ def egl_probe(timeout_s: float = TIMEOUT_S) -> Probe:
             "egl", ok=False, seconds=0.0, error="mujoco is not installed", cure="pip install 'vlagents-ray[metaworld]'"
         )
     return _run_child("egl", EGL_CURE, timeout_s)
+
+
+@contextlib.contextmanager
+def failing(env: str, doing: str) -> Iterator[None]:
+    """Whatever a simulator that renders through EGL raises becomes `EnvFailed`; this package's own errors pass."""
+    try:
+        yield
+    except VLAgentsError:
+        raise
+    except Exception as error:
+        about_egl = any(word in str(error) for word in ("EGL", "OpenGL", "GLContext", "mjr_makeContext"))
+        cure = f"; {EGL_CURE}" if about_egl else ""
+        raise EnvFailed(f"{env} failed to {doing}: {type(error).__name__}: {error}{cure}") from error
 
 
 def vulkan_cure() -> str:

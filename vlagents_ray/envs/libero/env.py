@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import contextlib
 import importlib.util
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
-from vlagents_ray.contract import Contract, check_action
-from vlagents_ray.envs.base import EvalEnv
+from vlagents_ray.contract import Contract
+from vlagents_ray.envs.base import EvalEnv, one_row
 from vlagents_ray.envs.libero import assets as asset_files
 from vlagents_ray.envs.libero import robot
 from vlagents_ray.envs.libero.protocol import Protocol
 from vlagents_ray.envs.libero.tasks import find_task, read_states, task_names
 from vlagents_ray.envs.libero.world import Seen, World
-from vlagents_ray.envs.probe import EGL_CURE, egl_probe
-from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset, VLAgentsError
+from vlagents_ray.envs.probe import egl_probe, failing
+from vlagents_ray.envs.recording import record_size_of
+from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
 from vlagents_ray.interface import HIGH_RES, Act, Obs
 
 
@@ -47,7 +47,7 @@ class Libero(EvalEnv):
         *,
         width: int = 256,
         height: int = 256,
-        record_size: tuple[int, int] | None = None,
+        record_size: Sequence[int] | None = None,
         max_steps: int | None = None,
         settling_steps: int | None = None,
         simulator_seed: int | None = None,
@@ -77,8 +77,7 @@ class Libero(EvalEnv):
         for name, value in (("width", width), ("height", height), ("max_steps", max_steps)):
             if value is not None and value < 1:
                 raise ConfigError(f"libero/{task}: {name} is {value}, want at least 1")
-        if record_size is not None and (len(record_size) != 2 or min(record_size) < 1):
-            raise ConfigError(f"libero/{task}: record_size is {record_size}, want (height, width), pixels")
+        record = record_size_of(record_size, f"libero/{task}")
         if (settling_steps or 0) < 0:
             raise ConfigError(f"libero/{task}: settling_steps is {settling_steps}, want 0 or more")
         self._task = find_task(task)
@@ -100,9 +99,9 @@ class Libero(EvalEnv):
         self._steps: int | None = None
         self._world: World | None = None
         self._contract = robot.contract(self._protocol)
-        with self._failing("make"):
+        with failing(self._name, "make"):
             self._states = read_states(self._task.states)
-            self._world = World(self._task, self._protocol, self._assets, record_size)
+            self._world = World(self._task, self._protocol, self._assets, record)
         self.init_states = len(self._states)
 
     @property
@@ -116,7 +115,7 @@ class Libero(EvalEnv):
     def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
         """Begin in the initial state `options["init_state"]`, or the one that the seed chooses."""
         world, state = self._alive(), self._initial(seed, options or {})
-        with self._failing("reset"):
+        with failing(self._name, "reset"):
             seen = world.begin(self._states[state])
         self._steps = 0
         return self._observe(seen), {"success": seen.success, "init_state": state}
@@ -125,10 +124,8 @@ class Libero(EvalEnv):
         world = self._alive()
         if self._steps is None:
             raise NotReset(f"{self._name}: step before reset; call reset(seed=...) first")
-        action = check_action(act.action, self._contract)
-        if action.ndim != 1:
-            raise InvalidAction(f"action: got {action.shape}, want (7,); step through a chunk row by row")
-        with self._failing("step"):
+        action = one_row(act, self._contract)
+        with failing(self._name, "step"):
             seen = world.step(robot.to_simulator(action, self._protocol), look=self.looked_at)
         self._steps += 1
         ended = seen.success and self._protocol.stop_at_success
@@ -201,17 +198,6 @@ class Libero(EvalEnv):
         if self._world is None:
             raise EnvFailed(f"{self._name} is closed; make a new one")
         return self._world
-
-    @contextlib.contextmanager
-    def _failing(self, doing: str) -> Iterator[None]:
-        try:
-            yield
-        except VLAgentsError:
-            raise
-        except Exception as error:
-            about_egl = any(word in str(error) for word in ("EGL", "OpenGL", "GLContext", "mjr_makeContext"))
-            cure = f"; {EGL_CURE}" if about_egl else ""
-            raise EnvFailed(f"{self._name} failed to {doing}: {type(error).__name__}: {error}{cure}") from error
 
 
 def _turned(image: np.ndarray) -> np.ndarray:

@@ -10,13 +10,14 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from vlagents_ray.contract import CameraSpec, Contract, check_action
-from vlagents_ray.envs.base import EvalEnv
+from vlagents_ray.contract import CameraSpec, Contract
+from vlagents_ray.envs.base import EvalEnv, one_row
 from vlagents_ray.envs.mapping import plain
 from vlagents_ray.envs.rcs import making
 from vlagents_ray.envs.rcs.arms import Arms
 from vlagents_ray.envs.rcs.tasks import DUOBENCH_TASKS, RCS_TASKS, ControlMode, Task
-from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset, UnknownEnv
+from vlagents_ray.envs.recording import record_size_of
+from vlagents_ray.errors import ConfigError, EnvFailed, NotReset, UnknownEnv
 from vlagents_ray.interface import HIGH_RES, Act, Obs
 from vlagents_ray.registry import require
 
@@ -50,7 +51,7 @@ class Rcs(EvalEnv):
         width: int = 224,
         height: int = 224,
         cameras: Sequence[str] | None = None,
-        record_size: tuple[int, int] | None = None,
+        record_size: Sequence[int] | None = None,
         instruction: str | None = None,
         max_steps: int | None = None,
     ) -> None:
@@ -77,7 +78,7 @@ class Rcs(EvalEnv):
         limit = protocol.max_steps if max_steps is None and protocol is not None else max_steps
         if limit is None:
             raise ConfigError(f"{self._name} has no step limit of its own; set max_steps")
-        sizes = {"width": width, "height": height, "record_size": min(record_size or (1,)), "max_steps": limit}
+        sizes = {"width": width, "height": height, "max_steps": limit}
         for name, value in sizes.items():
             if value < 1:
                 raise ConfigError(f"{self._name}: {name} is {value}, want at least 1")
@@ -85,7 +86,8 @@ class Rcs(EvalEnv):
         self._mode = control_mode or self._task.control_mode
         self._given_instruction = instruction
         self._instruction = ""
-        self._recording = record_size is not None
+        record = record_size_of(record_size, self._name)
+        self._recording = record is not None
         self._steps: int | None = None
         self._env: Any = None
         hz = control_hz or self._task.control_hz
@@ -100,7 +102,7 @@ class Rcs(EvalEnv):
             binary_gripper=binary_gripper,
             size=(height, width),
             cameras=cameras,
-            record_size=record_size,
+            record_size=record,
         )
         with self._failing("make"):
             self._env = maker.create_env(config)
@@ -141,10 +143,7 @@ class Rcs(EvalEnv):
         env = self._alive()
         if self._steps is None:
             raise NotReset(f"{self._name}: step before reset; call reset(seed=...) first")
-        action = check_action(act.action, self._contract)
-        if action.ndim != 1:
-            dim = self._contract.action.dim
-            raise InvalidAction(f"action: got {action.shape}, want ({dim},); step through a chunk row by row")
+        action = one_row(act, self._contract)
         with self._failing("step"):
             raw, reward, terminated, _, info = env.step(self._arms.command(action))
         if "success" not in info:
