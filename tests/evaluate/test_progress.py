@@ -9,9 +9,9 @@ from rich.console import Console
 from vlagents_ray.evaluate import Rate, progress_for
 from vlagents_ray.evaluate.cells import Cell, cells
 from vlagents_ray.evaluate.episode import EpisodeResult, Status
+from vlagents_ray.evaluate.failures import Failure
 from vlagents_ray.evaluate.jobs import EpisodeKey, Job
 from vlagents_ray.evaluate.progress import LineProgress, LiveProgress, Progress
-from vlagents_ray.evaluate.rollout import Failure
 from vlagents_ray.evaluate.stopping import confidence_sequence
 
 RETRY = Failure("worker", "env_failed", "the simulator exploded\nwith a long story")

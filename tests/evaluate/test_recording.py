@@ -89,6 +89,7 @@ def test_nothing_is_encoded_or_collected_unless_it_is_asked_for(
     monkeypatch.setattr(TrajectoryRecorder, "see", fail)
     with Recording(config(video="none", record="none"), 10.0) as recording:
         recording.see(Obs(state={"position": np.zeros(1, np.float32)}))
+        assert not recording.wants_images
 
 
 def test_an_observation_that_lacks_a_part_of_the_state_is_the_simulators_failure() -> None:

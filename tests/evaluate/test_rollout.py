@@ -23,8 +23,9 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, rollout
 from vlagents_ray.evaluate.cells import cells
+from vlagents_ray.evaluate.failures import explain
 from vlagents_ray.evaluate.jobs import EpisodeKey, Job
-from vlagents_ray.evaluate.rollout import Report, Rollout, explain
+from vlagents_ray.evaluate.rollout import Report, Rollout
 from vlagents_ray.interface import Agent
 
 Config = Callable[..., EvalConfig]

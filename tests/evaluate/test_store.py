@@ -13,9 +13,10 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.evaluate.cells import cells
 from vlagents_ray.evaluate.episode import EpisodeResult
+from vlagents_ray.evaluate.failures import Failure
 from vlagents_ray.evaluate.jobs import EpisodeKey, Job, plan
 from vlagents_ray.evaluate.results import Results
-from vlagents_ray.evaluate.rollout import Failure, Made
+from vlagents_ray.evaluate.rollout import Made
 from vlagents_ray.evaluate.store import Store
 from vlagents_ray.evaluate.summary import summarize
 
@@ -102,6 +103,9 @@ def test_results_are_not_touched_without_resume(config: Config) -> None:
 def test_a_folder_that_was_opened_and_not_used_needs_no_resume(config: Config) -> None:
     Store(config()).close()
     Store(config(seed=5)).close()
+    found = Results.load(config().out)
+    assert found.runs == ()
+    assert [cell.cell for cell in found.cells] == [cell.fingerprint for cell in cells(config(seed=5))]
 
 
 def test_a_run_that_a_wrong_setting_ended_before_its_first_episode_leaves_nothing_to_resume(config: Config) -> None:
@@ -149,6 +153,8 @@ def test_more_of_the_same_is_resumed(config: Config, change: dict[str, object]) 
     with Store(config()) as store:
         store.begin_run(config(), {})
     Store(config(resume=True, **change)).close()
+    known = {cell.cell for cell in Results.load(config().out).cells}
+    assert known >= {cell.fingerprint for one in (config(), config(**change)) for cell in cells(one)}
 
 
 def test_two_evaluations_do_not_write_to_one_folder(config: Config) -> None:

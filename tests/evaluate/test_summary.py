@@ -13,11 +13,12 @@ from rich.console import Console
 from vlagents_ray.evaluate import EvalConfig, Summary, print_summary, synchronous_twin
 from vlagents_ray.evaluate.cells import cells
 from vlagents_ray.evaluate.episode import EpisodeResult
+from vlagents_ray.evaluate.failures import Failure
 from vlagents_ray.evaluate.html import write_report
 from vlagents_ray.evaluate.jobs import plan
 from vlagents_ray.evaluate.provenance import versions
 from vlagents_ray.evaluate.results import Results
-from vlagents_ray.evaluate.rollout import Failure, Made
+from vlagents_ray.evaluate.rollout import Made
 from vlagents_ray.evaluate.store import Store
 from vlagents_ray.evaluate.summary import summarize, write_summary
 

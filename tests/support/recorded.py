@@ -12,9 +12,10 @@ from eval_fakes import LINE, OTHER_LINE
 from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.episode import EpisodeResult
+from vlagents_ray.evaluate.failures import Failure
 from vlagents_ray.evaluate.jobs import Job, plan
 from vlagents_ray.evaluate.provenance import versions
-from vlagents_ray.evaluate.rollout import Failure, Made
+from vlagents_ray.evaluate.rollout import Made
 from vlagents_ray.evaluate.store import Store
 from vlagents_ray.evaluate.video import VideoRecorder, save_videos
 from vlagents_ray.interface import Obs

@@ -18,9 +18,10 @@ from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.config import EvalConfig, WorkerConfig
 from vlagents_ray.evaluate.episode import Phase
+from vlagents_ray.evaluate.failures import Failure
 from vlagents_ray.evaluate.jobs import Job
 from vlagents_ray.evaluate.logs import tail_at
-from vlagents_ray.evaluate.rollout import AgentFactory, Failure, Pulse, Report, Rollout
+from vlagents_ray.evaluate.rollout import AgentFactory, Pulse, Report, Rollout
 
 log = logging.getLogger(__name__)
 

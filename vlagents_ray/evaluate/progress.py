@@ -13,8 +13,8 @@ from rich.text import Text
 
 from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.episode import EpisodeResult
+from vlagents_ray.evaluate.failures import Failure
 from vlagents_ray.evaluate.jobs import Job
-from vlagents_ray.evaluate.rollout import Failure
 from vlagents_ray.evaluate.statistics import Rate
 from vlagents_ray.evaluate.stopping import confidence_sequence
 

@@ -16,35 +16,18 @@ import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from time import monotonic, sleep
-from typing import Any, Literal
+from typing import Any
 
 from vlagents_ray.client import RemoteAgent
 from vlagents_ray.code import Code, code_of
 from vlagents_ray.contract import require_match
 from vlagents_ray.envs import EvalEnv, make_env
 from vlagents_ray.envs.batch import BatchEnv, make_batch
-from vlagents_ray.errors import (
-    ConfigError,
-    ContractMismatch,
-    DeadlineExceeded,
-    EnvFailed,
-    InvalidInput,
-    MalformedMessage,
-    MessageTooLarge,
-    MissingCamera,
-    MissingDependency,
-    MissingState,
-    NotReset,
-    PolicyFailed,
-    PolicyUnavailable,
-    UnknownApp,
-    UnknownCheckpoint,
-    UnknownSession,
-    VLAgentsError,
-)
+from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, VLAgentsError
 from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.config import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.episode import EpisodeResult, Phase, run_episode
+from vlagents_ray.evaluate.failures import Failure, explain
 from vlagents_ray.evaluate.jobs import Job
 from vlagents_ray.evaluate.logs import own_logs
 from vlagents_ray.evaluate.recording import Kept, Recording
@@ -57,26 +40,10 @@ from vlagents_ray.wire.plain import plain_values
 log = logging.getLogger(__name__)
 
 AgentFactory = Callable[[PolicyConfig], Agent]
-Cause = Literal["user", "policy", "worker"]
 
 FIRST_WAIT_S = 0.5  # before trying again to reach a policy, doubled each time
 LONGEST_WAIT_S = 10.0
 LONG_S = 1.0  # in one phase, before a look at it asks where
-
-
-@dataclass(frozen=True, slots=True)
-class Failure:
-    """Why an attempt came to nothing, and who can do something about it.
-
-    "user": a mistake in the settings, which stops the evaluation; "policy": the way to the policy;
-    "worker": the simulator or its process, which is then replaced.
-    """
-
-    cause: Cause
-    code: str  # of `vlagents_ray.errors`
-    message: str
-    traceback: str = ""
-    log: str = ""  # the last of what the worker wrote, if it broke
 
 
 @dataclass(frozen=True, slots=True)
@@ -275,35 +242,6 @@ class Rollout:
         if env is not None:
             with env_side("close"):
                 env.close()
-
-
-_USER = (
-    ConfigError,
-    ContractMismatch,
-    MalformedMessage,
-    MessageTooLarge,
-    MissingCamera,
-    MissingDependency,
-    MissingState,
-    PolicyFailed,
-    UnknownApp,
-    UnknownCheckpoint,
-)
-_POLICY = (PolicyUnavailable, DeadlineExceeded, UnknownSession, NotReset)
-_WORKER = (EnvFailed, InvalidInput)  # InvalidInput left here: the env gave an observation nobody can use
-
-
-def explain(error: VLAgentsError) -> Failure:
-    """Who is to blame for `error`. A `PolicyFailed` outside an episode is a policy that cannot start."""
-    cause: Cause
-    if isinstance(error, _USER):
-        cause = "user"
-    elif isinstance(error, _POLICY) or not isinstance(error, _WORKER):
-        cause = "policy"
-    else:
-        cause = "worker"
-    message = f"{error} (worker's Python: {sys.executable})" if isinstance(error, MissingDependency) else str(error)
-    return Failure(cause, error.code, message, "".join(traceback.format_exception(error)))
 
 
 def _code(cell: Cell) -> Code | None:

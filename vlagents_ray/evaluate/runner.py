@@ -19,6 +19,7 @@ from vlagents_ray.client import RemoteAgent
 from vlagents_ray.errors import ConfigError, from_code
 from vlagents_ray.evaluate.config import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.episode import EpisodeResult
+from vlagents_ray.evaluate.failures import Failure
 from vlagents_ray.evaluate.html import FILE as REPORT
 from vlagents_ray.evaluate.html import write_report
 from vlagents_ray.evaluate.jobs import Job, JobQueue, plan
@@ -27,7 +28,7 @@ from vlagents_ray.evaluate.progress import Progress, SilentProgress
 from vlagents_ray.evaluate.provenance import driver_code, policy_code, save_diffs, versions
 from vlagents_ray.evaluate.recording import Kept, save
 from vlagents_ray.evaluate.results import Results, rate_of
-from vlagents_ray.evaluate.rollout import AgentFactory, Failure, Report
+from vlagents_ray.evaluate.rollout import AgentFactory, Report
 from vlagents_ray.evaluate.stopping import Stopping
 from vlagents_ray.evaluate.store import Store
 from vlagents_ray.evaluate.summary import Summary, summarize, write_summary

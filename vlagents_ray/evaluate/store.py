@@ -20,8 +20,9 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.cells import Cell, cells
 from vlagents_ray.evaluate.config import EvalConfig, canonical
 from vlagents_ray.evaluate.episode import EpisodeResult
+from vlagents_ray.evaluate.failures import Failure
 from vlagents_ray.evaluate.jobs import Job
-from vlagents_ray.evaluate.rollout import Failure, Made
+from vlagents_ray.evaluate.rollout import Made
 from vlagents_ray.evaluate.schema import FILE, SCHEMA, VERSION, require_version
 
 LOCK = "results.lock"
