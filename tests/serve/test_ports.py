@@ -11,7 +11,7 @@ import pytest
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve import ports
 from vlagents_ray.serve.haproxy import Front, ingress_environment
-from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK, free_ports, is_free
+from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK, free_port, free_ports, is_free, keep
 
 
 def test_a_port_that_is_taken_on_one_address_is_not_free_everywhere() -> None:
@@ -32,6 +32,16 @@ def test_haproxys_ports_are_different_ones_that_nobody_has(monkeypatch: pytest.M
         taken.listen()
         monkeypatch.setattr(ports, "_PORTS", (first, first + 4))
         assert free_ports(3) == [first + 1, first + 2, first + 3]
+
+
+def test_no_port_is_given_twice_though_nobody_listens_yet(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ports, "_PORTS", (41_000, 41_100))
+    monkeypatch.setattr(ports, "_given", set())
+    keep(*range(41_000, 41_010))
+    given = {free_port() for _ in range(40)}
+    assert len(given) == 40
+    assert min(given) >= 41_010
+    assert len({free_port() for _ in range(40)}) == 40  # most are given: from the start again
 
 
 def test_haproxy_alone_faces_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

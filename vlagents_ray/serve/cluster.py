@@ -21,11 +21,11 @@ from ray.serve.schema import ServeDeploySchema
 
 from vlagents_ray.errors import ConfigError, PolicyUnavailable
 from vlagents_ray.serve.auth import require_access
-from vlagents_ray.serve.config import AccessArgs
+from vlagents_ray.serve.config import AccessArgs, ServerArgs
 from vlagents_ray.serve.files import IMPORT_PATH, with_gateways_at
 from vlagents_ray.serve.haproxy import Front, wait_for_haproxy
 from vlagents_ray.serve.own_ray import own_ray
-from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK, free_port
+from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK, free_port, keep
 from vlagents_ray.serve.tls import Tls
 from vlagents_ray.signals import own_sigterm
 
@@ -70,6 +70,8 @@ def running_server(
         _require_access(config, host, insecure)
     if tls is not None:
         tls.check()
+    for app in _our_apps(config):
+        keep(*(door.port for door in ServerArgs(**app.args).dialects.gateways().values()))
     port = port or free_port(host)
     with contextlib.ExitStack() as stack:
         http = stack.enter_context(_ray(address, host, port, tls, num_cpus, show_logs))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.haproxy import Front, haproxy_binary, ingress_environment
-from vlagents_ray.serve.ports import HOST, LOOPBACK, free_port, is_free
+from vlagents_ray.serve.ports import HOST, LOOPBACK, free_port, is_free, keep
 from vlagents_ray.serve.reaper import MARK, reaped
 from vlagents_ray.serve.tls import Tls
 from vlagents_ray.signals import own_sigterm
@@ -40,13 +40,14 @@ def own_ray(
         )
     if not is_free(host, port):
         raise ConfigError(f"cannot listen on {host}:{port}: it is taken; choose another --port or --host")
+    keep(port)
     with tempfile.TemporaryDirectory(prefix="vlagents-ray-") as name, contextlib.ExitStack() as stack:
         folder = Path(name)
         # Ray starts its workers with a low priority, which would make a policy wait for whatever else runs here.
         environment = {"RAY_worker_niceness": "0"}
         # Where replicas listen for WebSockets. Not for the network where that is to see nothing but TLS.
         ours = {MARK: name, _ALONE: "0", HOST: host if tls is None else LOOPBACK}
-        ours[_METRICS] = str(free_port(LOOPBACK, but={port}))
+        ours[_METRICS] = str(free_port())
         front = None
         if (binary := haproxy_binary()) is not None:
             front = _front(folder, host, port, tls)
@@ -75,7 +76,7 @@ def _front(folder: Path, host: str, port: int, tls: Tls | None) -> Front | None:
     return Front(
         host,
         port,
-        free_port(LOOPBACK, but={port}),
+        free_port(),
         None if tls is None else tls.bundle(folder),
         None if tls is None or tls.client_ca is None else tls.client_ca.absolute(),
     )
