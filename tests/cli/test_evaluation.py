@@ -17,7 +17,7 @@ WORDS = ["eval", "tabletop", "--policy", "http://127.0.0.1:9"]
 
 def test_no_retry_is_a_number_of_retries(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     seen: list[EvalConfig] = []
-    monkeypatch.setattr(evaluation, "run_evaluation", lambda config, _address: seen.append(config))
+    monkeypatch.setattr(evaluation, "run_evaluation", lambda config, _address, **_: seen.append(config))
     done = CliRunner().invoke(app, [*WORDS, "--out", str(tmp_path / "out"), "--retries", "0"])
     assert done.exit_code == 0, done.output
     assert [config.retries for config in seen] == [0]

@@ -13,11 +13,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 import yaml
 
-from vlagents_ray.cli.console import errors, out
-from vlagents_ray.cli.settings import parse_list, parse_settings
+from vlagents_ray.cli.console import errors, fail, out
+from vlagents_ray.cli.settings import parse_list, parse_settings, parse_time
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.checkpoints import STEP, resolved
-from vlagents_ray.serve.cluster import running_server
+from vlagents_ray.serve.cluster import joined, running_server, spread_over_gpus
 from vlagents_ray.serve.files import own_settings, read_deployment, together, with_settings
 
 if TYPE_CHECKING:
@@ -29,6 +29,7 @@ Set = Annotated[list[str], typer.Option("--set", metavar="KEY=VALUE", help="A se
 Address = Annotated[
     str | None, typer.Option(help="A running Ray cluster ('auto' finds it); default: one for the run, on this machine.")
 ]
+UNFINISHED = 75  # exit status: out of time, try again (EX_TEMPFAIL of sysexits.h)
 _FILE = (".yaml", ".yml")
 
 
@@ -79,43 +80,42 @@ def evaluate_command(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Print plan, count and estimated time; play nothing.")
     ] = False,
+    end_at: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TIME",
+            help="Begin no episode that would not end by then: 2027-01-31T18:30, local time, or s since 1970.",
+        ),
+    ] = None,
+    replica_per_gpu: Annotated[
+        bool,
+        typer.Option(
+            "--replica-per-gpu",
+            help="With --address: a policy has a replica on each GPU of the cluster, unless its deployment says more.",
+        ),
+    ] = False,
     address: Address = None,
 ) -> None:
     """Evaluate policies: episodes in parallel, success rates with confidence intervals, videos.
 
     A file holds policies, their checkpoints, suites of environments, seeds; --out, --workers, --video, --record,
     --track, --retries and --resume win over it.
-    """
-    from vlagents_ray.evaluate import EvalConfig
 
+    Exit status: 0 when every episode has its result, 75 when --end-at left some over (--resume goes on), 130 after
+    Ctrl-C or SIGTERM (likewise), 2 for wrong settings, 1 for what else failed.
+    """
     with errors():
-        running = _given(
-            out=out_dir, workers=workers, video=video, record=record, track=parse_list(track), retries=retries,
-            resume=resume,
+        config = configured(
+            what, policy, out_dir, episodes, workers, seed, video, record, track, resume, execute, retries, settings,
+            env_set, reset_set,
         )  # fmt: skip
-        of_policy = _given(
-            source=policy,
-            execute=execute,
-            config=parse_settings(settings, "--set"),
-            options=parse_settings(reset_set, "--reset-set"),
-        )
-        of_suite = _given(episodes=episodes, env_options=parse_settings(env_set, "--env-set"))
-        if seed is not None:
-            of_suite["seeds"] = [seed]
-        if what[0].endswith(_FILE):
-            if beside := [*what[1:], *of_policy, *of_suite]:
-                raise ConfigError(f"{what[0]} says what is evaluated; got {beside} beside it: write that there")
-            fields = read_run(Path(what[0])) | running
-        else:
-            if policy is None or out_dir is None:
-                raise ConfigError("want --policy and --out, or a file of runs (.yaml)")
-            fields = {"policies": [of_policy], "suites": [{"envs": what} | of_suite], **running}
-        config = EvalConfig.model_validate(fields)
         watching = _given(until=until, settle_s=settle, marker=marker)
         if watching and watch is None:
             raise ConfigError(f"got {sorted(watching)} without --watch")
         if dry_run and watch is not None:
             raise ConfigError("--dry-run and --watch exclude each other: nobody knows yet which steps there will be")
+        if end_at is not None and watch is not None:
+            raise ConfigError("--end-at and --watch exclude each other: watching ends with --until, or by Ctrl-C")
         if dry_run:
             from vlagents_ray.cli.forecasting import print_plan
 
@@ -125,7 +125,52 @@ def evaluate_command(
 
             watch_training(config, watch, address, **watching)
         else:
-            run_evaluation(config, address)
+            end = None if end_at is None else parse_time(end_at, "--end-at")
+            run_evaluation(config, address, end_at=end, replica_per_gpu=replica_per_gpu)
+
+
+def configured(
+    what: list[str],
+    policy: str | None,
+    out_dir: Path | None,
+    episodes: int | None,
+    workers: int | None,
+    seed: int | None,
+    video: str | None,
+    record: str | None,
+    track: str,
+    resume: bool,
+    execute: int | None,
+    retries: int | None,
+    settings: list[str],
+    env_set: list[str],
+    reset_set: list[str],
+) -> EvalConfig:
+    """What these options of `eval`, by the names that the command gives them, ask for."""
+    from vlagents_ray.evaluate import EvalConfig
+
+    running = _given(
+        out=out_dir, workers=workers, video=video, record=record, track=parse_list(track), retries=retries,
+        resume=resume,
+    )  # fmt: skip
+    of_policy = _given(
+        source=policy,
+        execute=execute,
+        config=parse_settings(settings, "--set"),
+        options=parse_settings(reset_set, "--reset-set"),
+    )
+    of_suite = _given(episodes=episodes, env_options=parse_settings(env_set, "--env-set"))
+    if seed is not None:
+        of_suite["seeds"] = [seed]
+    if what[0].endswith(_FILE):
+        if beside := [*what[1:], *of_policy, *of_suite]:
+            raise ConfigError(f"{what[0]} says what is evaluated; got {beside} beside it: write that there")
+        fields = read_run(Path(what[0])) | running
+    else:
+        if policy is None or out_dir is None:
+            raise ConfigError("want --policy and --out, or a file of runs (.yaml)")
+        fields = {"policies": [of_policy], "suites": [{"envs": what} | of_suite], **running}
+    return EvalConfig.model_validate(fields)
 
 
 def _given(**options: Any) -> dict[str, Any]:
@@ -147,10 +192,12 @@ def read_run(file: Path) -> dict[str, Any]:
     return {"out": Path("runs") / file.stem} | document
 
 
-def run_evaluation(config: EvalConfig, address: str | None = None) -> None:
-    """Serve the policies that are not at a URL, evaluate them all, print the table."""
-    with served(config, address) as ready:
-        evaluate_and_print(ready)
+def run_evaluation(
+    config: EvalConfig, address: str | None = None, *, end_at: float | None = None, replica_per_gpu: bool = False
+) -> None:
+    """Serve the policies that are not at a URL, evaluate them all, print the table; `end_at` as in `evaluate`."""
+    with served(config, address, replica_per_gpu=replica_per_gpu) as ready:
+        evaluate_and_print(ready, end_at)
 
 
 def evaluated(config: EvalConfig, address: str | None = None, *, only: tuple[int, int] | None = None) -> Summary:
@@ -162,13 +209,16 @@ def evaluated(config: EvalConfig, address: str | None = None, *, only: tuple[int
 
 
 @contextlib.contextmanager
-def served(config: EvalConfig, address: str | None = None) -> Iterator[EvalConfig]:
+def served(config: EvalConfig, address: str | None = None, *, replica_per_gpu: bool = False) -> Iterator[EvalConfig]:
     """`config` with the URLs of its policies, those that are not at one being served for the length of the context."""
     from vlagents_ray.evaluate import check, most_cpus
 
     config, parts = reached(config)
     check(config)  # what is wrong is said before anything starts
     with contextlib.ExitStack() as stack:
+        if parts and replica_per_gpu:
+            stack.enter_context(joined(address))
+            parts = spread_over_gpus(parts, kept=config.workers * config.worker.gpus)
         if parts:
             # Ray's CPUs are bookkeeping here: the number of workers that the user asked for must fit.
             cpus = max(os.cpu_count() or 1, math.ceil(config.workers * most_cpus(config)))
@@ -176,14 +226,16 @@ def served(config: EvalConfig, address: str | None = None) -> Iterator[EvalConfi
         yield config
 
 
-def evaluate_and_print(config: EvalConfig) -> None:
+def evaluate_and_print(config: EvalConfig, end_at: float | None = None) -> None:
     """Evaluate policies that are at their URLs; an interrupted evaluation prints what it has."""
-    from vlagents_ray.evaluate import EvaluationInterrupted, evaluate, print_summary, progress_for
+    from vlagents_ray.evaluate import EvaluationInterrupted, OutOfTime, evaluate, print_summary, progress_for
 
     try:
-        summary = evaluate(config, progress=progress_for(out))
+        summary = evaluate(config, progress=progress_for(out), end_at=end_at)
     except EvaluationInterrupted as interrupted:
         print_summary(out, interrupted.summary)
+        if isinstance(interrupted, OutOfTime):
+            fail(str(interrupted), UNFINISHED)
         raise
     print_summary(out, summary)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Iterable
 from typing import Any
 
@@ -44,3 +45,15 @@ def parse_counts(text: str, option: str) -> list[int]:
     if not counts or counts[0] < 1:
         raise ConfigError(f"{option}: got {text!r}, want numbers from 1 on")
     return counts
+
+
+def parse_time(text: str, option: str) -> float:
+    """A point in time, in seconds since 1970: those, or a date and time of day, local unless it says otherwise."""
+    try:
+        return float(text)
+    except ValueError:
+        pass
+    try:
+        return datetime.datetime.fromisoformat(text).timestamp()
+    except ValueError as error:
+        raise ConfigError(f"{option}: got {text!r}, want seconds since 1970, or as in 2027-01-31T18:30") from error

@@ -9,7 +9,7 @@ from vlagents_ray.evaluate.config import ClockConfig, EvalConfig, PolicyConfig, 
 from vlagents_ray.evaluate.progress import Progress, SilentProgress, progress_for
 from vlagents_ray.evaluate.report import print_summary, results_table
 from vlagents_ray.evaluate.results import Results, synchronous_twin
-from vlagents_ray.evaluate.runner import EvaluationInterrupted, check, evaluate, most_cpus
+from vlagents_ray.evaluate.runner import EvaluationInterrupted, OutOfTime, check, evaluate, most_cpus
 from vlagents_ray.evaluate.statistics import Rate, wilson
 from vlagents_ray.evaluate.stopping import confidence_sequence
 from vlagents_ray.evaluate.summary import Group, Summary
@@ -19,6 +19,7 @@ __all__ = [
     "EvalConfig",
     "EvaluationInterrupted",
     "Group",
+    "OutOfTime",
     "PolicyConfig",
     "Progress",
     "Rate",

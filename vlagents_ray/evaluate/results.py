@@ -63,7 +63,7 @@ class Run:
     run: int
     started: float  # seconds since 1970
     ended: float | None  # None: it was killed
-    state: str  # "complete", "interrupted", "stopped" by an error, or "running"
+    state: str  # "complete", "interrupted", "out of time", "stopped" by an error, or "running"
     config: dict[str, Any]
     versions: dict[str, Any]
 

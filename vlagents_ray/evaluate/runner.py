@@ -18,6 +18,7 @@ import ray
 from vlagents_ray.client import RemoteAgent
 from vlagents_ray.errors import ConfigError, from_code
 from vlagents_ray.evaluate.config import EvalConfig, PolicyConfig
+from vlagents_ray.evaluate.deadline import Deadline
 from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.failures import Failure
 from vlagents_ray.evaluate.html import FILE as REPORT
@@ -42,10 +43,18 @@ POLL_S = 0.25  # how soon a signal is noticed
 class EvaluationInterrupted(KeyboardInterrupt):
     """Ctrl-C or SIGTERM; what was finished is kept, and `resume` goes on from there."""
 
+    why = "interrupted"
+
     def __init__(self, summary: Summary) -> None:
         done, planned = summary.total.episodes, summary.total.planned
-        super().__init__(f"interrupted after {done} of {planned} episodes; go on with --resume --out {summary.out}")
+        super().__init__(f"{self.why} after {done} of {planned} episodes; go on with --resume --out {summary.out}")
         self.summary = summary
+
+
+class OutOfTime(EvaluationInterrupted):
+    """No further episode would have ended by `end_at`; `resume` goes on, as after an interruption."""
+
+    why = "out of time"
 
 
 def evaluate(
@@ -54,10 +63,12 @@ def evaluate(
     agent_factory: Callable[[], Agent] | None = None,
     progress: Progress | None = None,
     only: tuple[int, int] | None = None,
+    end_at: float | None = None,
 ) -> Summary:
     """Play every episode of `config` that has no result yet; the results are in `config.out`.
 
     `only`: of each env the episode with this number and this seed, and no other.
+    `end_at`, in seconds since 1970: begin no episode that would not end by then, as far as those before it tell.
 
     Episodes run in Ray actors: in the cluster that this process is connected to, or else in one
     that `RAY_ADDRESS` names, or in a local one started for the length of the run. Each worker talks to
@@ -65,7 +76,8 @@ def evaluate(
 
     Raises `ConfigError` for settings that cannot be, or that contradict the results in `config.out`;
     `ContractMismatch` if policy and env do not fit; the last infrastructure error after
-    `config.abort_after` lost episodes in a row; `EvaluationInterrupted` on Ctrl-C or SIGTERM.
+    `config.abort_after` lost episodes in a row; `EvaluationInterrupted` on Ctrl-C or SIGTERM, and `OutOfTime`, which
+    is one, when `end_at` left episodes over.
     Whatever it raises, each recorded episode is kept, and summary.json and report.html written.
     """
     factory = _remote_agents(config) if agent_factory is None else functools.partial(_own_agent, agent_factory)
@@ -76,16 +88,16 @@ def evaluate(
         state = "stopped"
         try:
             with tracking:
-                run = _Run(config, store, progress or SilentProgress(), tracking, only)
-                complete = run.play(factory)
-            state = "complete" if complete else "interrupted"
+                run = _Run(config, store, progress or SilentProgress(), tracking, only, end_at)
+                state = run.play(factory)
         finally:
             store.end_run(state)
             summary = summarize(Results.load(config.out))
             write_summary(summary)
             write_report(summary.results, config.out / REPORT)
-    if state == "interrupted":
-        raise EvaluationInterrupted(summary)
+    for stopped in (EvaluationInterrupted, OutOfTime):
+        if state == stopped.why:
+            raise stopped(summary)
     return summary
 
 
@@ -98,7 +110,13 @@ class _Run:
     """The driver's side of one run."""
 
     def __init__(
-        self, config: EvalConfig, store: Store, progress: Progress, tracking: Tracking, only: tuple[int, int] | None
+        self,
+        config: EvalConfig,
+        store: Store,
+        progress: Progress,
+        tracking: Tracking,
+        only: tuple[int, int] | None,
+        end_at: float | None,
     ) -> None:
         self._config = config
         self._store = store
@@ -118,31 +136,45 @@ class _Run:
         pending = [job for job in wanted if str(job.key) not in finished and not self._has_stopped(job)]
         self._queue = JobQueue(pending)
         self._left = Counter(job.key.settings for job in pending)  # by cell
+        played = (one.result.seconds for cell in earlier.values() for one in cell.episodes)
+        self._deadline = Deadline(end_at, played)
 
-    def play(self, factory: AgentFactory) -> bool:
-        """Play all that is queued; False if a signal ended it early."""
+    def play(self, factory: AgentFactory) -> str:
+        """Play all that is queued, until a signal or the deadline ends it early; returns the state of the run."""
         if not len(self._queue):
-            return True
+            return "complete"
         with ray_cluster(self._config), stop_signals() as stop:
             self._progress.begin(self._store.cells, self._recorded, len(self._queue))
             try:
                 with WorkerPool(self._config, factory) as pool:
-                    while (len(self._queue) or pool.busy) and not stop.is_set():
+                    while not stop.is_set() and not self._deadline.is_over and self._has_more(pool):
                         self._turn(pool)
+                    unfinished = len(self._queue) or pool.busy
                     if not stop.is_set():
                         pool.close()
             finally:
                 self._progress.end()
-            return not stop.is_set()
+            if stop.is_set():
+                return EvaluationInterrupted.why
+            return OutOfTime.why if unfinished else "complete"
+
+    def _has_more(self, pool: WorkerPool) -> bool:
+        return pool.busy or (len(self._queue) > 0 and self._deadline.leaves_room)
 
     def _turn(self, pool: WorkerPool) -> None:
+        if self._deadline.leaves_room:
+            self._hand_out(pool)
+        for job, report in pool.wait(POLL_S):
+            self._deadline.end(job)
+            self._handle(job, report)
+
+    def _hand_out(self, pool: WorkerPool) -> None:
         for worker in pool.idle():
             if jobs := self._queue.take(worker.kind, worker.made, pool.working()):
+                self._deadline.begin(jobs)
                 pool.dispatch(worker, jobs)
         while (cell := self._queue.wants(pool.kinds(), pool.unoccupied())) is not None and pool.make_room():
             pool.start(cell)
-        for job, report in pool.wait(POLL_S):
-            self._handle(job, report)
 
     def _handle(self, job: Job, report: Report) -> None:
         if report.policy is not None:

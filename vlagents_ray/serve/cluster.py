@@ -22,14 +22,14 @@ from ray.serve.schema import ServeDeploySchema
 from vlagents_ray.errors import ConfigError, PolicyUnavailable
 from vlagents_ray.serve.auth import require_access
 from vlagents_ray.serve.config import AccessArgs, ServerArgs
-from vlagents_ray.serve.files import IMPORT_PATH, with_gateways_at
+from vlagents_ray.serve.files import IMPORT_PATH, with_gateways_at, with_replicas_on
 from vlagents_ray.serve.haproxy import Front, wait_for_haproxy
 from vlagents_ray.serve.own_ray import own_ray
 from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK, free_port, keep
 from vlagents_ray.serve.tls import Tls
 from vlagents_ray.signals import own_sigterm
 
-__all__ = ["Server", "free_port", "running_server"]
+__all__ = ["Server", "free_port", "joined", "running_server", "spread_over_gpus"]
 
 _SHUTDOWN_S = 30.0
 
@@ -146,12 +146,32 @@ def _ray(
             f"host {host}: with HAProxy Serve would find no replica at a single address; "
             f"use {EVERYWHERE} (or {LOOPBACK}), or leave ray.init() to this function"
         )
-    with contextlib.ExitStack() as stack:
-        if not ray.is_initialized():
-            with own_sigterm():
-                ray.init(address=address, log_to_driver=show_logs, logging_level="WARNING")
-            stack.callback(ray.shutdown)
+    with joined(address, show_logs=show_logs):
         yield {"host": host, "port": port}
+
+
+@contextlib.contextmanager
+def joined(address: str | None, *, show_logs: bool = False) -> Iterator[None]:
+    """Be connected to the Ray cluster at `address`, or to the one that this process is connected to already."""
+    import ray
+
+    if ray.is_initialized():
+        yield
+        return
+    with own_sigterm():
+        ray.init(address=address, log_to_driver=show_logs, logging_level="WARNING")
+    try:
+        yield
+    finally:
+        ray.shutdown()
+
+
+def spread_over_gpus(parts: Mapping[str, ServeDeploySchema], *, kept: float = 0.0) -> dict[str, ServeDeploySchema]:
+    """Deployments that share the GPUs of the cluster that this process is connected to, less those that are `kept`."""
+    import ray
+
+    share = max(0.0, ray.cluster_resources().get("GPU", 0.0) - kept) / len(parts)
+    return {name: with_replicas_on(part, share) for name, part in parts.items()}
 
 
 def _behind(front: Front | None, host: str, port: int, tls: Tls | None) -> dict[str, Any]:

@@ -104,6 +104,20 @@ def with_settings(config: ServeDeploySchema, settings: Mapping[str, Any], *, ste
     return _checked(changed.model_dump(exclude_unset=True), "settings")
 
 
+def with_replicas_on(config: ServeDeploySchema, gpus: float) -> ServeDeploySchema:
+    """The deployment with as many replicas as have room on `gpus`, each on one of its own unless the file says more.
+
+    A policy whose file states a number of replicas, autoscaling, or that it wants no GPU, stays as it is.
+    """
+    changed = config.model_copy(deep=True)
+    for app in _ours(changed):
+        resources = {"num_gpus": 1.0} | app.args.get("resources", {})
+        replicas = int(gpus / resources["num_gpus"]) if resources["num_gpus"] else 0
+        if replicas and app.args.get("replicas") is None and app.args.get("autoscaling") is None:
+            app.args |= {"replicas": replicas, "resources": resources}
+    return changed
+
+
 def listens_at(config: ServeDeploySchema) -> tuple[str, int]:
     """Host and port that the file names, or ours; Serve's own default would listen to everybody."""
     http = config.http_options
