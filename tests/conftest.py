@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from assets import assets
 from browser import CHROMIUM
+from cluster_hosts import no_hosts
 from fail_on_skip import pytest_make_collect_report, pytest_runtest_makereport
 
 from vlagents_ray.envs.headless import prepare_rendering
@@ -35,6 +36,8 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         [simulator] = marker.args
         if assets(simulator) is None:
             pytest.skip(f"no assets of {simulator}: VLAGENTS_RAY_ASSETS names their folder")
+    if item.get_closest_marker("hosts") and (reason := no_hosts()):
+        pytest.skip(reason)
     if item.get_closest_marker("browser") and CHROMIUM is None:
         pytest.skip("no Chromium")
     if item.get_closest_marker("vulkan"):
