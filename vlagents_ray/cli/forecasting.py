@@ -8,7 +8,7 @@ from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
 from vlagents_ray.cli.console import out
-from vlagents_ray.cli.evaluation import reached
+from vlagents_ray.cli.reaching import reached
 from vlagents_ray.evaluate import EvalConfig, Results
 from vlagents_ray.evaluate.cells import cells
 from vlagents_ray.evaluate.forecast import Forecast, forecasts

@@ -21,6 +21,7 @@ from vlagents_ray.cli.merge import merge_command
 from vlagents_ray.cli.replay import replay_command
 from vlagents_ray.cli.report import report_command
 from vlagents_ray.cli.settings import parse_settings
+from vlagents_ray.cli.slurm import slurm
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.serve.cluster import running_server
 from vlagents_ray.serve.files import listens_at, read_deployment, with_dialect
@@ -108,6 +109,7 @@ app.command("report")(report_command)
 app.add_typer(bench, name="bench")
 app.add_typer(env, name="env")
 app.add_typer(keys_app, name="keys")
+app.add_typer(slurm, name="slurm")
 
 
 @app.command()

@@ -7,7 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from vlagents_ray.cli.console import out
-from vlagents_ray.cli.evaluation import deployed, evaluate_and_print, served
+from vlagents_ray.cli.evaluation import evaluate_and_print
+from vlagents_ray.cli.reaching import deployed, served
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.runner import ray_cluster

@@ -1,0 +1,154 @@
+"""`vlagents-ray slurm`: evaluations and policy servers as Slurm jobs."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from vlagents_ray.cli.console import errors, out
+from vlagents_ray.cli.evaluation import configured, evaluate_command
+from vlagents_ray.cli.reaching import reached
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.serve.files import read_deployment
+from vlagents_ray.slurm.options import first_index, split
+from vlagents_ray.slurm.script import Script
+from vlagents_ray.slurm.submission import submit
+
+if TYPE_CHECKING:
+    from vlagents_ray.evaluate import EvalConfig
+
+slurm = typer.Typer(
+    no_args_is_help=True,
+    help="Evaluations and servers as Slurm jobs. Options that are not this command's are sbatch's: --nodes, --time, …",
+)
+_BOTH = {"allow_extra_args": True, "ignore_unknown_options": True}
+_TASK = "%a"  # stands for the number of a task of --array, as in sbatch's file names
+Print = Annotated[bool, typer.Option("--print", help="Print the script; write and submit nothing.")]
+Parsable = Annotated[bool, typer.Option("--parsable", help="Print the job's number and nothing else.")]
+Setup = Annotated[Path | None, typer.Option(help="File of shell lines that the job begins with: module load, export.")]
+
+
+@slurm.command("eval", context_settings=_BOTH)
+def eval_(
+    context: typer.Context,
+    resubmit: Annotated[
+        int, typer.Option(min=0, help="Times that the job, out of time, queues itself again to go on.")
+    ] = 0,
+    closing: Annotated[
+        float, typer.Option(min=0, metavar="S", help="The evaluation ends so long before the job's time does.")
+    ] = 60.0,
+    setup: Setup = None,
+    print_only: Print = False,
+    parsable: Parsable = False,
+) -> None:
+    """Evaluate in a job: what `vlagents-ray eval` takes, and sbatch's options.
+
+    Results that are there already are gone on with, so the same command after `scancel` or a failure finishes the
+    rest. Without --workers there is one for each CPU but one, and a policy has a replica on each GPU.
+    """
+    with errors():
+        words, options = split(context.args, _options(evaluate_command))
+        given = _parsed(evaluate_command, words)
+        _refuse(given, "address", "end_at", "watch", "dry_run")
+        array = options.get("array")
+        if array is not None and _TASK not in str(given["out_dir"]):
+            raise ConfigError(f"--array: its tasks write to one folder; want {_TASK} in it, as in --out runs/x/{_TASK}")
+        index = "0" if array is None else first_index(array)
+        first = _parsed(evaluate_command, [word.replace(_TASK, index) for word in words])
+        config = configured(**{name: first[name] for name in inspect.signature(configured).parameters})
+        _check(config)
+        fill = "workers" not in config.model_fields_set
+        folder = _without_task(given["out_dir"] or config.out) / "slurm"
+        arguments = ["eval", *(["--fill"] if fill else []), f"--closing={closing:g}", "--", *words]
+        _submit(Script("eval", folder, arguments, options, resubmit, setup), print_only, parsable)
+
+
+@slurm.command("serve", context_settings=_BOTH)
+def serve(
+    context: typer.Context,
+    out_dir: Annotated[
+        Path | None,
+        typer.Option("--out", help="Folder of script, logs, and server.json; default: runs/serve/POLICY."),
+    ] = None,
+    setup: Setup = None,
+    print_only: Print = False,
+    parsable: Parsable = False,
+) -> None:
+    """Serve a policy in a job until its time is over: what `vlagents-ray serve` takes, and sbatch's options.
+
+    Once it answers, URL, key and the line for ssh stand in OUT/JOB/server.json and in the job's log.
+    """
+    from vlagents_ray.cli.main import serve as command  # which has this one among its own
+
+    with errors():
+        words, options = split(context.args, _options(command))
+        given = _parsed(command, words)
+        _refuse(given, "address", "host", "tls_cert", "tls_key", "tls_client_ca")
+        if "array" in options:
+            raise ConfigError("--array: a server is one job; submit several")
+        source = given["source"]
+        apps = {app.name: app.route_prefix or "/" for app in read_deployment(source).applications}
+        folder = out_dir or Path("runs") / "serve" / Path(source).stem
+        arguments = ["serve", *(f"--app={name}={route}" for name, route in apps.items())]
+        arguments += [] if given["port"] is None else [f"--port={given['port']}"]
+        arguments += ["--key"] if given["keys"] is None and not given["insecure"] else []
+        _submit(Script("serve", folder, [*arguments, "--", *words], options, setup=setup), print_only, parsable)
+
+
+def _submit(script: Script, print_only: bool, parsable: bool) -> None:
+    if print_only:
+        typer.echo(script.text(), nl=False)
+        return
+    job = submit(script)
+    if parsable:
+        typer.echo(job)
+        return
+    logs = script.folder / job
+    lines = [
+        f"job {job} is queued; its script: {script.file}",
+        f"  state   squeue --jobs={job}",
+        f"  log     {logs}.log, and Ray's of each node in {logs}/",
+        *([f"  way in  {logs}/server.json, once it answers"] if script.name == "serve" else []),
+        f"  end it  scancel {job}",
+    ]
+    out.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+
+
+def _options(command: Callable[..., None]) -> dict[str, bool]:
+    """The options of a command, and whether each takes a value."""
+    found = _click(command)
+    return {name: not param.is_flag for param in found.params if hasattr(param, "is_flag") for name in param.opts}
+
+
+def _parsed(command: Callable[..., None], words: list[str]) -> dict[str, Any]:
+    """What a command would be called with; wrong words are told as it would tell them."""
+    params: dict[str, Any] = _click(command).make_context(command.__name__, list(words)).params
+    return params
+
+
+def _click(command: Callable[..., None]) -> Any:
+    app = typer.Typer(add_completion=False)
+    app.command()(command)
+    return typer.main.get_command(app)
+
+
+def _refuse(given: dict[str, Any], *names: str) -> None:
+    said = [f"--{name.replace('_', '-')}" for name in names if given[name]]
+    if said:
+        raise ConfigError(f"{', '.join(said)}: not for a job, which finds that out for itself; leave it out")
+
+
+def _check(config: EvalConfig) -> None:
+    """Raise here what would end the job as soon as it had begun."""
+    from vlagents_ray.evaluate.cells import cells
+
+    cells(reached(config, ask=False)[0])
+
+
+def _without_task(folder: Path) -> Path:
+    """The folder, or the one above it that all tasks of an array share."""
+    return next(one for one in (folder, *folder.parents) if _TASK not in str(one))

@@ -1,0 +1,98 @@
+"""Says how to get in, once a job's policy server answers.
+
+python -m vlagents_ray.slurm.door FOLDER PORT NAME=ROUTE...
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import sys
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from vlagents_ray.client.credentials import KEY_VARIABLE
+
+FILE = "server.json"
+_LOOK_S = 0.5
+_MOST_S = 3600.0  # that loading its policies may take
+
+_TEXT = """\
+serving {names} in job {job}, until it ends; all of this is in {file}
+where {host} can be reached:   {url}
+from anywhere else, first:     {ssh}
+                               and use http://localhost:{port} in its place
+
+    export {variable}={key}
+
+    from vlagents_ray import Obs, RemoteAgent
+    with RemoteAgent("{url}") as agent:
+        agent.reset(obs, "pick up the cube")   # obs = Obs(cameras=..., state=...)
+        print(agent.act(obs).action)
+"""
+
+
+def main() -> None:
+    """Wait until each application answers; write the file, and print it for the job's log."""
+    folder, port, apps = Path(sys.argv[1]), int(sys.argv[2]), dict(one.split("=", 1) for one in sys.argv[3:])
+    deadline = time.monotonic() + _MOST_S
+    server = os.getppid()
+    while not all(_answers(f"http://127.0.0.1:{port}{route.rstrip('/')}/healthz") for route in apps.values()):
+        if time.monotonic() > deadline or os.getppid() != server:  # it has ended, and says why itself
+            return
+        time.sleep(_LOOK_S)
+    found = way_in(apps, port, os.environ)
+    write(folder / FILE, found)
+    sys.stdout.write(told(found, folder / FILE))
+    sys.stdout.flush()
+
+
+def way_in(apps: Mapping[str, str], port: int, environ: Mapping[str, str]) -> dict[str, Any]:
+    """What a tool has to know. `apps` are the applications and their routes."""
+    host = socket.gethostname()
+    url = f"http://{host}:{port}"
+    login = environ.get("SLURM_SUBMIT_HOST", host)
+    user = environ.get("SLURM_JOB_USER", environ.get("USER", ""))
+    return {
+        "job": int(environ["SLURM_JOB_ID"]),
+        "host": host,
+        "address": environ["VLAGENTS_RAY_HEAD"],
+        "port": port,
+        "url": url,
+        "apps": {name: url + route.rstrip("/") for name, route in apps.items()},
+        "key": environ.get(KEY_VARIABLE) or None,
+        "ssh": f"ssh -N -L {port}:{host}:{port} {user}@{login}",
+    }
+
+
+def told(found: Mapping[str, Any], file: Path) -> str:
+    """The same for people."""
+    url = next(iter(found["apps"].values()))
+    key = found["key"] or "(the key that you were given; none, if the server is --insecure)"
+    names = ", ".join(found["apps"])
+    return _TEXT.format(**{**found, "url": url, "key": key, "names": names, "file": file, "variable": KEY_VARIABLE})
+
+
+def write(file: Path, found: Mapping[str, Any]) -> None:
+    """Whole or not at all, and for its owner alone: it holds a key."""
+    part = file.with_suffix(".part")
+    part.touch(mode=0o600)
+    part.write_text(json.dumps(found, indent=2) + "\n")
+    part.replace(file)
+
+
+def _answers(url: str) -> bool:
+    try:
+        with urllib.request.urlopen(url, timeout=5):  # noqa: S310 - our own door
+            return True
+    except (urllib.error.URLError, OSError):
+        return False
+
+
+if __name__ == "__main__":
+    main()

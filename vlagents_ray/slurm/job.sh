@@ -1,0 +1,39 @@
+# Ray over the allocation, one process a node, as `ray symmetric-run` has it, but with steps of Slurm's, so that nothing
+# of another job's on these nodes is looked at or stopped; and at the first node the command, whose end ends it all.
+set -uo pipefail
+trap : TERM INT  # Slurm tells the command by itself, which then ends in order
+
+if [ -n "$setup" ]; then source "$setup"; fi
+logs=$folder/$SLURM_JOB_ID
+mkdir -p "$logs"
+arguments=("${arguments[@]//%a/${SLURM_ARRAY_TASK_ID:-%a}}")
+
+unset RAY_ADDRESS RAY_AUTH_TOKEN
+export RAY_AUTH_MODE=token RAY_AUTH_TOKEN_PATH=$logs/token PATH=$(dirname "$python"):$PATH
+(umask 077 && od -An -N32 -tx1 /dev/urandom | tr -d ' \n' >"$RAY_AUTH_TOKEN_PATH")  # the user's alone
+VLAGENTS_RAY_HEAD=$("$python" -m vlagents_ray.slurm.allocation) || exit 1
+export VLAGENTS_RAY_HEAD
+
+srun --nodes="$SLURM_JOB_NUM_NODES" --ntasks="$SLURM_JOB_NUM_NODES" --ntasks-per-node=1 --overlap --export=ALL \
+  --cpu-bind=none --kill-on-bad-exit=0 --wait=0 --open-mode=append --output="$logs/ray-%N.log" \
+  "$python" -m vlagents_ray.slurm.node &
+ray=$!
+"$python" -m vlagents_ray.slurm.head "${arguments[@]}" &
+command=$!
+
+wait -n "$ray" "$command"
+if ! kill -0 "$ray" 2>/dev/null && kill -TERM "$command" 2>/dev/null; then
+  echo "Ray ended before the command; why is in $logs/ray-*.log" >&2
+fi
+wait "$command"
+status=$?
+kill "$ray" 2>/dev/null
+wait "$ray"
+rm -f "$RAY_AUTH_TOKEN_PATH"
+
+# Out of time: the same job once more, with the same number, so that jobs that depend on it go on waiting.
+if [ "$status" = "$unfinished" ] && [ "$(cat "$logs/requeued" 2>/dev/null | wc -l)" -lt "$resubmit" ]; then
+  date >>"$logs/requeued"
+  scontrol requeue "$SLURM_JOB_ID" && exit 0
+fi
+exit "$status"
