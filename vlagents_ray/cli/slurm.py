@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -52,17 +53,12 @@ def eval_(
     """
     with errors():
         words, options = split(context.args, _options(evaluate_command))
-        given = _parsed(evaluate_command, words)
-        _refuse(given, "address", "end_at", "watch", "dry_run")
-        array = options.get("array")
-        if array is not None and _TASK not in str(given["out_dir"]):
+        index = first_index(options.get("array") or "0")
+        config, other = (_evaluation([word.replace(_TASK, one) for word in words]) for one in (index, f"{index}0"))
+        if "array" in options and config.out == other.out:
             raise ConfigError(f"--array: its tasks write to one folder; want {_TASK} in it, as in --out runs/x/{_TASK}")
-        index = "0" if array is None else first_index(array)
-        first = _parsed(evaluate_command, [word.replace(_TASK, index) for word in words])
-        config = configured(**{name: first[name] for name in inspect.signature(configured).parameters})
-        _check(config)
         fill = "workers" not in config.model_fields_set
-        folder = _without_task(given["out_dir"] or config.out) / "slurm"
+        folder = Path(os.path.commonpath([config.out, other.out])) / "slurm"  # of an array: above those of its tasks
         arguments = ["eval", *(["--fill"] if fill else []), f"--closing={closing:g}", "--", *words]
         _submit(Script("eval", folder, arguments, options, resubmit, setup), print_only, parsable)
 
@@ -142,13 +138,12 @@ def _refuse(given: dict[str, Any], *names: str) -> None:
         raise ConfigError(f"{', '.join(said)}: not for a job, which finds that out for itself; leave it out")
 
 
-def _check(config: EvalConfig) -> None:
-    """Raise here what would end the job as soon as it had begun."""
+def _evaluation(words: list[str]) -> EvalConfig:
+    """What `eval` would make of the words; raises here what would end the job as soon as it had begun."""
     from vlagents_ray.evaluate.cells import cells
 
+    given = _parsed(evaluate_command, words)
+    _refuse(given, "address", "end_at", "watch", "dry_run")
+    config = configured(**{name: given[name] for name in inspect.signature(configured).parameters})
     cells(reached(config, ask=False)[0])
-
-
-def _without_task(folder: Path) -> Path:
-    """The folder, or the one above it that all tasks of an array share."""
-    return next(one for one in (folder, *folder.parents) if _TASK not in str(one))
+    return config

@@ -9,7 +9,6 @@ import os
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 HEAD = "VLAGENTS_RAY_HEAD"  # address of the first node, which the job's script exports
 _FIRST_PORT, _PORTS, _JOBS = 10_000, 4, 2_500  # below those that the package and the system give to others
@@ -58,13 +57,11 @@ class Allocation:
         first = _FIRST_PORT + self.job % _JOBS * _PORTS
         return Ports(*range(first, first + _PORTS))
 
-    @property
-    def folder(self) -> Path:
-        """Of Ray's sockets, logs and spilled objects on this node; short, as the names of sockets are limited."""
-        return Path(f"/tmp/vlagents-ray-{self.job}-{self.node}")  # noqa: S108 - made for this user alone, by `node`
+    def ray_start(self, head: str, folder: str) -> list[str]:
+        """What starts Ray on this node, with what Slurm gave and no more.
 
-    def ray_start(self, head: str) -> list[str]:
-        """What starts Ray on this node, with what Slurm gave and no more; `head` is the first node's address."""
+        `head` is the first node's address; `folder`, on this node, is for Ray's sockets, logs and spilled objects.
+        """
         ports = self.ports
         if self.node == 0:
             where = ["--head", f"--node-ip-address={head}", f"--port={ports.gcs}", "--include-dashboard=false"]
@@ -77,7 +74,7 @@ class Allocation:
             given += [f"--object-store-memory={objects}", f"--memory={self.memory - objects}"]
         # Whatever else listens takes a port that is free. (Ray's defaults are the same numbers for every Ray.)
         free = ["--min-worker-port=0", "--max-worker-port=0", "--dashboard-agent-listen-port=0"]
-        return ["ray", "start", *where, *given, *free, f"--temp-dir={self.folder}", "--block", "--disable-usage-stats"]
+        return ["ray", "start", *where, *given, *free, f"--temp-dir={folder}", "--block", "--disable-usage-stats"]
 
 
 def _gpus(environ: Mapping[str, str]) -> int:

@@ -15,7 +15,7 @@ VLAGENTS_RAY_HEAD=$("$python" -m vlagents_ray.slurm.allocation) || exit 1
 export VLAGENTS_RAY_HEAD
 
 srun --nodes="$SLURM_JOB_NUM_NODES" --ntasks="$SLURM_JOB_NUM_NODES" --ntasks-per-node=1 --overlap --export=ALL \
-  --cpu-bind=none --kill-on-bad-exit=0 --wait=0 --open-mode=append --output="$logs/ray-%N.log" \
+  --cpu-bind=none --kill-on-bad-exit=1 --wait=0 --open-mode=append --output="$logs/ray-%N.log" \
   "$python" -m vlagents_ray.slurm.node &
 ray=$!
 "$python" -m vlagents_ray.slurm.head "${arguments[@]}" &

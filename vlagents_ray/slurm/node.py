@@ -3,37 +3,37 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from types import FrameType
 
 from vlagents_ray.slurm.allocation import HEAD, Allocation
 
+_SHORT = "/tmp"  # noqa: S108 - the names of Ray's sockets are limited to 107 bytes
 _HEAD_S = 120.0  # that the head may take to listen
 
 
 def main() -> int:
-    """Run it, and clean up behind it; returns its exit status."""
+    """Run it, and clean up behind it; returns its exit status at the head, whose end is the end of the step."""
     allocation = Allocation.here()
     head = os.environ[HEAD]
     if allocation.node:
         wait_for_head(head, allocation.ports.gcs)
-    allocation.folder.mkdir(mode=0o700)  # fails if it is there: nobody else's is used
     environment = os.environ | {"AUTOSCALER_METRIC_PORT": str(allocation.ports.metrics)}
-    try:
-        ray = subprocess.Popen(allocation.ray_start(head), env=environment)  # noqa: S603 - made there
+    with tempfile.TemporaryDirectory(prefix=f"vlr-{allocation.job}-", dir=_SHORT, ignore_cleanup_errors=True) as folder:
+        ray = subprocess.Popen(allocation.ray_start(head, folder), env=environment)  # noqa: S603 - made there
 
         def end(_number: int, _frame: FrameType | None) -> None:
             ray.terminate()
 
         signal.signal(signal.SIGTERM, end)
-        return ray.wait()
-    finally:
-        shutil.rmtree(allocation.folder, ignore_errors=True)
+        status = ray.wait()
+    sys.stdout.write(f"Ray ended with {status}\n")
+    return 0 if allocation.node else status  # without another node the job goes on with those that are left
 
 
 def wait_for_head(host: str, port: int, timeout_s: float = _HEAD_S) -> None:

@@ -1,0 +1,74 @@
+"""The call of a training script."""
+
+from __future__ import annotations
+
+import json
+import logging
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from vlagents_ray.slurm import submit_evaluation
+from vlagents_ray.slurm.hook import HookFailed
+
+WORDS = ["env/*", "--policy", "p", "--set", "checkpoint={checkpoint}", "--out", "runs/{step}"]
+PYTHON = """#!/bin/bash
+printf '%s\\n' "${{@:3}}" >>"{folder}/words"
+[ -e "{folder}/broken" ] && {{ echo 'no partition' >&2; exit 2; }}
+echo 77
+"""
+
+
+@pytest.fixture
+def python(tmp_path: Path) -> Path:
+    """In place of the one that has the command; notes what it was called with."""
+    file = tmp_path / "python"
+    file.write_text(PYTHON.format(folder=tmp_path))
+    file.chmod(0o755)
+    return file
+
+
+def calls(folder: Path) -> int:
+    return (folder / "words").read_text().split().count("--parsable")
+
+
+def test_a_checkpoint_is_submitted_once_with_its_path_and_step(tmp_path: Path, python: Path) -> None:
+    def call(_number: int) -> str | None:
+        return submit_evaluation(WORDS, checkpoint="/c/20", step=20, record=tmp_path / "record", python=python)
+
+    with ThreadPoolExecutor(8) as ranks:
+        found = list(ranks.map(call, range(8)))
+    assert sorted(found, key=str) == ["77", *[None] * 7]
+    assert calls(tmp_path) == 1
+    assert "checkpoint=/c/20\n--out\nruns/20\n" in (tmp_path / "words").read_text()
+    [mark] = (tmp_path / "record").iterdir()
+    assert json.loads(mark.read_text())["job"] == "77"
+    assert submit_evaluation(WORDS, checkpoint="/c/30", step=30, record=tmp_path / "record", python=python) == "77"
+    assert calls(tmp_path) == 2
+
+
+def test_a_failure_is_logged_training_goes_on_and_a_later_call_tries_again(
+    tmp_path: Path, python: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / "broken").touch()
+    with caplog.at_level(logging.ERROR):
+        assert submit_evaluation(WORDS, checkpoint="/c", step=5, record=tmp_path / "record", python=python) is None
+    assert "no partition" in caplog.text
+    with pytest.raises(HookFailed, match=r"step 5.*no partition"):
+        submit_evaluation(WORDS, checkpoint="/c", step=5, record=tmp_path / "record", python=python, raise_errors=True)
+    (tmp_path / "broken").unlink()
+    assert submit_evaluation(WORDS, checkpoint="/c", step=5, record=tmp_path / "record", python=python) == "77"
+
+
+def test_a_python_that_is_not_there_does_not_stop_training(tmp_path: Path) -> None:
+    gone = tmp_path / "gone"
+    assert submit_evaluation(WORDS, checkpoint="/c", step=5, record=tmp_path / "record", python=gone) is None
+
+
+def test_the_hook_needs_the_light_install_only() -> None:
+    code = "import sys, vlagents_ray.slurm; print({'ray', 'torch', 'pydantic', 'typer', 'yaml'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout.strip() == "set()"

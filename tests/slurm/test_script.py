@@ -1,0 +1,85 @@
+"""The script that sbatch gets."""
+
+from __future__ import annotations
+
+import os
+import stat
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.slurm.script import BODY, Script
+from vlagents_ray.slurm.submission import SubmissionFailed, outside_of_jobs, submit
+
+SBATCH = """#!/bin/bash
+printf '%s\\n' "$@" >"{folder}/words"
+env >"{folder}/environment"
+{end}
+"""
+
+
+def script(folder: Path, **more: object) -> Script:
+    return Script("eval", folder, ["eval", "--", "env/*", "--set", "a b=$HOME"], {"nodes": "4"}, **more)  # type: ignore[arg-type]
+
+
+def fake_sbatch(folder: Path, end: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = folder / "bin" / "sbatch"
+    file.parent.mkdir()
+    file.write_text(SBATCH.format(folder=folder, end=end))
+    file.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{file.parent}{os.pathsep}{os.environ['PATH']}")
+
+
+def test_the_script_is_one_that_bash_reads(tmp_path: Path) -> None:
+    text = script(tmp_path, setup=tmp_path / "it's here").text()
+    subprocess.run(["bash", "-n"], input=text, text=True, check=True)
+    shown = subprocess.run(
+        ["bash", "-c", text.removesuffix(BODY.read_text()) + 'printf "%s\\n" "${arguments[@]}" "$setup"'],
+        check=True, capture_output=True, text=True,
+    ).stdout.splitlines()  # fmt: skip
+    assert shown == ["eval", "--", "env/*", "--set", "a b=$HOME", str(tmp_path / "it's here")]
+
+
+def test_the_users_options_win_over_the_usual_ones(tmp_path: Path) -> None:
+    options = {"nodes": "4", "output": "mine/%j", "no-requeue": None, "comment": "two words"}
+    lines = Script("eval", tmp_path, [], options).text().splitlines()
+    found = [line.removeprefix("#SBATCH ") for line in lines if line.startswith("#SBATCH")]
+    assert {"--nodes=4", "--output=mine/%j", "--no-requeue", '--comment="two words"'} <= set(found)
+    assert "--requeue" not in found
+    assert len({line.partition("=")[0] for line in found}) == len(found)
+
+
+def test_a_job_that_is_submitted_from_within_a_job_does_not_inherit_its_options(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fake_sbatch(tmp_path, "echo '812;there'", monkeypatch)
+    for name, value in {"SLURM_NTASKS": "8", "SLURM_CONF": "/x", "SBATCH_ACCOUNT": "mine"}.items():
+        monkeypatch.setenv(name, value)
+    assert submit(script(tmp_path / "s")) == "812"
+    seen = (tmp_path / "environment").read_text()
+    assert "SLURM_NTASKS" not in seen
+    assert "SLURM_CONF=/x\n" in seen
+    assert "SBATCH_ACCOUNT=mine\n" in seen
+    assert (tmp_path / "words").read_text().split() == ["--parsable", str(tmp_path / "s" / "eval.sh")]
+    assert stat.S_IMODE((tmp_path / "s" / "eval.sh").stat().st_mode) == 0o700
+
+
+def test_what_sbatch_says_is_handed_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fake_sbatch(tmp_path, "echo 'invalid partition' >&2; exit 1", monkeypatch)
+    with pytest.raises(SubmissionFailed, match="invalid partition"):
+        submit(script(tmp_path / "s"))
+
+
+def test_without_slurm_the_script_is_there_to_be_taken_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(ConfigError, match=r"no sbatch here.*eval\.sh"):
+        submit(script(tmp_path / "s"))
+    assert (tmp_path / "s" / "eval.sh").is_file()
+
+
+def test_only_slurms_own_variables_are_left_out() -> None:
+    assert outside_of_jobs({"SLURM_JOB_ID": "1", "SLURM_CONF": "c", "HOME": "h"}) == {"SLURM_CONF": "c", "HOME": "h"}

@@ -1,0 +1,146 @@
+"""A Slurm of a test's own: its controller on one host, slurmd on others, with their own key and files."""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from vlagents_ray.bench.hosts import Host, HostFailed, hosts
+
+_TOOLS = ("munged", "slurmctld", "slurmd", "sbatch", "srun", "scontrol", "squeue", "scancel")
+_READY_S = 60.0
+_ROOT = Path(__file__).parents[2]
+_PATH = f"{_ROOT}:{_ROOT / 'tests' / 'support'}"  # of jobs
+ENDED = {"CANCELLED", "COMPLETED", "FAILED", "NODE_FAIL", "OUT_OF_MEMORY", "TIMEOUT"}
+_CONFIGURATION = """
+ClusterName=test
+SlurmctldHost={head.name}({head.address})
+SlurmUser=root
+SlurmdUser=root
+AuthType=auth/munge
+AuthInfo=socket={folder}/munge.socket,cred_expire=2
+ProctrackType=proctrack/linuxproc
+TaskPlugin=task/none
+SelectType=select/cons_tres
+SelectTypeParameters=CR_CPU
+MpiDefault=none
+ReturnToService=2
+KillWait=20
+CompleteWait=0
+SchedulerParameters=batch_sched_delay=0,sched_interval=2
+AccountingStorageType=accounting_storage/none
+StateSaveLocation={folder}/state
+SlurmdSpoolDir={folder}/spool-%n
+SlurmctldPidFile={folder}/slurmctld.pid
+SlurmdPidFile={folder}/slurmd-%n.pid
+SlurmctldLogFile={folder}/slurmctld.log
+SlurmdLogFile={folder}/slurmd-%n.log
+{nodes}
+PartitionName=all Nodes=ALL Default=YES MaxTime=60 DefaultTime=10
+"""
+
+
+def no_slurm() -> str | None:
+    """Why tests cannot have a Slurm here; None if they can."""
+    missing = [tool for tool in _TOOLS if shutil.which(tool) is None]
+    return f"{', '.join(missing)} not found; install slurm-wlm and munge" if missing else None
+
+
+@dataclass(frozen=True, slots=True)
+class Slurm:
+    """One that runs. Jobs are submitted at `login`, which is no node."""
+
+    login: Host
+    nodes: list[Host]
+
+    def vlagents_ray(self, *words: str) -> str:
+        """What `vlagents-ray` prints where jobs are submitted."""
+        return self.login.run([sys.executable, "-c", "from vlagents_ray.cli import main; main()", *words])
+
+    def do(self, *command: str) -> str:
+        """What one of Slurm's own commands prints there."""
+        return self.login.run(command)
+
+    def state(self, job: str) -> str:
+        """PENDING, RUNNING, COMPLETED, …"""
+        return self.do("squeue", "--noheader", "--format=%T", "--states=all", f"--jobs={job}").strip()
+
+    def wait_for_end(self, job: str, timeout_s: float = 150.0) -> str:
+        """Until the job is over; its last state."""
+        self.wait_for(job, lambda: self.state(job) in ENDED, timeout_s)
+        return self.state(job)
+
+    def wait_for(self, job: str, true: Callable[[], bool], timeout_s: float = 120.0) -> None:
+        """Poll until `true()`; says what the job's logs hold if it never is."""
+        deadline = time.monotonic() + timeout_s
+        while not true():
+            if time.monotonic() > deadline:
+                raise AssertionError(f"job {job} is {self.state(job)}:\n{self.do('scontrol', 'show', 'job', job)}")
+            time.sleep(0.2)
+
+
+@contextlib.contextmanager
+def running_slurm(nodes: int, cpus: int) -> Iterator[Slurm]:
+    """A cluster of so many nodes with so many CPUs each, which are bookkeeping; all of it ends with the context."""
+    folder = Path(tempfile.mkdtemp(prefix="slurm-"))
+    try:
+        with hosts(nodes + 1) as [login, *others]:
+            (folder / "munge.key").write_bytes(secrets.token_bytes(128))
+            (folder / "munge.key").chmod(0o600)
+            lines = [f"NodeName={one.name} NodeAddr={one.address} CPUs={cpus} State=UNKNOWN" for one in others]
+            configuration = folder / "slurm.conf"
+            configuration.write_text(_CONFIGURATION.format(head=login, folder=folder, nodes="\n".join(lines)))
+            for one in (login, *others):
+                one.environment |= {"SLURM_CONF": str(configuration), "PYTHONPATH": _PATH}
+                (folder / f"spool-{one.name}").mkdir()
+            slurm = Slurm(login, others)
+            (folder / "state").mkdir()
+            with _daemons(slurm, folder):
+                yield slurm
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _daemons(slurm: Slurm, folder: Path) -> Iterator[None]:
+    files = [f"--{name}-file={folder}/munge.{name}" for name in ("key", "log", "pid", "seed")]
+    munged = ["munged", "--foreground", "--force", f"--socket={folder}/munge.socket", *files]
+    with contextlib.ExitStack() as stack:
+
+        def start(host: Host, command: Sequence[str]) -> None:
+            quiet = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+            process = host.start(command, **quiet)
+            stack.callback(process.wait, 20)
+            stack.callback(process.terminate)
+
+        start(slurm.login, munged)
+        _until((folder / "munge.socket").exists, folder)
+        start(slurm.login, ["slurmctld", "-D"])
+        for node in slurm.nodes:
+            start(node, ["slurmd", "-D", "-N", node.name])
+        _until(lambda: _idle(slurm) == len(slurm.nodes), folder)
+        yield
+
+
+def _idle(slurm: Slurm) -> int:
+    try:
+        return slurm.do("sinfo", "--noheader", "--Node", "--format=%t").split().count("idle")
+    except HostFailed:  # slurmctld does not answer yet
+        return 0
+
+
+def _until(true: Callable[[], bool], folder: Path) -> None:
+    deadline = time.monotonic() + _READY_S
+    while not true():
+        if time.monotonic() > deadline:
+            logs = "\n".join(f"{log.name}:\n{log.read_text()[-3000:]}" for log in folder.glob("*.log"))
+            raise AssertionError(f"Slurm does not start:\n{logs}")
+        time.sleep(0.1)
