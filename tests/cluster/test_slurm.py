@@ -103,6 +103,8 @@ def test_a_server_in_a_job_says_how_to_get_in_and_lets_nobody_else_in(slurm: Slu
     assert said == ["[0.0, 0.0, 0.0]", "refused"]
     server = json.loads(file.read_text())
     assert (server["job"], server["host"]) == (int(job), slurm.nodes[0].name)
-    assert server["url"] in (tmp_path / f"{job}.log").read_text()
+    log = tmp_path / f"{job}.log"
+    slurm.wait_for(job, lambda: server["key"] in log.read_text())
+    assert log.stat().st_mode & 0o777 == 0o600
     slurm.do("scancel", job)
     assert slurm.wait_for_end(job) == "CANCELLED"

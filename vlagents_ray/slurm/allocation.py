@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 HEAD = "VLAGENTS_RAY_HEAD"  # address of the first node, which the job's script exports
 _FIRST_PORT, _PORTS, _JOBS = 10_000, 4, 2_500  # below those that the package and the system give to others
+_REST = ("--block", "--disable-usage-stats", "--log-color=false")
 _OBJECTS = (
     0.25  # of the memory: Ray's object store, of which /dev/shm is part; Ray's own default is 0.3 of the machine's
 )
@@ -74,7 +75,7 @@ class Allocation:
             given += [f"--object-store-memory={objects}", f"--memory={self.memory - objects}"]
         # Whatever else listens takes a port that is free. (Ray's defaults are the same numbers for every Ray.)
         free = ["--min-worker-port=0", "--max-worker-port=0", "--dashboard-agent-listen-port=0"]
-        return ["ray", "start", *where, *given, *free, f"--temp-dir={folder}", "--block", "--disable-usage-stats"]
+        return ["ray", "start", *where, *given, *free, f"--temp-dir={folder}", *_REST]
 
 
 def _gpus(environ: Mapping[str, str]) -> int:

@@ -14,6 +14,7 @@ from types import FrameType
 from vlagents_ray.slurm.allocation import HEAD, Allocation
 
 _SHORT = "/tmp"  # noqa: S108 - the names of Ray's sockets are limited to 107 bytes
+_LEAVE = {"RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S": "5"}  # for the command to end first, when both get SIGTERM; Ray: 30
 _HEAD_S = 120.0  # that the head may take to listen
 
 
@@ -23,7 +24,7 @@ def main() -> int:
     head = os.environ[HEAD]
     if allocation.node:
         wait_for_head(head, allocation.ports.gcs)
-    environment = os.environ | {"AUTOSCALER_METRIC_PORT": str(allocation.ports.metrics)}
+    environment = os.environ | {"AUTOSCALER_METRIC_PORT": str(allocation.ports.metrics), **_LEAVE}
     with tempfile.TemporaryDirectory(prefix=f"vlr-{allocation.job}-", dir=_SHORT, ignore_cleanup_errors=True) as folder:
         ray = subprocess.Popen(allocation.ray_start(head, folder), env=environment)  # noqa: S603 - made there
 
