@@ -106,6 +106,8 @@ def evaluate_command(
             raise ConfigError("--dry-run and --watch exclude each other: nobody knows yet which steps there will be")
         if end_at is not None and watch is not None:
             raise ConfigError("--end-at and --watch exclude each other: watching ends with --until, or by Ctrl-C")
+        if replica_per_gpu and address is None:
+            raise ConfigError("--replica-per-gpu: want --address, a cluster whose GPUs can be counted")
         if dry_run:
             from vlagents_ray.cli.forecasting import print_plan
 

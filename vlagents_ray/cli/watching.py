@@ -11,7 +11,7 @@ from vlagents_ray.cli.evaluation import evaluate_and_print
 from vlagents_ray.cli.reaching import deployed, served
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig
-from vlagents_ray.evaluate.runner import ray_cluster
+from vlagents_ray.evaluate.cluster import ray_cluster
 from vlagents_ray.evaluate.schema import FILE
 from vlagents_ray.evaluate.watching import Watcher, rounds
 from vlagents_ray.policies.base.checkpoint import STEP

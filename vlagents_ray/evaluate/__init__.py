@@ -5,11 +5,12 @@ summary = evaluate(
 )
 """
 
+from vlagents_ray.evaluate.cluster import most_cpus
 from vlagents_ray.evaluate.config import ClockConfig, EvalConfig, PolicyConfig, StopConfig, SuiteConfig, WorkerConfig
 from vlagents_ray.evaluate.progress import Progress, SilentProgress, progress_for
 from vlagents_ray.evaluate.report import print_summary, results_table
 from vlagents_ray.evaluate.results import Results, synchronous_twin
-from vlagents_ray.evaluate.runner import EvaluationInterrupted, OutOfTime, check, evaluate, most_cpus
+from vlagents_ray.evaluate.runner import EvaluationInterrupted, OutOfTime, check, evaluate
 from vlagents_ray.evaluate.statistics import Rate, wilson
 from vlagents_ray.evaluate.stopping import confidence_sequence
 from vlagents_ray.evaluate.summary import Group, Summary

@@ -15,11 +15,11 @@ from vlagents_ray.envs import make_env
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.clock import neutral
+from vlagents_ray.evaluate.cluster import ray_cluster
 from vlagents_ray.evaluate.config import EvalConfig
 from vlagents_ray.evaluate.jobs import plan
 from vlagents_ray.evaluate.pool import runtime_env
 from vlagents_ray.evaluate.results import CellResults, Results
-from vlagents_ray.evaluate.runner import ray_cluster
 from vlagents_ray.evaluate.sides import env_side
 from vlagents_ray.interface import Act
 

@@ -3,20 +3,12 @@
 from __future__ import annotations
 
 import functools
-import os
-import signal
-import threading
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from math import ceil
-from types import FrameType
-from typing import Any
-
-import ray
+from collections.abc import Callable
 
 from vlagents_ray.client import RemoteAgent
 from vlagents_ray.errors import ConfigError, from_code
+from vlagents_ray.evaluate.cluster import ray_cluster
 from vlagents_ray.evaluate.config import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.deadline import Deadline
 from vlagents_ray.evaluate.episode import EpisodeResult
@@ -35,7 +27,7 @@ from vlagents_ray.evaluate.store import Store
 from vlagents_ray.evaluate.summary import Summary, summarize, write_summary
 from vlagents_ray.evaluate.trackers import Tracking
 from vlagents_ray.interface import Agent
-from vlagents_ray.signals import own_sigterm
+from vlagents_ray.signals import stop_signals
 
 POLL_S = 0.25  # how soon a signal is noticed
 
@@ -235,55 +227,6 @@ class _Run:
             dropped = self._queue.drop(job.cell.fingerprint)
             self._left[job.key.settings] -= dropped
             self._progress.stopped(job.cell, stopping.at, dropped)
-
-
-@contextmanager
-def ray_cluster(config: EvalConfig) -> Iterator[None]:
-    """The cluster this process is in; or one that is left, and if local shut down, at the end."""
-    if ray.is_initialized():
-        yield
-        return
-    options: dict[str, Any] = {"log_to_driver": False, "logging_level": "WARNING"}
-    if not os.environ.get("RAY_ADDRESS"):
-        # Its CPUs are bookkeeping: the user's number of workers must fit.
-        needed = ceil(config.workers * most_cpus(config))
-        options |= {"num_cpus": max(os.cpu_count() or 1, needed), "include_dashboard": False}
-    with own_sigterm():
-        ray.init(**options)
-    try:
-        yield
-    finally:
-        ray.shutdown()
-
-
-@contextmanager
-def stop_signals() -> Iterator[threading.Event]:
-    """An event that Ctrl-C and SIGTERM set; a second one interrupts whatever is running.
-
-    A signal that only sets a flag cannot split a transaction. Outside the main thread Python delivers
-    no signals, and the event stays unset.
-    """
-    stop = threading.Event()
-    if threading.current_thread() is not threading.main_thread():
-        yield stop
-        return
-
-    def on_signal(_number: int, _frame: FrameType | None) -> None:
-        if stop.is_set():
-            raise KeyboardInterrupt
-        stop.set()
-
-    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
-
-
-def most_cpus(config: EvalConfig) -> float:
-    """What the hungriest worker takes."""
-    return max(worker.cpus for worker in [config.worker, *(suite.worker or config.worker for suite in config.suites)])
 
 
 def _remote_agents(config: EvalConfig) -> AgentFactory:

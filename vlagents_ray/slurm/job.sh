@@ -1,9 +1,10 @@
 # Ray over the allocation, one process a node, as `ray symmetric-run` has it, but with steps of Slurm's, so that nothing
 # of another job's on these nodes is looked at or stopped; and at the first node the command, whose end ends it all.
-set -uo pipefail
-trap : TERM INT  # Slurm tells the command by itself, which then ends in order
-
 if [ -n "$setup" ]; then source "$setup"; fi
+set -uo pipefail
+stopped=
+trap 'stopped=1' TERM INT  # Slurm sends them to all of a job's processes: the command ends in order by itself
+
 logs=$folder/$SLURM_JOB_ID
 mkdir -p "$logs"
 arguments=("${arguments[@]//%a/${SLURM_ARRAY_TASK_ID:-%a}}")
@@ -22,7 +23,7 @@ ray=$!
 command=$!
 
 wait -n "$ray" "$command"
-if ! kill -0 "$ray" 2>/dev/null && kill -TERM "$command" 2>/dev/null; then
+if [ -z "$stopped" ] && ! kill -0 "$ray" 2>/dev/null && kill -TERM "$command" 2>/dev/null; then
   echo "Ray ended before the command; why is in $logs/ray-*.log" >&2
 fi
 wait "$command"
