@@ -11,6 +11,10 @@ from typer.testing import CliRunner, Result
 
 from vlagents_ray.cli.main import app
 
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "cluster" / "slurm.md"
+DOCUMENTED = re.findall(r"^vlagents-ray slurm (.*)$", PAGE.read_text(), re.MULTILINE)
+
 EVAL = ["eval", "tabletop", "--policy", "scripted", "--print"]
 RUNS = """
 policies: [{source: scripted}]
@@ -87,3 +91,15 @@ def test_a_server_listens_where_its_job_is(words: list[str], text: str) -> None:
     done = slurm("serve", "noop", *words, "--print")
     assert done.exit_code == 2, done.output
     assert text in done.stderr
+
+
+@pytest.mark.parametrize("line", DOCUMENTED)
+def test_what_the_page_shows_becomes_a_script(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    done = slurm(*shlex.split(line), "--print")
+    assert done.exit_code == 0, done.output
+    assert done.stdout.startswith("#!/bin/bash")
+
+
+def test_the_page_shows_evaluations_and_servers() -> None:
+    assert {line.split()[0] for line in DOCUMENTED} == {"eval", "serve"}

@@ -33,7 +33,7 @@ SelectType=select/cons_tres
 SelectTypeParameters=CR_CPU
 MpiDefault=none
 ReturnToService=2
-KillWait=20
+KillWait=10
 CompleteWait=0
 SchedulerParameters=batch_sched_delay=0,sched_interval=2
 AccountingStorageType=accounting_storage/none
@@ -119,7 +119,7 @@ def _daemons(slurm: Slurm, folder: Path) -> Iterator[None]:
             quiet = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
             process = host.start(command, **quiet)
             stack.callback(process.wait, 20)
-            stack.callback(process.terminate)
+            stack.callback(process.kill)  # what it started in the host ends with that
 
         start(slurm.login, munged)
         _until((folder / "munge.socket").exists, folder)

@@ -107,7 +107,7 @@ def _submit(script: Script, print_only: bool, parsable: bool) -> None:
     lines = [
         f"job {job} is queued; its script: {script.file}",
         f"  state   squeue --jobs={job}",
-        f"  log     {logs}.log, and Ray's of each node in {logs}/",
+        f"  log     {script.log.replace('%j', job)}, and Ray's of each node in {logs}/",
         *([f"  way in  {logs}/server.json, once it answers"] if script.name == "serve" else []),
         f"  end it  scancel {job}",
     ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import threading
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
@@ -27,6 +28,7 @@ log = logging.getLogger(__name__)
 
 WATCH_S = 1.0  # between two looks at a busy worker
 GRACE_S = 5.0  # a call past its deadline gets this long to fail by itself
+KILL_S = 3.0  # for Ray to take note that workers are to be killed
 CLOSE_S = 10.0  # for workers to close their simulators when they leave
 MOST_FAILED_STARTS = 3  # in a row
 
@@ -83,8 +85,11 @@ class WorkerPool:
         return self
 
     def __exit__(self, *exc: object) -> None:
-        for actor in [worker.actor for worker in self._workers] + [actor for actor, _ in self._leaving]:
-            ray.kill(actor)
+        actors = [worker.actor for worker in self._workers] + [actor for actor, _ in self._leaving]
+        # A Ray that is itself being ended, as with a job of a cluster's, does not answer; the results are to be kept.
+        killing = threading.Thread(target=_kill, args=(actors,), daemon=True)
+        killing.start()
+        killing.join(KILL_S)
         self._workers.clear()
         self._leaving.clear()
 
@@ -253,6 +258,11 @@ class WorkerPool:
             f"free are {ray.available_resources()} of {ray.cluster_resources()}; lower `workers` or "
             f"`worker.cpus`, or raise `place_timeout_s` if the cluster is still growing"
         )
+
+
+def _kill(actors: list[Any]) -> None:
+    for actor in actors:
+        ray.kill(actor)
 
 
 def _refs(worker: Worker) -> list[Any]:

@@ -74,7 +74,7 @@ def wait_for_nodes(address: str, number: int, timeout_s: float = _NODES_S) -> in
 
 
 def _names(nodes: list[dict[str, Any]]) -> str:
-    found = sorted((one["NodeManagerHostname"], one["Resources"]) for one in nodes)
+    found = sorted(((one["NodeManagerHostname"], one["Resources"]) for one in nodes), key=lambda one: one[0])
     return ", ".join(f"{name} ({has.get('CPU', 0):g} CPUs, {has.get('GPU', 0):g} GPUs)" for name, has in found)
 
 

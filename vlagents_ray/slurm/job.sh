@@ -10,7 +10,7 @@ mkdir -p "$logs"
 arguments=("${arguments[@]//%a/${SLURM_ARRAY_TASK_ID:-%a}}")
 
 unset RAY_ADDRESS RAY_AUTH_TOKEN
-export RAY_AUTH_MODE=token RAY_AUTH_TOKEN_PATH=$logs/token PATH=$(dirname "$python"):$PATH
+export RAY_AUTH_MODE=token RAY_AUTH_TOKEN_PATH=$logs/token RAY_COLOR_PREFIX=0 PATH=${python%/*}:$PATH
 (umask 077 && od -An -N32 -tx1 /dev/urandom | tr -d ' \n' >"$RAY_AUTH_TOKEN_PATH")  # the user's alone
 VLAGENTS_RAY_HEAD=$("$python" -m vlagents_ray.slurm.allocation) || exit 1
 export VLAGENTS_RAY_HEAD

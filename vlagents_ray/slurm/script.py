@@ -29,6 +29,11 @@ class Script:
         """Where it is written to."""
         return self.folder / f"{self.name}.sh"
 
+    @property
+    def log(self) -> str:
+        """Where sbatch is to write the job's output, by its pattern."""
+        return self.options.get("output") or str(self.folder.absolute() / "%j.log")
+
     def text(self) -> str:
         """As sbatch takes it."""
         usual = {
@@ -36,7 +41,7 @@ class Script:
             "nodes": "1",
             "ntasks-per-node": "1",
             "chdir": os.getcwd(),
-            "output": str(self.folder.absolute() / "%j.log"),
+            "output": self.log,
             "open-mode": "append",
             **({} if "no-requeue" in self.options else {"requeue": None}),
         }

@@ -40,7 +40,8 @@ def submit(script: Script) -> str:
     if done.returncode:
         raise SubmissionFailed(f"sbatch {file}: {done.stderr.strip() or done.stdout.strip()}")
     job = done.stdout.strip().partition(";")[0]
-    record = {"job": job, "script": str(file), "log": str(file.parent / f"{job}.log"), "logs": str(file.parent / job)}
+    log = script.log.replace("%j", job)
+    record = {"job": job, "script": str(file), "log": log, "logs": str(file.parent / job)}
     (file.parent / RECORD).write_text(json.dumps(record, indent=2) + "\n")
     return job
 
