@@ -41,7 +41,14 @@ def slurm() -> Iterator[Slurm]:
 def command(folder: Path, *more: str) -> list[str]:
     """An evaluation of twelve episodes on both nodes; the two with seeds 6 and 7 wait for `folder/open`."""
     words = ["slurm", "eval", NOTED, "--policy=noop", "--set=action_dim=1", "--episodes=12", f"--out={folder}/out"]
-    words += [f"--env-set=folder={folder}", "--env-set=held=[6, 7]", "--nodes=2", "--cpus-per-task=2", "--parsable"]
+    words += [
+        f"--env-set=folder={folder}",
+        "--env-set=held=[6, 7]",
+        "--nodes=2",
+        "--cpus-per-task=2",
+        "--gpus-per-node=1",
+        "--parsable",
+    ]
     return [*words, *more]
 
 
@@ -69,13 +76,16 @@ def test_a_cancelled_evaluation_is_finished_by_the_same_command_with_each_episod
     slurm.do("scancel", job)
     assert slurm.wait_for_end(job) == "CANCELLED"
     before = episodes(tmp_path)
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["state"] == "interrupted"
     assert [episode for episode, _ in before] == [0, 1, 2, 3, 4, 5, 8, 9, 10, 11]
 
     (tmp_path / "open").touch()
     again = slurm.vlagents_ray(*command(tmp_path)).strip()
-    assert slurm.wait_for_end(again) == "COMPLETED", (tmp_path / "out" / "slurm" / f"{again}.log").read_text()
+    log = tmp_path / "out" / "slurm" / f"{again}.log"
+    assert slurm.wait_for_end(again) == "COMPLETED", log.read_text()
     assert episodes(tmp_path) == sorted([*before, (6, 2), (7, 2)])
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["state"] == "complete"
+    assert all(f"{one.name} (2 CPUs, 1 GPUs)" in log.read_text() for one in slurm.nodes)
     assert {file.name.partition("-")[0] for file in tmp_path.glob("host*-*")} == {one.name for one in slurm.nodes}
     logs = tmp_path / "out" / "slurm" / job
     assert {file.name for file in logs.iterdir()} >= {f"ray-{one.name}.log" for one in slurm.nodes}
@@ -88,7 +98,8 @@ def test_a_job_that_is_out_of_time_queues_itself_again_and_goes_on(slurm: Slurm,
     requeued = tmp_path / "out" / "slurm" / job / "requeued"
     slurm.wait_for(job, requeued.exists)
     assert episodes(tmp_path) == []
-    slurm.do("scontrol", "update", f"job={job}", "TimeLimit=30")
+    slurm.wait_for(job, lambda: slurm.state(job) == "PENDING")
+    slurm.do("scontrol", "update", f"job={job}", "TimeLimit=30", "StartTime=now")
     assert slurm.wait_for_end(job) == "COMPLETED", (tmp_path / "out" / "slurm" / f"{job}.log").read_text()
     assert [episode for episode, _ in episodes(tmp_path)] == list(range(12))
 

@@ -26,11 +26,12 @@ SlurmctldHost={head.name}({head.address})
 SlurmUser=root
 SlurmdUser=root
 AuthType=auth/munge
-AuthInfo=socket={folder}/munge.socket,cred_expire=2
+AuthInfo=socket={folder}/munge.socket,cred_expire=5
 ProctrackType=proctrack/linuxproc
 TaskPlugin=task/none
 SelectType=select/cons_tres
 SelectTypeParameters=CR_CPU
+GresTypes=gpu
 MpiDefault=none
 ReturnToService=2
 KillWait=10
@@ -95,9 +96,12 @@ def running_slurm(nodes: int, cpus: int) -> Iterator[Slurm]:
         with hosts(nodes + 1) as [login, *others]:
             (folder / "munge.key").write_bytes(secrets.token_bytes(128))
             (folder / "munge.key").chmod(0o600)
-            lines = [f"NodeName={one.name} NodeAddr={one.address} CPUs={cpus} State=UNKNOWN" for one in others]
+            lines = [
+                f"NodeName={one.name} NodeAddr={one.address} CPUs={cpus} Gres=gpu:1 State=UNKNOWN" for one in others
+            ]
             configuration = folder / "slurm.conf"
             configuration.write_text(_CONFIGURATION.format(head=login, folder=folder, nodes="\n".join(lines)))
+            (folder / "gres.conf").write_text("Name=gpu File=/dev/null\n")  # a GPU as far as bookkeeping goes
             for one in (login, *others):
                 one.environment |= {"SLURM_CONF": str(configuration), "PYTHONPATH": _PATH}
                 (folder / f"spool-{one.name}").mkdir()

@@ -8,13 +8,14 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from types import FrameType
 
 from vlagents_ray.slurm.allocation import HEAD, Allocation
 
 _SHORT = "/tmp"  # noqa: S108 - the names of Ray's sockets are limited to 107 bytes
-_LEAVE = {"RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S": "5"}  # for the command to end first, when both get SIGTERM; Ray: 30
+_AT_ONCE = {"RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S": "0"}  # Ray would wait 30 s for work that nobody goes on with
 _HEAD_S = 120.0  # that the head may take to listen
 
 
@@ -24,15 +25,19 @@ def main() -> int:
     head = os.environ[HEAD]
     if allocation.node:
         wait_for_head(head, allocation.ports.gcs)
-    environment = os.environ | {"AUTOSCALER_METRIC_PORT": str(allocation.ports.metrics), **_LEAVE}
+    environment = os.environ | {"AUTOSCALER_METRIC_PORT": str(allocation.ports.metrics), **_AT_ONCE}
+    asked = threading.Event()
     with tempfile.TemporaryDirectory(prefix=f"vlr-{allocation.job}-", dir=_SHORT, ignore_cleanup_errors=True) as folder:
         ray = subprocess.Popen(allocation.ray_start(head, folder), env=environment)  # noqa: S603 - made there
 
         def end(_number: int, _frame: FrameType | None) -> None:
+            asked.set()
             ray.terminate()
 
         signal.signal(signal.SIGTERM, end)
         status = ray.wait()
+    if asked.is_set():
+        return 0
     sys.stdout.write(f"Ray ended with {status}\n")
     return 0 if allocation.node else status  # without another node the job goes on with those that are left
 
