@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import threading
@@ -261,8 +262,9 @@ class WorkerPool:
 
 
 def _kill(actors: list[Any]) -> None:
-    for actor in actors:
-        ray.kill(actor)
+    with contextlib.suppress(RayError):  # they end with this process in any case
+        for actor in actors:
+            ray.kill(actor)
 
 
 def _refs(worker: Worker) -> list[Any]:
