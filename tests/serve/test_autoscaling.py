@@ -113,6 +113,7 @@ def test_nothing_is_taken_away_before_all_have_reported() -> None:
 
 def test_only_an_unused_application_may_have_no_replica() -> None:
     assert wanted(MeasuredLoad(), [0.0]) == 0
+    assert wanted(MeasuredLoad(), [8e-7]) == 0  # what an idle replica measures
     assert wanted(MeasuredLoad(), [0.0], sessions=1) == 1
     assert wanted(MeasuredLoad(), [0.0], requests=1.0) == 1
 
