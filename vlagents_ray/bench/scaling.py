@@ -4,7 +4,7 @@ Environment and policy sleep, so that many workers run on few cores: what is mea
 clusters of one to three hosts (`vlagents_ray.bench.hosts`), or one that runs already, evaluations with more and more
 workers are played in turns with one of a single worker; the rate is that while all of them were playing, so that their
 start does not count. Every node has a replica for each worker that it has room for: nobody waits for another's batch.
-Beside that, as many workers as possible share one replica a node, with single actions and with chunks.
+Beside that, on the first cluster, all workers share one replica a node, with single actions and with chunks.
 
 Then the driver: short evaluations with steps, episodes and workers in different proportions. Its CPU time is fitted by
 what an episode costs, what a step, and what a second of a worker's being watched.
@@ -79,19 +79,19 @@ def measure_scaling(
 ) -> dict[str, Any]:
     """As plain JSON values. `address`: of a running cluster, in place of hosts on this machine."""
     found: dict[str, Any] = {"plan": asdict(plan), "cores": os.cpu_count(), "clusters": []}
-    for nodes in (0,) if address else plan.nodes:
-        with _driver(plan, nodes, address) as (driver, size):
-            cluster = _cluster(plan, size, driver, tell)
-            found["clusters"].append(cluster)
-            if nodes in (0, plan.nodes[-1]):
+    clusters = (0,) if address else plan.nodes
+    for nodes in clusters:
+        with driving(plan, nodes, address) as (driver, size):
+            found["clusters"].append(measure_cluster(plan, size, driver, tell, shared=nodes == clusters[0]))
+            if nodes == clusters[-1]:
                 tell("the driver's costs")
                 found["driver"] = _driver_costs(plan, driver)
     return found
 
 
 @contextlib.contextmanager
-def _driver(plan: ScalingPlan, nodes: int, address: str | None) -> Iterator[tuple[Child, int]]:
-    """A driver whose policies are served, and how many nodes there are."""
+def driving(plan: ScalingPlan, nodes: int, address: str | None = None) -> Iterator[tuple[Child, int]]:
+    """A driver whose policies are served, on `nodes` hosts or at `address`, and how many nodes there are."""
     slots = math.ceil(plan.most / max(1, nodes))
     room = {OWN: slots, SHARED: 1, CHUNKS: 1}  # for replicas, on each node
     pinned = address is None
@@ -118,9 +118,14 @@ def _driver(plan: ScalingPlan, nodes: int, address: str | None) -> Iterator[tupl
         yield child, child.hear(_START_S)["nodes"]
 
 
-def _cluster(plan: ScalingPlan, nodes: int, driver: Child, tell: Callable[[str], None]) -> dict[str, Any]:
+def measure_cluster(
+    plan: ScalingPlan, nodes: int, driver: Child, tell: Callable[[str], None] = lambda _: None, *, shared: bool = False
+) -> dict[str, Any]:
+    """Rates by number of workers, from rounds in which each is played once; and where all share a node's replica."""
     counts = [workers for workers in plan.workers if workers == 1 or workers >= nodes]
-    kinds = [*((OWN, workers) for workers in counts), (SHARED, plan.most), (CHUNKS, plan.most)]
+    kinds = [(OWN, workers) for workers in counts]
+    if shared:
+        kinds += [(SHARED, plan.most), (CHUNKS, plan.most)]
     played: dict[tuple[str, int], list[Played]] = {kind: [] for kind in kinds}
     for number in range(plan.rounds):
         for app, workers in kinds:
