@@ -79,7 +79,7 @@ def measure_scaling(
 ) -> dict[str, Any]:
     """As plain JSON values. `address`: of a running cluster, in place of hosts on this machine."""
     found: dict[str, Any] = {"plan": asdict(plan), "cores": os.cpu_count(), "clusters": []}
-    clusters = (0,) if address else plan.nodes
+    clusters = (0,) if address else plan.nodes  # 0: as many as there are
     for nodes in clusters:
         with driving(plan, nodes, address) as (driver, size):
             found["clusters"].append(measure_cluster(plan, size, driver, tell, shared=nodes == clusters[0]))
@@ -92,21 +92,20 @@ def measure_scaling(
 @contextlib.contextmanager
 def driving(plan: ScalingPlan, nodes: int, address: str | None = None) -> Iterator[tuple[Child, int]]:
     """A driver whose policies are served, on `nodes` hosts or at `address`, and how many nodes there are."""
-    slots = math.ceil(plan.most / max(1, nodes))
-    room = {OWN: slots, SHARED: 1, CHUNKS: 1}  # for replicas, on each node
+    size = max(1, nodes)
+    slots = math.ceil(plan.most / size)
     pinned = address is None
     fleets = {
-        OWN: Fleet(slots * max(1, nodes), pinned=pinned),
-        SHARED: Fleet(max(1, nodes), pinned=pinned),
-        CHUNKS: Fleet(max(1, nodes), CHUNK, pinned),
+        OWN: Fleet(slots * size, pinned=pinned),
+        SHARED: Fleet(size, pinned=pinned),
+        CHUNKS: Fleet(size, CHUNK, pinned),
     }
     with contextlib.ExitStack() as stack:
         start: Callable[[list[str]], list[str]] = list
         if address is None:
+            room = json.dumps({OWN: slots, SHARED: 1, CHUNKS: 1})  # for replicas, on each node
             made = stack.enter_context(hosts(nodes))
-            cluster = stack.enter_context(
-                ray_cluster(made, slots, our_environment(), resources=json.dumps(room))
-            )  # fmt: skip
+            cluster = stack.enter_context(ray_cluster(made, slots, our_environment(), resources=room))
             address, start = cluster.address, cluster.head.command
         settings = {
             "address": address,
