@@ -25,6 +25,9 @@ from vlagents_ray.cli.main import app
         (["evaluation", "--episodes", "5"], "multiple of the 2 workers"),
         (["evaluation", "--peers", "nobody"], "nobody"),
         (["report", "--readme", "nowhere.md"], "nowhere.md"),
+        (["scaling", "--workers", "2,4"], "from 1 on"),
+        (["scaling", "--nodes", "none"], "--nodes"),
+        (["autoscaling", "--plot", "a.gif"], ".png"),
     ],
 )
 def test_mistakes_are_told_in_a_line(words: list[str], text: str) -> None:

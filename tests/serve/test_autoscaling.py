@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from pydantic import ValidationError
 from ray.serve._private.common import DeploymentID, ReplicaID
 from ray.serve.config import AutoscalingConfig, AutoscalingContext
 
 from vlagents_ray.serve.autoscaling import SESSIONS, UTILISATION, WAITING, MeasuredLoad
-from vlagents_ray.serve.config import AutoscalingArgs
+from vlagents_ray.serve.config import AutoscalingArgs, ServerArgs
 
 POLICY = DeploymentID("Policy", "app")
 
@@ -113,6 +116,7 @@ def test_nothing_is_taken_away_before_all_have_reported() -> None:
 
 def test_only_an_unused_application_may_have_no_replica() -> None:
     assert wanted(MeasuredLoad(), [0.0]) == 0
+    assert wanted(MeasuredLoad(), [8e-7]) == 0  # what an idle replica measures
     assert wanted(MeasuredLoad(), [0.0], sessions=1) == 1
     assert wanted(MeasuredLoad(), [0.0], requests=1.0) == 1
 
@@ -130,3 +134,12 @@ def test_settings_reach_serve() -> None:
 def test_other_settings_are_refused(args: dict[str, Any]) -> None:
     with pytest.raises(ValidationError):
         AutoscalingArgs(**args)
+
+
+def test_the_deployment_of_the_page_about_it_is_accepted() -> None:
+    page = Path(__file__).parents[2] / "docs" / "cluster" / "autoscaling.md"
+    [block] = re.findall(r"```yaml\n(.*?)```", page.read_text(), re.DOTALL)
+    [application] = yaml.safe_load(block)["applications"]
+    args = ServerArgs(**application["args"])
+    assert args.autoscaling is not None
+    assert args.autoscaling.min_replicas == 0

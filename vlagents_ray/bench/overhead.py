@@ -135,7 +135,7 @@ def measure_overhead(
             )
             with CpuSampler(lambda: marked(os.environ[MARK])) as cpu:  # the cluster's own mark
                 evaluate(config)
-            playing = steady(_recorded(config.out), workers)
+            playing = steady(recorded(config.out), workers)
             evaluated.append(Rate(playing.rate, cpu.between(playing.first, playing.last) * 1e3 / playing.steps))
             tell(f"round {number + 1}/{rounds}: evaluated {evaluated[-1].steps_per_s:.1f} steps/s")
     return Overhead(env, workers, tuple(bare), tuple(evaluated))
@@ -208,7 +208,8 @@ def _play(
         results.put((spans, time.process_time() - used))
 
 
-def _recorded(out: Path) -> list[Span]:
+def recorded(out: Path) -> list[Span]:
+    """Every episode of these results."""
     with contextlib.closing(sqlite3.connect(out / "results.db")) as db:
         rows = db.execute("SELECT finished - seconds, finished, steps FROM episodes").fetchall()
     return [Span(*row) for row in rows]

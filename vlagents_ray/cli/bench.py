@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vlagents_ray.cli.bench_evaluations import bench_eval, bench_evaluation, bench_soak
+from vlagents_ray.cli.bench_scaling import bench_autoscaling, bench_scaling
 from vlagents_ray.cli.console import errors, out, save, tell
-from vlagents_ray.cli.options import DEFAULT_PEERS_PYTHON, PEERS_DIR, Json, PeersPython
+from vlagents_ray.cli.options import DEFAULT_PEERS_PYTHON, PEERS_DIR, Json, PeersPython, Plot
 from vlagents_ray.cli.settings import parse_counts, parse_list, parse_settings
 from vlagents_ray.cli.tables import show_policy, show_round_trips, show_throughput
 from vlagents_ray.errors import ConfigError
@@ -21,7 +22,6 @@ if TYPE_CHECKING:
 
 bench = typer.Typer(no_args_is_help=True, help="Measure on this machine what the README claims.")
 
-Plot = Annotated[Path | None, typer.Option("--plot", help="Draw the medians here: .png, .svg or .pdf.")]
 Peers = Annotated[str, typer.Option(help="vlagents, openpi, openvla, vla-eval, with commas between them, or 'all'.")]
 
 
@@ -159,6 +159,8 @@ def bench_policy(
 bench.command("eval")(bench_eval)
 bench.command("evaluation")(bench_evaluation)
 bench.command("soak")(bench_soak)
+bench.command("scaling")(bench_scaling)
+bench.command("autoscaling")(bench_autoscaling)
 
 
 @bench.command("peers-setup")

@@ -115,6 +115,49 @@ def show_soak(found: Mapping[str, Any]) -> None:
     show_outcomes(soak_outcomes(found))
 
 
+def show_scaling(found: Mapping[str, Any]) -> None:
+    """A row for each number of workers on each cluster."""
+    plan = found["plan"]
+    table = Table("nodes", "workers", "replicas", "episodes/min", "of linear", "of ideal", "whole run s", "by")
+    table.title = (
+        f"{plan['steps']} steps of {plan['step_ms']:g} ms, policy {plan['policy_ms']:g} ms, "
+        f"medians of {plan['rounds']} rounds on {found['cores']} cores"
+    )
+    for cluster in found["clusters"]:
+        for row in cluster["rows"]:
+            counts = (str(cluster["nodes"]), str(row["workers"]), row["app"], f"{row['episodes_per_minute']:.1f}")
+            ratios = (f"{row['of_linear']:.3f}", f"{row['of_ideal']:.3f}", f"{row['wall_s']:.1f}")
+            table.add_row(*counts, *ratios, ", ".join(row["transports"]))
+        table.add_section()
+    out.print(table)
+
+
+def show_driver(found: Mapping[str, Any]) -> None:
+    """What a driver costs, and how many workers it has time for."""
+    costs, flooded = found["costs_ms"], found["flooded"]
+    out.print(
+        f"the driver's CPU time: {costs['episode']:.2f} ms an episode, {costs['step'] * 1e3:.1f} µs a step, "
+        f"{costs['worker_second']:.2f} ms a second for each worker, {costs['second']:.1f} ms a second at all\n"
+        f"flooded by {flooded['workers']} workers: {flooded['episodes_per_s']:.0f} episodes/s, "
+        f"{flooded['driver_ms_per_episode']:.2f} ms each, {100 * flooded['driver_share']:.0f} % of a core",
+        highlight=False,
+    )
+    for seconds, workers in found["saturated_workers"].items():
+        out.print(f"episodes of {seconds} s: one driver is saturated by {workers:.0f} workers", highlight=False)
+
+
+def show_autoscaling(found: Mapping[str, Any]) -> None:
+    """A row for each who came."""
+    table = Table("", "first reset s", "replicas", "acts", "failed", "begun again", "median ms", "p95 ms", "longest")
+    for one in found["phases"]:
+        waited = "" if one["first_reset_s"] is None else f"{one['first_reset_s']:.1f}"
+        table.add_row(
+            one["name"], waited, str(one["most_replicas"]), str(one["acts"]), str(len(one["failed"])),
+            str(one["resumed"]), *(f"{one[key]:.1f}" for key in ("median_ms", "p95_ms", "longest_ms")),
+        )  # fmt: skip
+    out.print(table)
+
+
 def show_outcomes(lines: Sequence[Outcome]) -> None:
     """Targets, and whether they are met."""
     if not lines:

@@ -155,7 +155,9 @@ class WorkerPool:
         """
         refs = {ref: worker for worker in self._workers for ref in _refs(worker)}
         if refs:
-            done, _ = ray.wait(list(refs), num_returns=1, timeout=timeout_s)
+            done, waiting = ray.wait(list(refs), num_returns=1, timeout=timeout_s)
+            if done and waiting:  # all that have come: a turn looks at every worker, so it must not be one's alone
+                done += ray.wait(waiting, num_returns=len(waiting), timeout=0)[0]
             for ref in done:
                 yield from self._arrived(refs[ref], ref)
         yield from self._look()

@@ -24,6 +24,7 @@ WAITING = "waiting"
 SESSIONS = "sessions"
 
 _MARGIN = 0.8  # one replica less must carry the load at this share of each target, or the replicas would flap
+_NOTHING = 1e-3  # of a replica: an idle one measures that it was busy for some millionths of the time
 
 
 class MeasuredLoad:
@@ -56,4 +57,4 @@ class MeasuredLoad:
 
     def _needed(self, totals: Mapping[str, float], margin: float) -> int:
         needed = max(totals[name] / (margin * target) for name, target in self._targets.items())
-        return math.ceil(needed - 1e-9)
+        return math.ceil(needed - _NOTHING)

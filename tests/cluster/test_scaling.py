@@ -1,0 +1,72 @@
+"""More workers play more, on several nodes; and several drivers share a cluster."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from dataclasses import asdict
+from pathlib import Path
+
+import pytest
+
+from vlagents_ray.bench.child import Child
+from vlagents_ray.bench.hosts import hosts, ray_cluster
+from vlagents_ray.bench.scaling import OWN, ScalingPlan, driving, measure_cluster
+from vlagents_ray.bench.scaling_driver import Fleet
+from vlagents_ray.bench.slept import SLEPT
+from vlagents_ray.bench.ways import our_environment
+from vlagents_ray.evaluate import Results
+
+pytestmark = pytest.mark.hosts
+
+DRIVER = """
+import sys
+import ray
+from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, evaluate
+env, seed, out = sys.argv[1:]
+ray.init(logging_level="WARNING", log_to_driver=False)
+options = {"max_steps": 5, "step_ms": 10.0, "size": 32}
+evaluate(EvalConfig(
+    policies=[PolicyConfig(name="noop", url="serve://own")], workers=2, video="none", out=out,
+    suites=[SuiteConfig(envs=[env], episodes=6, seeds=[int(seed)], env_options=options)],
+))
+"""
+
+
+def test_four_workers_on_two_nodes_play_nearly_four_times_as_much_as_one() -> None:
+    """Anything that all wait for would halve it; the bound leaves room for a machine that has other work to do."""
+    plan = ScalingPlan(workers=(1, 4), rounds=1, steps=20, seconds=3.0)
+    with driving(plan, nodes=2) as (driver, size):
+        assert size == 2
+        rows = {(row["app"], row["workers"]): row for row in measure_cluster(plan, size, driver)["rows"]}
+    own = rows[OWN, 4]
+    assert own["of_linear"] > 0.6
+    assert own["of_ideal"] <= 1.01
+    assert own["failures"] == 0
+    assert own["transports"] == ["shm"], "a replica for each worker of a node is on that node"
+
+
+def test_two_drivers_on_one_cluster_play_a_part_each_and_their_results_are_merged(tmp_path: Path) -> None:
+    settings = {"address": None, "policy_ms": 5.0, "fleets": {"own": asdict(Fleet(2))}}
+    with hosts(2) as both, ray_cluster(both, 4, our_environment()) as cluster:
+        serving = [sys.executable, "-m", "vlagents_ray.bench.scaling_driver"]
+        settings["address"] = cluster.address
+        with Child("server", cluster.head.command([*serving, json.dumps(settings)]), our_environment()) as server:
+            server.hear(120)
+            parts = [tmp_path / seed for seed in ("0", "6")]
+            drivers = [
+                host.start([sys.executable, "-c", DRIVER, SLEPT, part.name, str(part)])
+                for host, part in zip(both, parts, strict=True)
+            ]
+            assert [driver.wait(120) for driver in drivers] == [0, 0]
+    merge = [sys.executable, "-c", "from vlagents_ray.cli import main; main()", "merge"]
+    done = subprocess.run(
+        [*merge, str(tmp_path / "all"), *map(str, parts)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    merged = Results.load(tmp_path / "all")
+    assert [sorted(one.result.key.seed for one in cell.episodes) for cell in merged.cells] == [list(range(12))]
+    assert [one.result.status for one in merged.cells[0].episodes] == ["done"] * 12
+    first, second = sorted(merged.runs, key=lambda run: run.started)
+    assert second.started < (first.ended or 0), "they were there at the same time"
