@@ -153,6 +153,18 @@ class ToZero(Agent):
         return Act((-float(obs.state["position"][0]) + noise).astype(np.float32))
 
 
+class Unhurried(ToZero):
+    """Chunks of a second for a robot at 50 Hz. Each takes its time, so that an evaluation lasts."""
+
+    def __init__(self, takes_s: float = 0.02) -> None:
+        super().__init__(chunk=50, state_dim=1)
+        self._takes_s = takes_s
+
+    def act(self, obs: Obs) -> Act:
+        time.sleep(self._takes_s)
+        return super().act(obs)
+
+
 class Silent(ToZero):
     """Never answers an `act`."""
 
