@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import socket
 import threading
 import time
@@ -10,6 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import pytest
 from eval_fakes import wait_for
+from held import descriptors, running_threads
 
 from vlagents_ray.serve.batching import BatchQueue, Rank, Ticket
 from vlagents_ray.serve.ears import Ears
@@ -232,11 +232,12 @@ def test_closing_ends_the_wait(slow: Callable[..., Slow]) -> None:
 
 
 def test_no_descriptor_and_no_thread_is_left() -> None:
-    before = len(os.listdir("/proc/self/fd")), threading.active_count()
+    files, running = descriptors(), running_threads()
     for lend in (False, True):
         ears = Ears()
         if lend:
             ears.lend()
             ears.take_back()
         ears.close()
-    assert (len(os.listdir("/proc/self/fd")), threading.active_count()) == before
+    assert not descriptors() - files
+    assert not running_threads() - running

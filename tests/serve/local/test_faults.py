@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 from eval_fakes import wait_for
+from held import descriptors
 from local_door import LIMITS, call, client, request
 
 from vlagents_ray.client.shm import ShmTransport, reaches
@@ -87,14 +88,14 @@ def test_who_leaves_before_hearing_that_the_replica_is_full_keeps_nobody_out(ser
 
 @pytest.mark.parametrize("message", [bytes(LocalAddress.REQUEST.size), b""])
 def test_descriptors_that_a_message_brings_are_all_closed(served: tuple[Engine, LocalDoor], message: bytes) -> None:
-    before = len(os.listdir("/proc/self/fd"))
+    before = descriptors()
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as odd, open(os.devnull) as file:
         odd.settimeout(5)
         odd.connect(f"\0{served[1].address.socket}")
         socket.send_fds(odd, [message], [file.fileno()] * 2)
         odd.recv(1000)  # an error, or the end
     wait_for(lambda: not served[1]._clients)
-    assert len(os.listdir("/proc/self/fd")) == before
+    assert not descriptors() - before
 
 
 def test_faults_are_answered_and_harm_nobody(served: tuple[Engine, LocalDoor]) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import gc
-import os
 import signal
 import subprocess
 import sys
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from eval_fakes import wait_for
+from held import descriptors, running_threads
 from local_door import Keeper, call, client, request
 
 from vlagents_ray.errors import (
@@ -126,7 +126,7 @@ def test_a_late_reply_is_discarded_and_its_memory_is_not_reused_meanwhile(served
 
 def test_a_killed_client_leaves_nothing(served: tuple[Engine, LocalDoor]) -> None:
     engine, door = served
-    descriptors = len(os.listdir("/proc/self/fd"))
+    before = descriptors()
     code = (
         "import sys, time, numpy as np\n"
         "from vlagents_ray.client.shm import ShmTransport\n"
@@ -144,7 +144,7 @@ def test_a_killed_client_leaves_nothing(served: tuple[Engine, LocalDoor]) -> Non
         assert len(engine.sessions) == 1
         process.send_signal(signal.SIGKILL)
     wait_for(lambda: len(engine.sessions) == 0)
-    wait_for(lambda: len(os.listdir("/proc/self/fd")) <= descriptors)
+    wait_for(lambda: not descriptors() - before)
 
 
 def test_many_sessions_leave_nothing(served: tuple[Engine, LocalDoor]) -> None:
@@ -157,12 +157,11 @@ def test_many_sessions_leave_nothing(served: tuple[Engine, LocalDoor]) -> None:
     cycle()
     wait_for(lambda: len(served[0].sessions) == 0)
     gc.collect()
-    before = len(os.listdir("/proc/self/fd")), threading.active_count(), _mapped()
+    files, running, mapped = descriptors(), running_threads(), _mapped()
     for _ in range(300):
         cycle()
     wait_for(lambda: len(served[0].sessions) == 0)
-    wait_for(lambda: len(os.listdir("/proc/self/fd")) <= before[0] and threading.active_count() <= before[1])
-    wait_for(lambda: _mapped() <= before[2])
+    wait_for(lambda: not descriptors() - files and not running_threads() - running and _mapped() <= mapped)
 
 
 def _mapped() -> int:
