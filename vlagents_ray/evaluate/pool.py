@@ -76,7 +76,8 @@ class WorkerPool:
         self._failed_starts = 0
         self._failed_start = 0.0  # when the last of them failed
         self._mute: dict[str, float] = {}  # hosts that do not answer, until when
-        self._short = False  # is it known that there is not room for all workers?
+        self._busy = 0.0  # when an episode was last being played
+        self._short = False  # has it been said that there is not room for all workers?
         self._limit_s: dict[Phase, float] = {
             "connect": config.connect_timeout_s + config.policy_timeout_s,
             "make": config.make_timeout_s,
@@ -228,6 +229,8 @@ class WorkerPool:
 
     def _look(self) -> Iterator[tuple[Job, Report]]:
         now = monotonic()
+        if self.busy:
+            self._busy = now
         self._see_off(now)
         for worker in list(self._workers):
             if worker.starting is not None:
@@ -274,21 +277,21 @@ class WorkerPool:
             return failure
 
     def _no_room(self, worker: WorkerConfig) -> None:
-        """Go on with the workers that play: one of their nodes may have been lost, and may come back."""
-        if not self._head.answers():
+        """Go on with the workers that play: the node of another one may have been lost, and may come back."""
+        stuck = monotonic() - self._busy > self._config.place_timeout_s
+        if (self._short and not stuck) or not self._head.answers():
             return
+        self._short = True
         want = {"CPU": worker.cpus, "GPU": worker.gpus}
         message = (
             f"the cluster found no room for a worker in {self._config.place_timeout_s:g} s: each wants {want}, "
             f"free are {ray.available_resources()} of {ray.cluster_resources()}; lower `workers` or "
             f"`worker.cpus`, or raise `place_timeout_s` if the cluster is still growing"
         )
-        if not self.busy:
+        if stuck:
             raise ConfigError(message)
-        if not self._short:
-            self._short = True
-            playing = sum(self.working().values())
-            log.warning("going on with %d of %d workers: %s", playing, self._config.workers, message)
+        running = sum(one.starting is None for one in self._workers)
+        log.warning("going on with %d of %d workers: %s", running, self._config.workers, message)
 
 
 def _refs(worker: Worker) -> list[Any]:
