@@ -10,8 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from eval_fakes import wait_for
-from lasting import Evaluation, cluster_of, serving, workers_on
+from lasting import Evaluation, cluster_of, serving, until, workers_on
 
 from vlagents_ray.bench.hosts import Host, hosts
 from vlagents_ray.client.credentials import KEY_VARIABLE
@@ -43,10 +42,10 @@ def out_of_memory(host: Host, folder: Path) -> Iterator[None]:
 
 def test_lost_nodes_and_partitions_cost_attempts_alone(tmp_path: Path) -> None:
     """Two nodes with a replica and a worker each, and one with two workers."""
-    episodes = 500
+    episodes = 320
     run = Evaluation(tmp_path, episodes, workers=4)
     with hosts(5) as [head, one, two, simulating, spare]:
-        nodes = {one: (1, True), two: (1, True), simulating: (2, False)}
+        nodes = [(one, 1, True), (two, 1, True), (simulating, 2, False)]
         with (
             cluster_of(head, nodes) as cluster,
             serving(head, tmp_path, replicas=2) as token,
@@ -60,49 +59,48 @@ def test_lost_nodes_and_partitions_cost_attempts_alone(tmp_path: Path) -> None:
                 run.goes_on()
             run.goes_on()
             simulating.kill()
-            wait_for(lambda: "the worker on host4 died" in run.said())
+            until(lambda: "the worker on host4 died" in run.said())
             run.goes_on()
             spare.environment |= head.environment
             cluster.join(spare, 2)
-            wait_for(lambda: workers_on(spare) == 2)
+            until(lambda: workers_on(spare) == 2)
             two.kill()
             assert run.ends() == 0, run.said()
             for host in (head, one, spare):
-                wait_for(lambda host=host: workers_on(host) == 0)
+                until(lambda host=host: workers_on(host) == 0)
     run.is_whole(episodes)
     assert {attempt.cause for attempt in run.attempts()} <= {"worker", "policy"}
-    assert "going on with" in run.said(), "while there is no room for as many workers as before"
 
 
 def test_a_robot_a_crowd_and_a_head_that_dies(tmp_path: Path) -> None:
     """An evaluation at a node, beside a robot outside of the cluster; then memory runs out, then the head dies."""
-    episodes = 400
+    episodes = 160
     run = Evaluation(tmp_path, episodes, workers=3)
     with hosts(4) as [head, one, two, robot]:
-        nodes = {one: (2, True), two: (2, False)}
+        nodes = [(one, 2, True), (two, 2, False)]
         patience = {"RAY_gcs_rpc_server_reconnect_timeout_s": "20"}
         with cluster_of(head, nodes, **patience), serving(head, tmp_path, replicas=1) as token:
             with run.running(one, token):
                 robot.limit("1gbit")
                 robot.environment |= {KEY_VARIABLE: token}
                 loop = ["--hz", "50", "--seconds", "20", "--transport", "websocket", "--baseline", "0"]
-                said = robot.run([sys.executable, "-m", "vlagents_ray.robot", f"http://{head.name}:8000", *loop])
-                assert "ticks without an action of the policy: 0" in said
+                # Its exit status says so if a tick had no action of the policy.
+                robot.run([sys.executable, "-m", "vlagents_ray.robot", f"http://{head.name}:8000", *loop])
                 assert run.attempts() == []
                 with out_of_memory(two, tmp_path):
-                    wait_for(lambda: any("memory" in attempt.error for attempt in run.attempts()))
+                    until(lambda: any("memory" in attempt.error for attempt in run.attempts()))
                 run.goes_on()
                 head.kill()
-                run.goes_on()
+                run.goes_on(by=2)
                 assert run.ends() == 1
             assert "ClusterLost: the head of the Ray cluster, 198.18.0.1:6379, has not answered" in run.said()
             summary = json.loads((run.out / "summary.json").read_text())
             assert summary["state"] == "stopped"
             assert summary["total"]["episodes"] == len(run.played()) > 0
             for host in (one, two):
-                wait_for(lambda host=host: workers_on(host) == 0)
+                until(lambda host=host: workers_on(host) == 0)
         with (
-            cluster_of(robot, {one: (2, True)}),
+            cluster_of(robot, [(one, 2, True)]),
             serving(robot, tmp_path, replicas=1) as token,
             run.running(robot, token, "--resume"),
         ):

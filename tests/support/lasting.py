@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import yaml
@@ -22,17 +23,18 @@ from vlagents_ray.serve.keyfile import new_key
 from vlagents_ray.serve.ports import EVERYWHERE
 
 ROOT = Path(__file__).parents[2]
+until = functools.partial(wait_for, every_s=0.25)  # what takes a process, or all results, to find out
 POLICY = "policy"  # a resource of nodes that replicas may run on
 # Joined to the cluster before the command asks its policy, which is inside.
 _EVAL = "import ray; ray.init(log_to_driver=False); from vlagents_ray.cli.main import app; app()"
 
 
 @contextlib.contextmanager
-def cluster_of(head: Host, nodes: Mapping[Host, tuple[int, bool]], **environment: str) -> Iterator[RayCluster]:
+def cluster_of(head: Host, nodes: Sequence[tuple[Host, int, bool]], **environment: str) -> Iterator[RayCluster]:
     """A head that plays nothing, and nodes with so many workers, and perhaps a replica."""
     path = f"{ROOT / 'tests' / 'support'}{os.pathsep}{ROOT}"
     with ray_cluster([head], cpus=0, environment={"PYTHONPATH": path, "TERM": "dumb"} | environment) as cluster:
-        for host, (workers, serves) in nodes.items():
+        for host, workers, serves in nodes:
             host.environment |= head.environment
             cluster.join(host, workers, resources=json.dumps({POLICY: 1} if serves else {}))
         yield cluster
@@ -49,7 +51,7 @@ def serving(head: Host, folder: Path, replicas: int) -> Iterator[str]:
     token = new_key(keys, "all")
     command = ["vlagents-ray", "serve", str(file), "--address", "auto", "--host", EVERYWHERE, "--keys", str(keys)]
     with log.open("w") as output, head.start(command, stdout=output, stderr=output) as server:
-        wait_for(lambda: "serving line" in log.read_text() or server.poll() is not None)
+        until(lambda: "serving line" in log.read_text() or server.poll() is not None)
         assert server.poll() is None, log.read_text()
         yield token
         server.kill()
@@ -64,7 +66,7 @@ class Evaluation:
         self._file = folder / "eval.yaml"
         policy = {"name": "line", "url": "serve://line", "execute": 1}
         suite = {"envs": [LINE], "episodes": episodes}
-        run = {"workers": workers, "worker": {"cpus": 1}, "video": "none", "out": str(self.out), "place_timeout_s": 10}
+        run = {"workers": workers, "worker": {"cpus": 1}, "video": "none", "out": str(self.out), "place_timeout_s": 60}
         self._file.write_text(yaml.safe_dump({"policies": [policy], "suites": [suite], **run}))
         self._process: subprocess.Popen[str] | None = None
 
@@ -89,7 +91,7 @@ class Evaluation:
         """Wait for so many episodes in all."""
         process = self._process
         assert process is not None
-        wait_for(lambda: len(self.played()) >= episodes or process.poll() is not None)
+        until(lambda: len(self.played()) >= episodes or process.poll() is not None)
         assert process.poll() is None, self.said()
 
     def goes_on(self, by: int = 12) -> None:

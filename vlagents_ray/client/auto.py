@@ -67,7 +67,7 @@ class AutoTransport:
             self._chosen = near
         elif inside is not None:
             channel = self._channel(inside, metadata, left_s)
-            self._chosen, self._handle = channel or inside, channel and inside
+            self._chosen, self._handle = channel or inside, None if channel is None else inside
         else:
             self._chosen = WebSocketTransport(self._url, self._codec, self._credentials)
             self._chosen.connect(left_s)
