@@ -25,6 +25,7 @@
     │   ├── UnknownPolicy
     │   └── UnknownEnv
     ├── EnvFailed                           a simulator broke: an infrastructure failure, never a policy's
+    ├── ClusterLost                         the head of the Ray cluster does not answer any more
     └── MissingDependency (also ImportError)
 
 `code` is stable and is what travels in a problem+json document; `status` is the HTTP status that
@@ -205,6 +206,12 @@ class EnvFailed(VLAgentsError):
     """A simulator broke or hung: an infrastructure failure, never counted against the policy."""
 
     code = "env_failed"
+
+
+class ClusterLost(VLAgentsError):
+    """The head of the Ray cluster does not answer any more, and nothing goes on without it."""
+
+    code = "cluster_lost"
 
 
 class MissingDependency(VLAgentsError, ImportError):

@@ -45,3 +45,11 @@ def test_another_node_reads_its_own_files(tmp_path: Path, monkeypatch: pytest.Mo
 def test_a_host_that_is_gone_has_no_log(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ray, "nodes", list)
     assert tail_at("gone", ["/log"]) == ""
+
+
+@pytest.mark.usefixtures("cluster")
+def test_a_host_that_does_not_answer_is_no_host_without_a_log(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(socket, "gethostname", lambda: "here")
+    monkeypatch.setattr(logs, "TIMEOUT_S", 0.0)
+    with pytest.raises(TimeoutError, match="did not answer"):
+        tail_at(ray.nodes()[0]["NodeManagerHostname"], ["/log"])

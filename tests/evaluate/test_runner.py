@@ -4,6 +4,7 @@ import functools
 import json
 import os
 import signal
+import socket
 import sqlite3
 import threading
 from collections.abc import Callable
@@ -63,7 +64,7 @@ class TestOnACluster:
         ("kind", "error"),
         [
             ("raise", "the simulator exploded"),
-            ("exit", "the worker died"),
+            ("exit", f"the worker on {socket.gethostname()} died"),
             ("hang", "env step after 3 steps took longer than 3 s"),
             ("freeze", "no sign of life"),
         ],

@@ -201,6 +201,19 @@ def test_auto_takes_plasma_where_the_socket_of_shared_memory_does_not_reach(monk
         assert other.act(frame(pixel=5)).action.tolist() == [5]
 
 
+@pytest.mark.parametrize("first", [8, 3600])
+def test_auto_goes_on_by_the_handle_where_the_store_has_no_room_for_a_channel(
+    monkeypatch: pytest.MonkeyPatch, first: int
+) -> None:
+    monkeypatch.setattr("vlagents_ray.client.auto.reaches", lambda _: False)
+    with RemoteAgent(f"serve://{APP}") as other:
+        other.reset(frame(first), "x")
+        act = other.act(frame(3600, pixel=6))  # 39 MB, so a channel of 64 MB
+        assert other.transport == "handle"
+        assert (act.action.tolist(), act.info["instruction"]) == ([6], "x")
+        assert act.info.get("resumed", False) is (first == 8)
+
+
 def test_a_killed_replica_is_noticed_and_the_next_one_serves() -> None:
     """The last test: it replaces the replica."""
     agent = RemoteAgent(f"serve://{APP}", transport="plasma", resume=False)

@@ -153,6 +153,18 @@ class ToZero(Agent):
         return Act((-float(obs.state["position"][0]) + noise).astype(np.float32))
 
 
+class Unhurried(ToZero):
+    """Chunks of a second for a robot at 50 Hz. Each takes its time, so that an evaluation lasts."""
+
+    def __init__(self, takes_s: float = 0.05) -> None:
+        super().__init__(chunk=50, state_dim=1)
+        self._takes_s = takes_s
+
+    def act(self, obs: Obs) -> Act:
+        time.sleep(self._takes_s)
+        return super().act(obs)
+
+
 class Silent(ToZero):
     """Never answers an `act`."""
 
@@ -168,10 +180,10 @@ class Teller(ToZero):
         raise PolicyFailed(str({name: os.environ.get(name) for name in ("OMP_NUM_THREADS", "LP_NUM_THREADS", "EXTRA")}))
 
 
-def wait_for(true: Any, timeout_s: float = 120.0) -> None:
+def wait_for(true: Any, timeout_s: float = 120.0, every_s: float = 0.02) -> None:
     """Poll until `true()`; `TimeoutError` if it never is."""
     deadline = time.monotonic() + timeout_s
     while not true():
         if time.monotonic() > deadline:
             raise TimeoutError(f"waited {timeout_s:g} s for {true}")
-        time.sleep(0.02)
+        time.sleep(every_s)

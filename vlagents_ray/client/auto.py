@@ -15,7 +15,7 @@ from vlagents_ray.client.plasma import PlasmaTransport
 from vlagents_ray.client.shm import ShmTransport, reaches
 from vlagents_ray.client.transport import Transport
 from vlagents_ray.client.websocket import WebSocketTransport
-from vlagents_ray.errors import ConfigError, NotReset, PolicyUnavailable
+from vlagents_ray.errors import ConfigError, MessageTooLarge, NotReset, PolicyUnavailable
 from vlagents_ray.wire.messages import Reply, Request, boot_id
 
 
@@ -24,7 +24,8 @@ class AutoTransport:
 
     Inside the cluster: shared memory, else a plasma channel on the replica's node, else the Serve handle.
     Shared memory comes first because it is faster, without Ray's locks and framing; plasma
-    reaches a replica on this node whose socket is in another network namespace.
+    reaches a replica on this node whose socket is in another network namespace. Where the object store has no
+    room for a channel, the handle takes over: its frames lie there for a moment, or for want of room on the disk.
     """
 
     def __init__(
@@ -35,6 +36,7 @@ class AutoTransport:
         self._codec = codec
         self._only_shm = only_shm
         self._chosen: Transport | None = None
+        self._handle: HandleTransport | None = None  # beside a channel to the same replica
 
     @property
     def name(self) -> str:
@@ -64,7 +66,8 @@ class AutoTransport:
         if near is not None:
             self._chosen = near
         elif inside is not None:
-            self._chosen = self._channel(inside, metadata, left_s) or inside
+            channel = self._channel(inside, metadata, left_s)
+            self._chosen, self._handle = channel or inside, None if channel is None else inside
         else:
             self._chosen = WebSocketTransport(self._url, self._codec, self._credentials)
             self._chosen.connect(left_s)
@@ -74,13 +77,20 @@ class AutoTransport:
         """By the chosen transport."""
         if self._chosen is None:
             raise NotReset("not connected; reset first")
+        try:
+            return self._chosen.call(requests, timeout_s)
+        except MessageTooLarge:  # for the channel; nothing was sent
+            if self._handle is None:
+                raise
+        self._chosen.close()
+        self._chosen, self._handle = self._handle, None
         return self._chosen.call(requests, timeout_s)
 
     def close(self) -> None:
         """End the connection; the next one chooses anew, since the server may have moved."""
         if self._chosen is not None:
             self._chosen.close()
-            self._chosen = None
+            self._chosen = self._handle = None
 
     def _channel(self, inside: HandleTransport, metadata: dict[str, Any], timeout_s: float) -> PlasmaTransport | None:
         transport = PlasmaTransport(urlsplit(self._url).netloc)

@@ -7,6 +7,7 @@ a handle may send each request to another one.
 from __future__ import annotations
 
 import pickle
+import time
 import uuid
 from collections.abc import Sequence
 from typing import Any
@@ -15,6 +16,8 @@ from vlagents_ray.errors import ConfigError, ConnectionLost, DeadlineExceeded, P
 from vlagents_ray.wire.codecs import RAW
 from vlagents_ray.wire.frames import decode_replies, encode_requests
 from vlagents_ray.wire.messages import Reply, Request, boot_id
+
+_PAUSE_S = 0.2  # before another replica is asked for in place of one that is gone
 
 
 class HandleTransport:
@@ -31,16 +34,28 @@ class HandleTransport:
         self._replica: Any = None
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
-        """Choose a replica; returns the metadata."""
+        """Choose a replica, as long as those chosen turn out to be gone; returns the metadata."""
         import ray
-        from ray import serve
-        from ray._private.worker import global_worker
-        from ray.serve.exceptions import RayServeException
 
         if not ray.is_initialized():
             raise ConfigError(
                 f"serve://{self._app}: this process is in no Ray cluster; call ray.init(), or use http://"
             )
+        deadline = time.monotonic() + timeout_s
+        while True:
+            try:
+                return self._attach(max(0.0, deadline - time.monotonic()))
+            except ConnectionLost as error:  # Serve notices after a while that a node was lost
+                if time.monotonic() + _PAUSE_S > deadline:
+                    raise PolicyUnavailable(str(error)) from error
+                time.sleep(_PAUSE_S)
+
+    def _attach(self, timeout_s: float) -> dict[str, Any]:
+        import ray
+        from ray import serve
+        from ray._private.worker import global_worker
+        from ray.serve.exceptions import RayServeException
+
         try:
             handle = serve.get_app_handle(self._app)
             here = ray.get_runtime_context().get_node_id() if global_worker.connected else ""
@@ -48,10 +63,12 @@ class HandleTransport:
             metadata, self._replica = attaching.result(timeout_s=timeout_s)
         except ray.exceptions.RayTaskError as error:
             raise PolicyUnavailable(f"serve://{self._app}: {error.cause}") from error
-        except (RayServeException, ray.exceptions.RayActorError) as error:
+        except RayServeException as error:
             raise PolicyUnavailable(f"serve://{self._app}: {error}") from error
         except TimeoutError as error:
             raise PolicyUnavailable(f"serve://{self._app}: no replica within {timeout_s:g} s") from error
+        except ray.exceptions.RayError as error:
+            raise ConnectionLost(f"serve://{self._app}: {error}") from error
         found: dict[str, Any] = metadata
         return found
 
@@ -60,15 +77,21 @@ class HandleTransport:
         import ray
 
         # A bare buffer, which lies in plasma apart from its pickle: an array's pickle depends on the numpy.
-        frame = ray.put(pickle.PickleBuffer(encode_requests(requests, RAW)))
+        content = pickle.PickleBuffer(encode_requests(requests, RAW))
+        try:
+            frame = ray.put(content)
+        except ray.exceptions.RayError as error:  # neither the object store nor the disk has room
+            raise PolicyUnavailable(
+                f"serve://{self._app}: {len(content.raw())} bytes cannot be sent: {error}"
+            ) from error
         pending = call_replica(self._replica, "call", self._session, frame, request_id=requests[0].request_id)
         try:
             return decode_replies(ray.get(pending, timeout=timeout_s))
         except ray.exceptions.GetTimeoutError as error:
             ray.cancel(pending)
             raise DeadlineExceeded(f"serve://{self._app}: no answer within {timeout_s:g} s") from error
-        except ray.exceptions.RayActorError as error:
-            raise ConnectionLost(f"serve://{self._app}: the session's replica is gone; reset again") from error
+        except ray.exceptions.RayError as error:  # the replica is gone, or its node with the frame or the answer
+            raise self._lost(error) from error
 
     def ask(self, method: str, *args: Any, timeout_s: float) -> Any:
         """What a method of the chosen replica returns; what it raises of ours is raised here."""
@@ -78,16 +101,19 @@ class HandleTransport:
             return ray.get(call_replica(self._replica, method, *args), timeout=timeout_s)
         except ray.exceptions.GetTimeoutError as error:
             raise DeadlineExceeded(f"serve://{self._app}: no answer within {timeout_s:g} s") from error
-        except ray.exceptions.RayActorError as error:
-            raise ConnectionLost(f"serve://{self._app}: the replica is gone; reset again") from error
         except ray.exceptions.RayTaskError as error:
             if isinstance(error.cause, VLAgentsError):
                 raise error.cause from None
             raise PolicyUnavailable(f"serve://{self._app}: {error.cause}") from error
+        except ray.exceptions.RayError as error:
+            raise self._lost(error) from error
 
     def close(self) -> None:
         """Forget the replica."""
         self._replica = None
+
+    def _lost(self, error: Exception) -> ConnectionLost:
+        return ConnectionLost(f"serve://{self._app}: the replica is gone ({type(error).__name__}); reset again")
 
 
 def call_replica(replica: Any, method: str, *args: Any, request_id: str = "") -> Any:

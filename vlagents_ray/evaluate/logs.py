@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import ray
-from ray.exceptions import RayError
+from ray.exceptions import GetTimeoutError, RayError
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 MOST_BYTES = 64_000  # of a log that is kept, all files together
@@ -36,7 +36,7 @@ def tail(paths: Sequence[str]) -> str:
 
 
 def tail_at(host: str, paths: Sequence[str]) -> str:
-    """The same of files on any host of the cluster; "" if it does not answer."""
+    """The same of files on any host of the cluster; "" if it is lost, `TimeoutError` if it does not answer."""
     if host == socket.gethostname():
         return tail(paths)
     nodes = [node["NodeID"] for node in ray.nodes() if node["Alive"] and node["NodeManagerHostname"] == host]
@@ -47,6 +47,8 @@ def tail_at(host: str, paths: Sequence[str]) -> str:
         read: str = ray.get(
             ray.remote(tail).options(num_cpus=0, scheduling_strategy=there).remote(list(paths)), timeout=TIMEOUT_S
         )
-    except RayError:  # the node is gone with its files; GetTimeoutError is one of them
+    except GetTimeoutError:
+        raise TimeoutError(f"host {host} did not answer within {TIMEOUT_S:g} s") from None
+    except RayError:  # the node is gone with its files
         return ""
     return read

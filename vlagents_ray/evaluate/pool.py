@@ -21,6 +21,7 @@ from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.config import EvalConfig, WorkerConfig
 from vlagents_ray.evaluate.episode import Phase
 from vlagents_ray.evaluate.failures import Failure
+from vlagents_ray.evaluate.head import Head
 from vlagents_ray.evaluate.jobs import Job
 from vlagents_ray.evaluate.logs import tail_at
 from vlagents_ray.evaluate.rollout import AgentFactory, Pulse, Report, Rollout
@@ -31,7 +32,8 @@ WATCH_S = 1.0  # between two looks at a busy worker
 GRACE_S = 5.0  # a call past its deadline gets this long to fail by itself
 KILL_S = 3.0  # for Ray to take note that workers are to be killed
 CLOSE_S = 10.0  # for workers to close their simulators when they leave
-MOST_FAILED_STARTS = 3  # in a row
+MOST_FAILED_STARTS = 3  # in a row; those that fail together, as with their node, count as one
+MUTE_S = 60.0  # a host that did not give the logs of a lost worker is not asked for so long
 
 # Pinned before any import in the worker: several workers share a machine.
 THREAD_VARIABLES = (
@@ -64,13 +66,21 @@ class Worker:
 
 
 class WorkerPool:
-    """Up to `config.workers` workers. Use as a context manager: leaving it kills every worker."""
+    """Up to `config.workers` workers. Use as a context manager: leaving it kills every worker.
+
+    While the head of the cluster does not answer, those that are there play on, and no others are started.
+    """
 
     def __init__(self, config: EvalConfig, agent_factory: AgentFactory) -> None:
         self._config = config
         self._actor_class = ray.remote(concurrency_groups={"watch": 1})(Rollout)
         self._agent_factory = agent_factory
+        self._head = Head()
         self._failed_starts = 0
+        self._failed_start = 0.0  # when the last of them failed
+        self._mute: dict[str, float] = {}  # hosts that do not answer, until when
+        self._busy = 0.0  # when an episode was last being played
+        self._short = False  # has it been said that there is not room for all workers?
         self._limit_s: dict[Phase, float] = {
             "connect": config.connect_timeout_s + config.policy_timeout_s,
             "make": config.make_timeout_s,
@@ -117,6 +127,8 @@ class WorkerPool:
 
     def make_room(self) -> bool:
         """Is there room for one more worker? An idle one leaves if there is none."""
+        if not self._head.answers():
+            return False
         if len(self._workers) < self._config.workers:
             return True
         idle = self.idle()
@@ -151,8 +163,10 @@ class WorkerPool:
     def wait(self, timeout_s: float) -> Iterator[tuple[Job, Report]]:
         """Reports that arrive within `timeout_s`, those of workers that died or hung included.
 
-        Such a worker, and one that reports that its simulator broke, is killed.
+        Such a worker, and one that reports that its simulator broke, is killed. `ClusterLost` when the head of the
+        cluster has not answered for long.
         """
+        self._head.answers()
         refs = {ref: worker for worker in self._workers for ref in _refs(worker)}
         if refs:
             done, waiting = ray.wait(list(refs), num_returns=1, timeout=timeout_s)
@@ -187,21 +201,22 @@ class WorkerPool:
             worker.looking = None
             try:
                 worker.pulse, worker.heard = ray.get(ref), monotonic()
-            except RayActorError as error:  # the answer to its job says the same
+            except RayError as error:  # the answer to its job says the same
                 log.debug("a worker did not answer: %s", error)
         elif worker.jobs:
             jobs, worker.jobs, worker.running = worker.jobs, (), None
             try:
                 reports: list[Report] = ray.get(ref)
             except RayError as error:
-                reason = f"the worker {'died' if isinstance(error, RayActorError) else 'failed'}: {error}"
+                what = "died" if isinstance(error, RayActorError) else "failed"
+                reason = f"the worker on {worker.process['host']} {what}: {error}"
                 reports = [Report(failure=Failure("worker", EnvFailed.code, reason))] * len(jobs)
             if reports[0].made is not None:
                 worker.made = jobs[0].cell.place
             broken = [one.failure for one in reports if one.failure is not None and one.failure.cause == "worker"]
             if broken:
                 self._end(worker)
-                with_log = _with_log(broken[0], worker)
+                with_log = self._with_log(broken[0], worker)
                 reports = [replace(one, failure=with_log) if one.failure in broken else one for one in reports]
             yield from zip(jobs, reports, strict=True)
 
@@ -209,27 +224,31 @@ class WorkerPool:
         try:
             worker.process = ray.get(worker.starting)
         except RayError as error:
-            self._failed_starts += 1
+            if worker.since > self._failed_start:
+                self._failed_starts, self._failed_start = self._failed_starts + 1, monotonic()
             if self._failed_starts >= MOST_FAILED_STARTS:
                 raise EnvFailed(f"workers do not start, {self._failed_starts} in a row: {error}") from error
             self._end(worker)
         else:
             log.info("worker %s", worker.process)
             self._failed_starts = 0
+            self._short = False
             worker.starting = None
 
     def _look(self) -> Iterator[tuple[Job, Report]]:
         now = monotonic()
+        if self.busy:
+            self._busy = now
         self._see_off(now)
         for worker in list(self._workers):
             if worker.starting is not None:
                 if now - worker.since > self._config.place_timeout_s:
-                    raise ConfigError(self._no_room(worker.config))
+                    self._no_room(worker.config)
             elif worker.jobs:
                 reason = self._overdue(worker, now)
                 if reason is not None:
                     self._end(worker)
-                    failure = _with_log(Failure("worker", EnvFailed.code, reason, worker.pulse.stack), worker)
+                    failure = self._with_log(Failure("worker", EnvFailed.code, reason, worker.pulse.stack), worker)
                     yield from ((job, Report(failure=failure)) for job in worker.jobs)
                 elif worker.looking is None and now - worker.looked > WATCH_S:
                     worker.looked = now
@@ -254,13 +273,33 @@ class WorkerPool:
             return f"no sign of life for {silent_s:.0f} s, last seen in {pulse.phase}; the worker was killed"
         return None
 
-    def _no_room(self, worker: WorkerConfig) -> str:
+    def _with_log(self, failure: Failure, worker: Worker) -> Failure:
+        """Nobody waits for a lost node more than once, however many workers it had."""
+        host: str = worker.process["host"]
+        if monotonic() < self._mute.get(host, 0.0) or not self._head.answers():
+            return failure
+        try:
+            return replace(failure, log=tail_at(host, worker.process["logs"]))
+        except TimeoutError:
+            self._mute[host] = monotonic() + MUTE_S
+            return failure
+
+    def _no_room(self, worker: WorkerConfig) -> None:
+        """Go on with the workers that play: the node of another one may have been lost, and may come back."""
+        stuck = monotonic() - self._busy > self._config.place_timeout_s
+        if (self._short and not stuck) or not self._head.answers():
+            return
+        self._short = True
         want = {"CPU": worker.cpus, "GPU": worker.gpus}
-        return (
+        message = (
             f"the cluster found no room for a worker in {self._config.place_timeout_s:g} s: each wants {want}, "
             f"free are {ray.available_resources()} of {ray.cluster_resources()}; lower `workers` or "
             f"`worker.cpus`, or raise `place_timeout_s` if the cluster is still growing"
         )
+        if stuck:
+            raise ConfigError(message)
+        running = sum(one.starting is None for one in self._workers)
+        log.warning("going on with %d of %d workers: %s", running, self._config.workers, message)
 
 
 def _kill(actors: list[Any]) -> None:
@@ -271,10 +310,6 @@ def _kill(actors: list[Any]) -> None:
 
 def _refs(worker: Worker) -> list[Any]:
     return [ref for ref in (worker.starting, worker.running, worker.looking) if ref is not None]
-
-
-def _with_log(failure: Failure, worker: Worker) -> Failure:
-    return replace(failure, log=tail_at(worker.process["host"], worker.process["logs"]))
 
 
 def runtime_env(worker: WorkerConfig) -> dict[str, Any]:

@@ -1,0 +1,69 @@
+"""What a Ray that broke makes of a call through a Serve handle: an infrastructure failure, never the policy's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import ray
+from ray.exceptions import ActorDiedError, LocalRayletDiedError, ObjectStoreFullError, OutOfDiskError
+
+from vlagents_ray.client import handle
+from vlagents_ray.client.handle import HandleTransport
+from vlagents_ray.errors import ConnectionLost, PolicyUnavailable
+from vlagents_ray.interface import Obs
+from vlagents_ray.wire.messages import Request
+
+REQUEST = Request("act", Obs(gripper=1.0), session="s", request_id="r")
+
+
+def failing(error: Exception) -> Any:
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    return fail
+
+
+@pytest.mark.parametrize("error", [ObjectStoreFullError("full"), OutOfDiskError("full")])
+def test_a_frame_that_neither_store_nor_disk_has_room_for_is_not_sent(
+    monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    monkeypatch.setattr(ray, "put", failing(error))
+    with pytest.raises(PolicyUnavailable, match=r"\d+ bytes cannot be sent") as raised:
+        HandleTransport("app").call([REQUEST], 1)
+    assert not isinstance(raised.value, ConnectionLost), "that would say that it may have been executed"
+
+
+@pytest.mark.parametrize("error", [ActorDiedError(), LocalRayletDiedError()])
+def test_an_answer_that_is_lost_with_its_node_is_a_lost_connection(
+    monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    monkeypatch.setattr(ray, "put", lambda _: None)
+    monkeypatch.setattr(handle, "call_replica", lambda *_, **__: None)
+    monkeypatch.setattr(ray, "get", failing(error))
+    with pytest.raises(ConnectionLost, match=f"replica is gone \\({type(error).__name__}\\)"):
+        HandleTransport("app").call([REQUEST], 1)
+
+
+class TestConnecting:
+    @pytest.fixture(autouse=True)
+    def in_a_cluster(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(ray, "is_initialized", lambda: True)
+
+    def test_another_replica_is_chosen_in_place_of_one_that_is_gone(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        answers: Iterator[Any] = iter([ConnectionLost("gone"), ConnectionLost("gone"), {"policy": "p"}])
+
+        def attach(self: HandleTransport, timeout_s: float) -> Any:
+            answer = next(answers)
+            if isinstance(answer, Exception):
+                raise answer
+            return answer
+
+        monkeypatch.setattr(HandleTransport, "_attach", attach)
+        assert HandleTransport("app").connect(30) == {"policy": "p"}
+
+    def test_where_all_are_gone_the_time_limit_holds(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(HandleTransport, "_attach", failing(ConnectionLost("gone")))
+        with pytest.raises(PolicyUnavailable, match="gone"):
+            HandleTransport("app").connect(0.5)

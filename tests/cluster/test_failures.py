@@ -1,0 +1,108 @@
+"""What is lost when machines and networks of a cluster fail: time and attempts, no episode and no result."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from lasting import Evaluation, cluster_of, serving, until, workers_on
+
+from vlagents_ray.bench.hosts import Host, hosts
+from vlagents_ray.client.credentials import KEY_VARIABLE
+
+pytestmark = [pytest.mark.hosts, pytest.mark.slow]
+
+NO_MEMORY = "MemTotal: 16000000 kB\nMemFree: 80000 kB\nMemAvailable: 80000 kB\nBuffers: 0 kB\nCached: 0 kB\n"
+
+
+@contextlib.contextmanager
+def cut_off(host: Host, seconds: float) -> Iterator[None]:
+    """A partition of that length, at least; the block runs meanwhile."""
+    healed = time.monotonic() + seconds
+    host.cut()
+    yield
+    time.sleep(max(0.0, healed - time.monotonic()))
+    host.heal()
+
+
+@contextlib.contextmanager
+def out_of_memory(host: Host, folder: Path) -> Iterator[None]:
+    """As far as Ray's memory monitor there can see."""
+    fake = folder / "meminfo"
+    fake.write_text(NO_MEMORY)
+    host.run(["mount", "--bind", str(fake), "/proc/meminfo"])
+    yield
+    host.run(["umount", "/proc/meminfo"])
+
+
+def test_lost_nodes_and_partitions_cost_attempts_alone(tmp_path: Path) -> None:
+    """Two nodes with a replica and a worker each, and one with two workers."""
+    episodes = 320
+    run = Evaluation(tmp_path, episodes, workers=4)
+    with hosts(5) as [head, one, two, simulating, spare]:
+        nodes = [(one, 1, True), (two, 1, True), (simulating, 2, False)]
+        with (
+            cluster_of(head, nodes) as cluster,
+            serving(head, tmp_path, replicas=2) as token,
+            run.running(head, token),
+        ):
+            with cut_off(two, 3.0):
+                pass
+            run.goes_on()
+            assert run.attempts() == [], "a short partition costs time alone"
+            with cut_off(two, 20.0):
+                run.goes_on()
+            run.goes_on()
+            simulating.kill()
+            until(lambda: "the worker on host4 died" in run.said())
+            run.goes_on()
+            spare.environment |= head.environment
+            cluster.join(spare, 2)
+            until(lambda: workers_on(spare) == 2)
+            two.kill()
+            assert run.ends() == 0, run.said()
+            for host in (head, one, spare):
+                until(lambda host=host: workers_on(host) == 0)
+    run.is_whole(episodes)
+    assert {attempt.cause for attempt in run.attempts()} <= {"worker", "policy"}
+
+
+def test_a_robot_a_crowd_and_a_head_that_dies(tmp_path: Path) -> None:
+    """An evaluation at a node, beside a robot outside of the cluster; then memory runs out, then the head dies."""
+    episodes = 160
+    run = Evaluation(tmp_path, episodes, workers=3)
+    with hosts(4) as [head, one, two, robot]:
+        nodes = [(one, 2, True), (two, 2, False)]
+        patience = {"RAY_gcs_rpc_server_reconnect_timeout_s": "20"}
+        with cluster_of(head, nodes, **patience), serving(head, tmp_path, replicas=1) as token:
+            with run.running(one, token):
+                robot.limit("1gbit")
+                robot.environment |= {KEY_VARIABLE: token}
+                loop = ["--hz", "50", "--seconds", "20", "--transport", "websocket", "--baseline", "0"]
+                # Its exit status says so if a tick had no action of the policy.
+                robot.run([sys.executable, "-m", "vlagents_ray.robot", f"http://{head.name}:8000", *loop])
+                assert run.attempts() == []
+                with out_of_memory(two, tmp_path):
+                    until(lambda: any("memory" in attempt.error for attempt in run.attempts()))
+                run.goes_on()
+                head.kill()
+                run.goes_on(by=2)
+                assert run.ends() == 1
+            assert "ClusterLost: the head of the Ray cluster, 198.18.0.1:6379, has not answered" in run.said()
+            summary = json.loads((run.out / "summary.json").read_text())
+            assert summary["state"] == "stopped"
+            assert summary["total"]["episodes"] == len(run.played()) > 0
+            for host in (one, two):
+                until(lambda host=host: workers_on(host) == 0)
+        with (
+            cluster_of(robot, [(one, 2, True)]),
+            serving(robot, tmp_path, replicas=1) as token,
+            run.running(robot, token, "--resume"),
+        ):
+            assert run.ends() == 0, run.said()
+    run.is_whole(episodes)

@@ -1,0 +1,49 @@
+"""The driver notices that the cluster's head is gone, before Ray ends the driver for it."""
+
+from __future__ import annotations
+
+import socket
+from types import SimpleNamespace
+
+import pytest
+import ray
+
+from vlagents_ray.errors import ClusterLost
+from vlagents_ray.evaluate import head
+from vlagents_ray.evaluate.head import Head
+
+
+@pytest.fixture
+def listening(monkeypatch: pytest.MonkeyPatch) -> socket.socket:
+    """In place of the head's socket."""
+    listening = socket.create_server(("127.0.0.1", 0))
+    context = SimpleNamespace(gcs_address=f"127.0.0.1:{listening.getsockname()[1]}")
+    monkeypatch.setattr(ray, "get_runtime_context", lambda: context)
+    monkeypatch.setattr(head, "PERIOD_S", 0.0)
+    return listening
+
+
+def test_a_head_that_is_silent_for_a_while_is_waited_for(listening: socket.socket) -> None:
+    watched, port = Head(), listening.getsockname()[1]
+    assert watched.answers()
+    listening.close()
+    assert not watched.answers()
+    with socket.create_server(("127.0.0.1", port)):
+        assert watched.answers()
+
+
+def test_one_that_stays_silent_is_given_up_before_ray_ends_this_process(
+    listening: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RAY_gcs_rpc_server_reconnect_timeout_s", "0.000001")
+    watched = Head()
+    listening.close()
+    with pytest.raises(ClusterLost, match=r"127\.0\.0\.1:\d+, has not answered.*--resume"):
+        watched.answers()
+
+
+def test_it_is_not_asked_at_every_turn(listening: socket.socket, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(head, "PERIOD_S", 3600.0)
+    watched = Head()
+    listening.close()
+    assert watched.answers()

@@ -1,0 +1,80 @@
+"""What the pool of workers makes of nodes that are lost."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from time import monotonic
+from typing import Any
+
+import pytest
+import ray
+from eval_fakes import LINE, ToZero, wait_for
+
+from vlagents_ray.errors import ConfigError, EnvFailed
+from vlagents_ray.evaluate import EvalConfig, pool
+from vlagents_ray.evaluate.failures import Failure
+from vlagents_ray.evaluate.jobs import EpisodeKey, Job
+from vlagents_ray.evaluate.pool import Worker, WorkerPool
+
+pytestmark = pytest.mark.usefixtures("cluster")
+
+Config = Callable[..., EvalConfig]
+
+
+@ray.remote
+def lost() -> None:
+    raise RuntimeError("its node died")
+
+
+@ray.remote(num_cpus=0)
+class Process:
+    """Of a worker, whatever it runs."""
+
+
+def worker(config: EvalConfig, starting: Any = None, **known: Any) -> Worker:
+    return Worker(config.worker, "kind", Process.remote(), starting=starting, since=monotonic(), **known)
+
+
+def test_workers_that_are_lost_together_while_they_start_are_no_row_of_failures(config: Config) -> None:
+    settings = config(workers=5)
+
+    def lose(workers: int) -> None:
+        started._workers = [worker(settings, lost.remote()) for _ in range(workers)]
+        while started.kinds():
+            assert list(started.wait(1)) == []
+
+    with WorkerPool(settings, ToZero) as started:
+        lose(5)
+        lose(5)
+        with pytest.raises(EnvFailed, match="workers do not start, 3 in a row"):
+            lose(1)
+
+
+def test_workers_play_on_while_there_is_no_room_for_all(config: Config, caplog: pytest.LogCaptureFixture) -> None:
+    settings = config(workers=2, place_timeout_s=0.2)
+    job = Job(EpisodeKey(LINE, 0, 0, "settings"), None)  # type: ignore[arg-type]
+    waiting = worker(settings, Process.options(num_cpus=64).remote().__ray_ready__.remote())
+    playing = worker(settings, jobs=(job,), heard=monotonic(), looked=monotonic())
+    with WorkerPool(settings, ToZero) as short:
+        short._workers = [waiting, playing]
+        wait_for(lambda: list(short.wait(0.1)) or "going on with 1 of 2 workers: the cluster found no" in caplog.text)
+        playing.jobs = ()
+        assert list(short.wait(0.1)) == [], "between two episodes"
+        with pytest.raises(ConfigError, match="lower `workers`"):
+            wait_for(lambda: list(short.wait(0.1)))
+
+
+def test_a_host_that_does_not_answer_is_waited_for_once(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def silent(host: str, paths: object) -> str:
+        asked.append(host)
+        raise TimeoutError
+
+    monkeypatch.setattr(pool, "tail_at", silent)
+    failure = Failure("worker", EnvFailed.code, "the worker died")
+    with WorkerPool(config(), ToZero) as watched:
+        for host in ("host1", "host1", "host2"):
+            process = {"host": host, "logs": ["/log"]}
+            assert watched._with_log(failure, worker(config(), process=process)) == failure
+    assert asked == ["host1", "host2"]
