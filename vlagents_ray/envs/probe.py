@@ -108,18 +108,33 @@ def vulkan_cure() -> str:
     return VULKAN_CURE_NVIDIA if nvidia else VULKAN_CURE
 
 
-def vulkan_device_name(*, on_gpu: bool) -> str | None:
-    """The device that SAPIEN renders on in this process, e.g. "llvmpipe (LLVM 15.0.6, 256 bits)"."""
+@dataclass(frozen=True, slots=True)
+class VulkanDevice:
+    """What SAPIEN renders on."""
+
+    name: str  # "llvmpipe (LLVM 15.0.6, 256 bits)"
+    cuda: int | None  # CUDA's number of it in this process; None of what CUDA does not know
+
+
+def vulkan_device(*, on_gpu: bool) -> VulkanDevice | None:
+    """The device that SAPIEN renders on in this process."""
     import sapien.render
 
-    usable: list[tuple[str, bool]] = []  # name, whether CUDA knows it
-    for block in sapien.render.get_device_summary().split("GPU:")[1:]:
+    usable = usable_devices(sapien.render.get_device_summary())
+    usable.sort(key=lambda device: (device.cuda is not None) != on_gpu)  # stable: otherwise SAPIEN's order
+    return usable[0] if usable else None
+
+
+def usable_devices(summary: str) -> list[VulkanDevice]:
+    """Those that SAPIEN's `summary` of all calls supported, in its order."""
+    found = []
+    for block in summary.split("GPU:")[1:]:
         name, *lines = block.splitlines()
         facts = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
         if facts.get("Supported") == "1":
-            usable.append((name.strip(), facts.get("cudaId", "-1") != "-1"))
-    usable.sort(key=lambda device: device[1] != on_gpu)  # stable: otherwise SAPIEN's order
-    return usable[0][0] if usable else None
+            cuda = int(facts.get("cudaId", "-1"))
+            found.append(VulkanDevice(name.strip(), cuda if cuda >= 0 else None))
+    return found
 
 
 def _run_child(api: Literal["vulkan", "egl"], cure: str, timeout_s: float) -> Probe:
@@ -170,7 +185,8 @@ def _render_vulkan() -> str | None:
     scene.update_render()
     camera.take_picture()
     _require_contrast(np.asarray(camera.get_picture("Color"))[..., :3])
-    return vulkan_device_name(on_gpu=device.is_cuda())
+    found = vulkan_device(on_gpu=device.is_cuda())
+    return None if found is None else found.name
 
 
 def _render_egl() -> str | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 import os
 import signal
 import threading
@@ -17,6 +18,7 @@ import ray
 
 from vlagents_ray.client import RemoteAgent
 from vlagents_ray.errors import ConfigError, from_code
+from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.config import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.failures import Failure
@@ -33,8 +35,11 @@ from vlagents_ray.evaluate.stopping import Stopping
 from vlagents_ray.evaluate.store import Store
 from vlagents_ray.evaluate.summary import Summary, summarize, write_summary
 from vlagents_ray.evaluate.trackers import Tracking
+from vlagents_ray.evaluate.whereabouts import Whereabouts, unused_gpus
 from vlagents_ray.interface import Agent
 from vlagents_ray.signals import own_sigterm
+
+log = logging.getLogger(__name__)
 
 POLL_S = 0.25  # how soon a signal is noticed
 
@@ -105,6 +110,7 @@ class _Run:
         self._progress = progress
         self._tracking = tracking
         self._lost_in_a_row = 0
+        self._hints: set[str] = set()  # that were given
         earlier = {cell.cell: cell for cell in Results.load(config.out).cells}
         self._recorded = {cell: rate_of([results], "success_once") for cell, results in earlier.items()}
         self._stopping: dict[str, Stopping] = {}
@@ -151,11 +157,20 @@ class _Run:
         if report.made is not None:
             self._store.note_env(job.cell.place, report.made)
             save_diffs(self._config.out, [report.made.code])
+        if report.where is not None:
+            self._met(job.cell, report.where)
         if report.failure is not None:
             self._failed(job, report.failure)
         elif report.result is not None:
             self._lost_in_a_row = 0
             self._record(job, report.result, report.kept)
+
+    def _met(self, cell: Cell, where: Whereabouts) -> None:
+        self._store.note_worker(where)
+        hint = unused_gpus(cell, where)
+        if hint is not None and hint not in self._hints:
+            self._hints.add(hint)
+            log.warning(hint)
 
     def _failed(self, job: Job, failure: Failure) -> None:
         beyond = self._has_stopped(job)  # nobody waits for it
