@@ -37,18 +37,14 @@ class Meeting(Line):
 def serve() -> None:
     """Until standard input ends."""
     from vlagents_ray.serve.cluster import running_server
-    from vlagents_ray.serve.files import deployment
+    from vlagents_ray.serve.files import deployment, together
 
-    first, *rest = [
-        deployment("eval_fakes:ToZero", replicas=REPLICAS[app], resources={"custom": {RESOURCE[app]: 1}})
-        for app in RESOURCE
-    ]
-    applications = [one.applications[0] for one in (first, *rest)]
-    named = [
-        application.model_copy(update={"name": app, "route_prefix": f"/{app}"})
-        for app, application in zip(RESOURCE, applications, strict=True)
-    ]
-    both = first.model_copy(update={"applications": named})
+    both = together(
+        {
+            app: deployment("eval_fakes:ToZero", replicas=number, resources={"custom": {RESOURCE[app]: 1}})
+            for app, number in REPLICAS.items()
+        }
+    )
     with running_server(both, host="0.0.0.0", port=PORT, address="auto", insecure=True):  # noqa: S104 - of hosts
         print("ready", flush=True)
         sys.stdin.read()
