@@ -19,11 +19,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
 import vlagents_ray
+from vlagents_ray.envs import egl
+from vlagents_ray.envs.egl import EglDevice
 from vlagents_ray.errors import EnvFailed, VLAgentsError
 
 TIMEOUT_S = 60.0  # a software driver compiles its shaders in 3 to 10 s
@@ -63,6 +65,7 @@ class Probe:
     device: str | None = None  # as the driver names it; "llvmpipe ..." is Mesa's software driver
     error: str | None = None
     cure: str | None = None
+    devices: tuple[EglDevice, ...] = ()  # all of EGL's, if it was EGL that was tried
 
 
 @functools.cache
@@ -160,8 +163,9 @@ def _run_child(api: Literal["vulkan", "egl"], cure: str, timeout_s: float) -> Pr
         return Probe(api, ok=False, seconds=time.monotonic() - started, error=error, cure=cure)
     seconds = time.monotonic() - started
     if child.returncode == 0:
-        device = json.loads(child.stdout.splitlines()[-1])["device"]
-        return Probe(api, ok=True, seconds=seconds, device=device)
+        answer = json.loads(child.stdout.splitlines()[-1])
+        devices = tuple(EglDevice(**one) for one in answer["devices"])
+        return Probe(api, ok=True, seconds=seconds, device=answer["device"], devices=devices)
     said = [line for line in child.stderr.splitlines() if line.strip()]
     ended = f"the child ended with {child.returncode}"
     return Probe(api, ok=False, seconds=seconds, error=said[-1].strip() if said else ended, cure=cure)
@@ -216,7 +220,8 @@ def _require_contrast(image: object) -> None:
 
 def _main(api: str) -> None:
     device = _render_vulkan() if api == "vulkan" else _render_egl()
-    sys.stdout.write("\n" + json.dumps({"device": device}) + "\n")
+    devices = [asdict(one) for one in egl.devices()] if api == "egl" else []
+    sys.stdout.write("\n" + json.dumps({"device": device, "devices": devices}) + "\n")
 
 
 if __name__ == "__main__":

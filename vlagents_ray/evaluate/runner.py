@@ -110,7 +110,7 @@ class _Run:
         self._progress = progress
         self._tracking = tracking
         self._lost_in_a_row = 0
-        self._hints: set[str] = set()  # that were given
+        self._looked_for_gpus = False  # when an env first drew
         earlier = {cell.cell: cell for cell in Results.load(config.out).cells}
         self._recorded = {cell: rate_of([results], "success_once") for cell, results in earlier.items()}
         self._stopping: dict[str, Stopping] = {}
@@ -167,10 +167,10 @@ class _Run:
 
     def _met(self, cell: Cell, where: Whereabouts) -> None:
         self._store.note_worker(where)
-        hint = unused_gpus(cell, where)
-        if hint is not None and hint not in self._hints:
-            self._hints.add(hint)
-            log.warning(hint)
+        if where.renderer is not None and not self._looked_for_gpus:
+            self._looked_for_gpus = True
+            if (hint := unused_gpus(cell, where)) is not None:
+                log.warning(hint)
 
     def _failed(self, job: Job, failure: Failure) -> None:
         beyond = self._has_stopped(job)  # nobody waits for it

@@ -40,8 +40,8 @@ def here(policy: str, agent: Agent, env: EvalEnv | BatchEnv) -> Whereabouts:
 
 def unused_gpus(cell: Cell, where: Whereabouts) -> str | None:
     """A hint that the workers of `cell` draw in software in a cluster with GPUs, which may be meant; None if not so."""
-    gpus = ray.cluster_resources().get("GPU", 0)
-    if where.renderer is None or cell.worker.gpus or not gpus:
+    gpus = 0 if cell.worker.gpus else ray.cluster_resources().get("GPU", 0)
+    if not gpus:
         return None
     return (
         f"{cell.env} draws on {where.renderer}, as its workers have no GPU; the cluster has {gpus:g}: {SHARE}, "
