@@ -88,6 +88,13 @@ def test_what_the_user_chose_stays_and_is_no_mistake(monkeypatch: pytest.MonkeyP
     require_own(graphics.vulkan_renderer("NVIDIA H200", None))
 
 
+def test_the_nvidia_driver_that_sapien_names_by_itself_is_nobodys_wish(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(GPUS, "")
+    monkeypatch.setenv(graphics.VULKAN_DRIVERS[0], "/venv/sapien/vulkan_library/nvidia_icd.json")
+    with pytest.raises(ConfigError, match="given no GPU"):
+        require_own(graphics.vulkan_renderer("NVIDIA H200", None))
+
+
 def test_where_no_device_fits_none_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(egl, "devices", lambda: TWO_GPUS[:3])
     assert chosen(monkeypatch, "") is None

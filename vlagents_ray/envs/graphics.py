@@ -19,6 +19,7 @@ GPUS = "CUDA_VISIBLE_DEVICES"
 EGL_DEVICE = "MUJOCO_EGL_DEVICE_ID"
 VULKAN_DRIVERS = ("VK_ICD_FILENAMES", "VK_DRIVER_FILES")  # the first is also read by the old loader that SAPIEN brings
 _ICD_FOLDERS = ("/usr/local/share/vulkan/icd.d", "/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
+_SAPIENS_OWN = "sapien/vulkan_library/"  # of NVIDIA's driver, which it names where it finds no other
 _SOFTWARE_VULKAN = "llvmpipe"  # how lavapipe names its device
 
 SHARE = "worker: {gpus: 0.25} gives each worker a part of a GPU"
@@ -27,8 +28,8 @@ _CURE_HIDDEN = (
 )
 _CURE_OWN = (
     "install the NVIDIA driver's graphics part on that node (libnvidia-gl; in a container "
-    "NVIDIA_DRIVER_CAPABILITIES=all), or leave worker.gpus at 0 to render in software; a device that "
-    f"{EGL_DEVICE} names in worker.runtime_env.env_vars is taken whatever it is"
+    "NVIDIA_DRIVER_CAPABILITIES=all), or leave worker.gpus at 0 to render in software; if it is meant, say so by "
+    f"render_backend in env_options (ManiSkill) or {EGL_DEVICE} in worker.runtime_env.env_vars"
 )
 
 
@@ -77,7 +78,8 @@ def opengl_renderer() -> Renderer | None:
 
 def vulkan_renderer(name: str, cuda: int | None, *, asked_for: bool = False) -> Renderer:
     """Of the device that SAPIEN says it draws on; `asked_for` if the env was told which."""
-    named = has_gpu() is False and any(os.environ.get(variable) for variable in VULKAN_DRIVERS)
+    files = filter(None, map(os.environ.get, VULKAN_DRIVERS))
+    named = has_gpu() is False and any(_SAPIENS_OWN not in file for file in files)
     return Renderer(name, name.startswith(_SOFTWARE_VULKAN), cuda, asked_for or named)
 
 
