@@ -11,6 +11,8 @@ from rich.console import Console
 
 from vlagents_ray.cli import doctor, machine
 from vlagents_ray.cli.doctor import Check
+from vlagents_ray.envs import probe
+from vlagents_ray.envs.egl import EglDevice
 from vlagents_ray.errors import MissingDependency
 
 GB = machine.GB
@@ -127,6 +129,18 @@ def test_a_gpu_counts_only_if_torch_can_use_it(
     assert row.status == status
     assert "NVIDIA H200, 143771 MiB, 580.1" in row.detail
     assert said in row.detail
+
+
+@pytest.mark.parametrize(("software", "status"), [(True, "ok"), (False, "warn")])
+def test_a_machine_on_which_workers_without_a_gpu_could_not_render_is_told(
+    monkeypatch: pytest.MonkeyPatch, software: bool, status: str
+) -> None:
+    devices = (EglDevice(0, software=False, cuda=0), *([EglDevice(1, software=True, cuda=None)] if software else []))
+    found = probe.Probe("egl", ok=True, seconds=1.0, device="NVIDIA H200/PCIe/SSE2", devices=devices)
+    monkeypatch.setattr(probe, "egl_probe", lambda: found)
+    row = doctor.egl()
+    assert row.status == status
+    assert ("gpus: 0.25" in row.cure) is not software
 
 
 def test_h264_survives_encoding_and_decoding() -> None:

@@ -34,6 +34,7 @@ def test_mujoco_renders_through_egl() -> None:
     found = probe.egl_probe()
     assert found.ok, found.error
     assert found.device
+    assert [one.number for one in found.devices] == list(range(len(found.devices)))
 
 
 @needs_sapien

@@ -54,6 +54,15 @@ def test_parts_that_overlap_make_the_whole(part: Callable[..., Path], tmp_path: 
     assert (tmp_path / "out" / "summary.json").is_file()
 
 
+def test_the_workers_of_each_part_are_known_with_its_runs(part: Callable[..., Path], tmp_path: Path) -> None:
+    merge(tmp_path / "merged", [part("a", 3, 4, 5), part("b", 0, 1)])
+    found = Results.load(tmp_path / "merged").workers
+    assert [(one.run, one.pid, one.transport) for one in found] == [
+        (1, os.getpid(), "local"),
+        (2, os.getpid(), "local"),
+    ]
+
+
 def test_an_episode_of_both_is_as_the_first_has_it(part: Callable[..., Path], tmp_path: Path) -> None:
     a, b = part("a"), part("b")
     merge(tmp_path / "out", [a, b])

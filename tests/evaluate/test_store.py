@@ -19,6 +19,7 @@ from vlagents_ray.evaluate.results import Results
 from vlagents_ray.evaluate.rollout import Made
 from vlagents_ray.evaluate.store import Store
 from vlagents_ray.evaluate.summary import summarize
+from vlagents_ray.evaluate.whereabouts import Whereabouts
 
 
 def planned(config: EvalConfig) -> list[Job]:
@@ -181,6 +182,32 @@ def test_what_is_known_of_an_env_survives_a_resume(config: Config) -> None:
     with Store(config(resume=True)) as store:
         assert store.cells == [cell]
     assert [one.described for one in Results.load(config().out).cells] == [{"simulator": "line"}]
+
+
+def test_where_workers_ran_is_kept(config: Config) -> None:
+    near = Whereabouts("gpu1", "ab12", 7, "pi0", "shm", "llvmpipe")
+    with Store(config()) as store:
+        store.begin_run(config(), {})
+        store.note_worker(near)
+        store.note_worker(replace(near, host="cpu1", transport="handle", renderer=None))
+    found = Results.load(config().out).workers
+    assert [(one.run, one.host, one.node, one.pid, one.policy, one.transport, one.renderer) for one in found] == [
+        (1, "gpu1", "ab12", 7, "pi0", "shm", "llvmpipe"),
+        (1, "cpu1", "ab12", 7, "pi0", "handle", None),
+    ]
+
+
+def test_results_from_before_workers_were_noted_are_read_and_gone_on_with(config: Config) -> None:
+    with Store(config()) as store:
+        store.begin_run(config(), {})
+        store.record(done(planned(config())[0].key), attempts=1)
+    with closing(sqlite3.connect(config().out / "results.db")) as db:
+        db.execute("DROP TABLE workers")
+    assert Results.load(config().out).workers == ()
+    with Store(config(resume=True)) as store:
+        store.begin_run(config(resume=True), {})
+        store.note_worker(Whereabouts("here", None, 1, "policy", "local", None))
+    assert [(one.run, one.host) for one in Results.load(config().out).workers] == [(2, "here")]
 
 
 def test_a_results_file_of_another_version_is_refused(config: Config) -> None:

@@ -7,11 +7,13 @@ import signal
 from collections.abc import Iterator
 
 import pytest
+import ray
 from eval_fakes import wait_for
 
 from tests.integration.conftest import serving
 from tests.integration.test_sessions import obs
 from vlagents_ray import ConnectionLost, NotReset, RemoteAgent
+from vlagents_ray.client.handle import ReplicaNodes
 from vlagents_ray.client.ways import TransportName
 from vlagents_ray.serve.cluster import Server
 
@@ -41,6 +43,12 @@ def test_http_sessions_stay_on_their_replica(server: Server) -> None:
     check(agents, pids, 20)
     for agent in agents:
         agent.close()
+
+
+def test_a_caller_learns_on_which_nodes_the_replicas_are_and_of_no_application_nothing(server: Server) -> None:
+    assert server.apps.keys() == {"Reacher"}
+    assert ReplicaNodes("Reacher").look() == {ray.get_runtime_context().get_node_id(): 3}
+    assert ReplicaNodes("Nobody").look() == {}
 
 
 @pytest.mark.parametrize("transport", ["handle", "shm", "plasma"])

@@ -30,6 +30,8 @@ def play(config: EvalConfig, make: Callable[[], Agent] = ToZero, *, left_out: It
                 store.note_policy(job.cell.policy.name, report.policy)
             if report.made is not None:
                 store.note_env(job.cell.place, report.made)
+            if report.where is not None:
+                store.note_worker(report.where)
             store.record(report.result, job.attempt, *save(config.out, job.cell, report.result, report.kept))
         store.end_run("complete")
     worker.close()

@@ -18,6 +18,7 @@ from vlagents_ray.evaluate.provenance import versions
 from vlagents_ray.evaluate.rollout import Made
 from vlagents_ray.evaluate.store import Store
 from vlagents_ray.evaluate.video import VideoRecorder, save_videos
+from vlagents_ray.evaluate.whereabouts import Whereabouts
 from vlagents_ray.interface import Obs
 
 HOSTILE = "</script><img src=x onerror=alert(1)>\"'&"
@@ -65,6 +66,8 @@ def record(
             store.note_env(place, Made(described, {"action": {"dim": 1}}))
         for policy in config.policies:
             store.note_policy(policy.name, {"policy": policy.name, "checkpoint": None})
+            for pid in (1, 1, 2):
+                store.note_worker(Whereabouts("gpu-box", None, pid, policy.name, "handle", f"llvmpipe {HOSTILE}"))
         store.end_run("complete")
     return Results.load(config.out)
 

@@ -153,10 +153,16 @@ def vulkan() -> Check:
 
 
 def egl() -> Check:
-    """Does MuJoCo really render a frame here without a display?"""
+    """Does MuJoCo really render a frame here without a display, and can a worker to which no GPU is given?"""
+    from vlagents_ray.envs.graphics import SHARE, fitting
     from vlagents_ray.envs.probe import egl_probe
 
-    return _rendered("EGL", "MuJoCo", egl_probe())
+    probe = egl_probe()
+    found = _rendered("EGL", "MuJoCo", probe)
+    if not probe.ok or fitting(probe.devices, gpu=False) is not None:
+        return found
+    cure = f"apt-get install libegl1 libgl1-mesa-dri; or {SHARE}"
+    return Check("EGL", "warn", f"{found.detail}; no device renders in software, for workers without a GPU", cure)
 
 
 def video() -> Check:

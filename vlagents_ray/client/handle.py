@@ -18,6 +18,8 @@ from vlagents_ray.wire.frames import decode_replies, encode_requests
 from vlagents_ray.wire.messages import Reply, Request, boot_id
 
 _PAUSE_S = 0.2  # before another replica is asked for in place of one that is gone
+_LOOK_S = 10.0  # between two looks at where replicas are: they come and go
+_FIRST_LOOK_S = 3.0  # what is waited for the first; an application without a replica does not answer
 
 
 class HandleTransport:
@@ -114,6 +116,36 @@ class HandleTransport:
 
     def _lost(self, error: Exception) -> ConnectionLost:
         return ConnectionLost(f"serve://{self._app}: the replica is gone ({type(error).__name__}); reset again")
+
+
+class ReplicaNodes:
+    """On which nodes an application has its replicas, as a caller learns it who has no time to wait."""
+
+    def __init__(self, app: str) -> None:
+        self._app = app
+        self._nodes: dict[str, int] = {}
+        self._asked: float | None = None  # when it was
+        self._answer: Any = None  # that is yet to come
+
+    def look(self) -> dict[str, int]:
+        """How many replicas there are on which node, by Ray's id, as of the last answer; {} if that is not known."""
+        import ray
+        from ray import serve
+        from ray.serve.exceptions import RayServeException
+
+        now, wait_s = time.monotonic(), 0.0 if self._asked is not None else _FIRST_LOOK_S
+        try:
+            if self._answer is None and (self._asked is None or now - self._asked > _LOOK_S):
+                self._asked = now
+                self._answer = serve.get_app_handle(self._app).nodes.remote()
+            if self._answer is not None:
+                self._nodes = self._answer.result(timeout_s=wait_s)
+                self._answer = None
+        except TimeoutError:
+            pass  # it comes later
+        except (RayServeException, ray.exceptions.RayError):
+            self._nodes, self._answer = {}, None
+        return self._nodes
 
 
 def call_replica(replica: Any, method: str, *args: Any, request_id: str = "") -> Any:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vlagents_ray.contract import Contract, check_action
+from vlagents_ray.envs.graphics import Renderer, opengl_renderer
 from vlagents_ray.errors import ConfigError, InvalidAction
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.registry import env_class, env_task
@@ -79,6 +80,10 @@ class EvalEnv(ABC):
     def batched(cls, num_envs: int, **options: Any) -> BatchEnv | None:  # noqa: ARG003 - for those that override it
         """`num_envs` environments in one simulator, made with the constructor's options; None if that cannot be."""
         return None
+
+    def renderer(self) -> Renderer | None:
+        """What draws its images, once it is made; None if that is no device. Here: this thread's OpenGL context."""
+        return opengl_renderer()
 
     def describe(self) -> dict[str, Any]:
         """What a reader of the results must know: versions, control mode, render backend."""

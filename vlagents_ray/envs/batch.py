@@ -12,6 +12,7 @@ import numpy as np
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import EvalEnv, env_arguments, one_row
+from vlagents_ray.envs.graphics import Renderer, opengl_renderer
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Act, Obs
 
@@ -66,6 +67,10 @@ class BatchEnv(ABC):
         None is for an idle environment. Raises `InvalidAction` before anything has moved, and
         `EnvFailed` when the simulator breaks, which ends all episodes.
         """
+
+    def renderer(self) -> Renderer | None:
+        """As `EvalEnv.renderer`."""
+        return opengl_renderer()
 
     def describe(self) -> dict[str, Any]:
         """What a reader of the results must know, as `EvalEnv.describe`."""
@@ -139,6 +144,9 @@ class InTurn(BatchEnv):
                 self._seen[i], rewards[i], terminated[i], truncated[i], infos[i] = env.step(act)
         self._seen = self._together(self._seen)
         return list(self._seen), rewards, terminated, truncated, infos
+
+    def renderer(self) -> Renderer | None:
+        return self._envs[0].renderer()
 
     def describe(self) -> dict[str, Any]:
         return {**self._envs[0].describe(), "num_envs": self.num_envs}

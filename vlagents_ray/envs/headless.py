@@ -5,6 +5,8 @@ from __future__ import annotations
 import ctypes
 import os
 
+from vlagents_ray.envs.graphics import choose_devices
+
 
 def prepare_rendering() -> None:
     """Set what drivers and simulators read when they are loaded; what the user has set stays.
@@ -15,6 +17,7 @@ def prepare_rendering() -> None:
     os.environ.setdefault("LP_NUM_THREADS", "1")  # Mesa's software drivers take all cores otherwise
     if not os.environ.get("MUJOCO_GL") and not os.environ.get("DISPLAY") and _has_egl():
         os.environ["MUJOCO_GL"] = "egl"
+    choose_devices()
 
 
 def _has_egl() -> bool:

@@ -19,11 +19,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
 
 import vlagents_ray
+from vlagents_ray.envs import egl
+from vlagents_ray.envs.egl import EglDevice
 from vlagents_ray.errors import EnvFailed, VLAgentsError
 
 TIMEOUT_S = 60.0  # a software driver compiles its shaders in 3 to 10 s
@@ -63,6 +65,7 @@ class Probe:
     device: str | None = None  # as the driver names it; "llvmpipe ..." is Mesa's software driver
     error: str | None = None
     cure: str | None = None
+    devices: tuple[EglDevice, ...] = ()  # all of EGL's, if it was EGL that was tried
 
 
 @functools.cache
@@ -108,18 +111,33 @@ def vulkan_cure() -> str:
     return VULKAN_CURE_NVIDIA if nvidia else VULKAN_CURE
 
 
-def vulkan_device_name(*, on_gpu: bool) -> str | None:
-    """The device that SAPIEN renders on in this process, e.g. "llvmpipe (LLVM 15.0.6, 256 bits)"."""
+@dataclass(frozen=True, slots=True)
+class VulkanDevice:
+    """What SAPIEN renders on."""
+
+    name: str  # "llvmpipe (LLVM 15.0.6, 256 bits)"
+    cuda: int | None  # CUDA's number of it in this process; None of what CUDA does not know
+
+
+def vulkan_device(*, on_gpu: bool) -> VulkanDevice | None:
+    """The device that SAPIEN renders on in this process."""
     import sapien.render
 
-    usable: list[tuple[str, bool]] = []  # name, whether CUDA knows it
-    for block in sapien.render.get_device_summary().split("GPU:")[1:]:
+    usable = usable_devices(sapien.render.get_device_summary())
+    usable.sort(key=lambda device: (device.cuda is not None) != on_gpu)  # stable: otherwise SAPIEN's order
+    return usable[0] if usable else None
+
+
+def usable_devices(summary: str) -> list[VulkanDevice]:
+    """Those that SAPIEN's `summary` of all calls supported, in its order."""
+    found = []
+    for block in summary.split("GPU:")[1:]:
         name, *lines = block.splitlines()
         facts = {key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)}
         if facts.get("Supported") == "1":
-            usable.append((name.strip(), facts.get("cudaId", "-1") != "-1"))
-    usable.sort(key=lambda device: device[1] != on_gpu)  # stable: otherwise SAPIEN's order
-    return usable[0][0] if usable else None
+            cuda = int(facts.get("cudaId", "-1"))
+            found.append(VulkanDevice(name.strip(), cuda if cuda >= 0 else None))
+    return found
 
 
 def _run_child(api: Literal["vulkan", "egl"], cure: str, timeout_s: float) -> Probe:
@@ -145,8 +163,9 @@ def _run_child(api: Literal["vulkan", "egl"], cure: str, timeout_s: float) -> Pr
         return Probe(api, ok=False, seconds=time.monotonic() - started, error=error, cure=cure)
     seconds = time.monotonic() - started
     if child.returncode == 0:
-        device = json.loads(child.stdout.splitlines()[-1])["device"]
-        return Probe(api, ok=True, seconds=seconds, device=device)
+        answer = json.loads(child.stdout.splitlines()[-1])
+        devices = tuple(EglDevice(**one) for one in answer["devices"])
+        return Probe(api, ok=True, seconds=seconds, device=answer["device"], devices=devices)
     said = [line for line in child.stderr.splitlines() if line.strip()]
     ended = f"the child ended with {child.returncode}"
     return Probe(api, ok=False, seconds=seconds, error=said[-1].strip() if said else ended, cure=cure)
@@ -170,7 +189,8 @@ def _render_vulkan() -> str | None:
     scene.update_render()
     camera.take_picture()
     _require_contrast(np.asarray(camera.get_picture("Color"))[..., :3])
-    return vulkan_device_name(on_gpu=device.is_cuda())
+    found = vulkan_device(on_gpu=device.is_cuda())
+    return None if found is None else found.name
 
 
 def _render_egl() -> str | None:
@@ -200,7 +220,8 @@ def _require_contrast(image: object) -> None:
 
 def _main(api: str) -> None:
     device = _render_vulkan() if api == "vulkan" else _render_egl()
-    sys.stdout.write("\n" + json.dumps({"device": device}) + "\n")
+    devices = [asdict(one) for one in egl.devices()] if api == "egl" else []
+    sys.stdout.write("\n" + json.dumps({"device": device, "devices": devices}) + "\n")
 
 
 if __name__ == "__main__":

@@ -19,6 +19,7 @@ import numpy as np
 
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.envs.base import EvalEnv, one_row
+from vlagents_ray.envs.graphics import Renderer
 from vlagents_ray.envs.headless import prepare_rendering
 from vlagents_ray.envs.maniskill import ManiSkill, making
 from vlagents_ray.envs.maniskill.simulator import Moment, Simulator
@@ -168,6 +169,9 @@ class Simpler(EvalEnv):
     def missing(cls) -> str | None:
         """As `ManiSkill.missing`; and the assets, which no package brings."""
         return ManiSkill.missing() or _missing_assets(_asset_folder())
+
+    def renderer(self) -> Renderer | None:
+        return self._simulator.renderer()
 
     def describe(self) -> dict[str, Any]:
         return {

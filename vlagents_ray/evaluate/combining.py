@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate.results import CellResults, Results, Run
+from vlagents_ray.evaluate.results import CellResults, Results, Run, Worker
 
 
 def combined(folders: Sequence[Results]) -> Results:
@@ -29,6 +29,7 @@ def combined(folders: Sequence[Results]) -> Results:
     cells: list[CellResults] = []
     runs: list[Run] = []
     policies: dict[str, dict[str, Any]] = {}
+    workers: list[Worker] = []
     for each, label in zip(folders, _labels(folders, base), strict=True):
         names = {
             cell.policy: f"{cell.policy} ({label})" if cell.policy in clashing else cell.policy for cell in each.cells
@@ -36,8 +37,11 @@ def combined(folders: Sequence[Results]) -> Results:
         prefix = each.out.resolve().relative_to(base)
         cells += [_moved(cell, names[cell.policy], prefix, len(runs)) for cell in each.cells]
         policies |= {names.get(name, name): said for name, said in each.policies.items()}
+        workers += [
+            replace(one, policy=names.get(one.policy, one.policy), run=one.run + len(runs)) for one in each.workers
+        ]
         runs += [replace(run, run=run.run + len(runs)) for run in each.runs]
-    return Results(base, tuple(cells), tuple(runs), policies)
+    return Results(base, tuple(cells), tuple(runs), policies, tuple(workers))
 
 
 def _require_apart(folders: Sequence[Results]) -> None:

@@ -83,7 +83,7 @@ def longest_episode(env: str, env_options: Mapping[str, Any], reset_options: Map
 
 
 def _measured(cell: Cell, timeout_s: float) -> float | str:
-    options = {"num_cpus": cell.worker.cpus, "num_gpus": cell.worker.gpus, "runtime_env": runtime_env(cell.worker)}
+    options = {"num_cpus": cell.worker.cpus, "num_gpus": cell.worker.gpus, "runtime_env": runtime_env(cell)}
     task = ray.remote(longest_episode).options(max_retries=0, **options)
     try:
         found: float | str = ray.get(

@@ -17,7 +17,7 @@ from vlagents_ray.evaluate.files import PROVENANCE, link_or_copy, whole
 from vlagents_ray.evaluate.html import FILE as REPORT
 from vlagents_ray.evaluate.html import write_report
 from vlagents_ray.evaluate.results import Results, episode_of, reading, table
-from vlagents_ray.evaluate.schema import FILE, SCHEMA, VERSION
+from vlagents_ray.evaluate.schema import FILE, SCHEMA, VERSION, WORKERS
 from vlagents_ray.evaluate.store import IDENTITY
 from vlagents_ray.evaluate.summary import Summary, summarize, write_summary
 
@@ -34,6 +34,7 @@ class _Merged:
     cells: dict[str, Row] = field(default_factory=dict)
     episodes: dict[str, Row] = field(default_factory=dict)
     attempts: list[Row] = field(default_factory=list)
+    workers: list[Row] = field(default_factory=list)
     home: dict[str, Path] = field(default_factory=dict)
 
 
@@ -122,11 +123,12 @@ def _extend(cell: Row, other: Row, folder: Path) -> None:
 
 
 def _add_episodes(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[str]:
-    """Also runs and attempts, which are numbered anew; returns what contradicts the folders before it."""
+    """Also runs, attempts and workers, which are numbered anew; returns what contradicts the folders before it."""
     offset = len(merged.runs)
     runs = {row["run"]: offset + i for i, row in enumerate(table(db, "runs"), 1)}
     merged.runs += [row | {"run": runs[row["run"]]} for row in table(db, "runs")]
     merged.attempts += [row | {"run": runs[row["run"]]} for row in table(db, "attempts")]
+    merged.workers += [row | {"run": runs[row["run"]]} for row in table(db, "workers")]
     conflicts = []
     for row in table(db, "episodes"):
         row["run"] = runs[row["run"]]
@@ -174,9 +176,10 @@ def _write(merged: _Merged, path: Path) -> None:
         "cells": list(merged.cells.values()),
         "episodes": list(merged.episodes.values()),
         "attempts": merged.attempts,
+        "workers": merged.workers,
     }
     with closing(sqlite3.connect(path)) as db:
-        db.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
+        db.executescript(f"BEGIN; {SCHEMA} {WORKERS} PRAGMA user_version = {VERSION}; COMMIT;")
         with db:
             for name, rows in tables.items():
                 for row in rows:

@@ -16,6 +16,7 @@ import ray
 from ray.exceptions import RayActorError, RayError
 
 from vlagents_ray.client.credentials import KEY_VARIABLE
+from vlagents_ray.envs.graphics import GPUS
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.config import EvalConfig, WorkerConfig
@@ -24,6 +25,7 @@ from vlagents_ray.evaluate.failures import Failure
 from vlagents_ray.evaluate.head import Head
 from vlagents_ray.evaluate.jobs import Job
 from vlagents_ray.evaluate.logs import tail_at
+from vlagents_ray.evaluate.placement import Placement, strategy
 from vlagents_ray.evaluate.rollout import AgentFactory, Pulse, Report, Rollout
 
 log = logging.getLogger(__name__)
@@ -55,6 +57,7 @@ class Worker:
     actor: Any
     starting: Any  # ref of `ready()`; None once it runs
     since: float  # when it was started
+    node: str | None  # Ray's id of the one it runs on, or while it starts, is wanted on; None: any
     jobs: tuple[Job, ...] = ()  # that it plays, of one cell
     running: Any = None  # ref of `run(jobs)`
     made: str | None = None  # the place of the env it holds
@@ -76,6 +79,7 @@ class WorkerPool:
         self._actor_class = ray.remote(concurrency_groups={"watch": 1})(Rollout)
         self._agent_factory = agent_factory
         self._head = Head()
+        self._placement = Placement()
         self._failed_starts = 0
         self._failed_start = 0.0  # when the last of them failed
         self._mute: dict[str, float] = {}  # hosts that do not answer, until when
@@ -141,16 +145,17 @@ class WorkerPool:
         return True
 
     def start(self, cell: Cell) -> None:
-        """Have one more worker, which can play `cell`."""
+        """Have one more worker, which can play `cell`, near to its policy if there is room."""
+        node = self._placement.node(cell.policy.url, Counter(worker.node for worker in self._workers))
         options = {
             "num_cpus": cell.worker.cpus,
             "num_gpus": cell.worker.gpus,
             "max_restarts": 0,
-            "scheduling_strategy": "SPREAD",
-            "runtime_env": runtime_env(cell.worker),
+            "scheduling_strategy": strategy(node),
+            "runtime_env": runtime_env(cell),
         }
         actor = self._actor_class.options(**options).remote(self._config, self._agent_factory)
-        self._workers.append(Worker(cell.worker, cell.kind, actor, starting=actor.ready.remote(), since=monotonic()))
+        self._workers.append(Worker(cell.worker, cell.kind, actor, actor.ready.remote(), monotonic(), node))
 
     def dispatch(self, worker: Worker, jobs: tuple[Job, ...]) -> None:
         """Have `worker` play `jobs`, side by side."""
@@ -233,7 +238,7 @@ class WorkerPool:
             log.info("worker %s", worker.process)
             self._failed_starts = 0
             self._short = False
-            worker.starting = None
+            worker.starting, worker.node = None, worker.process["node"]
 
     def _look(self) -> Iterator[tuple[Job, Report]]:
         now = monotonic()
@@ -312,10 +317,12 @@ def _refs(worker: Worker) -> list[Any]:
     return [ref for ref in (worker.starting, worker.running, worker.looking) if ref is not None]
 
 
-def runtime_env(worker: WorkerConfig) -> dict[str, Any]:
-    """Ray's, with the thread settings of a worker's process."""
-    given: dict[str, Any] = dict(worker.runtime_env)
-    variables = dict.fromkeys(THREAD_VARIABLES, str(worker.threads))
+def runtime_env(cell: Cell) -> dict[str, Any]:
+    """Ray's, with the thread settings of a worker's process, and without GPUs if none is set aside for it."""
+    given: dict[str, Any] = dict(cell.worker.runtime_env)
+    variables = dict.fromkeys(THREAD_VARIABLES, str(cell.worker.threads))
+    if not cell.worker.gpus and (cell.policy.url or cell.policy.source):  # else the policy is in the worker
+        variables[GPUS] = ""  # Ray hides none from whoever asked for none
     if key := os.environ.get(KEY_VARIABLE):  # for the policy's server, on nodes that do not know it
         variables[KEY_VARIABLE] = key
     return given | {"env_vars": variables | given.get("env_vars", {})}

@@ -57,6 +57,20 @@ class Attempt:
 
 
 @dataclass(frozen=True, slots=True)
+class Worker:
+    """A worker that connected to a policy or made an env, and where; one that did so again is here again."""
+
+    run: int
+    at: float  # seconds since 1970
+    host: str
+    node: str | None  # Ray's id
+    pid: int
+    policy: str
+    transport: str
+    renderer: str | None  # that its env drew with
+
+
+@dataclass(frozen=True, slots=True)
 class Run:
     """One run over the plan: the first, or one that resumed it."""
 
@@ -106,6 +120,7 @@ class Results:
     cells: tuple[CellResults, ...]  # in the order of the plan
     runs: tuple[Run, ...]
     policies: dict[str, dict[str, Any]]  # what each policy's server said of itself
+    workers: tuple[Worker, ...] = ()  # in the order of time; of old results none
 
     @classmethod
     def load(cls, out: Path) -> Results:
@@ -125,6 +140,7 @@ class Results:
                 ),
                 tuple(_run(row) for row in table(db, "runs")),
                 {row["name"]: json.loads(row["metadata"]) for row in table(db, "policies")},
+                tuple(Worker(**row) for row in table(db, "workers")),
             )
 
     @property
@@ -158,7 +174,9 @@ def reading(out: Path) -> Iterator[sqlite3.Connection]:
 
 
 def table(db: sqlite3.Connection, name: str, order: str = "rowid") -> Iterator[dict[str, Any]]:
-    """The rows of a table, by its columns' names."""
+    """The rows of a table, by its columns' names; none if the file is older than the table."""
+    if db.execute("SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ?", (name,)).fetchone() is None:
+        return iter(())
     return (dict(row) for row in db.execute(f"SELECT * FROM {name} ORDER BY {order}"))  # noqa: S608 (constants)
 
 

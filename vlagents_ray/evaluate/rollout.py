@@ -19,6 +19,7 @@ from time import monotonic, sleep
 from typing import Any
 
 from vlagents_ray.client import RemoteAgent
+from vlagents_ray.client.plasma import this_node
 from vlagents_ray.code import Code, code_of
 from vlagents_ray.contract import require_match
 from vlagents_ray.envs import EvalEnv, make_env
@@ -33,6 +34,7 @@ from vlagents_ray.evaluate.logs import own_logs
 from vlagents_ray.evaluate.recording import Kept, Recording
 from vlagents_ray.evaluate.side_by_side import Outcome, run_episodes
 from vlagents_ray.evaluate.sides import env_side, policy_side
+from vlagents_ray.evaluate.whereabouts import Whereabouts, here
 from vlagents_ray.interface import Agent
 from vlagents_ray.registry import env_class
 from vlagents_ray.wire.plain import plain_values
@@ -64,6 +66,7 @@ class Report:
     kept: Kept = field(default_factory=Kept)
     made: Made | None = None  # if an env was made for it
     policy: dict[str, Any] | None = None  # metadata of the policy ({} of a local one), if newly connected
+    where: Whereabouts | None = None  # if one of these two is new
 
 
 @dataclass(slots=True)
@@ -72,6 +75,7 @@ class _Found:
 
     made: Made | None = None
     policy: dict[str, Any] | None = None
+    where: Whereabouts | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +105,7 @@ class Rollout:
 
     def ready(self) -> dict[str, Any]:
         """Answered as soon as the process runs: which it is, and the files that it writes to."""
-        return {"pid": os.getpid(), "host": socket.gethostname(), "logs": own_logs()}
+        return {"pid": os.getpid(), "host": socket.gethostname(), "node": this_node(), "logs": own_logs()}
 
     def progress(self) -> Pulse:
         """Called from another thread while `run` is under way."""
@@ -125,7 +129,7 @@ class Rollout:
             self._drop_agent()
         elif any(report.result is not None for report in reports):
             self._broken_agents = 0
-        return [replace(reports[0], made=found.made, policy=found.policy), *reports[1:]]
+        return [replace(reports[0], made=found.made, policy=found.policy, where=found.where), *reports[1:]]
 
     def close(self) -> None:
         """Free the simulator and the connection."""
@@ -144,6 +148,7 @@ class Rollout:
         agent, env = self._agent, self._env
         if found.made is not None or found.policy is not None:
             require_match(agent.contract, env.contract)
+            found.where = here(cell.policy.name, agent, env)
         with contextlib.ExitStack() as stack:
             recordings = [stack.enter_context(Recording(self._config, env.contract.control_hz)) for _ in jobs]
             return [

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import functools
+import logging
 from collections import Counter
 from collections.abc import Callable
 
 from vlagents_ray.client import RemoteAgent
 from vlagents_ray.errors import ConfigError, from_code
+from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.cluster import ray_cluster
 from vlagents_ray.evaluate.config import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.deadline import Deadline
@@ -26,8 +28,11 @@ from vlagents_ray.evaluate.stopping import Stopping
 from vlagents_ray.evaluate.store import Store
 from vlagents_ray.evaluate.summary import Summary, summarize, write_summary
 from vlagents_ray.evaluate.trackers import Tracking
+from vlagents_ray.evaluate.whereabouts import Whereabouts, unused_gpus
 from vlagents_ray.interface import Agent
 from vlagents_ray.signals import stop_signals
+
+log = logging.getLogger(__name__)
 
 POLL_S = 0.25  # how soon a signal is noticed
 
@@ -115,6 +120,7 @@ class _Run:
         self._progress = progress
         self._tracking = tracking
         self._lost_in_a_row = 0
+        self._looked_for_gpus = False  # when an env first drew
         earlier = {cell.cell: cell for cell in Results.load(config.out).cells}
         self._recorded = {cell: rate_of([results], "success_once") for cell, results in earlier.items()}
         self._stopping: dict[str, Stopping] = {}
@@ -175,11 +181,20 @@ class _Run:
         if report.made is not None:
             self._store.note_env(job.cell.place, report.made)
             save_diffs(self._config.out, [report.made.code])
+        if report.where is not None:
+            self._met(job.cell, report.where)
         if report.failure is not None:
             self._failed(job, report.failure)
         elif report.result is not None:
             self._lost_in_a_row = 0
             self._record(job, report.result, report.kept)
+
+    def _met(self, cell: Cell, where: Whereabouts) -> None:
+        self._store.note_worker(where)
+        if where.renderer is not None and not self._looked_for_gpus:
+            self._looked_for_gpus = True
+            if (hint := unused_gpus(cell, where)) is not None:
+                log.warning(hint)
 
     def _failed(self, job: Job, failure: Failure) -> None:
         beyond = self._has_stopped(job)  # nobody waits for it

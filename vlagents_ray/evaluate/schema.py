@@ -42,6 +42,14 @@ CREATE TABLE tracked (
 );
 """
 
+# Apart, because older results of this version have none: it is made when they are gone on with.
+WORKERS = """
+CREATE TABLE IF NOT EXISTS workers (
+    run INTEGER NOT NULL REFERENCES runs, at REAL NOT NULL, host TEXT NOT NULL, node TEXT, pid INTEGER NOT NULL,
+    policy TEXT NOT NULL, transport TEXT NOT NULL, renderer TEXT
+);
+"""
+
 
 def require_version(out: Path, db: sqlite3.Connection) -> None:
     """`ConfigError` for a results file that this version of the package does not read."""

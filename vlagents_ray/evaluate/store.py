@@ -23,7 +23,8 @@ from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.failures import Failure
 from vlagents_ray.evaluate.jobs import Job
 from vlagents_ray.evaluate.rollout import Made
-from vlagents_ray.evaluate.schema import FILE, SCHEMA, VERSION, require_version
+from vlagents_ray.evaluate.schema import FILE, SCHEMA, VERSION, WORKERS, require_version
+from vlagents_ray.evaluate.whereabouts import Whereabouts
 
 LOCK = "results.lock"
 IDENTITY = ("policy", "checkpoint")  # of a policy's metadata: what must not change between runs
@@ -120,6 +121,13 @@ class Store:
         with self._db:
             self._db.execute("INSERT INTO attempts VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", where + why)
 
+    def note_worker(self, where: Whereabouts) -> None:
+        """Keep where a worker runs that connected to a policy or made an env just now."""
+        row = asdict(where) | {"run": self._run, "at": time.time()}
+        columns, marks = ", ".join(row), ", ".join("?" * len(row))
+        with self._db:
+            self._db.execute(f"INSERT INTO workers ({columns}) VALUES ({marks})", tuple(row.values()))  # noqa: S608 (our own column names)
+
     def note_env(self, place: str, made: Made) -> None:
         """Keep what a worker found out about the env of the cells at `place`.
 
@@ -180,6 +188,7 @@ class Store:
             if version == 0:
                 db.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
             require_version(self._out, db)
+            db.executescript(WORKERS)
             self._require_resumable(db, config)
             self._note_cells(db, config)
         except BaseException:
@@ -192,7 +201,7 @@ class Store:
         causes = {cause for (cause,) in db.execute("SELECT DISTINCT cause FROM attempts")}
         if not runs or (not episodes and causes == {"user"}):
             with db:
-                for table in ("attempts", "cells", "policies", "runs"):
+                for table in ("attempts", "cells", "policies", "workers", "runs"):
                     db.execute(f"DELETE FROM {table}")  # noqa: S608 - of a plan that could not begin
             return
         if not config.resume:

@@ -6,6 +6,7 @@ import asyncio
 import importlib.metadata
 import logging
 import os
+from collections import Counter
 from dataclasses import asdict
 from functools import partial
 from typing import Any
@@ -179,6 +180,11 @@ class PolicyReplica:
     async def load(self) -> Load:
         """For other replicas, which compare it with theirs."""
         return self._balance.load()
+
+    async def nodes(self) -> dict[str, int]:
+        """Where a client does best to run: how many replicas that take sessions there are on which node."""
+        loads = [self._balance.load(), *await asyncio.to_thread(self._peers.loads)]
+        return dict(Counter(load.node for load in loads if load.accepts))
 
     async def _near(self, caller: str) -> dict[str, Any]:
         """The metadata of the least loaded replica on the machine with that boot id; there may be none: this one's."""

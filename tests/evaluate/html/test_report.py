@@ -76,6 +76,10 @@ def test_rates_stand_with_their_intervals(page: Read) -> None:
     assert re.search(r"all learner@1000 35/36 25\.7 14\.2 to 42\.1 25\.7", page.words)
 
 
+def test_workers_are_counted_where_they_ran_by_transport_and_renderer(page: Read) -> None:
+    assert re.search(r"gpu-box base handle llvmpipe .* 2 gpu-box learner handle llvmpipe .* 2 ", page.words)
+
+
 def test_every_part_is_there(page: Read) -> None:
     headings = ["Success", "Comparison", "Learning curve", "Success over time", "Latency", "Failures", "Errors"]
     headings += ["Protocol", "Configuration", "To cite and to repeat"]

@@ -13,6 +13,7 @@ import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
+from vlagents_ray.envs.graphics import EGL_DEVICE, GPUS
 from vlagents_ray.envs.headless import prepare_rendering
 from vlagents_ray.envs.probe import EGL_CURE
 from vlagents_ray.errors import EnvFailed, MissingDependency
@@ -34,10 +35,9 @@ def root() -> Path:
 def load() -> Path:
     """Import LIBERO and robosuite, once a process; returns `root()`."""
     prepare_rendering()
-    _choose_egl_device()
     folder = root()
     try:
-        with _own_config(folder), _no_log_file(), warnings.catch_warnings():
+        with _own_config(folder), _no_log_file(), _egl_number(), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of code that nobody here can change; LIBERO itself changes the filters
             require("libero.libero.benchmark")
             require("libero.libero.envs")
@@ -93,7 +93,21 @@ def _no_log_file() -> Iterator[None]:
         log.setLevel(level)
 
 
-def _choose_egl_device() -> None:
-    """robosuite reads the device from CUDA_VISIBLE_DEVICES, and fails on "", which Ray sets where there is no GPU."""
-    if os.environ.get("CUDA_VISIBLE_DEVICES") == "":
-        os.environ.setdefault("MUJOCO_EGL_DEVICE_ID", "0")
+@contextlib.contextmanager
+def _egl_number() -> Iterator[None]:
+    """robosuite takes EGL's numbers for CUDA's: it refuses one that is not among those in CUDA_VISIBLE_DEVICES.
+
+    It reads them when it is imported. Where no EGL device was chosen it would draw on the one with CUDA's number, and
+    fail on "": the worker finds out on which.
+    """
+    chosen, visible = os.environ.get(EGL_DEVICE), os.environ.get(GPUS)
+    if visible == "" and chosen is None and os.environ.get("MUJOCO_GL") == "egl":
+        raise EnvFailed(f"libero finds no EGL device that renders in software, and was given no GPU; {EGL_CURE}")
+    if chosen is None or not visible:
+        yield
+        return
+    os.environ[GPUS] = chosen
+    try:
+        yield
+    finally:
+        os.environ[GPUS] = visible

@@ -10,6 +10,7 @@ import numpy as np
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import one_row
 from vlagents_ray.envs.batch import BatchEnv, Options, Steps, episodes_of
+from vlagents_ray.envs.graphics import Renderer
 from vlagents_ray.envs.maniskill import making, protocol
 from vlagents_ray.envs.maniskill.simulator import Simulator
 from vlagents_ray.errors import ConfigError, NotReset
@@ -105,6 +106,9 @@ class ManiSkillBatch(BatchEnv):
         over = self._steps >= self.max_steps
         infos = [{"success": success} for success in now.success[:n]]
         return now.obs[:n], now.rewards[:n], [False] * n, [over] * n, infos
+
+    def renderer(self) -> Renderer | None:
+        return self._simulator.renderer()
 
     def describe(self) -> dict[str, Any]:
         rules = protocol.described(reconfigure=self._reconfigure, max_steps=self.max_steps, own_limit=self._own_limit)

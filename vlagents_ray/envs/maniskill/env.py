@@ -11,6 +11,7 @@ import numpy as np
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import EvalEnv, one_row
 from vlagents_ray.envs.batch import BatchEnv
+from vlagents_ray.envs.graphics import Renderer
 from vlagents_ray.envs.maniskill import making, protocol
 from vlagents_ray.envs.maniskill.simulator import Simulator
 from vlagents_ray.envs.maniskill.tasks import INSTRUCTIONS
@@ -137,6 +138,9 @@ class ManiSkill(EvalEnv):
         if options.get("sim_backend") not in ON_GPU:
             return None
         return ManiSkillBatch(num_envs=num_envs, **options)
+
+    def renderer(self) -> Renderer | None:
+        return self._simulator.renderer()
 
     def describe(self) -> dict[str, Any]:
         reconfigure = bool(self._rebuild)

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract
+from vlagents_ray.envs.graphics import Renderer, vulkan_renderer
 from vlagents_ray.envs.maniskill import making
 from vlagents_ray.envs.maniskill.recording import RecordCameras
 from vlagents_ray.envs.maniskill.robot import Robot, action_spec
 from vlagents_ray.envs.maniskill.tasks import instruction_for
-from vlagents_ray.envs.probe import vulkan_device_name
+from vlagents_ray.envs.probe import vulkan_device
 from vlagents_ray.envs.recording import Size
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.interface import HIGH_RES, Obs
@@ -52,6 +53,7 @@ class Simulator:
         """`name` stands in errors. Raises `ConfigError`, or `EnvFailed` with its cure."""
         self.name = name
         self._task = task
+        self._asked_for = render_backend != "auto"
         self._record: RecordCameras | None = None
         self.env: Any = making.make(
             task,
@@ -147,6 +149,11 @@ class Simulator:
         success = [bool(value) for value in info["success"]]
         return Moment(seen, success, [0.0] * len(seen))
 
+    def renderer(self) -> Renderer | None:
+        """The Vulkan device that draws."""
+        found = vulkan_device(on_gpu=self.alive().backend.render_device.is_cuda())
+        return None if found is None else vulkan_renderer(found.name, found.cuda, asked_for=self._asked_for)
+
     def describe(self) -> dict[str, Any]:
         """Versions, backends and modes, for the record."""
         env = self.alive()
@@ -161,7 +168,7 @@ class Simulator:
             "reward_mode": env.reward_mode,
             "sim_backend": env.backend.sim_backend,
             "render_backend": env.backend.render_backend,
-            "render_device": vulkan_device_name(on_gpu=env.backend.render_device.is_cuda()),
+            "render_device": None if (renderer := self.renderer()) is None else renderer.name,
             "shaders": {name: env.scene.sensors[name].config.shader_config.shader_pack for name in self.cameras},
             "num_envs": env.num_envs,
         }

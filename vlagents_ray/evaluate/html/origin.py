@@ -28,7 +28,7 @@ def protocol(results: Results) -> Section:
 
 
 def configuration(results: Results) -> Section:
-    """Runs, versions, what each policy's server said of itself, and all settings."""
+    """Runs, workers, versions, what each policy's server said of itself, and all settings."""
     runs = [
         row(
             str(run.run), moment(run.started), "killed" if run.ended is None else duration(run.ended - run.started),
@@ -42,6 +42,7 @@ def configuration(results: Results) -> Section:
         "Configuration",
         table(["Run", "Started", "Took", "State", "Folder"], runs, "Runs", words=5),
         [tag("h3", "Checkpoints"), terms(named)] if named else None,
+        _workers(results),
         tag("h3", "Versions"),
         [_versions(run) for run in _last_runs(results)],
         [
@@ -94,6 +95,18 @@ def _value(value: Any) -> Child:
     if isinstance(value, Mapping):
         return _facts(value)
     return tag("code", value if isinstance(value, str) else json.dumps(value, ensure_ascii=False))
+
+
+def _workers(results: Results) -> list[Html] | None:
+    """Where the workers ran, by host, policy, transport and renderer; None of results that do not say."""
+    if not results.workers:
+        return None
+    alike: dict[tuple[str, ...], set[tuple[int, int]]] = {}
+    for one in results.workers:
+        alike.setdefault((one.host, one.policy, one.transport, one.renderer or "none"), set()).add((one.run, one.pid))
+    head = ["Host", "Policy", "Transport", "Renderer", "Workers"]
+    rows = [row(*where, str(len(workers)), words=4) for where, workers in sorted(alike.items())]
+    return [tag("h3", "Workers"), table(head, rows, "Where the workers ran", words=4)]
 
 
 def _last_runs(results: Results) -> list[Run]:

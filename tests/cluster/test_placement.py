@@ -1,0 +1,76 @@
+"""Who runs where, and by which transport: a real Ray cluster of three nodes, and a robot on a host outside it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from vlagents_ray.bench.hosts import Host, RayCluster, hosts, ray_cluster
+
+pytestmark = pytest.mark.hosts
+
+ROOT = Path(__file__).parents[2]
+PLACED = [sys.executable, "-m", "placed"]
+CPUS = 2  # of each node, each of which has room for as many workers
+STORE = {"object_store_memory": "200000000"}
+
+
+@dataclass(frozen=True, slots=True)
+class Served:
+    """Application "one" has its replica on host2, "two" one each on host2 and host3."""
+
+    cluster: RayCluster
+    robot: Host
+
+    def play(self, app: str, workers: int, out: Path, transport: str = "auto") -> Counter[tuple[str, str]]:
+        """How many of an evaluation's workers ran where, and had which transport."""
+        said = self.cluster.head.run([*PLACED, "play", app, str(workers), transport, str(out)])
+        found = json.loads(said.splitlines()[-1])
+        assert found["episodes"] == 2 * workers
+        return Counter((host, way) for host, way in found["workers"])
+
+
+@pytest.fixture(scope="module")
+def served() -> Iterator[Served]:
+    environment = {"PYTHONPATH": f"{ROOT / 'tests' / 'support'}:{ROOT}"}
+    with hosts(4) as [head, second, third, robot], ray_cluster([head], CPUS, environment, **STORE) as cluster:
+        for host, resources in ((second, {"of_one": 1, "of_two": 1}), (third, {"of_two": 1})):
+            host.environment |= head.environment
+            cluster.join(host, CPUS, resources=json.dumps(resources), **STORE)
+        robot.environment |= environment
+        with head.start([*PLACED, "serve"], stdin=-1, stdout=-1) as server:
+            assert server.stdin is not None
+            assert server.stdout is not None
+            assert server.stdout.readline() == "ready\n"
+            yield Served(cluster, robot)
+            server.stdin.close()
+            server.wait(60)
+
+
+def test_workers_fill_the_replicas_node_first_and_reach_it_without_a_copy_then_spill(
+    served: Served, tmp_path: Path
+) -> None:
+    found = served.play("one", 4, tmp_path)
+    assert found["host2", "shm"] == CPUS
+    assert sum(found.values()) == 4
+    assert {way for host, way in found if host != "host2"} == {"handle"}
+
+
+def test_plasma_is_there_on_the_replicas_node(served: Served, tmp_path: Path) -> None:
+    assert served.play("one", 2, tmp_path, "plasma") == {("host2", "plasma"): 2}
+
+
+def test_workers_are_shared_over_the_nodes_of_several_replicas(served: Served, tmp_path: Path) -> None:
+    assert served.play("two", 4, tmp_path) == {("host2", "shm"): 2, ("host3", "shm"): 2}
+
+
+def test_a_robot_outside_the_cluster_comes_by_websocket_or_http(served: Served) -> None:
+    served.robot.limit("1gbit")
+    said = served.robot.run([*PLACED, "robot", f"http://{served.cluster.head.address}:8000/one"])
+    assert json.loads(said.splitlines()[-1]) == ["websocket", "http"]
