@@ -119,5 +119,5 @@ def test_its_command_asks_for_keys(monkeypatch: pytest.MonkeyPatch) -> None:
     name, *words = json.loads(of("CMD", STAGES[-1])[0])
     assert name == "vlagents-ray"
     result = CliRunner().invoke(app, words)
-    assert result.exit_code == 1
+    assert result.exit_code != 0
     assert "keys new" in result.output
