@@ -17,7 +17,7 @@ from vlagents_ray.cli.console import errors, out
 from vlagents_ray.cli.settings import parse_list, parse_settings
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.checkpoints import STEP, resolved
-from vlagents_ray.serve.cluster import running_server
+from vlagents_ray.serve.cluster import joined, running_server
 from vlagents_ray.serve.files import own_settings, read_deployment, together, with_settings
 
 if TYPE_CHECKING:
@@ -166,9 +166,11 @@ def served(config: EvalConfig, address: str | None = None) -> Iterator[EvalConfi
     """`config` with the URLs of its policies, those that are not at one being served for the length of the context."""
     from vlagents_ray.evaluate import check, most_cpus
 
-    config, parts = reached(config)
-    check(config)  # what is wrong is said before anything starts
     with contextlib.ExitStack() as stack:
+        if address is not None:
+            stack.enter_context(joined(address))
+        config, parts = reached(config)
+        check(config)  # what is wrong is said before anything starts
         if parts:
             # Ray's CPUs are bookkeeping here: the number of workers that the user asked for must fit.
             cpus = max(os.cpu_count() or 1, math.ceil(config.workers * most_cpus(config)))
