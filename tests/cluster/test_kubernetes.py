@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import re
 import shlex
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import yaml
 from cluster_pages import serve_runs
 from kuberay import FOLDER, RayJob, RayService, check, documents, manifest
 from pydantic import ValidationError
+from readme_blocks import check_command
 from typer.testing import CliRunner
 
 from vlagents_ray.bench.hosts import HostFailed, hosts, ray_cluster
@@ -182,6 +184,21 @@ def vlagents_ray_version() -> str:
     version = re.search(r'^version = "(.*)"$', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
     assert version is not None
     return version[1]
+
+
+def test_the_page_names_files_that_exist_and_settings_that_are_taken() -> None:
+    page = (ROOT / "docs/cluster/kubernetes.md").read_text()
+    [args] = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    assert ServerArgs(**yaml.safe_load(args)).resources.num_gpus == 1
+    shell = "\n".join(re.findall(r"```bash\n(.*?)```", page, re.DOTALL))
+    assert subprocess.run(["bash", "-n"], input=shell, text=True, check=False).returncode == 0
+    named = re.findall(r"cluster/\w+/[\w.]+", shell)
+    assert {Path(name).name for name in named if name.endswith(".yaml")} <= {
+        file.name for file in FOLDER.glob("*.yaml")
+    }
+    assert all((ROOT / name).is_file() for name in named)
+    [words] = [shlex.split(line, comments=True) for line in shell.splitlines() if line.startswith("vlagents-ray")]
+    check_command(words, "kubernetes.md")
 
 
 @pytest.mark.hosts
