@@ -67,7 +67,7 @@ class Machines:
 
         def serves() -> bool:
             assert server.poll() is None, log.read_text()
-            return "serving" in log.read_text()
+            return "serving scripted at" in log.read_text()
 
         try:
             wait_for(serves)

@@ -155,14 +155,23 @@ def _ray(
 
 @contextlib.contextmanager
 def joined(address: str | None, *, show_logs: bool = False) -> Iterator[None]:
-    """Be connected to the Ray cluster at `address`, or to the one that this process is connected to already."""
+    """Be connected to the Ray cluster at `address`, or to the one that this process is connected to already.
+
+    `ConfigError` if there is none, or it wants another token.
+    """
     import ray
 
     if ray.is_initialized():
         yield
         return
-    with own_sigterm():
-        ray.init(address=address, log_to_driver=show_logs, logging_level="WARNING")
+    try:
+        with own_sigterm():
+            ray.init(address=address, log_to_driver=show_logs, logging_level="WARNING")
+    except (ConnectionError, ray.exceptions.AuthenticationError) as error:
+        raise ConfigError(
+            f"no way into a Ray cluster at {address!r}: {error}. Start Ray on this machine, or have it join one "
+            f"(`ray start`); the page docs/cluster/ray.md shows how"
+        ) from error
     try:
         yield
     finally:
