@@ -27,9 +27,11 @@ def served(config: EvalConfig, address: str | None = None, *, replica_per_gpu: b
     """`config` with the URLs of its policies, those that are not at one being served for the length of the context."""
     from vlagents_ray.evaluate import check, most_cpus
 
-    config, parts = reached(config)
-    check(config)  # what is wrong is said before anything starts
     with contextlib.ExitStack() as stack:
+        if address is not None:
+            stack.enter_context(joined(address))
+        config, parts = reached(config)
+        check(config)  # what is wrong is said before anything starts
         if parts and replica_per_gpu:
             stack.enter_context(joined(address))
             parts = spread_over_gpus(parts, kept=config.workers * config.worker.gpus)

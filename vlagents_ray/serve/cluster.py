@@ -31,6 +31,7 @@ from vlagents_ray.signals import own_sigterm
 
 __all__ = ["Server", "free_port", "joined", "running_server", "spread_over_gpus"]
 
+_START_S, _GROW_S = 600.0, 3600.0  # until a policy is ready: here; on a cluster that may first want another machine
 _SHUTDOWN_S = 30.0
 
 
@@ -51,7 +52,7 @@ def running_server(
     address: str | None = None,
     num_cpus: int | None = None,
     show_logs: bool = False,
-    timeout_s: float = 600.0,
+    timeout_s: float | None = None,
     keys_file: Path | None = None,
     insecure: bool = False,
     tls: Tls | None = None,
@@ -59,7 +60,7 @@ def running_server(
     """Serve `config` for the length of the context, and take down on exit what was started here.
 
     `port` 0 takes a free one. `address` names a running Ray cluster (or "auto"); otherwise a local
-    one is started, unless this process is connected already.
+    one is started, unless this process is connected already. `timeout_s` is 600, with an `address` 3600.
     `keys_file` and `insecure` stand for `access` in the applications' args; unless `host` is a loopback
     address, one of the two must be given somewhere.
     Raises `ConfigError` when the deployment fails, `PolicyUnavailable` when it takes too long.
@@ -91,6 +92,8 @@ def running_server(
         client.deploy_apps(config)
         url = f"{'http' if tls is None else 'https'}://{LOOPBACK if host == EVERYWHERE else host}:{port}"
         paths = {app.name: (app.route_prefix or "").rstrip("/") for app in config.applications}
+        if timeout_s is None:
+            timeout_s = _START_S if address is None else _GROW_S
         deadline = time.monotonic() + timeout_s
         inside = _inside(http)
         _wait(serve, {name: inside + path for name, path in paths.items()}, _our_apps(config), deadline)
@@ -152,14 +155,23 @@ def _ray(
 
 @contextlib.contextmanager
 def joined(address: str | None, *, show_logs: bool = False) -> Iterator[None]:
-    """Be connected to the Ray cluster at `address`, or to the one that this process is connected to already."""
+    """Be connected to the Ray cluster at `address`, or to the one that this process is connected to already.
+
+    `ConfigError` if there is none, or it wants another token.
+    """
     import ray
 
     if ray.is_initialized():
         yield
         return
-    with own_sigterm():
-        ray.init(address=address, log_to_driver=show_logs, logging_level="WARNING")
+    try:
+        with own_sigterm():
+            ray.init(address=address, log_to_driver=show_logs, logging_level="WARNING")
+    except (ConnectionError, ray.exceptions.AuthenticationError) as error:
+        raise ConfigError(
+            f"no way into a Ray cluster at {address!r}: {error}. Start Ray on this machine, or have it join one "
+            f"(`ray start`); the page docs/cluster/ray.md shows how"
+        ) from error
     try:
         yield
     finally:

@@ -194,6 +194,11 @@ class ServerArgs(_Closed):
     checkpoints: CheckpointArgs = CheckpointArgs()
     replicas: int | None = Field(default=None, ge=1, description="a fixed number; excludes `autoscaling`")
     autoscaling: AutoscalingArgs | None = None
+    answer_while_loading: bool = Field(
+        default=True,
+        description="an application's first replica runs at once, and says 503 until its policy has loaded; false: it "
+        "runs only then, for whoever sends robots to a new cluster as soon as that runs",
+    )
     batch: BatchArgs = BatchArgs()
     sessions: SessionArgs = SessionArgs()
     limits: LimitArgs = LimitArgs()

@@ -51,8 +51,9 @@ _WATCH_S = 0.25
 class PolicyReplica:
     """Loads the policy when it starts.
 
-    While no replica of the application can act, its door answers 503 at once. A replica that joins
-    others loads in its first `reconfigure`, so that Serve routes to it only when it can act too.
+    While no replica of the application can act, its door answers 503 at once, unless `answer_while_loading`
+    is off. A replica that joins others loads in its first `reconfigure`, so that Serve routes to it only when
+    it can act too.
     """
 
     async def __init__(self, args: dict[str, Any], gateway: Any = None) -> None:  # type: ignore[misc]
@@ -107,7 +108,7 @@ class PolicyReplica:
 
     async def _start(self) -> None:
         self._loading = asyncio.ensure_future(asyncio.to_thread(self._engine.start))
-        if await asyncio.to_thread(_others_run):
+        if not self._args.answer_while_loading or await asyncio.to_thread(_others_run):
             await self._loading
         else:
             self._loading.add_done_callback(_log_failure)

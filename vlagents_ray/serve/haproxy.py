@@ -21,9 +21,22 @@ from vlagents_ray.serve.reaper import MARK
 _BALANCE = "RAY_SERVE_HAPROXY_BALANCE_ALGORITHM"  # the last line of the settings that all parts of HAProxy share
 _BINARY = "RAY_SERVE_HAPROXY_BINARY_PATH"
 _REPLICA_PORTS = 200  # a server's replicas listen on ports from a block of its own
-# Headers have to be here in time, and no request may stand still; a WebSocket's silence is the replica's business.
-_PATIENCE = "    timeout http-request 15s\n    timeout tunnel 24h\n"
-_SILENT_S = 60
+# What any cluster of Serve's that robots connect to wants of its HAProxy. The files in cluster/ say the same, for
+# clusters that somebody else starts.
+ROBOTS = {
+    "RAY_SERVE_ENABLE_HA_PROXY": "1",
+    # A session stays on its replica (by the header that the Python proxy's router hashes, too), and a replica that
+    # joins or leaves moves only its own share of them. Headers have to be here in time; a WebSocket's silence is the
+    # replica's business. Serve copies the value into HAProxy's settings, so further lines come with it.
+    _BALANCE: "hdr(x-session-id)\n    hash-type consistent sdbm avalanche\n"
+    "    timeout http-request 15s\n    timeout tunnel 24h\n",
+    "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": "60",  # no request may stand still
+    # When replicas change, a new HAProxy takes over and the old one keeps the connections it has: for a day,
+    # not for two minutes, after which it would cut every robot's WebSocket.
+    "RAY_SERVE_HAPROXY_HARD_STOP_AFTER_S": "86400",
+    # HAProxy learns of a leaving replica within a second; the default holds every stop for 30 s.
+    "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S": "1",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,10 +89,9 @@ def ingress_environment(folder: Path, binary: str, front: Front | None = None) -
     replicas = free_block(_REPLICA_PORTS)
     metrics, stats, fallback = free_ports(3)
     return {
-        "RAY_SERVE_ENABLE_HA_PROXY": "1",
+        **ROBOTS,
         _BINARY: str(_launcher(folder, binary)),
         "RAY_SERVE_HAPROXY_METRICS_SOCKET_PATH": str(folder / "metrics.sock"),
-        "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": str(_SILENT_S),
         "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(folder / "haproxy.cfg"),
         "RAY_SERVE_HAPROXY_SOCKET_PATH": str(folder / "admin.sock"),
         "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(folder),
@@ -87,19 +99,10 @@ def ingress_environment(folder: Path, binary: str, front: Front | None = None) -
         "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
         "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
         "RAY_SERVE_HAPROXY_NBTHREAD": "2",
-        # A session stays on its replica (by the header that the Python proxy's router hashes, too), and a
-        # replica that joins or leaves moves only its own share of them: a second line of HAProxy's settings.
-        _BALANCE: "hdr(x-session-id)\n    hash-type consistent sdbm avalanche\n"
-        + _PATIENCE
-        + ("" if front is None else front.settings()),
+        _BALANCE: ROBOTS[_BALANCE] + ("" if front is None else front.settings()),
         "RAY_SERVE_DIRECT_INGRESS_MIN_HTTP_PORT": str(replicas),
         "RAY_SERVE_DIRECT_INGRESS_MAX_HTTP_PORT": str(replicas + _REPLICA_PORTS),
         "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback),
-        # When replicas change, a new HAProxy takes over and the old one keeps the connections it has: for a day,
-        # not for two minutes, after which it would cut every robot's WebSocket.
-        "RAY_SERVE_HAPROXY_HARD_STOP_AFTER_S": "86400",
-        # HAProxy learns of a leaving replica within a second; the default holds every stop for 30 s.
-        "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S": "1",
     }
 
 

@@ -1,0 +1,223 @@
+"""The manifests in cluster/kuberay: as the schemas want them, in step with each other, and a server that comes up."""
+
+from __future__ import annotations
+
+import copy
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import kubernetes_validate
+import pytest
+import yaml
+from cluster_pages import serve_runs
+from kuberay import FOLDER, RayJob, RayService, check, documents, manifest
+from pydantic import ValidationError
+from readme_blocks import check_command
+from typer.testing import CliRunner
+
+from vlagents_ray.bench.hosts import HostFailed, hosts, ray_cluster
+from vlagents_ray.cli.main import app
+from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.serve.auth import FILE_VARIABLE
+from vlagents_ray.serve.config import ServerArgs
+from vlagents_ray.serve.files import listens_at, read_deployment
+from vlagents_ray.serve.haproxy import ROBOTS
+from vlagents_ray.serve.keyfile import new_key
+
+ROOT = Path(__file__).parents[2]
+SERVICE = RayService.model_validate(manifest("RayService", "policy"))
+JOB = RayJob.model_validate(manifest("RayJob", "evaluation"))
+PODS = {
+    "policy-head": SERVICE.cluster.head_group_spec.template,
+    **{f"policy-{group.group_name}": group.template for group in SERVICE.cluster.worker_group_specs},
+    "evaluation-head": JOB.cluster.head_group_spec.template,
+    **{f"evaluation-{group.group_name}": group.template for group in JOB.cluster.worker_group_specs},
+    "evaluation-submitter": JOB.spec.submitter_pod_template,
+    "reader": manifest("Pod", "results-reader"),
+}
+RAY_PODS = {name: pod for name, pod in PODS.items() if name not in ("evaluation-submitter", "reader")}
+ROBOT = """
+import sys
+from vlagents_ray import RemoteAgent, Unauthorized
+from vlagents_ray.envs import make_env
+
+url, key = sys.argv[1:]
+env = make_env("tabletop")
+obs, info = env.reset(seed=0)
+try:
+    with RemoteAgent(url, api_key="vlr_wrong") as agent:
+        agent.reset(obs, env.instruction, env="tabletop")
+    sys.exit("a wrong key was let in")
+except Unauthorized:
+    pass
+with RemoteAgent(url, api_key=key) as agent:
+    agent.reset(obs, env.instruction, env="tabletop")
+    for _ in range(20):
+        obs, *_ = env.step(agent.act(obs))
+    print(agent.transport, agent.metadata["policy"])
+"""
+
+
+def values_of(document: Any, key: str) -> list[Any]:
+    """Of every `key` in a manifest, however deep."""
+    if isinstance(document, list):
+        return [value for one in document for value in values_of(one, key)]
+    if not isinstance(document, dict):
+        return []
+    return [value for name, one in document.items() for value in ([one] if name == key else values_of(one, key))]
+
+
+@pytest.mark.parametrize("file", sorted(FOLDER.glob("*.yaml")), ids=lambda file: file.stem)
+def test_a_manifest_is_as_its_schema_wants_it(file: Path) -> None:
+    assert documents(file)
+    for document in documents(file):
+        check(document)
+
+
+@pytest.mark.parametrize("where", ["cluster", "group", "pod", "container", "autoscaler"])
+def test_a_misspelt_key_is_found(where: str) -> None:
+    document = copy.deepcopy(manifest("RayService", "policy"))
+    cluster = document["spec"]["rayClusterConfig"]
+    pod = cluster["headGroupSpec"]["template"]["spec"]
+    places = {
+        "cluster": cluster,
+        "group": cluster["workerGroupSpecs"][0],
+        "pod": pod,
+        "container": pod["containers"][0],
+        "autoscaler": cluster["autoscalerOptions"]["resources"],
+    }
+    places[where]["mispelt"] = 1
+    with pytest.raises((ValidationError, kubernetes_validate.ValidationError), match="mispelt"):
+        check(document)
+
+
+def test_the_embedded_deployment_is_one_that_serve_takes(tmp_path: Path) -> None:
+    file = tmp_path / "service.yaml"
+    file.write_text(SERVICE.spec.serve_config_v2)
+    config = read_deployment(str(file))
+    [port] = [
+        port["containerPort"]
+        for port in SERVICE.cluster.head_group_spec.template["spec"]["containers"][0]["ports"]
+        if port["name"] == "serve"
+    ]
+    assert listens_at(config) == ("0.0.0.0", port)  # noqa: S104 - a pod's
+    [application] = config.applications
+    args = ServerArgs(**application.args)
+    assert not args.answer_while_loading
+    assert args.autoscaling is not None
+    cpu = next(group for group in SERVICE.cluster.worker_group_specs if group.group_name == "cpu")
+    room = int(cpu.template["spec"]["containers"][0]["resources"]["limits"]["cpu"]) // args.resources.num_cpus
+    assert args.autoscaling.max_replicas <= cpu.max_replicas * room
+
+
+def test_the_run_file_and_the_entrypoint_are_ones_that_eval_takes(tmp_path: Path) -> None:
+    run = manifest("ConfigMap", "evaluation-run")["data"]["run.yaml"]
+    assert EvalConfig.model_validate(yaml.safe_load(run) | {"out": "runs/x"}).workers == 8
+    name, *words = shlex.split(JOB.spec.entrypoint)
+    assert name == "vlagents-ray"
+    (tmp_path / "run.yaml").write_text(run)
+    here = [str(tmp_path / "run.yaml") if word == "/etc/vlagents/run/run.yaml" else word for word in words]
+    result = CliRunner().invoke(app, [*here, "--dry-run"])
+    assert result.exit_code == 0, result.output
+
+
+def test_pods_find_the_settings_that_a_server_of_our_own_gives_haproxy() -> None:
+    settings = manifest("ConfigMap", "policy-settings")["data"]
+    assert {name: settings[name] for name in ROBOTS} == ROBOTS
+    for name, pod in RAY_PODS.items():
+        if name.startswith("policy-"):
+            [container] = pod["spec"]["containers"]
+            assert container["envFrom"] == [{"configMapRef": {"name": "policy-settings"}}]
+            [mount] = [one for one in container["volumeMounts"] if one["name"] == "keys"]
+            assert settings[FILE_VARIABLE] == f"{mount['mountPath']}/keys.json"
+
+
+@pytest.mark.parametrize("name", PODS)
+def test_a_pod_runs_as_the_images_user_and_gets_what_it_asks_for(name: str) -> None:
+    user = re.search(r"^USER (\d+):(\d+)$", (ROOT / "cluster/docker/Dockerfile").read_text(), re.MULTILINE)
+    assert user is not None
+    spec = PODS[name]["spec"]
+    security = spec["securityContext"]
+    assert security["runAsNonRoot"] is True
+    assert (security["runAsUser"], security["runAsGroup"]) == (int(user[1]), int(user[2]))
+    for container in spec["containers"]:
+        assert container["resources"]["requests"] == container["resources"]["limits"]
+        assert container["securityContext"]["capabilities"] == {"drop": ["ALL"]}
+
+
+@pytest.mark.parametrize("name", RAY_PODS)
+def test_the_object_store_fits_into_the_pods_shared_memory(name: str) -> None:
+    cluster, _, group = name.partition("-")
+    spec = (SERVICE if cluster == "policy" else JOB).cluster
+    groups = {"head": spec.head_group_spec} | {one.group_name: one for one in spec.worker_group_specs}
+    store = int(groups[group].ray_start_params["object-store-memory"])
+    [shm] = [one["emptyDir"] for one in RAY_PODS[name]["spec"]["volumes"] if one["name"] == "shm"]
+    memory = RAY_PODS[name]["spec"]["containers"][0]["resources"]["limits"]["memory"]
+    assert shm["medium"] == "Memory"
+    assert store < gibibytes(shm["sizeLimit"]) <= gibibytes(memory) / 2
+
+
+def gibibytes(quantity: str) -> int:
+    return int(quantity.removesuffix("Gi")) * 2**30
+
+
+def test_manifests_agree_on_names_versions_and_labels() -> None:
+    everything = [one for file in FOLDER.glob("*.yaml") for one in documents(file)]
+    assert set(values_of(everything, "image")) == {f"vlagents-ray:{vlagents_ray_version()}"}
+    pinned = re.search(r'"ray\[serve\]==([\d.]+)"', (ROOT / "pyproject.toml").read_text())
+    assert pinned is not None
+    assert {SERVICE.cluster.ray_version, JOB.cluster.ray_version} == {pinned[1]}
+    for name, pod in PODS.items():
+        label = pod["metadata"]["labels"]["vlagents-ray/cluster"]
+        assert label == ("policy" if name.startswith("policy") else "evaluation")
+        assert manifest("NetworkPolicy", label)["spec"]["podSelector"]["matchLabels"] == {"vlagents-ray/cluster": label}
+    [backend] = values_of(manifest("Ingress", "policy"), "service")
+    assert backend["name"] == f"{SERVICE.metadata.name}-serve-svc"  # as KubeRay names it
+    assert set(values_of(everything, "claimName")) == {manifest("PersistentVolumeClaim", "results")["metadata"]["name"]}
+
+
+def vlagents_ray_version() -> str:
+    version = re.search(r'^version = "(.*)"$', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
+    assert version is not None
+    return version[1]
+
+
+def test_the_page_names_files_that_exist_and_settings_that_are_taken() -> None:
+    page = (ROOT / "docs/cluster/kubernetes.md").read_text()
+    [args] = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    assert ServerArgs(**yaml.safe_load(args)).resources.num_gpus == 1
+    shell = "\n".join(re.findall(r"```bash\n(.*?)```", page, re.DOTALL))
+    assert subprocess.run(["bash", "-n"], input=shell, text=True, check=False).returncode == 0
+    named = re.findall(r"cluster/\w+/[\w.]+", shell)
+    assert {Path(name).name for name in named if name.endswith(".yaml")} <= {
+        file.name for file in FOLDER.glob("*.yaml")
+    }
+    assert all((ROOT / name).is_file() for name in named)
+    [words] = [shlex.split(line, comments=True) for line in shell.splitlines() if line.startswith("vlagents-ray")]
+    check_command(words, "kubernetes.md")
+
+
+@pytest.mark.hosts
+@pytest.mark.slow
+def test_the_manifests_server_comes_up_and_robots_with_a_key_play(tmp_path: Path) -> None:
+    (tmp_path / "serve.yaml").write_text(SERVICE.spec.serve_config_v2)
+    keys = tmp_path / "keys.json"
+    key = new_key(keys, "arm")
+    environment = manifest("ConfigMap", "policy-settings")["data"] | {FILE_VARIABLE: str(keys)}
+    with (
+        hosts(2) as [head, robot],
+        ray_cluster([head], cpus=2, environment=environment, include_dashboard="true") as cluster,
+    ):
+        head.run(["serve", "deploy", str(tmp_path / "serve.yaml")])
+        serve_runs(cluster)
+        said = robot.run([sys.executable, "-c", ROBOT, f"http://{head.name}:8000", key])
+        assert said.split() == ["websocket", "scripted"]
+        health = "import sys, urllib.request as u; print(u.urlopen(sys.argv[1], timeout=5).read().decode())"
+        # what KubeRay asks, and what nobody is told without a key
+        assert "success" in head.run([sys.executable, "-c", health, "http://localhost:8000/-/healthz"])
+        with pytest.raises(HostFailed, match="401"):
+            robot.run([sys.executable, "-c", health, f"http://{head.name}:8000/v1/metadata"])
