@@ -32,7 +32,7 @@ class Process:
 
 
 def worker(config: EvalConfig, starting: Any = None, **known: Any) -> Worker:
-    return Worker(config.worker, "kind", Process.remote(), starting=starting, since=monotonic(), node=None, **known)
+    return Worker(config.worker, "kind", Process.remote(), starting=starting, since=monotonic(), **known)
 
 
 def test_workers_that_are_lost_together_while_they_start_are_no_row_of_failures(config: Config) -> None:

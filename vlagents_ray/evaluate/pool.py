@@ -57,7 +57,6 @@ class Worker:
     actor: Any
     starting: Any  # ref of `ready()`; None once it runs
     since: float  # when it was started
-    node: str | None  # Ray's id of the one it runs on, or while it starts, is wanted on; None: any
     jobs: tuple[Job, ...] = ()  # that it plays, of one cell
     running: Any = None  # ref of `run(jobs)`
     made: str | None = None  # the place of the env it holds
@@ -66,6 +65,7 @@ class Worker:
     pulse: Pulse = field(default_factory=lambda: Pulse("idle", 0.0, 0))
     heard: float = 0.0  # when it last answered
     process: dict[str, Any] = field(default_factory=dict)  # what `ready()` said
+    node: str | None = None  # Ray's id of the one it runs on or, while it starts, is wanted on; None: any
 
 
 class WorkerPool:
@@ -155,7 +155,8 @@ class WorkerPool:
             "runtime_env": runtime_env(cell),
         }
         actor = self._actor_class.options(**options).remote(self._config, self._agent_factory)
-        self._workers.append(Worker(cell.worker, cell.kind, actor, actor.ready.remote(), monotonic(), node))
+        starting, since = actor.ready.remote(), monotonic()
+        self._workers.append(Worker(cell.worker, cell.kind, actor, starting=starting, since=since, node=node))
 
     def dispatch(self, worker: Worker, jobs: tuple[Job, ...]) -> None:
         """Have `worker` play `jobs`, side by side."""
@@ -238,7 +239,8 @@ class WorkerPool:
             log.info("worker %s", worker.process)
             self._failed_starts = 0
             self._short = False
-            worker.starting, worker.node = None, worker.process["node"]
+            worker.starting = None
+            worker.node = worker.process["node"]
 
     def _look(self) -> Iterator[tuple[Job, Report]]:
         now = monotonic()
