@@ -148,7 +148,8 @@ def wait_for_haproxy(serve: Any, apps: Mapping[str, str], stats_port: int, deadl
             deployments = status[name].deployments
             ours = [deployments[POLICY]] if POLICY in deployments else list(deployments.values())
             running = sum(d.replica_states.get("RUNNING", 0) for d in ours)
-            if not (up and all(up) and (len(up) >= running or len(ours) > 1)):
+            # One that nobody has asked for yet may be down to no replica again.
+            if running and not (up and all(up) and (len(up) >= running or len(ours) > 1)):
                 late.append(name)
         if not late:
             return
