@@ -74,12 +74,12 @@ class Slurm:
         """PENDING, RUNNING, COMPLETED, …"""
         return self.do("squeue", "--noheader", "--format=%T", "--states=all", f"--jobs={job}").strip()
 
-    def wait_for_end(self, job: str, timeout_s: float = 150.0) -> str:
+    def wait_for_end(self, job: str, timeout_s: float = 240.0) -> str:
         """Until the job is over; its last state."""
         self.wait_for(job, lambda: self.state(job) in ENDED, timeout_s)
         return self.state(job)
 
-    def wait_for(self, job: str, true: Callable[[], bool], timeout_s: float = 120.0) -> None:
+    def wait_for(self, job: str, true: Callable[[], bool], timeout_s: float = 180.0) -> None:
         """Poll until `true()`; says what the job's logs hold if it never is."""
         deadline = time.monotonic() + timeout_s
         while not true():

@@ -28,7 +28,7 @@ if [ -z "$stopped" ] && ! kill -0 "$ray" 2>/dev/null && kill -TERM "$command" 2>
 fi
 wait "$command"
 status=$?
-scancel --signal=TERM "$SLURM_JOB_ID.0"  # its only step; a signal to srun would kill it before it has cleaned up
+scancel --signal=TERM "$SLURM_JOB_ID.0" 2>/dev/null  # a signal to srun would kill the step before it has cleaned up
 wait "$ray"
 rm -f "$RAY_AUTH_TOKEN_PATH"
 
