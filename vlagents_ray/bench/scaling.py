@@ -105,7 +105,9 @@ def driving(plan: ScalingPlan, nodes: int, address: str | None = None) -> Iterat
         if address is None:
             room = json.dumps({OWN: slots, SHARED: 1, CHUNKS: 1})  # for replicas, on each node
             made = stack.enter_context(hosts(nodes))
-            cluster = stack.enter_context(ray_cluster(made, slots, our_environment(), resources=room))
+            # Ray's workers would wait for whatever else runs here; a server of our own sets the same.
+            environment = our_environment() | {"RAY_worker_niceness": "0"}
+            cluster = stack.enter_context(ray_cluster(made, slots, environment, resources=room))
             address, start = cluster.address, cluster.head.command
         settings = {
             "address": address,
