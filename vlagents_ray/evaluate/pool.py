@@ -76,7 +76,7 @@ class WorkerPool:
         self._failed_starts = 0
         self._failed_start = 0.0  # when the last of them failed
         self._mute: dict[str, float] = {}  # hosts that do not answer, until when
-        self._busy = 0.0  # when an episode was last being played
+        self._busy = monotonic()  # when an episode was last being played
         self._short = False  # has it been said that there is not room for all workers?
         self._limit_s: dict[Phase, float] = {
             "connect": config.connect_timeout_s + config.policy_timeout_s,
