@@ -44,7 +44,7 @@ def out_of_memory(host: Host, folder: Path) -> Iterator[None]:
 
 def test_lost_nodes_and_partitions_cost_attempts_alone(tmp_path: Path) -> None:
     """Two nodes with a replica and a worker each, and one with two workers."""
-    episodes = 320
+    episodes = 220
     run = Evaluation(tmp_path, episodes, workers=4)
     with hosts(5) as [head, one, two, simulating, spare]:
         nodes = [(one, 1, True), (two, 1, True), (simulating, 2, False)]
@@ -75,7 +75,7 @@ def test_lost_nodes_and_partitions_cost_attempts_alone(tmp_path: Path) -> None:
 
 def test_a_robot_a_crowd_and_a_head_that_dies(tmp_path: Path) -> None:
     """An evaluation at a node, beside a robot outside of the cluster; then memory runs out, then the head dies."""
-    episodes = 200
+    episodes = 140
     run = Evaluation(tmp_path, episodes, workers=3)
     with hosts(4) as [head, one, two, robot]:
         nodes = [(one, 2, True), (two, 2, False)]
