@@ -14,7 +14,7 @@ import ray
 from ray.exceptions import RayActorError, RayError
 
 from vlagents_ray.client.credentials import KEY_VARIABLE
-from vlagents_ray.errors import ConfigError, EnvFailed
+from vlagents_ray.errors import ClusterLost, ConfigError, EnvFailed
 from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.config import EvalConfig, WorkerConfig
 from vlagents_ray.evaluate.episode import Phase
@@ -92,7 +92,9 @@ class WorkerPool:
     def __enter__(self) -> WorkerPool:
         return self
 
-    def __exit__(self, *exc: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is ClusterLost:  # nobody is there to kill them; Ray ends them for want of a head, too
+            return
         for actor in [worker.actor for worker in self._workers] + [actor for actor, _ in self._leaving]:
             ray.kill(actor)
         self._workers.clear()

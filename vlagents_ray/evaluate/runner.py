@@ -16,7 +16,7 @@ from typing import Any
 import ray
 
 from vlagents_ray.client import RemoteAgent
-from vlagents_ray.errors import ConfigError, from_code
+from vlagents_ray.errors import ClusterLost, ConfigError, from_code
 from vlagents_ray.evaluate.config import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.failures import Failure
@@ -220,8 +220,12 @@ def ray_cluster(config: EvalConfig) -> Iterator[None]:
         ray.init(**options)
     try:
         yield
-    finally:
+    except ClusterLost:  # to take leave would wait for the head
+        raise
+    except BaseException:
         ray.shutdown()
+        raise
+    ray.shutdown()
 
 
 @contextmanager
