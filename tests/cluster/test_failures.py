@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import re
 import sys
 import time
 from collections.abc import Iterator
@@ -12,12 +13,12 @@ from pathlib import Path
 import pytest
 from lasting import Evaluation, cluster_of, serving, until, workers_on
 
-from vlagents_ray.bench.hosts import Host, hosts
+from vlagents_ray.bench.hosts import Host, hosts, ray_cluster
 from vlagents_ray.client.credentials import KEY_VARIABLE
 
 pytestmark = [pytest.mark.hosts, pytest.mark.slow]
 
-NO_MEMORY = "MemTotal: 16000000 kB\nMemFree: 80000 kB\nMemAvailable: 80000 kB\nBuffers: 0 kB\nCached: 0 kB\n"
+MEMORY = Path("/proc/meminfo")
 
 
 @contextlib.contextmanager
@@ -34,22 +35,23 @@ def cut_off(host: Host, seconds: float) -> Iterator[None]:
 def out_of_memory(host: Host, folder: Path) -> Iterator[None]:
     """As far as Ray's memory monitor there can see."""
     fake = folder / "meminfo"
-    fake.write_text(NO_MEMORY)
-    host.run(["mount", "--bind", str(fake), "/proc/meminfo"])
+    none = re.sub(r"(?m)^(MemFree|MemAvailable|Buffers|Cached|SReclaimable):.*", r"\1: 0 kB", MEMORY.read_text())
+    fake.write_text(none)
+    host.run(["mount", "--bind", str(fake), str(MEMORY)])
     yield
-    host.run(["umount", "/proc/meminfo"])
+    host.run(["umount", str(MEMORY)])
 
 
 def test_lost_nodes_and_partitions_cost_attempts_alone(tmp_path: Path) -> None:
     """Two nodes with a replica and a worker each, and one with two workers."""
-    episodes = 320
+    episodes = 220
     run = Evaluation(tmp_path, episodes, workers=4)
     with hosts(5) as [head, one, two, simulating, spare]:
         nodes = [(one, 1, True), (two, 1, True), (simulating, 2, False)]
         with (
             cluster_of(head, nodes) as cluster,
             serving(head, tmp_path, replicas=2) as token,
-            run.running(head, token),
+            run.running(head, token=token),
         ):
             with cut_off(two, 3.0):
                 pass
@@ -69,40 +71,41 @@ def test_lost_nodes_and_partitions_cost_attempts_alone(tmp_path: Path) -> None:
             for host in (head, one, spare):
                 until(lambda host=host: workers_on(host) == 0)
     run.is_whole(episodes)
-    assert {attempt.cause for attempt in run.attempts()} <= {"worker", "policy"}
 
 
-def test_a_robot_a_crowd_and_a_head_that_dies(tmp_path: Path) -> None:
-    """An evaluation at a node, beside a robot outside of the cluster; then memory runs out, then the head dies."""
-    episodes = 160
-    run = Evaluation(tmp_path, episodes, workers=3)
-    with hosts(4) as [head, one, two, robot]:
-        nodes = [(one, 2, True), (two, 2, False)]
-        patience = {"RAY_gcs_rpc_server_reconnect_timeout_s": "20"}
-        with cluster_of(head, nodes, **patience), serving(head, tmp_path, replicas=1) as token:
-            with run.running(one, token):
-                robot.limit("1gbit")
-                robot.environment |= {KEY_VARIABLE: token}
-                loop = ["--hz", "50", "--seconds", "20", "--transport", "websocket", "--baseline", "0"]
-                # Its exit status says so if a tick had no action of the policy.
-                robot.run([sys.executable, "-m", "vlagents_ray.robot", f"http://{head.name}:8000", *loop])
-                assert run.attempts() == []
-                with out_of_memory(two, tmp_path):
-                    until(lambda: any("memory" in attempt.error for attempt in run.attempts()))
-                run.goes_on()
+def test_a_robot_outside_of_the_cluster_keeps_its_loop_beside_an_evaluation(tmp_path: Path) -> None:
+    run = Evaluation(tmp_path, episodes=1000, workers=2)
+    with (
+        hosts(3) as [head, one, robot],
+        cluster_of(head, [(one, 2, True)]),
+        serving(head, tmp_path, replicas=1) as token,
+        run.running(head, token=token),
+    ):
+        robot.limit("1gbit")
+        robot.environment |= {KEY_VARIABLE: token}
+        loop = ["--hz", "50", "--seconds", "20", "--transport", "websocket", "--baseline", "0"]
+        # It fails if a tick has no action of the policy.
+        robot.run([sys.executable, "-m", "vlagents_ray.robot", f"http://{head.name}:8000", *loop])
+        assert run.attempts() == []
+        run.goes_on()
+
+
+def test_memory_that_runs_out_costs_attempts_and_a_lost_head_a_resumption(tmp_path: Path) -> None:
+    """The driver runs at the node that is left, which then becomes the head of another cluster."""
+    episodes = 70
+    run = Evaluation(tmp_path, episodes, workers=2)
+    with hosts(2) as [head, one]:
+        with cluster_of(head, [(one, 2, False)], RAY_gcs_rpc_server_reconnect_timeout_s="20"):
+            with run.running(one):
+                with out_of_memory(one, tmp_path):
+                    until(lambda: any("low on memory" in attempt.error for attempt in run.attempts()))
+                run.goes_on(by=4)
                 head.kill()
                 run.goes_on(by=2)
                 assert run.ends() == 1
             assert "ClusterLost: the head of the Ray cluster, 198.18.0.1:6379, has not answered" in run.said()
-            summary = json.loads((run.out / "summary.json").read_text())
-            assert summary["state"] == "stopped"
-            assert summary["total"]["episodes"] == len(run.played()) > 0
-            for host in (one, two):
-                until(lambda host=host: workers_on(host) == 0)
-        with (
-            cluster_of(robot, [(one, 2, True)]),
-            serving(robot, tmp_path, replicas=1) as token,
-            run.running(robot, token, "--resume"),
-        ):
+            assert json.loads((run.out / "summary.json").read_text())["state"] == "stopped"
+            until(lambda: workers_on(one) == 0)
+        with ray_cluster([one]), run.running(one, "--resume"):
             assert run.ends() == 0, run.said()
     run.is_whole(episodes)

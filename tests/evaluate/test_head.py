@@ -23,11 +23,15 @@ def listening(monkeypatch: pytest.MonkeyPatch) -> socket.socket:
     return listening
 
 
-def test_a_head_that_is_silent_for_a_while_is_waited_for(listening: socket.socket) -> None:
+def test_a_head_that_is_silent_for_a_while_is_waited_for(
+    listening: socket.socket, caplog: pytest.LogCaptureFixture
+) -> None:
     watched, port = Head(), listening.getsockname()[1]
     assert watched.answers()
     listening.close()
     assert not watched.answers()
+    assert not watched.answers()
+    assert caplog.text.count("does not answer") == 1
     with socket.create_server(("127.0.0.1", port)):
         assert watched.answers()
 

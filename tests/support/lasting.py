@@ -16,6 +16,7 @@ from eval_fakes import LINE, Line, Unhurried, wait_for
 
 from vlagents_ray.bench.hosts import Host, RayCluster, ray_cluster
 from vlagents_ray.client.credentials import KEY_VARIABLE
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import Results
 from vlagents_ray.evaluate.episode import EpisodeResult, run_episode
 from vlagents_ray.evaluate.results import Attempt
@@ -26,7 +27,19 @@ ROOT = Path(__file__).parents[2]
 until = functools.partial(wait_for, every_s=0.25)  # what takes a process, or all results, to find out
 POLICY = "policy"  # a resource of nodes that replicas may run on
 # Joined to the cluster before the command asks its policy, which is inside.
-_EVAL = "import ray; ray.init(log_to_driver=False); from vlagents_ray.cli.main import app; app()"
+_SERVED = "import ray; ray.init(log_to_driver=False); from vlagents_ray.cli.main import app; app()"
+_OWN = """
+import sys, yaml
+from eval_fakes import Unhurried
+from vlagents_ray.cli.console import out
+from vlagents_ray.errors import VLAgentsError
+from vlagents_ray.evaluate import EvalConfig, evaluate, progress_for
+settings = yaml.safe_load(open(sys.argv[2])) | {"resume": "--resume" in sys.argv}
+try:
+    evaluate(EvalConfig.model_validate(settings), agent_factory=Unhurried, progress=progress_for(out))
+except VLAgentsError as error:
+    sys.exit(f"{type(error).__name__}: {error}")
+"""
 
 
 @contextlib.contextmanager
@@ -58,7 +71,10 @@ def serving(head: Host, folder: Path, replicas: int) -> Iterator[str]:
 
 
 class Evaluation:
-    """One that runs at a host; `folder` has its results and its log."""
+    """One that runs at a host; `folder` has its results and its log.
+
+    Its policy is `serving`'s if there is one, else each worker has its own.
+    """
 
     def __init__(self, folder: Path, episodes: int, workers: int) -> None:
         self.out = folder / "out"
@@ -71,9 +87,10 @@ class Evaluation:
         self._process: subprocess.Popen[str] | None = None
 
     @contextlib.contextmanager
-    def running(self, host: Host, token: str, *options: str) -> Iterator[None]:
-        """From its first episode on."""
-        command = ["env", f"{KEY_VARIABLE}={token}", sys.executable, "-c", _EVAL, "eval", str(self._file), *options]
+    def running(self, host: Host, *options: str, token: str | None = None) -> Iterator[None]:
+        """From its first episode on; `token` is the server's."""
+        command = ["env", f"{KEY_VARIABLE}={token}", sys.executable, "-c", _OWN if token is None else _SERVED]
+        command += ["eval", str(self._file), *options]
         before = len(self.played())
         with self._log.open("a") as output, host.start(command, stdout=output, stderr=output) as self._process:
             try:
@@ -99,9 +116,12 @@ class Evaluation:
         self.plays(len(self.played()) + by)
 
     def played(self) -> list[EpisodeResult]:
-        if not (self.out / "results.db").exists():
+        """What is recorded so far."""
+        try:
+            cells = Results.load(self.out).cells
+        except ConfigError:  # nothing yet
             return []
-        return [one.result for cell in Results.load(self.out).cells for one in cell.episodes]
+        return [one.result for cell in cells for one in cell.episodes]
 
     def attempts(self) -> list[Attempt]:
         """Those that infrastructure failed."""

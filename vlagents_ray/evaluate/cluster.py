@@ -10,6 +10,7 @@ from typing import Any
 
 import ray
 
+from vlagents_ray.errors import ClusterLost
 from vlagents_ray.evaluate.config import EvalConfig
 from vlagents_ray.signals import own_sigterm
 
@@ -29,8 +30,12 @@ def ray_cluster(config: EvalConfig) -> Iterator[None]:
         ray.init(**options)
     try:
         yield
-    finally:
+    except ClusterLost:  # to take leave would wait for the head
+        raise
+    except BaseException:
         ray.shutdown()
+        raise
+    ray.shutdown()
 
 
 def most_cpus(config: EvalConfig) -> float:

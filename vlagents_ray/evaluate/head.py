@@ -6,6 +6,7 @@ And most of what one asks Ray meanwhile waits for it. So the driver looks for it
 
 from __future__ import annotations
 
+import logging
 import os
 import socket
 from time import monotonic
@@ -13,6 +14,8 @@ from time import monotonic
 import ray
 
 from vlagents_ray.errors import ClusterLost
+
+log = logging.getLogger(__name__)
 
 PERIOD_S = 2.0  # between two looks
 ANSWER_S = 1.0  # for one; the driver does nothing else meanwhile
@@ -27,6 +30,7 @@ class Head:
     def __init__(self) -> None:
         host, _, port = ray.get_runtime_context().gcs_address.rpartition(":")
         self._address = host.strip("[]"), int(port)
+        self._name = f"the head of the Ray cluster, {host}:{port},"
         self._patience_s = _SHARE * float(os.environ.get(_RAYS_PATIENCE) or _RAYS_PATIENCE_S)
         self._looked = self._answered = monotonic()
 
@@ -37,15 +41,20 @@ class Head:
         silent_s = self._looked - self._answered
         if silent_s > self._patience_s:
             raise ClusterLost(
-                f"the head of the Ray cluster, {':'.join(map(str, self._address))}, has not answered for "
-                f"{silent_s:.0f} s; what was played is kept: go on with --resume when there is a cluster again"
+                f"{self._name} has not answered for {silent_s:.0f} s; what was played is kept: go on with --resume "
+                f"when there is a cluster again"
             )
         return silent_s == 0.0
 
     def _look(self) -> None:
         try:
             socket.create_connection(self._address, ANSWER_S).close()
-        except OSError:
+        except OSError as error:
+            if self._looked == self._answered:
+                log.warning(
+                    "%s does not answer (%s): no worker is started until it does; this ends after %.0f s",
+                    self._name, error, self._patience_s,
+                )  # fmt: skip
             self._looked = monotonic()
         else:
             self._looked = self._answered = monotonic()

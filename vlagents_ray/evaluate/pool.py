@@ -17,7 +17,7 @@ from ray.exceptions import RayActorError, RayError
 
 from vlagents_ray.client.credentials import KEY_VARIABLE
 from vlagents_ray.envs.graphics import GPUS
-from vlagents_ray.errors import ConfigError, EnvFailed
+from vlagents_ray.errors import ClusterLost, ConfigError, EnvFailed
 from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.config import EvalConfig, WorkerConfig
 from vlagents_ray.evaluate.episode import Phase
@@ -83,7 +83,7 @@ class WorkerPool:
         self._failed_starts = 0
         self._failed_start = 0.0  # when the last of them failed
         self._mute: dict[str, float] = {}  # hosts that do not answer, until when
-        self._busy = 0.0  # when an episode was last being played
+        self._busy = monotonic()  # when an episode was last being played
         self._short = False  # has it been said that there is not room for all workers?
         self._limit_s: dict[Phase, float] = {
             "connect": config.connect_timeout_s + config.policy_timeout_s,
@@ -99,7 +99,9 @@ class WorkerPool:
     def __enter__(self) -> WorkerPool:
         return self
 
-    def __exit__(self, *exc: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is ClusterLost:  # nobody is there to kill them; Ray ends them for want of a head, too
+            return
         actors = [worker.actor for worker in self._workers] + [actor for actor, _ in self._leaving]
         # A Ray that is itself being ended, as with a job of a cluster's, does not answer; the results are to be kept.
         killing = threading.Thread(target=_kill, args=(actors,), daemon=True)
