@@ -12,14 +12,14 @@ import ssl
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ray.serve.schema import ServeDeploySchema
 
-from vlagents_ray.errors import ConfigError, PolicyUnavailable
+from vlagents_ray.errors import ClusterLost, ConfigError, PolicyUnavailable
 from vlagents_ray.serve.auth import require_access
 from vlagents_ray.serve.config import AccessArgs, ServerArgs
 from vlagents_ray.serve.files import IMPORT_PATH, with_gateways_at, with_replicas_on
@@ -88,7 +88,7 @@ def running_server(
                 f"Serve runs {running} on this cluster already; use their URL (serve://{running[0]} inside the "
                 f"cluster), or deploy beside them with `serve deploy`"
             )
-        stack.callback(_shutdown, client)
+        stack.push(_unless_lost(lambda: _shutdown(client)))
         client.deploy_apps(config)
         url = f"{'http' if tls is None else 'https'}://{LOOPBACK if host == EVERYWHERE else host}:{port}"
         paths = {app.name: (app.route_prefix or "").rstrip("/") for app in config.applications}
@@ -172,10 +172,19 @@ def joined(address: str | None, *, show_logs: bool = False) -> Iterator[None]:
             f"no way into a Ray cluster at {address!r}: {error}. Start Ray on this machine, or have it join one "
             f"(`ray start`); the page docs/cluster/ray.md shows how"
         ) from error
-    try:
+    with contextlib.ExitStack() as stack:
+        stack.push(_unless_lost(ray.shutdown))
         yield
-    finally:
-        ray.shutdown()
+
+
+def _unless_lost(leave: Callable[[], None]) -> Callable[..., None]:
+    """For an `ExitStack`: a cluster whose head is lost would keep one waiting who takes leave."""
+
+    def end(kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not ClusterLost:
+            leave()
+
+    return end
 
 
 def spread_over_gpus(parts: Mapping[str, ServeDeploySchema], *, kept: float = 0.0) -> dict[str, ServeDeploySchema]:
