@@ -83,7 +83,7 @@ def test_a_robot_outside_of_the_cluster_keeps_its_loop_beside_an_evaluation(tmp_
     ):
         robot.limit("1gbit")
         robot.environment |= {KEY_VARIABLE: token}
-        loop = ["--hz", "50", "--seconds", "20", "--transport", "websocket", "--baseline", "0"]
+        loop = ["--hz", "50", "--seconds", "20", "--transport", "websocket", "--baseline", "0", "--safe", "hold"]
         # It fails if a tick has no action of the policy.
         robot.run([sys.executable, "-m", "vlagents_ray.robot", f"http://{head.name}:8000", *loop])
         assert run.attempts() == []

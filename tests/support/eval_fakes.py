@@ -160,6 +160,9 @@ class Unhurried(ToZero):
         super().__init__(chunk=50, state_dim=1)
         self._takes_s = takes_s
 
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        return super().reset(obs, instruction, **{"seed": 0} | kwargs)  # a robot has none
+
     def act(self, obs: Obs) -> Act:
         time.sleep(self._takes_s)
         return super().act(obs)

@@ -64,10 +64,12 @@ def serving(head: Host, folder: Path, replicas: int) -> Iterator[str]:
     token = new_key(keys, "all")
     command = ["vlagents-ray", "serve", str(file), "--address", "auto", "--host", EVERYWHERE, "--keys", str(keys)]
     with log.open("w") as output, head.start(command, stdout=output, stderr=output) as server:
-        until(lambda: "serving line" in log.read_text() or server.poll() is not None)
-        assert server.poll() is None, log.read_text()
-        yield token
-        server.kill()
+        try:
+            until(lambda: "serving line" in log.read_text() or server.poll() is not None)
+            assert server.poll() is None, log.read_text()
+            yield token
+        finally:
+            server.kill()
 
 
 class Evaluation:
