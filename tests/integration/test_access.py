@@ -150,6 +150,13 @@ def test_every_door_refuses_what_is_over_the_limits_and_goes_on(served: Served, 
         agent.act(Obs())
 
 
+def test_whoever_is_in_the_cluster_finds_a_way_that_needs_no_key(served: Served) -> None:
+    with RemoteAgent("serve://noop") as agent:
+        agent.reset(Obs(), "x")
+        assert agent.act(Obs()).action.shape == (7,)
+        assert agent.transport == "plasma"
+
+
 def test_a_revoked_key_is_shut_out_of_every_door_within_seconds(served: Served) -> None:
     url = served.url.replace("https", "wss") + "/v1/stream"
     with contextlib.ExitStack() as stack:
