@@ -9,6 +9,7 @@ from collections.abc import Callable
 import pytest
 from eval_fakes import ToZero
 from flat_config import flat_config
+from set_clock import Clock
 
 from vlagents_ray.evaluate import EvalConfig, OutOfTime, SilentProgress, evaluate
 from vlagents_ray.evaluate.cells import Cell, cells
@@ -17,15 +18,6 @@ from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.jobs import plan
 
 JOBS = plan(cells(flat_config(envs=["tabletop"], episodes=3, out="out")))
-
-
-class Clock:
-    """Shows what it is set to."""
-
-    now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 def test_without_a_deadline_there_is_always_room() -> None:
@@ -57,7 +49,7 @@ def test_episodes_of_earlier_runs_tell_how_long_they_take() -> None:
 
 
 class SlowAfterTwo(SilentProgress):
-    """Once two episodes are recorded, the clock that the evaluation looks at jumps to its end."""
+    """Once two episodes are recorded, there is no time for another one."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self._left, self._monkeypatch = 2, monkeypatch

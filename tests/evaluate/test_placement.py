@@ -9,7 +9,7 @@ from flat_config import flat_config
 from vlagents_ray.envs.graphics import GPUS
 from vlagents_ray.evaluate.cells import Cell, cells
 from vlagents_ray.evaluate.placement import Placement, fewest, strategy
-from vlagents_ray.evaluate.pool import runtime_env
+from vlagents_ray.evaluate.process import runtime_env
 
 
 def filled(replicas: dict[str, int], workers: int) -> Counter[str | None]:

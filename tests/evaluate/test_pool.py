@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from time import monotonic
 from typing import Any
@@ -9,12 +10,14 @@ from typing import Any
 import pytest
 import ray
 from eval_fakes import LINE, ToZero, wait_for
+from ray.exceptions import RaySystemError
 
-from vlagents_ray.errors import ConfigError, EnvFailed
+from vlagents_ray.errors import EnvFailed
 from vlagents_ray.evaluate import EvalConfig, pool
 from vlagents_ray.evaluate.failures import Failure
 from vlagents_ray.evaluate.jobs import EpisodeKey, Job
-from vlagents_ray.evaluate.pool import Worker, WorkerPool
+from vlagents_ray.evaluate.pool import WorkerPool
+from vlagents_ray.evaluate.worker import Worker
 
 pytestmark = pytest.mark.usefixtures("cluster")
 
@@ -54,14 +57,10 @@ def test_workers_play_on_while_there_is_no_room_for_all(config: Config, caplog: 
     settings = config(workers=2, place_timeout_s=0.2)
     job = Job(EpisodeKey(LINE, 0, 0, "settings"), None)  # type: ignore[arg-type]
     waiting = worker(settings, Process.options(num_cpus=64).remote().__ray_ready__.remote())
-    playing = worker(settings, jobs=(job,), heard=monotonic(), looked=monotonic())
+    playing = worker(settings, jobs=(job,), heard=math.inf, looked=math.inf)  # nobody asks how it gets on
     with WorkerPool(settings, ToZero) as short:
         short._workers = [waiting, playing]
         wait_for(lambda: list(short.wait(0.1)) or "going on with 1 of 2 workers: the cluster found no" in caplog.text)
-        playing.jobs = ()
-        assert list(short.wait(0.1)) == [], "between two episodes"
-        with pytest.raises(ConfigError, match="lower `workers`"):
-            wait_for(lambda: list(short.wait(0.1)))
 
 
 def test_a_host_that_does_not_answer_is_waited_for_once(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -78,3 +77,23 @@ def test_a_host_that_does_not_answer_is_waited_for_once(config: Config, monkeypa
             process = {"host": host, "logs": ["/log"]}
             assert watched._with_log(failure, worker(config(), process=process)) == failure
     assert asked == ["host1", "host2"]
+
+
+def test_a_worker_that_cannot_be_killed_saves_no_other_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    killed = []
+
+    def kill(actor: str) -> None:
+        killed.append(actor)
+        raise RaySystemError("no answer")
+
+    monkeypatch.setattr(ray, "kill", kill)
+    pool._kill(["one", "other"])
+    assert killed == ["one", "other"]
+
+
+def test_who_kills_workers_of_a_ray_that_was_left_meanwhile_starts_no_other_ray(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    monkeypatch.setattr(ray, "kill", lambda _: pytest.fail("which Ray takes for a wish to be started"))
+    pool._kill(["one"])

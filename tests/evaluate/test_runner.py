@@ -17,7 +17,16 @@ import pytest
 from eval_fakes import CLINGING, EVERY, LINE, OTHER_LINE, Silent, Teller, ToZero, wait_for
 
 from vlagents_ray.errors import ConfigError, ConnectionLost, ContractMismatch, UnknownEnv
-from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, SilentProgress, SuiteConfig, check, evaluate, pool
+from vlagents_ray.evaluate import (
+    EvalConfig,
+    EvaluationInterrupted,
+    SilentProgress,
+    SuiteConfig,
+    check,
+    evaluate,
+    pool,
+    worker,
+)
 from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.store import Store
@@ -39,8 +48,8 @@ def outcomes(config: EvalConfig) -> list[tuple[Any, ...]]:
 
 
 def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pool, "WATCH_S", 0.1)
-    monkeypatch.setattr(pool, "GRACE_S", 0.2)
+    monkeypatch.setattr(worker, "WATCH_S", 0.1)
+    monkeypatch.setattr(worker, "GRACE_S", 0.2)
 
 
 @pytest.mark.usefixtures("cluster")

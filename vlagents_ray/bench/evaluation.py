@@ -32,7 +32,7 @@ from vlagents_ray.bench.child import Child, ChildFailed
 from vlagents_ray.bench.noted import NOTED, read_notes
 from vlagents_ray.bench.ways import SCRIPTS, our_environment, peer_ways
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate.pool import THREAD_VARIABLES
+from vlagents_ray.evaluate.process import THREAD_VARIABLES
 from vlagents_ray.serve.ports import LOOPBACK, free_block
 
 OURS = "vlagents-ray"

@@ -29,7 +29,7 @@ from vlagents_ray.bench.cpu import CpuSampler
 from vlagents_ray.envs import make_env
 from vlagents_ray.errors import EnvFailed
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, evaluate
-from vlagents_ray.evaluate.pool import THREAD_VARIABLES
+from vlagents_ray.evaluate.process import THREAD_VARIABLES
 from vlagents_ray.interface import Act
 from vlagents_ray.serve.cluster import running_server
 from vlagents_ray.serve.files import deployment

@@ -18,7 +18,7 @@ from vlagents_ray.evaluate.clock import neutral
 from vlagents_ray.evaluate.cluster import ray_cluster
 from vlagents_ray.evaluate.config import EvalConfig
 from vlagents_ray.evaluate.jobs import plan
-from vlagents_ray.evaluate.pool import runtime_env
+from vlagents_ray.evaluate.process import runtime_env
 from vlagents_ray.evaluate.results import CellResults, Results
 from vlagents_ray.evaluate.sides import env_side
 from vlagents_ray.interface import Act

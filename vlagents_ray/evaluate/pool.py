@@ -4,68 +4,36 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import os
 import threading
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from time import monotonic
 from typing import Any
 
 import ray
 from ray.exceptions import RayActorError, RayError
 
-from vlagents_ray.client.credentials import KEY_VARIABLE
-from vlagents_ray.envs.graphics import GPUS
-from vlagents_ray.errors import ClusterLost, ConfigError, EnvFailed
+from vlagents_ray.errors import ClusterLost, EnvFailed
 from vlagents_ray.evaluate.cells import Cell
-from vlagents_ray.evaluate.config import EvalConfig, WorkerConfig
+from vlagents_ray.evaluate.config import EvalConfig
 from vlagents_ray.evaluate.episode import Phase
 from vlagents_ray.evaluate.failures import Failure
 from vlagents_ray.evaluate.head import Head
 from vlagents_ray.evaluate.jobs import Job
 from vlagents_ray.evaluate.logs import tail_at
 from vlagents_ray.evaluate.placement import Placement, strategy
+from vlagents_ray.evaluate.process import runtime_env
 from vlagents_ray.evaluate.rollout import AgentFactory, Pulse, Report, Rollout
+from vlagents_ray.evaluate.room import Room
+from vlagents_ray.evaluate.worker import Limits, Worker
 
 log = logging.getLogger(__name__)
 
-WATCH_S = 1.0  # between two looks at a busy worker
-GRACE_S = 5.0  # a call past its deadline gets this long to fail by itself
 KILL_S = 3.0  # for Ray to take note that workers are to be killed
 CLOSE_S = 10.0  # for workers to close their simulators when they leave
 MOST_FAILED_STARTS = 3  # in a row; those that fail together, as with their node, count as one
 MUTE_S = 60.0  # a host that did not give the logs of a lost worker is not asked for so long
-
-# Pinned before any import in the worker: several workers share a machine.
-THREAD_VARIABLES = (
-    "OMP_NUM_THREADS",
-    "MKL_NUM_THREADS",
-    "OPENBLAS_NUM_THREADS",
-    "NUMEXPR_NUM_THREADS",
-    "OPENCV_FOR_THREADS_NUM",
-    "LP_NUM_THREADS",  # llvmpipe and lavapipe, Mesa's software renderers
-)
-
-
-@dataclass(slots=True, eq=False)
-class Worker:
-    """One worker as the driver sees it."""
-
-    config: WorkerConfig
-    kind: str  # stands for `config`
-    actor: Any
-    starting: Any  # ref of `ready()`; None once it runs
-    since: float  # when it was started
-    jobs: tuple[Job, ...] = ()  # that it plays, of one cell
-    running: Any = None  # ref of `run(jobs)`
-    made: str | None = None  # the place of the env it holds
-    looking: Any = None  # ref of `progress()`
-    looked: float = 0.0  # when it was asked
-    pulse: Pulse = field(default_factory=lambda: Pulse("idle", 0.0, 0))
-    heard: float = 0.0  # when it last answered
-    process: dict[str, Any] = field(default_factory=dict)  # what `ready()` said
-    node: str | None = None  # Ray's id of the one it runs on or, while it starts, is wanted on; None: any
 
 
 class WorkerPool:
@@ -83,16 +51,8 @@ class WorkerPool:
         self._failed_starts = 0
         self._failed_start = 0.0  # when the last of them failed
         self._mute: dict[str, float] = {}  # hosts that do not answer, until when
-        self._busy = monotonic()  # when an episode was last being played
-        self._short = False  # has it been said that there is not room for all workers?
-        self._limit_s: dict[Phase, float] = {
-            "connect": config.connect_timeout_s + config.policy_timeout_s,
-            "make": config.make_timeout_s,
-            "env reset": config.env_timeout_s,
-            "env step": config.env_timeout_s,
-            "policy reset": config.policy_timeout_s,
-            "policy act": config.policy_timeout_s,
-        }
+        self._room = Room(config)
+        self._limits = Limits(config)
         self._workers: list[Worker] = []
         self._leaving: list[tuple[Any, float]] = []  # actors on their way out, and since when
 
@@ -175,7 +135,7 @@ class WorkerPool:
         cluster has not answered for long.
         """
         self._head.answers()
-        refs = {ref: worker for worker in self._workers for ref in _refs(worker)}
+        refs = {ref: worker for worker in self._workers for ref in worker.refs}
         if refs:
             done, waiting = ray.wait(list(refs), num_returns=1, timeout=timeout_s)
             if done and waiting:  # all that have come: a turn looks at every worker, so it must not be one's alone
@@ -240,26 +200,26 @@ class WorkerPool:
         else:
             log.info("worker %s", worker.process)
             self._failed_starts = 0
-            self._short = False
+            self._room.found()
             worker.starting = None
             worker.node = worker.process["node"]
 
     def _look(self) -> Iterator[tuple[Job, Report]]:
         now = monotonic()
         if self.busy:
-            self._busy = now
+            self._room.used()
         self._see_off(now)
         for worker in list(self._workers):
             if worker.starting is not None:
-                if now - worker.since > self._config.place_timeout_s:
-                    self._no_room(worker.config)
+                if self._room.lacks(worker.since) and self._head.answers():
+                    self._room.miss(worker.config, sum(one.starting is None for one in self._workers))
             elif worker.jobs:
-                reason = self._overdue(worker, now)
+                reason = self._limits.overdue(worker, now)
                 if reason is not None:
                     self._end(worker)
                     failure = self._with_log(Failure("worker", EnvFailed.code, reason, worker.pulse.stack), worker)
                     yield from ((job, Report(failure=failure)) for job in worker.jobs)
-                elif worker.looking is None and now - worker.looked > WATCH_S:
+                elif worker.is_to_be_asked(now):
                     worker.looked = now
                     worker.looking = worker.actor.progress.options(concurrency_group="watch").remote()
 
@@ -269,18 +229,6 @@ class WorkerPool:
             if now - since > CLOSE_S:
                 ray.kill(actor)
         self._leaving = [one for one in self._leaving if now - one[1] <= CLOSE_S]
-
-    def _overdue(self, worker: Worker, now: float) -> str | None:
-        """Why `worker` must be replaced, if it must."""
-        pulse = worker.pulse
-        limit_s = self._limit_s.get(pulse.phase, self._config.env_timeout_s)
-        if pulse.age_s > limit_s + GRACE_S:
-            return f"{pulse.phase} after {pulse.steps} steps took longer than {limit_s:g} s; the worker was killed"
-        # A simulator that hangs inside C code holds the interpreter, so that nothing answers.
-        silent_s = now - worker.heard
-        if silent_s > max(limit_s, self._config.env_timeout_s) + GRACE_S + WATCH_S:
-            return f"no sign of life for {silent_s:.0f} s, last seen in {pulse.phase}; the worker was killed"
-        return None
 
     def _with_log(self, failure: Failure, worker: Worker) -> Failure:
         """Nobody waits for a lost node more than once, however many workers it had."""
@@ -293,40 +241,10 @@ class WorkerPool:
             self._mute[host] = monotonic() + MUTE_S
             return failure
 
-    def _no_room(self, worker: WorkerConfig) -> None:
-        """Go on with the workers that play: the node of another one may have been lost, and may come back."""
-        stuck = monotonic() - self._busy > self._config.place_timeout_s
-        if (self._short and not stuck) or not self._head.answers():
-            return
-        self._short = True
-        want = {"CPU": worker.cpus, "GPU": worker.gpus}
-        message = (
-            f"the cluster found no room for a worker in {self._config.place_timeout_s:g} s: each wants {want}, "
-            f"free are {ray.available_resources()} of {ray.cluster_resources()}; lower `workers` or "
-            f"`worker.cpus`, or raise `place_timeout_s` if the cluster is still growing"
-        )
-        if stuck:
-            raise ConfigError(message)
-        running = sum(one.starting is None for one in self._workers)
-        log.warning("going on with %d of %d workers: %s", running, self._config.workers, message)
-
 
 def _kill(actors: list[Any]) -> None:
-    with contextlib.suppress(RayError):  # they end with this process in any case
-        for actor in actors:
+    for actor in actors:
+        if not ray.is_initialized():  # nobody waited any longer; whoever asks Ray for anything now starts another one
+            return
+        with contextlib.suppress(RayError):  # it ends with this process in any case
             ray.kill(actor)
-
-
-def _refs(worker: Worker) -> list[Any]:
-    return [ref for ref in (worker.starting, worker.running, worker.looking) if ref is not None]
-
-
-def runtime_env(cell: Cell) -> dict[str, Any]:
-    """Ray's, with the thread settings of a worker's process, and without GPUs if none is set aside for it."""
-    given: dict[str, Any] = dict(cell.worker.runtime_env)
-    variables = dict.fromkeys(THREAD_VARIABLES, str(cell.worker.threads))
-    if not cell.worker.gpus and (cell.policy.url or cell.policy.source):  # else the policy is in the worker
-        variables[GPUS] = ""  # Ray hides none from whoever asked for none
-    if key := os.environ.get(KEY_VARIABLE):  # for the policy's server, on nodes that do not know it
-        variables[KEY_VARIABLE] = key
-    return given | {"env_vars": variables | given.get("env_vars", {})}

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import functools
 import logging
 from collections import Counter
 from collections.abc import Callable
 
-from vlagents_ray.client import RemoteAgent
-from vlagents_ray.errors import ConfigError, from_code
+from vlagents_ray.errors import from_code
+from vlagents_ray.evaluate.agents import agents
 from vlagents_ray.evaluate.cells import Cell
 from vlagents_ray.evaluate.cluster import ray_cluster
-from vlagents_ray.evaluate.config import EvalConfig, PolicyConfig
+from vlagents_ray.evaluate.config import EvalConfig
 from vlagents_ray.evaluate.deadline import Deadline
 from vlagents_ray.evaluate.episode import EpisodeResult
 from vlagents_ray.evaluate.failures import Failure
@@ -77,7 +76,7 @@ def evaluate(
     is one, when `end_at` left episodes over.
     Whatever it raises, each recorded episode is kept, and summary.json and report.html written.
     """
-    factory = _remote_agents(config) if agent_factory is None else functools.partial(_own_agent, agent_factory)
+    factory = agents(config, agent_factory)
     tracking = Tracking(config)
     with Store(config) as store:
         store.begin_run(config, versions())
@@ -242,29 +241,3 @@ class _Run:
             dropped = self._queue.drop(job.cell.fingerprint)
             self._left[job.key.settings] -= dropped
             self._progress.stopped(job.cell, stopping.at, dropped)
-
-
-def _remote_agents(config: EvalConfig) -> AgentFactory:
-    for policy in config.policies:
-        if policy.url is None:
-            raise ConfigError(
-                f"policy {policy.name!r}: got no url, want that of its server, e.g. http://localhost:8000"
-            )
-    return functools.partial(_remote_agent, config)
-
-
-def _own_agent(make: Callable[[], Agent], _policy: PolicyConfig) -> Agent:
-    return make()
-
-
-def _remote_agent(config: EvalConfig, policy: PolicyConfig) -> RemoteAgent:
-    assert policy.url is not None  # noqa: S101 - looked at by `_remote_agents`
-    return RemoteAgent(
-        policy.url,
-        transport=policy.transport,
-        timeout_s=config.policy_timeout_s,
-        connect_timeout_s=config.connect_timeout_s,
-        codec=policy.codec,
-        rank="simulation",
-        resume=False,  # an episode that was interrupted is played again, so that its result depends on its key alone
-    )
