@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import ray
-from ray.exceptions import ActorDiedError, LocalRayletDiedError, ObjectStoreFullError, OutOfDiskError
+from ray.exceptions import ActorDiedError, LocalRayletDiedError, ObjectStoreFullError, OutOfDiskError, RayTaskError
 
 from vlagents_ray.client import handle
 from vlagents_ray.client.handle import HandleTransport
@@ -43,6 +43,14 @@ def test_an_answer_that_is_lost_with_its_node_is_a_lost_connection(
     monkeypatch.setattr(handle, "call_replica", lambda *_, **__: None)
     monkeypatch.setattr(ray, "get", failing(error))
     with pytest.raises(ConnectionLost, match=f"replica is gone \\({type(error).__name__}\\)"):
+        HandleTransport("app").call([REQUEST], 1)
+
+
+def test_a_replica_that_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ray, "put", lambda _: None)
+    monkeypatch.setattr(handle, "call_replica", lambda *_, **__: None)
+    monkeypatch.setattr(ray, "get", failing(RayTaskError("call", "its traceback", ValueError("no such layout"))))
+    with pytest.raises(ConnectionLost, match="the replica failed: no such layout"):
         HandleTransport("app").call([REQUEST], 1)
 
 

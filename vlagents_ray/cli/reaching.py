@@ -10,8 +10,9 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any
 
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.joining import joined
 from vlagents_ray.serve.checkpoints import STEP, resolved
-from vlagents_ray.serve.cluster import joined, running_server, spread_over_gpus
+from vlagents_ray.serve.cluster import running_server, spread_over_gpus
 from vlagents_ray.serve.files import own_settings, read_deployment, together, with_settings
 
 if TYPE_CHECKING:
@@ -24,7 +25,10 @@ FILE = (".yaml", ".yml")
 
 @contextlib.contextmanager
 def served(config: EvalConfig, address: str | None = None, *, replica_per_gpu: bool = False) -> Iterator[EvalConfig]:
-    """`config` with the URLs of its policies, those that are not at one being served for the length of the context."""
+    """`config` with the URLs of its policies, those that are not at one being served for the length of the context.
+
+    `replica_per_gpu` goes with the `address` of a cluster, whose GPUs they share.
+    """
     from vlagents_ray.evaluate import check, most_cpus
 
     with contextlib.ExitStack() as stack:
@@ -33,7 +37,6 @@ def served(config: EvalConfig, address: str | None = None, *, replica_per_gpu: b
         config, parts = reached(config)
         check(config)  # what is wrong is said before anything starts
         if parts and replica_per_gpu:
-            stack.enter_context(joined(address))
             parts = spread_over_gpus(parts, kept=config.workers * config.worker.gpus)
         if parts:
             # Ray's CPUs are bookkeeping here: the number of workers that the user asked for must fit.

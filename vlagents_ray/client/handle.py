@@ -92,6 +92,8 @@ class HandleTransport:
         except ray.exceptions.GetTimeoutError as error:
             ray.cancel(pending)
             raise DeadlineExceeded(f"serve://{self._app}: no answer within {timeout_s:g} s") from error
+        except ray.exceptions.RayTaskError as error:  # nobody knows how far it came
+            raise ConnectionLost(f"serve://{self._app}: the replica failed: {error.cause}; reset again") from error
         except ray.exceptions.RayError as error:  # the replica is gone, or its node with the frame or the answer
             raise self._lost(error) from error
 

@@ -3,39 +3,20 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from math import ceil
-from typing import Any
 
-import ray
-
-from vlagents_ray.errors import ClusterLost
 from vlagents_ray.evaluate.config import EvalConfig
-from vlagents_ray.signals import own_sigterm
+from vlagents_ray.joining import joined
 
 
-@contextmanager
-def ray_cluster(config: EvalConfig) -> Iterator[None]:
+def ray_cluster(config: EvalConfig) -> AbstractContextManager[None]:
     """The cluster this process is in; or one that is left, and if local shut down, at the end."""
-    if ray.is_initialized():
-        yield
-        return
-    options: dict[str, Any] = {"log_to_driver": False, "logging_level": "WARNING"}
-    if not os.environ.get("RAY_ADDRESS"):
-        # Its CPUs are bookkeeping: the user's number of workers must fit.
-        needed = ceil(config.workers * most_cpus(config))
-        options |= {"num_cpus": max(os.cpu_count() or 1, needed), "include_dashboard": False}
-    with own_sigterm():
-        ray.init(**options)
-    try:
-        yield
-    except ClusterLost:  # to take leave would wait for the head
-        raise
-    except BaseException:
-        ray.shutdown()
-        raise
-    ray.shutdown()
+    if os.environ.get("RAY_ADDRESS"):
+        return joined()
+    # Its CPUs are bookkeeping: the user's number of workers must fit.
+    needed = ceil(config.workers * most_cpus(config))
+    return joined("local", num_cpus=max(os.cpu_count() or 1, needed), include_dashboard=False)
 
 
 def most_cpus(config: EvalConfig) -> float:

@@ -8,28 +8,26 @@ from __future__ import annotations
 
 import contextlib
 import os
-import ssl
 import time
-import urllib.error
-import urllib.request
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ray.serve.schema import ServeDeploySchema
 
-from vlagents_ray.errors import ClusterLost, ConfigError, PolicyUnavailable
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.joining import joined, unless_lost
 from vlagents_ray.serve.auth import require_access
 from vlagents_ray.serve.config import AccessArgs, ServerArgs
 from vlagents_ray.serve.files import IMPORT_PATH, with_gateways_at, with_replicas_on
 from vlagents_ray.serve.haproxy import Front, wait_for_haproxy
 from vlagents_ray.serve.own_ray import own_ray
 from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK, free_port, keep
+from vlagents_ray.serve.readiness import wait_until_ready
 from vlagents_ray.serve.tls import Tls
-from vlagents_ray.signals import own_sigterm
 
-__all__ = ["Server", "free_port", "joined", "running_server", "spread_over_gpus"]
+__all__ = ["Server", "free_port", "running_server", "spread_over_gpus"]
 
 _START_S, _GROW_S = 600.0, 3600.0  # until a policy is ready: here; on a cluster that may first want another machine
 _SHUTDOWN_S = 30.0
@@ -88,7 +86,7 @@ def running_server(
                 f"Serve runs {running} on this cluster already; use their URL (serve://{running[0]} inside the "
                 f"cluster), or deploy beside them with `serve deploy`"
             )
-        stack.push(_unless_lost(lambda: _shutdown(client)))
+        stack.push(unless_lost(lambda: _shutdown(client)))
         client.deploy_apps(config)
         url = f"{'http' if tls is None else 'https'}://{LOOPBACK if host == EVERYWHERE else host}:{port}"
         paths = {app.name: (app.route_prefix or "").rstrip("/") for app in config.applications}
@@ -96,7 +94,8 @@ def running_server(
             timeout_s = _START_S if address is None else _GROW_S
         deadline = time.monotonic() + timeout_s
         inside = _inside(http)
-        _wait(serve, {name: inside + path for name, path in paths.items()}, _our_apps(config), deadline)
+        ours = {app.name for app in _our_apps(config)}
+        wait_until_ready(serve, {name: inside + path for name, path in paths.items()}, ours, deadline)
         if address is None and (stats_port := os.environ.get("RAY_SERVE_HAPROXY_STATS_PORT")):
             wait_for_haproxy(serve, paths, int(stats_port), deadline)
         yield Server(url, {name: url + path for name, path in paths.items()})
@@ -149,42 +148,8 @@ def _ray(
             f"host {host}: with HAProxy Serve would find no replica at a single address; "
             f"use {EVERYWHERE} (or {LOOPBACK}), or leave ray.init() to this function"
         )
-    with joined(address, show_logs=show_logs):
+    with joined(address, log_to_driver=show_logs):
         yield {"host": host, "port": port}
-
-
-@contextlib.contextmanager
-def joined(address: str | None, *, show_logs: bool = False) -> Iterator[None]:
-    """Be connected to the Ray cluster at `address`, or to the one that this process is connected to already.
-
-    `ConfigError` if there is none, or it wants another token.
-    """
-    import ray
-
-    if ray.is_initialized():
-        yield
-        return
-    try:
-        with own_sigterm():
-            ray.init(address=address, log_to_driver=show_logs, logging_level="WARNING")
-    except (ConnectionError, ray.exceptions.AuthenticationError) as error:
-        raise ConfigError(
-            f"no way into a Ray cluster at {address!r}: {error}. Start Ray on this machine, or have it join one "
-            f"(`ray start`); the page docs/cluster/ray.md shows how"
-        ) from error
-    with contextlib.ExitStack() as stack:
-        stack.push(_unless_lost(ray.shutdown))
-        yield
-
-
-def _unless_lost(leave: Callable[[], None]) -> Callable[..., None]:
-    """For an `ExitStack`: a cluster whose head is lost would keep one waiting who takes leave."""
-
-    def end(kind: type[BaseException] | None, *_: object) -> None:
-        if kind is not ClusterLost:
-            leave()
-
-    return end
 
 
 def spread_over_gpus(parts: Mapping[str, ServeDeploySchema], *, kept: float = 0.0) -> dict[str, ServeDeploySchema]:
@@ -210,62 +175,6 @@ def _inside(http: Mapping[str, Any]) -> str:
     """Serve's own URL, for a process on its node."""
     scheme = "https" if http.get("ssl_certfile") else "http"
     return f"{scheme}://{LOOPBACK if http['host'] == EVERYWHERE else http['host']}:{http['port']}"
-
-
-def _wait(serve: Any, apps: Mapping[str, str], ours: Sequence[Any], deadline: float) -> None:
-    """Until each application runs and its door answers; raises what keeps it from doing so."""
-    while True:
-        status = serve.status().applications
-        for name in apps:
-            app = status.get(name)
-            if app is not None and app.status in ("DEPLOY_FAILED", "UNHEALTHY"):
-                raise ConfigError(f"application {name!r} failed to deploy: {_reason(app)}")
-        if all(name in status and status[name].status == "RUNNING" for name in apps):
-            break
-        if time.monotonic() > deadline:
-            raise PolicyUnavailable(f"not running in time: { {n: str(status[n].status) for n in apps if n in status} }")
-        time.sleep(0.1)
-    names = {app.name for app in ours}
-    for name, url in apps.items():
-        while (refusal := _refusal(url)) is not None:
-            refusal = (_said_inside(serve, name) if name in names else None) or refusal
-            if "did not load" in refusal:
-                raise ConfigError(f"application {name!r}: {refusal}")
-            if time.monotonic() > deadline:
-                raise PolicyUnavailable(f"application {name!r} is not ready: {refusal}")
-            time.sleep(0.05)
-
-
-def _refusal(url: str) -> str | None:
-    """Why `/healthz` is not 200 yet; None when it is."""
-    unverified = ssl._create_unverified_context() if url.startswith("https") else None  # noqa: S323 - our own door
-    try:
-        with urllib.request.urlopen(f"{url}/healthz", timeout=5, context=unverified):  # noqa: S310 - our own URL
-            return None
-    except urllib.error.HTTPError as error:
-        error.close()
-        return f"HTTP {error.code}"
-    except OSError as error:
-        return str(error)
-
-
-def _said_inside(serve: Any, app: str) -> str | None:
-    """Why the policy cannot act yet, which the door tells only whoever has a key."""
-    from ray.exceptions import RayError
-    from ray.serve.exceptions import RayServeException
-
-    try:
-        refusal: str | None = serve.get_app_handle(app).refusal.remote().result(timeout_s=5)
-    except (RayError, RayServeException, TimeoutError):
-        return None
-    return refusal
-
-
-def _reason(app: Any) -> str:
-    """The last line of what Serve says of a failure: the error, below its traceback."""
-    texts = [app.message, *(d.message for d in app.deployments.values())]
-    lines = [line.strip() for text in texts for line in (text or "").splitlines() if line.strip()]
-    return lines[-1] if lines else "Serve gives no reason"
 
 
 def _shutdown(client: Any) -> None:

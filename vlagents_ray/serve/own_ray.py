@@ -59,8 +59,10 @@ def own_ray(
         stack.enter_context(_alone())
         if front is not None:
             front.require()
-        with own_sigterm():
-            ray.init(num_cpus=num_cpus, include_dashboard=False, log_to_driver=show_logs, logging_level="WARNING")
+        with own_sigterm():  # "local": also where this machine is in a cluster, or RAY_ADDRESS names one
+            ray.init(
+                "local", num_cpus=num_cpus, include_dashboard=False, log_to_driver=show_logs, logging_level="WARNING"
+            )
         stack.callback(ray.shutdown)
         # Whoever reaches the object store's socket reads and writes all observations. (The folder would not stay
         # closed: each of Ray's processes opens it to everybody when it starts.)

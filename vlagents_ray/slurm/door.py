@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from vlagents_ray.client.credentials import KEY_VARIABLE
+from vlagents_ray.slurm.allocation import HEAD
 
 FILE = "server.json"
 _LOOK_S = 0.5
@@ -64,7 +65,7 @@ def way_in(apps: Mapping[str, str], port: int, environ: Mapping[str, str]) -> di
     return {
         "job": int(environ["SLURM_JOB_ID"]),
         "host": host,
-        "address": environ["VLAGENTS_RAY_HEAD"],
+        "address": environ[HEAD],
         "port": port,
         "url": url,
         "apps": {name: url + route.rstrip("/") for name, route in apps.items()},

@@ -8,7 +8,7 @@ import pytest
 import ray
 
 from vlagents_ray import ConfigError
-from vlagents_ray.serve.cluster import joined
+from vlagents_ray.joining import joined
 
 
 @pytest.mark.parametrize(
@@ -20,4 +20,14 @@ def test_a_cluster_that_cannot_be_joined_is_a_wrong_setting(error: Exception, mo
 
     monkeypatch.setattr(ray, "init", refuse)
     with pytest.raises(ConfigError, match=re.escape(f"Ray cluster at 'auto': {error}")), joined("auto"):
+        pytest.fail("joined it")
+
+
+def test_the_cluster_that_the_environment_names_is_named_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(**_options: object) -> None:
+        raise ConnectionError("nobody there")
+
+    monkeypatch.setattr(ray, "init", refuse)
+    monkeypatch.setenv("RAY_ADDRESS", "198.18.0.9:6379")
+    with pytest.raises(ConfigError, match=r"Ray cluster at '198\.18\.0\.9:6379'"), joined():
         pytest.fail("joined it")
