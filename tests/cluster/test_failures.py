@@ -44,12 +44,12 @@ def out_of_memory(host: Host, folder: Path) -> Iterator[None]:
 
 def test_lost_nodes_and_partitions_cost_attempts_alone(tmp_path: Path) -> None:
     """Two nodes with a replica and a worker each, and one with two workers."""
-    episodes = 220
+    episodes = 800
     run = Evaluation(tmp_path, episodes, workers=4)
     with hosts(5) as [head, one, two, simulating, spare]:
         nodes = [(one, 1, True), (two, 1, True), (simulating, 2, False)]
         with (
-            cluster_of(head, nodes) as cluster,
+            cluster_of(head, nodes, run) as cluster,
             serving(head, tmp_path, replicas=2) as token,
             run.running(head, token=token),
         ):
@@ -63,10 +63,11 @@ def test_lost_nodes_and_partitions_cost_attempts_alone(tmp_path: Path) -> None:
             simulating.kill()
             until(lambda: "the worker on host4 died" in run.said())
             run.goes_on()
-            spare.environment |= head.environment
             cluster.join(spare, 2)
             until(lambda: workers_on(spare) == 2)
             two.kill()
+            run.goes_on()
+            run.hurry.touch()
             assert run.ends() == 0, run.said()
             for host in (head, one, spare):
                 until(lambda host=host: workers_on(host) == 0)
@@ -77,7 +78,7 @@ def test_a_robot_outside_of_the_cluster_keeps_its_loop_beside_an_evaluation(tmp_
     run = Evaluation(tmp_path, episodes=1000, workers=2)
     with (
         hosts(3) as [head, one, robot],
-        cluster_of(head, [(one, 2, True)]),
+        cluster_of(head, [(one, 2, True)], run),
         serving(head, tmp_path, replicas=1) as token,
         run.running(head, token=token),
     ):
@@ -92,10 +93,10 @@ def test_a_robot_outside_of_the_cluster_keeps_its_loop_beside_an_evaluation(tmp_
 
 def test_memory_that_runs_out_costs_attempts_and_a_lost_head_a_resumption(tmp_path: Path) -> None:
     """The driver runs at the node that is left, which then becomes the head of another cluster."""
-    episodes = 70
+    episodes = 400
     run = Evaluation(tmp_path, episodes, workers=2)
     with hosts(2) as [head, one]:
-        with cluster_of(head, [(one, 2, False)], RAY_gcs_rpc_server_reconnect_timeout_s="20"):
+        with cluster_of(head, [(one, 2, False)], run, RAY_gcs_rpc_server_reconnect_timeout_s="20"):
             with run.running(one):
                 with out_of_memory(one, tmp_path):
                     until(lambda: any("low on memory" in attempt.error for attempt in run.attempts()))
@@ -107,5 +108,6 @@ def test_memory_that_runs_out_costs_attempts_and_a_lost_head_a_resumption(tmp_pa
             assert json.loads((run.out / "summary.json").read_text())["state"] == "stopped"
             until(lambda: workers_on(one) == 0)
         with ray_cluster([one]), run.running(one, "--resume"):
+            run.hurry.touch()
             assert run.ends() == 0, run.said()
     run.is_whole(episodes)

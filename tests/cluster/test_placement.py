@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from eval_fakes import PYTHONPATH
 
 from vlagents_ray.bench.hosts import Host, RayCluster, hosts, ray_cluster
 
 pytestmark = pytest.mark.hosts
 
-ROOT = Path(__file__).parents[2]
 PLACED = [sys.executable, "-m", "placed"]
 CPUS = 2  # of each node, each of which has room for as many workers
 STORE = {"object_store_memory": "200000000"}
@@ -38,10 +38,9 @@ class Served:
 
 @pytest.fixture(scope="module")
 def served() -> Iterator[Served]:
-    environment = {"PYTHONPATH": f"{ROOT / 'tests' / 'support'}:{ROOT}"}
+    environment = {"PYTHONPATH": PYTHONPATH}
     with hosts(4) as [head, second, third, robot], ray_cluster([head], CPUS, environment, **STORE) as cluster:
         for host, resources in ((second, {"of_one": 1, "of_two": 1}), (third, {"of_two": 1})):
-            host.environment |= head.environment
             cluster.join(host, CPUS, resources=json.dumps(resources), **STORE)
         robot.environment |= environment
         with head.start([*PLACED, "serve"], stdin=-1, stdout=-1) as server:

@@ -9,6 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import pytest
+from eval_fakes import PYTHONPATH
 
 from vlagents_ray.bench.child import Child
 from vlagents_ray.bench.hosts import hosts, ray_cluster
@@ -22,10 +23,14 @@ pytestmark = pytest.mark.hosts
 
 DRIVER = """
 import sys
+from pathlib import Path
 import ray
+from eval_fakes import wait_for
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, evaluate
 env, seed, out = sys.argv[1:]
 ray.init(logging_level="WARNING", log_to_driver=False)
+Path(out + ".here").touch()
+wait_for(lambda: len(list(Path(out).parent.glob("*.here"))) == 2)
 options = {"max_steps": 5, "step_ms": 10.0, "size": 32}
 evaluate(EvalConfig(
     policies=[PolicyConfig(name="noop", url="serve://own")], workers=2, video="none", out=out,
@@ -49,7 +54,7 @@ def test_four_workers_on_two_nodes_play_nearly_four_times_as_much_as_one() -> No
 
 def test_two_drivers_on_one_cluster_play_a_part_each_and_their_results_are_merged(tmp_path: Path) -> None:
     settings = {"address": None, "policy_ms": 5.0, "fleets": {"own": asdict(Fleet(2))}}
-    with hosts(2) as both, ray_cluster(both, 4, our_environment()) as cluster:
+    with hosts(2) as both, ray_cluster(both, 4, {"PYTHONPATH": PYTHONPATH}) as cluster:
         serving = [sys.executable, "-m", "vlagents_ray.bench.scaling_driver"]
         settings["address"] = cluster.address
         with Child("server", cluster.head.command([*serving, json.dumps(settings)]), our_environment()) as server:

@@ -6,13 +6,12 @@ from typing import Any
 
 import pytest
 import ray
-from eval_fakes import LINE
+from eval_fakes import LINE, PYTHONPATH
 from flat_config import flat_config
 
 from vlagents_ray.evaluate import EvalConfig
 
-ROOT = Path(__file__).parents[2]
-WORKER_PATH = {"env_vars": {"PYTHONPATH": f"{ROOT / 'tests' / 'support'}:{ROOT}"}}
+WORKER_PATH = {"env_vars": {"PYTHONPATH": PYTHONPATH}}
 
 
 @pytest.fixture

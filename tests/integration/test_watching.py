@@ -11,14 +11,13 @@ from pathlib import Path
 
 import pytest
 import yaml
-from eval_fakes import LINE, wait_for
+from eval_fakes import LINE, PYTHONPATH, wait_for
 from ray_processes import processes, ray_folder
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import Results
 
 COMMAND = str(Path(sys.executable).parent / "vlagents-ray")
-ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(name="ray_home")
@@ -56,7 +55,7 @@ def test_each_checkpoint_is_evaluated_once_it_is_whole_by_one_server(ray_home: P
         (tmp_path / "log").open("w") as log,
         subprocess.Popen(
             [COMMAND, "eval", str(file), "--watch", str(runs), "--marker", "done", "--until", "30"],
-            env=os.environ | {"RAY_TMPDIR": str(ray_home), "PYTHONPATH": f"{ROOT / 'tests' / 'support'}:{ROOT}"},
+            env=os.environ | {"RAY_TMPDIR": str(ray_home), "PYTHONPATH": PYTHONPATH},
             stdout=log, stderr=subprocess.STDOUT,
         ) as watching,
     ):  # fmt: skip

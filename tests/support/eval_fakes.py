@@ -22,6 +22,8 @@ LINE = "eval_fakes:Line"
 OTHER_LINE = "eval_fakes:OtherLine"
 CLINGING = "eval_fakes:Clinging"
 EVERY = -1  # seed
+HURRY = "VLAGENTS_RAY_TEST_HURRY"  # variable, see `Unhurried`
+PYTHONPATH = f"{Path(__file__).parent}:{Path(__file__).parents[2]}"  # with which other processes find this module
 
 
 class Line(EvalEnv):
@@ -154,7 +156,10 @@ class ToZero(Agent):
 
 
 class Unhurried(ToZero):
-    """Chunks of a second for a robot at 50 Hz. Each takes its time, so that an evaluation lasts."""
+    """Chunks of a second for a robot at 50 Hz.
+
+    Each takes its time, so that an evaluation lasts until there is the file that the variable `HURRY` names.
+    """
 
     def __init__(self, takes_s: float = 0.05) -> None:
         super().__init__(chunk=50, state_dim=1)
@@ -164,7 +169,8 @@ class Unhurried(ToZero):
         return super().reset(obs, instruction, **{"seed": 0} | kwargs)  # a robot has none
 
     def act(self, obs: Obs) -> Act:
-        time.sleep(self._takes_s)
+        if not Path(os.environ.get(HURRY, "")).is_file():
+            time.sleep(self._takes_s)
         return super().act(obs)
 
 

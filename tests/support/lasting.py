@@ -5,14 +5,13 @@ from __future__ import annotations
 import contextlib
 import functools
 import json
-import os
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import yaml
-from eval_fakes import LINE, Line, Unhurried, wait_for
+from eval_fakes import HURRY, LINE, PYTHONPATH, Line, Unhurried, wait_for
 
 from vlagents_ray.bench.hosts import Host, RayCluster, ray_cluster
 from vlagents_ray.client.credentials import KEY_VARIABLE
@@ -23,7 +22,6 @@ from vlagents_ray.evaluate.results import Attempt
 from vlagents_ray.serve.keyfile import new_key
 from vlagents_ray.serve.ports import EVERYWHERE
 
-ROOT = Path(__file__).parents[2]
 until = functools.partial(wait_for, every_s=0.25)  # what takes a process, or all results, to find out
 POLICY = "policy"  # a resource of nodes that replicas may run on
 # Joined to the cluster before the command asks its policy, which is inside.
@@ -43,12 +41,13 @@ except VLAgentsError as error:
 
 
 @contextlib.contextmanager
-def cluster_of(head: Host, nodes: Sequence[tuple[Host, int, bool]], **environment: str) -> Iterator[RayCluster]:
-    """A head that plays nothing, and nodes with so many workers, and perhaps a replica."""
-    path = f"{ROOT / 'tests' / 'support'}{os.pathsep}{ROOT}"
-    with ray_cluster([head], cpus=0, environment={"PYTHONPATH": path, "TERM": "dumb"} | environment) as cluster:
+def cluster_of(
+    head: Host, nodes: Sequence[tuple[Host, int, bool]], run: Evaluation, **environment: str
+) -> Iterator[RayCluster]:
+    """A head that plays nothing, and nodes with so many workers, and perhaps a replica; `run` is to be played there."""
+    shared = {"PYTHONPATH": PYTHONPATH, "TERM": "dumb", HURRY: str(run.hurry)} | environment
+    with ray_cluster([head], cpus=0, environment=shared) as cluster:
         for host, workers, serves in nodes:
-            host.environment |= head.environment
             cluster.join(host, workers, resources=json.dumps({POLICY: 1} if serves else {}))
         yield cluster
 
@@ -75,11 +74,12 @@ def serving(head: Host, folder: Path, replicas: int) -> Iterator[str]:
 class Evaluation:
     """One that runs at a host; `folder` has its results and its log.
 
-    Its policy is `serving`'s if there is one, else each worker has its own.
+    Its policy is `serving`'s if there is one, else each worker has its own. `episodes` are as many as would take far
+    longer than the test needs; the file `hurry` ends that.
     """
 
     def __init__(self, folder: Path, episodes: int, workers: int) -> None:
-        self.out = folder / "out"
+        self.out, self.hurry = folder / "out", folder / "hurry"
         self._log = folder / "eval.log"
         self._file = folder / "eval.yaml"
         policy = {"name": "line", "url": "serve://line", "execute": 1}

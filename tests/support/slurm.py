@@ -8,17 +8,16 @@ import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+from eval_fakes import PYTHONPATH, wait_for
 
 from vlagents_ray.bench.hosts import Host, HostFailed, hosts
 
 _TOOLS = ("munged", "slurmctld", "slurmd", "sbatch", "srun", "scontrol", "squeue", "scancel")
 _READY_S = 60.0
-_ROOT = Path(__file__).parents[2]
-_PATH = f"{_ROOT}:{_ROOT / 'tests' / 'support'}"  # of jobs
 ENDED = {"CANCELLED", "COMPLETED", "FAILED", "NODE_FAIL", "OUT_OF_MEMORY", "TIMEOUT"}
 _CONFIGURATION = """
 ClusterName=test
@@ -80,12 +79,11 @@ class Slurm:
         return self.state(job)
 
     def wait_for(self, job: str, true: Callable[[], bool], timeout_s: float = 180.0) -> None:
-        """Poll until `true()`; says what the job's logs hold if it never is."""
-        deadline = time.monotonic() + timeout_s
-        while not true():
-            if time.monotonic() > deadline:
-                raise AssertionError(f"job {job} is {self.state(job)}:\n{self.do('scontrol', 'show', 'job', job)}")
-            time.sleep(0.2)
+        """Poll until `true()`; says what Slurm knows of the job if it never is."""
+        try:
+            wait_for(true, timeout_s, every_s=0.2)
+        except TimeoutError as error:
+            raise AssertionError(f"job {job}:\n{self.do('scontrol', 'show', 'job', job)}") from error
 
 
 @contextlib.contextmanager
@@ -103,7 +101,7 @@ def running_slurm(nodes: int, cpus: int) -> Iterator[Slurm]:
             configuration.write_text(_CONFIGURATION.format(head=login, folder=folder, nodes="\n".join(lines)))
             (folder / "gres.conf").write_text("Name=gpu File=/dev/null\n")  # a GPU as far as bookkeeping goes
             for one in (login, *others):
-                one.environment |= {"SLURM_CONF": str(configuration), "PYTHONPATH": _PATH}
+                one.environment |= {"SLURM_CONF": str(configuration), "PYTHONPATH": PYTHONPATH}
                 (folder / f"spool-{one.name}").mkdir()
             slurm = Slurm(login, others)
             (folder / "state").mkdir()
@@ -142,9 +140,8 @@ def _idle(slurm: Slurm) -> int:
 
 
 def _until(true: Callable[[], bool], folder: Path) -> None:
-    deadline = time.monotonic() + _READY_S
-    while not true():
-        if time.monotonic() > deadline:
-            logs = "\n".join(f"{log.name}:\n{log.read_text()[-3000:]}" for log in folder.glob("*.log"))
-            raise AssertionError(f"Slurm does not start:\n{logs}")
-        time.sleep(0.1)
+    try:
+        wait_for(true, _READY_S, every_s=0.1)
+    except TimeoutError as error:
+        logs = "\n".join(f"{log.name}:\n{log.read_text()[-3000:]}" for log in folder.glob("*.log"))
+        raise AssertionError(f"Slurm does not start:\n{logs}") from error

@@ -240,7 +240,8 @@ class RayCluster:
         return self.head.run([sys.executable, "-c", code, *arguments], timeout_s)
 
     def join(self, host: Host, cpus: float, **options: str) -> None:
-        """Start Ray there, and let it join."""
+        """Start Ray there, with the environment of the head, and let it join."""
+        host.environment |= self.head.environment
         _ray_start(host, [f"--address={self.address}"], cpus, options)
 
 
@@ -259,9 +260,8 @@ def ray_cluster(
         "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
         **(environment or {}),
     }
-    for host in hosts:
-        host.environment |= shared | {"RAY_ADDRESS": f"{hosts[0].address}:{_PORT}"}
     cluster = RayCluster(list(hosts))
+    cluster.head.environment |= shared | {"RAY_ADDRESS": cluster.address}
     _ray_start(cluster.head, ["--head", f"--port={_PORT}", "--include-dashboard=false"], cpus, options)
     for host in hosts[1:]:
         cluster.join(host, cpus, **options)
