@@ -44,7 +44,7 @@ def out_of_memory(host: Host, folder: Path) -> Iterator[None]:
 
 def test_lost_nodes_and_partitions_cost_attempts_alone(tmp_path: Path) -> None:
     """Two nodes with a replica and a worker each, and one with two workers."""
-    episodes = 800
+    episodes = 600
     run = Evaluation(tmp_path, episodes, workers=4)
     with hosts(5) as [head, one, two, simulating, spare]:
         nodes = [(one, 1, True), (two, 1, True), (simulating, 2, False)]

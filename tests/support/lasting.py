@@ -104,7 +104,7 @@ class Evaluation:
     def ends(self) -> int:
         """The exit status."""
         assert self._process is not None
-        return self._process.wait(180)
+        return self._process.wait(300)
 
     def plays(self, episodes: int) -> None:
         """Wait for so many episodes in all."""
