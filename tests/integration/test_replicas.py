@@ -47,7 +47,8 @@ def test_http_sessions_stay_on_their_replica(server: Server) -> None:
 
 def test_a_caller_learns_on_which_nodes_the_replicas_are_and_of_no_application_nothing(server: Server) -> None:
     assert server.apps.keys() == {"Reacher"}
-    assert ReplicaNodes("Reacher").look() == {ray.get_runtime_context().get_node_id(): 3}
+    nodes, here = ReplicaNodes("Reacher"), ray.get_runtime_context().get_node_id()
+    wait_for(lambda: nodes.look() == {here: 3})
     assert ReplicaNodes("Nobody").look() == {}
 
 

@@ -7,6 +7,7 @@ and ports that no other server on the machine uses. It alone faces the network, 
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import time
 from collections.abc import Iterator, Mapping
@@ -28,6 +29,8 @@ from vlagents_ray.serve.readiness import wait_until_ready
 from vlagents_ray.serve.tls import Tls
 
 __all__ = ["Server", "free_port", "running_server", "spread_over_gpus"]
+
+log = logging.getLogger(__name__)
 
 _START_S, _GROW_S = 600.0, 3600.0  # until a policy is ready: here; on a cluster that may first want another machine
 _SHUTDOWN_S = 30.0
@@ -188,7 +191,11 @@ def _shutdown(client: Any) -> None:
 
     client.shutdown_cached_handles()
     last = client._controller.graceful_shutdown.options(max_task_retries=0).remote()
-    with contextlib.suppress(ray.exceptions.RayActorError):
+    try:
         ray.get(last, timeout=_SHUTDOWN_S)
+    except ray.exceptions.RayActorError:
+        pass
+    except ray.exceptions.GetTimeoutError:
+        log.warning("Serve has not ended within %g s; nobody waits for it any longer", _SHUTDOWN_S)
     client._shutdown = True
     _set_global_client(None)
