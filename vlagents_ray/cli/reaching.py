@@ -25,7 +25,7 @@ FILE = (".yaml", ".yml")
 @contextlib.contextmanager
 def served(config: EvalConfig, address: str | None = None, *, replica_per_gpu: bool = False) -> Iterator[EvalConfig]:
     """`config` with the URLs of its policies, those that are not at one being served for the length of the context."""
-    from vlagents_ray.evaluate import check, most_cpus
+    from vlagents_ray.evaluate import check, most_cpus, most_gpus
 
     with contextlib.ExitStack() as stack:
         if address is not None:
@@ -34,7 +34,7 @@ def served(config: EvalConfig, address: str | None = None, *, replica_per_gpu: b
         check(config)  # what is wrong is said before anything starts
         if parts and replica_per_gpu:
             stack.enter_context(joined(address))
-            parts = spread_over_gpus(parts, kept=config.workers * config.worker.gpus)
+            parts = spread_over_gpus(parts, kept=config.workers * most_gpus(config))
         if parts:
             # Ray's CPUs are bookkeeping here: the number of workers that the user asked for must fit.
             cpus = max(os.cpu_count() or 1, math.ceil(config.workers * most_cpus(config)))
