@@ -47,7 +47,7 @@ def eval_(
     print_only: Print = False,
     parsable: Parsable = False,
 ) -> None:
-    """Evaluate in a job: what `vlagents-ray eval` takes, and sbatch's options.
+    """Evaluate in a job: what `vlagents-ray eval` takes (see its --help), and sbatch's options.
 
     Results that are there already are gone on with, so the same command after `scancel` or a failure finishes the
     rest. Without --workers there is one for each CPU but one, and a policy has a replica on each GPU.
@@ -75,7 +75,7 @@ def serve(
     print_only: Print = False,
     parsable: Parsable = False,
 ) -> None:
-    """Serve a policy in a job until its time is over: what `vlagents-ray serve` takes, and sbatch's options.
+    """Serve a policy in a job, to its end: what `vlagents-ray serve` takes (see its --help), and sbatch's options.
 
     Once it answers, URL, key and the line for ssh stand in OUT/JOB/server.json and in the job's log.
     """
