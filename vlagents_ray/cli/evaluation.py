@@ -15,7 +15,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.slurm.script import UNFINISHED
 
 if TYPE_CHECKING:
-    from vlagents_ray.evaluate import EvalConfig, Summary
+    from vlagents_ray.evaluate import EvalConfig, Summary, WorkerConfig
 
 Set = Annotated[list[str], typer.Option("--set", metavar="KEY=VALUE", help="A setting of the policy, repeatable.")]
 Address = Annotated[
@@ -37,6 +37,9 @@ def evaluate_command(
     out_dir: Annotated[Path | None, typer.Option("--out", help="Folder of the results.")] = None,
     episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each environment; default: 10.")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Environments rolled out in parallel; default: 1.")] = None,
+    worker_cpus: Annotated[
+        float | None, typer.Option(min=0, help="CPUs of a worker, unless the file says how many; default: 0.5.")
+    ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Episode i uses seed + i; default: 0.")] = None,
     video: Annotated[str | None, typer.Option(help="none, failures (default) or all.")] = None,
     record: Annotated[
@@ -96,8 +99,8 @@ def evaluate_command(
     """
     with errors():
         config = configured(
-            what, policy, out_dir, episodes, workers, seed, video, record, track, resume, execute, retries, settings,
-            env_set, reset_set,
+            what, policy, out_dir, episodes, workers, worker_cpus, seed, video, record, track, resume, execute, retries,
+            settings, env_set, reset_set,
         )  # fmt: skip
         watching = _given(until=until, settle_s=settle, marker=marker)
         if watching and watch is None:
@@ -127,6 +130,7 @@ def configured(
     out_dir: Path | None,
     episodes: int | None,
     workers: int | None,
+    worker_cpus: float | None,
     seed: int | None,
     video: str | None,
     record: str | None,
@@ -162,7 +166,21 @@ def configured(
         if policy is None or out_dir is None:
             raise ConfigError("want --policy and --out, or a file of runs (.yaml)")
         fields = {"policies": [of_policy], "suites": [{"envs": what} | of_suite], **running}
-    return EvalConfig.model_validate(fields)
+    config = EvalConfig.model_validate(fields)
+    return config if worker_cpus is None else _with_cpus(config, worker_cpus)
+
+
+def _with_cpus(config: EvalConfig, cpus: float) -> EvalConfig:
+    """With so many CPUs for each worker of which nobody has said how many it takes."""
+
+    def filled(worker: WorkerConfig) -> WorkerConfig:
+        return worker if "cpus" in worker.model_fields_set else worker.model_copy(update={"cpus": cpus})
+
+    suites = [
+        suite if suite.worker is None else suite.model_copy(update={"worker": filled(suite.worker)})
+        for suite in config.suites
+    ]
+    return config.model_copy(update={"worker": filled(config.worker), "suites": suites})
 
 
 def _given(**options: Any) -> dict[str, Any]:

@@ -46,7 +46,8 @@ def main() -> None:
     if given.what == "eval":
         end = end_of_job(allocation.job)
         words += ["--resume", "--replica-per-gpu"]
-        words += [] if given.fill is None else [f"--workers={max(1, int((cpus - 1) / given.fill))}"]
+        if given.fill is not None:
+            words += [f"--workers={max(1, int((cpus - 1) / given.fill))}", f"--worker-cpus={given.fill:g}"]
         words += [] if end is None else [f"--end-at={end - given.closing:.0f}"]
     else:
         words += _door(given, allocation)
