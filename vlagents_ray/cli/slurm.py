@@ -150,7 +150,7 @@ def _cpus(config: EvalConfig) -> float:
 
     if most_gpus(config):
         raise ConfigError(
-            "`worker.gpus` is set, but no number of `workers`; want both: policies get the GPUs left over"
+            "workers have GPUs, but their number is not said; want --workers: policies get the GPUs left over"
         )
     return max(1.0, most_cpus(config))
 
