@@ -26,6 +26,22 @@ def test_no_retry_is_a_number_of_retries(monkeypatch: pytest.MonkeyPatch, tmp_pa
     assert [config.retries for config in seen] == [0]
 
 
+def test_workers_take_the_resources_that_are_said_unless_the_file_says_more(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    seen: list[EvalConfig] = []
+    monkeypatch.setattr(evaluation, "run_evaluation", lambda config, _address, **_: seen.append(config))
+    file = tmp_path / "runs.yaml"
+    suites = "{envs: [tabletop]}, {name: b, envs: [tabletop], worker: {threads: 2}}"
+    more = "{name: c, envs: [tabletop], worker: {cpus: 3}}"
+    file.write_text(f"policies: [{{url: 'http://127.0.0.1:9'}}]\nsuites: [{suites}, {more}]\n")
+    done = CliRunner().invoke(app, ["eval", str(file), "--worker-cpus", "1", "--worker-gpus", "0.25"])
+    assert done.exit_code == 0, done.output
+    [config] = seen
+    kinds = [suite.worker or config.worker for suite in config.suites]
+    assert [(worker.cpus, worker.gpus) for worker in kinds] == [(1.0, 0.25), (1.0, 0.25), (3.0, 0.25)]
+
+
 def test_a_checkpoint_may_count_at_once_and_the_first_step_be_the_last(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:

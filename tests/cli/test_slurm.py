@@ -40,15 +40,26 @@ def test_an_evaluation_keeps_its_words_and_sbatch_gets_the_others(tmp_path: Path
     assert done.exit_code == 0, done.output
     assert {"#SBATCH --nodes=4", "#SBATCH --gpus-per-node=2", "resubmit=3"} <= set(done.stdout.splitlines())
     words = ["tabletop", "--policy", "scripted", "--out", str(out), "--seed", "7"]
-    assert arguments(done.stdout) == ["eval", "--fill", "--closing=60", "--", *words]
+    assert arguments(done.stdout) == ["eval", "--fill=1", "--closing=60", "--", *words]
     assert not out.exists(), "--print writes nothing"
 
 
 def test_a_number_of_workers_that_the_user_has_said_is_kept(tmp_path: Path) -> None:
     file = tmp_path / "runs.yaml"
     file.write_text(RUNS)
-    assert "--fill" not in arguments(slurm("eval", str(file), "--out", str(tmp_path / "out"), "--print").stdout)
-    assert "--fill" not in arguments(slurm(*EVAL, "--out", str(tmp_path / "out"), "--workers", "2").stdout)
+    for words in (["eval", str(file), "--print"], [*EVAL, "--workers", "2"]):
+        done = slurm(*words, "--out", str(tmp_path / "out"))
+        assert arguments(done.stdout)[:2] == ["eval", "--closing=60"]
+
+
+def test_workers_that_fill_a_job_have_the_cpus_that_the_file_gives_each(tmp_path: Path) -> None:
+    file = tmp_path / "runs.yaml"
+    file.write_text(RUNS.replace("workers: 3", "worker: {cpus: 2}"))
+    assert "--fill=2" in arguments(slurm("eval", str(file), "--print").stdout)
+    file.write_text(RUNS.replace("workers: 3", "worker: {gpus: 0.25}"))
+    refused = slurm("eval", str(file), "--print")
+    assert refused.exit_code == 2
+    assert "workers" in refused.stderr
 
 
 def test_tasks_of_an_array_write_to_folders_of_their_own(tmp_path: Path) -> None:
@@ -65,7 +76,7 @@ def test_tasks_of_an_array_write_to_folders_of_their_own(tmp_path: Path) -> None
     ("words", "text"),
     [
         (["--address", "auto"], "leave it out"),
-        (["--watch", "runs"], "leave it out"),
+        (["--watch", "runs"], "submit_evaluation"),
         (["--ntasks", "4"], "--cpus-per-task"),
         (["--set", "nonsense"], "KEY=VALUE"),
         (["--set", "no_such_setting=1"], "no_such_setting"),

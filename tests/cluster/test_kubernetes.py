@@ -116,7 +116,10 @@ def test_the_embedded_deployment_is_one_that_serve_takes(tmp_path: Path) -> None
 
 def test_the_run_file_and_the_entrypoint_are_ones_that_eval_takes(tmp_path: Path) -> None:
     run = manifest("ConfigMap", "evaluation-run")["data"]["run.yaml"]
-    assert EvalConfig.model_validate(yaml.safe_load(run) | {"out": "runs/x"}).workers == 8
+    config = EvalConfig.model_validate(yaml.safe_load(run) | {"out": "runs/x"})
+    [cpu] = [group for group in JOB.cluster.worker_group_specs if group.group_name == "cpu"]
+    room = cpu.max_replicas * float(cpu.template["spec"]["containers"][0]["resources"]["limits"]["cpu"])
+    assert 1 <= config.worker.cpus <= room / config.workers
     name, *words = shlex.split(JOB.spec.entrypoint)
     assert name == "vlagents-ray"
     (tmp_path / "run.yaml").write_text(run)

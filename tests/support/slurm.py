@@ -25,7 +25,8 @@ SlurmctldHost={head.name}({head.address})
 SlurmUser=root
 SlurmdUser=root
 AuthType=auth/munge
-AuthInfo=socket={folder}/munge.socket,cred_expire=5
+# A requeued job begins so many s later: when what is left of its earlier life has been killed (KillWait).
+AuthInfo=socket={folder}/munge.socket,cred_expire=20
 ProctrackType=proctrack/linuxproc
 TaskPlugin=task/none
 SelectType=select/cons_tres

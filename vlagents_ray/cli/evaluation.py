@@ -15,7 +15,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.slurm.script import UNFINISHED
 
 if TYPE_CHECKING:
-    from vlagents_ray.evaluate import EvalConfig, Summary
+    from vlagents_ray.evaluate import EvalConfig, Summary, WorkerConfig
 
 Set = Annotated[list[str], typer.Option("--set", metavar="KEY=VALUE", help="A setting of the policy, repeatable.")]
 Address = Annotated[
@@ -37,6 +37,13 @@ def evaluate_command(
     out_dir: Annotated[Path | None, typer.Option("--out", help="Folder of the results.")] = None,
     episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each environment; default: 10.")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Environments rolled out in parallel; default: 1.")] = None,
+    worker_cpus: Annotated[
+        float | None, typer.Option(min=0, help="CPUs of each worker, unless the file says how many; default: 0.5.")
+    ] = None,
+    worker_gpus: Annotated[
+        float | None,
+        typer.Option(min=0, help="GPUs likewise, to render on: 0.25 is a quarter of one; default: 0, in software."),
+    ] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Episode i uses seed + i; default: 0.")] = None,
     video: Annotated[str | None, typer.Option(help="none, failures (default) or all.")] = None,
     record: Annotated[
@@ -96,8 +103,8 @@ def evaluate_command(
     """
     with errors():
         config = configured(
-            what, policy, out_dir, episodes, workers, seed, video, record, track, resume, execute, retries, settings,
-            env_set, reset_set,
+            what, policy, out_dir, episodes, workers, worker_cpus, worker_gpus, seed, video, record, track, resume,
+            execute, retries, settings, env_set, reset_set,
         )  # fmt: skip
         watching = _given(until=until, settle_s=settle, marker=marker)
         if watching and watch is None:
@@ -127,6 +134,8 @@ def configured(
     out_dir: Path | None,
     episodes: int | None,
     workers: int | None,
+    worker_cpus: float | None,
+    worker_gpus: float | None,
     seed: int | None,
     video: str | None,
     record: str | None,
@@ -162,7 +171,23 @@ def configured(
         if policy is None or out_dir is None:
             raise ConfigError("want --policy and --out, or a file of runs (.yaml)")
         fields = {"policies": [of_policy], "suites": [{"envs": what} | of_suite], **running}
-    return EvalConfig.model_validate(fields)
+    return _with_resources(EvalConfig.model_validate(fields), _given(cpus=worker_cpus, gpus=worker_gpus))
+
+
+def _with_resources(config: EvalConfig, resources: dict[str, float]) -> EvalConfig:
+    """With these for each worker, where nobody has said what that one takes."""
+    if not resources:
+        return config
+
+    def filled(worker: WorkerConfig) -> WorkerConfig:
+        unsaid = {name: value for name, value in resources.items() if name not in worker.model_fields_set}
+        return worker.model_copy(update=unsaid)
+
+    suites = [
+        suite if suite.worker is None else suite.model_copy(update={"worker": filled(suite.worker)})
+        for suite in config.suites
+    ]
+    return config.model_copy(update={"worker": filled(config.worker), "suites": suites})
 
 
 def _given(**options: Any) -> dict[str, Any]:

@@ -29,7 +29,7 @@ def served(config: EvalConfig, address: str | None = None, *, replica_per_gpu: b
 
     `replica_per_gpu` goes with the `address` of a cluster, whose GPUs they share.
     """
-    from vlagents_ray.evaluate import check, most_cpus
+    from vlagents_ray.evaluate import check, most_cpus, most_gpus
 
     with contextlib.ExitStack() as stack:
         if address is not None:
@@ -37,7 +37,7 @@ def served(config: EvalConfig, address: str | None = None, *, replica_per_gpu: b
         config, parts = reached(config)
         check(config)  # what is wrong is said before anything starts
         if parts and replica_per_gpu:
-            parts = spread_over_gpus(parts, kept=config.workers * config.worker.gpus)
+            parts = spread_over_gpus(parts, kept=config.workers * most_gpus(config))
         if parts:
             # Ray's CPUs are bookkeeping here: the number of workers that the user asked for must fit.
             cpus = max(os.cpu_count() or 1, math.ceil(config.workers * most_cpus(config)))

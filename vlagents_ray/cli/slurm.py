@@ -27,13 +27,14 @@ slurm = typer.Typer(
     help="Evaluations and servers as Slurm jobs. Options that are not this command's are sbatch's: --nodes, --time, …",
 )
 _BOTH = {"allow_extra_args": True, "ignore_unknown_options": True}
+_FOUND_OUT = "it finds that out for itself"
 _TASK = "%a"  # stands for the number of a task of --array, as in sbatch's file names
 Print = Annotated[bool, typer.Option("--print", help="Print the script; write and submit nothing.")]
 Parsable = Annotated[bool, typer.Option("--parsable", help="Print the job's number and nothing else.")]
 Setup = Annotated[Path | None, typer.Option(help="File of shell lines that the job begins with: module load, export.")]
 
 
-@slurm.command("eval", context_settings=_BOTH)
+@slurm.command("eval", context_settings=_BOTH, options_metavar="{FILE | ENV...} [OPTIONS]")
 def eval_(
     context: typer.Context,
     resubmit: Annotated[
@@ -46,7 +47,7 @@ def eval_(
     print_only: Print = False,
     parsable: Parsable = False,
 ) -> None:
-    """Evaluate in a job: what `vlagents-ray eval` takes, and sbatch's options.
+    """Evaluate in a job: what `vlagents-ray eval` takes (see its --help), and sbatch's options.
 
     Results that are there already are gone on with, so the same command after `scancel` or a failure finishes the
     rest. Without --workers there is one for each CPU but one, and a policy has a replica on each GPU.
@@ -57,13 +58,13 @@ def eval_(
         config, other = (_evaluation([word.replace(_TASK, one) for word in words]) for one in (index, f"{index}0"))
         if "array" in options and config.out == other.out:
             raise ConfigError(f"--array: its tasks write to one folder; want {_TASK} in it, as in --out runs/x/{_TASK}")
-        fill = "workers" not in config.model_fields_set
+        fill = [] if "workers" in config.model_fields_set else [f"--fill={_cpus(config):g}"]
         folder = Path(os.path.commonpath([config.out, other.out])) / "slurm"  # of an array: above those of its tasks
-        arguments = ["eval", *(["--fill"] if fill else []), f"--closing={closing:g}", "--", *words]
+        arguments = ["eval", *fill, f"--closing={closing:g}", "--", *words]
         _submit(Script("eval", folder, arguments, options, resubmit, setup), print_only, parsable)
 
 
-@slurm.command("serve", context_settings=_BOTH)
+@slurm.command("serve", context_settings=_BOTH, options_metavar="POLICY [OPTIONS]")
 def serve(
     context: typer.Context,
     out_dir: Annotated[
@@ -74,7 +75,7 @@ def serve(
     print_only: Print = False,
     parsable: Parsable = False,
 ) -> None:
-    """Serve a policy in a job until its time is over: what `vlagents-ray serve` takes, and sbatch's options.
+    """Serve a policy in a job, to its end: what `vlagents-ray serve` takes (see its --help), and sbatch's options.
 
     Once it answers, URL, key and the line for ssh stand in OUT/JOB/server.json and in the job's log.
     """
@@ -82,8 +83,9 @@ def serve(
 
     with errors():
         words, options = split(context.args, _options(command))
-        given = _parsed(command, words)
-        _refuse(given, "address", "host", "tls_cert", "tls_key", "tls_client_ca")
+        given = _parsed("serve", command, words)
+        _refuse(given, _FOUND_OUT, "address", "host")
+        _refuse(given, "its server speaks no TLS, the ssh line encrypts", "tls_cert", "tls_key", "tls_client_ca")
         if "array" in options:
             raise ConfigError("--array: a server is one job; submit several")
         source = given["source"]
@@ -103,12 +105,13 @@ def _submit(script: Script, print_only: bool, parsable: bool) -> None:
     if parsable:
         typer.echo(job)
         return
-    logs = script.folder / job
+    number = "*" if "array" in script.options else job  # each task has one of its own
+    log = script.options.get("output") or f"{script.folder}/{number}.log"
     lines = [
         f"job {job} is queued; its script: {script.file}",
         f"  state   squeue --jobs={job}",
-        f"  log     {script.log.replace('%j', job)}, and Ray's of each node in {logs}/",
-        *([f"  way in  {logs}/server.json, once it answers"] if script.name == "serve" else []),
+        f"  log     {log}, and Ray's of each node in {script.folder}/{number}/",
+        *([f"  way in  {script.folder}/{number}/server.json, once it answers"] if script.name == "serve" else []),
         f"  end it  scancel {job}",
     ]
     out.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
@@ -120,9 +123,9 @@ def _options(command: Callable[..., None]) -> dict[str, bool]:
     return {name: not param.is_flag for param in found.params if hasattr(param, "is_flag") for name in param.opts}
 
 
-def _parsed(command: Callable[..., None], words: list[str]) -> dict[str, Any]:
+def _parsed(name: str, command: Callable[..., None], words: list[str]) -> dict[str, Any]:
     """What a command would be called with; wrong words are told as it would tell them."""
-    params: dict[str, Any] = _click(command).make_context(command.__name__, list(words)).params
+    params: dict[str, Any] = _click(command).make_context(f"vlagents-ray slurm {name}", list(words)).params
     return params
 
 
@@ -132,18 +135,34 @@ def _click(command: Callable[..., None]) -> Any:
     return typer.main.get_command(app)
 
 
-def _refuse(given: dict[str, Any], *names: str) -> None:
+def _refuse(given: dict[str, Any], why: str, *names: str) -> None:
     said = [f"--{name.replace('_', '-')}" for name in names if given[name]]
     if said:
-        raise ConfigError(f"{', '.join(said)}: not for a job, which finds that out for itself; leave it out")
+        raise ConfigError(f"{', '.join(said)}: not for a job: {why}; leave it out")
+
+
+def _cpus(config: EvalConfig) -> float:
+    """That each worker takes of the job's, where there are as many workers as there is room for: a whole one at least.
+
+    `ConfigError` where GPUs are what limits them: how many of a job's are for policies, nobody has said.
+    """
+    from vlagents_ray.evaluate import most_cpus, most_gpus
+
+    if most_gpus(config):
+        raise ConfigError(
+            "workers have GPUs, but their number is not said; want --workers: policies get the GPUs left over"
+        )
+    return max(1.0, most_cpus(config))
 
 
 def _evaluation(words: list[str]) -> EvalConfig:
     """What `eval` would make of the words; raises here what would end the job as soon as it had begun."""
     from vlagents_ray.evaluate.cells import cells
 
-    given = _parsed(evaluate_command, words)
-    _refuse(given, "address", "end_at", "watch", "dry_run")
+    given = _parsed("eval", evaluate_command, words)
+    _refuse(given, _FOUND_OUT, "address", "end_at")
+    _refuse(given, "`vlagents-ray eval --dry-run` plans without one", "dry_run")
+    _refuse(given, "it would wait for a training; have that submit each checkpoint (`submit_evaluation`)", "watch")
     config = configured(**{name: given[name] for name in inspect.signature(configured).parameters})
     cells(reached(config, ask=False)[0])
     return config

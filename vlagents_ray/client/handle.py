@@ -41,7 +41,8 @@ class HandleTransport:
 
         if not ray.is_initialized():
             raise ConfigError(
-                f"serve://{self._app}: this process is in no Ray cluster; call ray.init(), or use http://"
+                f"serve://{self._app}: this process is in no Ray cluster; call ray.init() (`vlagents-ray eval` does, "
+                f"with --address), or use http://"
             )
         deadline = time.monotonic() + timeout_s
         while True:

@@ -22,7 +22,7 @@ _ICD_FOLDERS = ("/usr/local/share/vulkan/icd.d", "/usr/share/vulkan/icd.d", "/et
 _SAPIENS_OWN = "sapien/vulkan_library/"  # of NVIDIA's driver, which it names where it finds no other
 _SOFTWARE_VULKAN = "llvmpipe"  # how lavapipe names its device
 
-SHARE = "worker: {gpus: 0.25} gives each worker a part of a GPU"
+SHARE = "worker: {gpus: 0.25}, or --worker-gpus 0.25, gives each worker a part of a GPU"
 _CURE_HIDDEN = (
     f"{SHARE}; to render in software install Mesa's drivers (libegl1 libgl1-mesa-dri mesa-vulkan-drivers) on that node"
 )

@@ -5,7 +5,7 @@ summary = evaluate(
 )
 """
 
-from vlagents_ray.evaluate.cluster import most_cpus
+from vlagents_ray.evaluate.cluster import most_cpus, most_gpus
 from vlagents_ray.evaluate.config import ClockConfig, EvalConfig, PolicyConfig, StopConfig, SuiteConfig, WorkerConfig
 from vlagents_ray.evaluate.progress import Progress, SilentProgress, progress_for
 from vlagents_ray.evaluate.report import print_summary, results_table
@@ -34,6 +34,7 @@ __all__ = [
     "confidence_sequence",
     "evaluate",
     "most_cpus",
+    "most_gpus",
     "print_summary",
     "progress_for",
     "results_table",

@@ -6,7 +6,7 @@ import os
 from contextlib import AbstractContextManager
 from math import ceil
 
-from vlagents_ray.evaluate.config import EvalConfig
+from vlagents_ray.evaluate.config import EvalConfig, WorkerConfig
 from vlagents_ray.joining import joined
 
 
@@ -21,4 +21,13 @@ def ray_cluster(config: EvalConfig) -> AbstractContextManager[None]:
 
 def most_cpus(config: EvalConfig) -> float:
     """What the hungriest worker takes."""
-    return max(worker.cpus for worker in [config.worker, *(suite.worker or config.worker for suite in config.suites)])
+    return max(worker.cpus for worker in _kinds(config))
+
+
+def most_gpus(config: EvalConfig) -> float:
+    """Likewise."""
+    return max(worker.gpus for worker in _kinds(config))
+
+
+def _kinds(config: EvalConfig) -> list[WorkerConfig]:
+    return [config.worker, *(suite.worker for suite in config.suites if suite.worker is not None)]

@@ -87,7 +87,7 @@ def running_server(
         if running := sorted(serve.status().applications):
             raise ConfigError(
                 f"Serve runs {running} on this cluster already; use their URL (serve://{running[0]} inside the "
-                f"cluster), or deploy beside them with `serve deploy`"
+                f"cluster), or `serve deploy` one file that holds those and yours"
             )
         stack.push(unless_lost(lambda: _shutdown(client)))
         client.deploy_apps(config)

@@ -26,9 +26,9 @@ _MOST_S = 3600.0  # that loading its policies may take
 
 _TEXT = """\
 serving {names} in job {job}, until it ends; all of this is in {file}
-where {host} can be reached:   {url}
-from anywhere else, first:     {ssh}
-                               and use http://localhost:{port} in its place
+on the cluster's network:   {url}
+from elsewhere, first:      {ssh}
+                            and use http://localhost:{port} in its place
 
     export {variable}={key}
 

@@ -1,6 +1,6 @@
 """What a job does at its first node, once Ray runs on all of them: an evaluation, or a policy server.
 
-    python -m vlagents_ray.slurm.head eval [--fill] -- WORDS
+    python -m vlagents_ray.slurm.head eval [--fill CPUS] -- WORDS
     python -m vlagents_ray.slurm.head serve [--key] --app NAME=ROUTE... -- WORDS
 
 WORDS are those of `vlagents-ray eval` and `vlagents-ray serve`, which take this process's place.
@@ -29,7 +29,9 @@ def main() -> None:
     """Wait for Ray, and become the command."""
     parser = argparse.ArgumentParser()
     parser.add_argument("what", choices=["eval", "serve"])
-    parser.add_argument("--fill", action="store_true", help="as many workers as there are CPUs")
+    parser.add_argument(
+        "--fill", type=float, metavar="CPUS", help="as many workers as have so many CPUs each, less one CPU"
+    )
     parser.add_argument("--closing", type=float, default=0.0, help="s before the job's end, for ending it")
     parser.add_argument("--key", action="store_true", help="make a key")
     parser.add_argument("--port", type=int, help="of the server; by default one derived from the job's number")
@@ -43,7 +45,9 @@ def main() -> None:
     words = [*sys.argv[end_of_own + 1 :], f"--address={address}"]
     if given.what == "eval":
         end = end_of_job(allocation.job)
-        words += ["--resume", "--replica-per-gpu", *([f"--workers={max(1, cpus - 1)}"] if given.fill else [])]
+        words += ["--resume", "--replica-per-gpu"]
+        if given.fill is not None:
+            words += [f"--workers={max(1, int((cpus - 1) / given.fill))}", f"--worker-cpus={given.fill:g}"]
         words += [] if end is None else [f"--end-at={end - given.closing:.0f}"]
     else:
         words += _door(given, allocation)
