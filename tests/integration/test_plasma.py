@@ -53,7 +53,10 @@ def frame(size: int = 8, pixel: int = 0, **info: Any) -> Obs:
 
 def objects() -> int:
     """Objects in the node's store."""
-    found = re.search(r"(\d+) objects", memory_summary(stats_only=True).partition("Plasma memory usage")[2])
+    found = re.search(
+        r"(\d+) objects",
+        memory_summary(ray.get_runtime_context().gcs_address, stats_only=True).partition("Plasma memory usage")[2],
+    )
     assert found is not None
     return int(found[1])
 
