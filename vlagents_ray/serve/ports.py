@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import socket
+from collections import deque
 
 from vlagents_ray.errors import ConfigError
 
@@ -11,7 +12,8 @@ LOOPBACK, EVERYWHERE = "127.0.0.1", "0.0.0.0"  # noqa: S104 - compared, and trie
 HOST = "VLAGENTS_RAY_HOST"  # in the environment of a replica: where its server listens, if not where Serve does
 _BLOCKS = (20_000, 24_000)
 _PORTS = (24_000, 32_700)  # of HAProxy and the like: below those that the system gives to whoever asks for any
-_given: set[int] = set()
+_given: deque[int] = deque(maxlen=4_000)  # the latest
+_kept: set[int] = set()
 _random = random.SystemRandom()
 
 
@@ -21,19 +23,17 @@ def free_port(host: str = LOOPBACK) -> int:
     Whoever got that one may not listen yet. The system's own generator of random numbers draws, so
     that processes which seed Python's alike do not draw the same ports.
     """
-    if len(_given) > (_PORTS[1] - _PORTS[0]) // 2:
-        _given.clear()
     for _ in range(100):
         port = _random.randrange(*_PORTS)
-        if port not in _given and is_free(host, port):
-            _given.add(port)
+        if port not in _given and port not in _kept and is_free(host, port):
+            _given.append(port)
             return port
     raise ConfigError(f"no free port between {_PORTS[0]} and {_PORTS[1]}")
 
 
 def keep(*ports: int) -> None:
     """These are somebody's, who may not listen yet: `free_port` gives them to nobody."""
-    _given.update(ports)
+    _kept.update(ports)
 
 
 def free_ports(number: int) -> list[int]:
