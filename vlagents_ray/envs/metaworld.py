@@ -92,7 +92,7 @@ class MetaWorld(EvalEnv):
         if task not in known:
             raise UnknownEnv(f"metaworld has no task {task!r}: want one of {sorted(known)}")
         self.max_steps = max_steps
-        self._task = task
+        self._task, self._name = task, f"metaworld/{task}"
         self._instruction = instruction or task.removesuffix("-v3").replace("-", " ")
         self._ends_on_success = ends_on_success
         self._goals: list[Any] | None = None
@@ -100,9 +100,9 @@ class MetaWorld(EvalEnv):
         self._env: Any = None
         self._renderer: Any = None
         self._record: Any = None  # the renderer of the views for the record
-        record = record_size_of(record_size, f"metaworld/{task}")
+        record = record_size_of(record_size, self._name)
         tallest, widest = (max(pair) for pair in zip((height, width), record or (0, 0), strict=True))
-        with failing(f"metaworld/{self._task}", "make"):
+        with failing(self._name, "make"):
             self._env = known[task](width=widest, height=tallest)  # the model's frame buffer grows to this size
             have = [self._env.model.camera(i).name for i in range(self._env.model.ncam)]
             # what Meta-World does for its classes with an observable goal, but drawing from our seed
@@ -117,7 +117,7 @@ class MetaWorld(EvalEnv):
         unknown = sorted({*cameras, *(camera_positions or {})} - set(have))
         if unknown:
             self.close()
-            raise ConfigError(f"metaworld/{task} has no camera {unknown}: want some of {sorted(have)}")
+            raise ConfigError(f"{self._name} has no camera {unknown}: want some of {sorted(have)}")
         for name, position in (camera_positions or {}).items():
             self._env.model.camera(name).pos = position
         self._contract = Contract(
@@ -139,7 +139,7 @@ class MetaWorld(EvalEnv):
             control_hz=1.0 / self._env.dt,
         )
         try:
-            with failing(f"metaworld/{self._task}", "make its renderer"):
+            with failing(self._name, "make its renderer"):
                 self._renderer = require("mujoco").Renderer(self._env.model, height, width)
                 self._record = require("mujoco").Renderer(self._env.model, *record) if record else None
         except EnvFailed:
@@ -158,7 +158,7 @@ class MetaWorld(EvalEnv):
         """Begin the episode of `seed`, taken modulo 2^32, or with `goals_seed` the one of the option `init_state`."""
         env = self._alive()
         goal = self._goal(dict(options or {}))
-        with failing(f"metaworld/{self._task}", "reset"):
+        with failing(self._name, "reset"):
             env.seed(seed % 2**32)
             if goal is not None:
                 env.set_task(goal)
@@ -169,9 +169,9 @@ class MetaWorld(EvalEnv):
     def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
         env = self._alive()
         if self._steps is None:
-            raise NotReset(f"metaworld/{self._task}: step before reset; call reset(seed=...) first")
+            raise NotReset(f"{self._name}: step before reset; call reset(seed=...) first")
         action = one_row(act, self._contract)
-        with failing(f"metaworld/{self._task}", "step"):
+        with failing(self._name, "step"):
             raw, reward, _, _, info = env.step(np.clip(action, -1.0, 1.0))
             self._steps += 1
             success = bool(info["success"])
@@ -246,5 +246,5 @@ class MetaWorld(EvalEnv):
 
     def _alive(self) -> Any:
         if self._env is None:
-            raise EnvFailed(f"metaworld/{self._task} is closed; make a new one")
+            raise EnvFailed(f"{self._name} is closed; make a new one")
         return self._env

@@ -18,9 +18,9 @@ _random = random.SystemRandom()
 
 
 def free_port(host: str = LOOPBACK) -> int:
-    """A TCP port that nobody listens on at this moment, and none that was given before or is kept.
+    """A TCP port that nobody listens on at this moment, and none that was given lately or is kept.
 
-    Whoever got that one may not listen yet. The system's own generator of random numbers draws, so
+    Whoever has that one may not listen yet. The system's own generator of random numbers draws, so
     that processes which seed Python's alike do not draw the same ports.
     """
     for _ in range(100):

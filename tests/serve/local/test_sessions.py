@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import gc
 import signal
 import subprocess
@@ -161,7 +162,11 @@ def test_many_sessions_leave_nothing(served: tuple[Engine, LocalDoor]) -> None:
     for _ in range(300):
         cycle()
     wait_for(lambda: len(served[0].sessions) == 0)
-    wait_for(lambda: not descriptors() - files and not running_threads() - running and _mapped() <= mapped)
+    with contextlib.suppress(TimeoutError):  # what is left then is said below
+        wait_for(lambda: not descriptors() - files and not running_threads() - running and _mapped() <= mapped)
+    assert not descriptors() - files
+    assert not running_threads() - running
+    assert _mapped() <= mapped
 
 
 def _mapped() -> int:
