@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import threading
 import time
@@ -15,14 +16,14 @@ from starlette.testclient import TestClient
 
 from vlagents_ray.client.shm import ShmTransport
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.serve import stats as stats_module
+from vlagents_ray.serve.calls import Sender
 from vlagents_ray.serve.engine import Engine
 from vlagents_ray.serve.ingress import build_ingress
 from vlagents_ray.serve.local import LocalDoor
-from vlagents_ray.serve.stats import Handled, LoadMeter, Stats, Visit
+from vlagents_ray.serve.stats import SAMPLE, LoadMeter, Stats, Visit
 from vlagents_ray.wire.codecs import JPEG
 from vlagents_ray.wire.frames import CONTENT_TYPE, decode_reply, encode_request
-from vlagents_ray.wire.messages import Limits, Reply, Request
+from vlagents_ray.wire.messages import Limits, Op, Reply, Request
 
 OBS = Obs({"front": np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)}, 0.5)
 
@@ -110,16 +111,16 @@ def test_what_was_answered_is_recorded_with_its_code(client: TestClient, engine:
     with client.websocket_connect("/v1/stream") as socket:
         socket.send_bytes(b"garbage")
         socket.receive_bytes()
-    handled, batches = engine.stats.collect()
-    assert list(batches) == [(1, 1), (1, 1)]
-    assert [(op, transport, code) for op, transport, _, code, *_ in handled] == [
-        ("act", "http", "unknown_session"),
-        ("reset", "http", "ok"),
-        ("act", "http", "ok"),
-        ("act", "http", "policy_failed"),
-        ("act", "http", "malformed"),
-        ("unknown", "websocket", "malformed"),
-    ]
+    collected = engine.stats.collect()
+    assert collected.batches.values == [1, 1]
+    assert {kind: sample.seen for kind, sample in collected.requests.items()} == {
+        ("act", "http", "robot", "unknown_session"): 1,
+        ("reset", "http", "robot", "ok"): 1,
+        ("act", "http", "robot", "ok"): 1,
+        ("act", "http", "robot", "policy_failed"): 1,
+        ("act", "http", "robot", "malformed"): 1,
+        ("unknown", "websocket", "robot", "malformed"): 1,
+    }
 
 
 def test_sessions_are_counted_by_their_door(client: TestClient, engine: Engine) -> None:
@@ -131,16 +132,58 @@ def test_sessions_are_counted_by_their_door(client: TestClient, engine: Engine) 
         assert engine.sessions.by_transport() == {"http": 1, "websocket": 1}
 
 
-def test_nothing_is_kept_for_nobody_and_not_without_bound() -> None:
+KIND = ("act", "shm", "robot", "ok")
+
+
+def test_nothing_is_kept_for_nobody_and_each_thing_once() -> None:
     stats = Stats()
-    one: Handled = ("act", "shm", "robot", "ok", 1.0, 0.1, 0.2, 0.3, 0.4)
-    stats.handled(one)
-    assert len(stats.collect()[0]) == 0
+    stats.handled(KIND, (1.0,))
+    stats.batch(3, 4)
     stats.keep()
-    for _ in range(stats_module._KEPT + 5):
-        stats.handled(one)
-    assert len(list(stats.collect()[0])) == stats_module._KEPT
-    assert list(stats.collect()[0]) == []
+    nothing = stats.collect()
+    assert (nothing.requests, nothing.batches.seen, nothing.padding) == ({}, 0, 0)
+    stats.handled(KIND, (2.0,))
+    stats.batch(3, 4)
+    found = stats.collect()
+    assert (found.requests[KIND].values, found.batches.values, found.padding) == ([(2.0,)], [3], 1)
+    assert stats.collect().requests == {}
+
+
+def test_all_are_counted_from_whatever_thread_and_a_fair_sample_is_kept() -> None:
+    stats = Stats()
+    stats.keep()
+    threads = [
+        threading.Thread(target=lambda: [stats.handled(KIND, (float(n),)) for n in range(10_000)]) for _ in range(4)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    sample = stats.collect().requests[KIND]
+    assert (sample.seen, len(sample.values)) == (40_000, SAMPLE)
+    mean = sum(value for (value,) in sample.values) / SAMPLE
+    assert abs(mean - 5_000) < 5 * 10_000 / 12**0.5 / SAMPLE**0.5  # five standard errors of a uniform draw
+
+
+def test_a_request_leaves_nothing_to_the_garbage_collector(engine: Engine) -> None:
+    """It would stop the policy for it, again and again."""
+    engine.start()
+    sender, answered = Sender(engine, "shm"), threading.Semaphore(0)
+
+    def ask(op: Op) -> None:
+        sender.send([Request(op, Obs())], lambda _: answered.release())
+        assert answered.acquire(timeout=10)
+
+    ask("reset")
+    ask("act")
+    gc.collect()
+    gc.disable()
+    try:
+        for _ in range(50):
+            ask("act")
+        assert gc.collect() < 50
+    finally:
+        gc.enable()
 
 
 def test_load_is_the_busy_share_and_the_mean_queue(engine: Engine) -> None:
@@ -181,6 +224,6 @@ def test_recording_costs_a_request_little() -> None:
             times.append(time.perf_counter() - begun)
         return sorted(times)[1000]
 
-    recorded = median(lambda: stats.handled(("act", "shm", "robot", "ok", 1.0, 0.1, 0.2, 0.3, 0.4)))
+    recorded = median(lambda: stats.handled(KIND, (1.0, 0.1, 0.2, 0.3, 0.4)))
     encoded = median(lambda: Visit(stats, "shm").frame([Reply("x", Act(np.zeros(7)))]))
     assert recorded < encoded / 2

@@ -31,7 +31,7 @@ __all__ = ["RoundTripsOfAll", "measure_rtt", "observation"]
 POLICY = "vlagents_ray.bench.policy:Measured"
 LOOPBACK = "127.0.0.1"
 ROUND = 100  # calls of one way before it is the next one's turn
-UNBROKEN = 30  # rounds' worth of calls without a break
+UNBROKEN = 200  # rounds' worth of calls without a break: a second or two
 ON_NODE = ("shm", "plasma")
 
 

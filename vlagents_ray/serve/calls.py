@@ -187,6 +187,7 @@ class Round:
             self._left -= 1
             if self._left:
                 return
+        self.tickets.clear()  # each holds this: a ring, which the garbage collector would stop the policy for
         leave = self._leave()
         for each in self._replies:
             each.draining = leave  # type: ignore[union-attr]

@@ -1,15 +1,17 @@
 """What each request and each batch cost: told in the reply, and kept for whoever exports it.
 
-On a request's way this is two readings of the clock and one append; `vlagents_ray.serve.metrics`
-takes what was appended out again, on a thread of its own.
+On a request's way this is two readings of the clock and one addition to a sample; `vlagents_ray.serve.metrics`, on a
+thread of its own, has little left to do: each time it takes the interpreter, a request may wait for it.
 """
 
 from __future__ import annotations
 
 import json
+import random
+import threading
 import time
-from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Generic, NamedTuple, TypeVar
 
 from vlagents_ray.serve.batching import BatchQueue
@@ -20,60 +22,80 @@ from vlagents_ray.wire.plain import reply_to_json
 
 T = TypeVar("T")
 
-_KEPT = 20_000  # requests, and batches, between two collections; the oldest are dropped
-
 STAGES = ("decode", "queue", "inference", "encode")
 _STAGE_KEYS = [f"{stage}_ms" for stage in STAGES]
+_NOTHING = (0.0,) * len(STAGES)
+SAMPLE = 100
 
-Handled = tuple[str, str, str, str, float, float, float, float, float]
-"""A request: op, transport, class, "ok" or the error's code, total ms, ms of each of `STAGES`.
+Kind = tuple[str, str, str, str]
+"""Of requests: op, transport, class, "ok" or the error's code."""
 
-Flat and of plain values, which the garbage collector need not look at.
-"""
-
-Batch = tuple[int, int]
-"""Observations in a forward pass, and rows of it, padding included."""
+Times = tuple[float, ...]
+"""Of a request, in ms: in all, and in each of `STAGES`."""
 
 
-class Taken(Generic[T]):
-    """What a queue holds at this moment, to be taken out of it once."""
+class Sample(Generic[T]):
+    """How many values there were, and up to `SAMPLE` of them, each as likely to be there as any other."""
 
-    def __init__(self, queue: deque[T]) -> None:
-        self._queue = queue
-        self._left = len(queue)
+    __slots__ = ("seen", "values")
 
-    def __len__(self) -> int:
-        return self._left
+    def __init__(self) -> None:
+        self.seen = 0
+        self.values: list[T] = []
 
-    def __iter__(self) -> Iterator[T]:
-        while self._left:
-            self._left -= 1
-            yield self._queue.popleft()  # never empty: who adds to a full one drops no more than it adds
+    def add(self, value: T) -> None:
+        """One more (Vitter's algorithm R)."""
+        self.seen += 1
+        if self.seen <= SAMPLE:
+            self.values.append(value)
+        elif (place := int(random.random() * self.seen)) < SAMPLE:
+            self.values[place] = value
+
+
+@dataclass(slots=True)
+class Collected:
+    """What was handled in a while."""
+
+    requests: dict[Kind, Sample[Times]] = field(default_factory=dict)
+    batches: Sample[int] = field(default_factory=Sample)  # observations in a forward pass
+    padding: int = 0  # rows that filled batches up
 
 
 class Stats:
     """Bounded; keeps nothing until `keep` is called. Any thread may write."""
 
     def __init__(self) -> None:
-        self._handled: deque[Handled] = deque(maxlen=0)
-        self._batches: deque[Batch] = deque(maxlen=0)
+        self._kept = False
+        self._lock = threading.Lock()
+        self._collected = Collected()
 
     def keep(self) -> None:
         """From now on somebody collects."""
-        self._handled = deque(maxlen=_KEPT)
-        self._batches = deque(maxlen=_KEPT)
+        self._kept = True
 
-    def handled(self, one: Handled) -> None:
+    def handled(self, kind: Kind, times: Times) -> None:
         """A request was answered."""
-        self._handled.append(one)
+        if not self._kept:
+            return
+        with self._lock:
+            sample = self._collected.requests.get(kind)
+            if sample is None:
+                sample = self._collected.requests[kind] = Sample()
+            sample.add(times)
 
     def batch(self, observations: int, rows: int) -> None:
-        """A forward pass was made."""
-        self._batches.append((observations, rows))
+        """A forward pass was made of so many rows, padding included."""
+        if not self._kept:
+            return
+        with self._lock:
+            self._collected.batches.add(observations)
+            self._collected.padding += rows - observations
 
-    def collect(self) -> tuple[Taken[Handled], Taken[Batch]]:
-        """All since the last time; they leave one by one, as they are looked at."""
-        return Taken(self._handled), Taken(self._batches)
+    def collect(self) -> Collected:
+        """All since the last time."""
+        with self._lock:
+            collected, self._collected = self._collected, Collected()
+        return collected
 
 
 class Visit:
@@ -135,7 +157,7 @@ class Visit:
         """The answer to all of it is the error with this code, or nobody waits for one."""
         total_ms = (time.perf_counter() - self.arrived) * 1e3
         for op, rank in self._asked:
-            self._stats.handled((op, self.transport, rank, code, total_ms, 0.0, 0.0, 0.0, 0.0))
+            self._stats.handled((op, self.transport, rank, code), (total_ms, *_NOTHING))
 
     def _written(self, reply: Reply, begun: float) -> None:
         ended = time.perf_counter()
@@ -154,14 +176,12 @@ class Visit:
         if len(replies) != len(self._asked):  # the frame was unreadable as a whole
             self._asked = self._asked[:1]
         for (op, rank), reply in zip(self._asked, replies, strict=True):
-            get = reply.timing.get
-            if reply.error is not None:
+            if reply.error is None:
+                times = (reply.timing["total_ms"], *[reply.timing.get(key, 0.0) for key in _STAGE_KEYS])
+                self._stats.handled((op, self.transport, rank, "ok"), times)
+            else:
                 total_ms = (time.perf_counter() - self.arrived) * 1e3
-                self._stats.handled((op, self.transport, rank, reply.error.code, total_ms, 0.0, 0.0, 0.0, 0.0))
-                continue
-            decode, queue, inference, encode = [get(key, 0.0) for key in _STAGE_KEYS]
-            total = reply.timing["total_ms"]
-            self._stats.handled((op, self.transport, rank, "ok", total, decode, queue, inference, encode))
+                self._stats.handled((op, self.transport, rank, reply.error.code), (total_ms, *_NOTHING))
 
 
 class Load(NamedTuple):

@@ -58,8 +58,8 @@ def test_dialects_count_in_the_statistics_by_their_names() -> None:
         with client.websocket_connect("/vla-eval") as socket:
             say(socket, "observation", seen(4), 4)
             hear(socket)
-        handled = [one[:4] for one in engine.stats.collect()[0]]
-    assert handled == [
+        handled = engine.stats.collect().requests
+    assert list(handled) == [
         ("reset", "openpi", "robot", "ok"),
         ("act", "openpi", "robot", "ok"),
         ("reset", "openvla", "robot", "ok"),
