@@ -18,7 +18,7 @@ PLAN = ScalingPlan(workers=(1, 4), rounds=3)
 
 def played(rate: float, **changes: object) -> Played:
     """A round in which nothing but its rate matters."""
-    usual = Played(rate, 30.0, ["shm"], 0, 100, 20.0, 0.4, dict.fromkeys(DAEMONS, 0.2))
+    usual = Played(rate, 30.0, ["shm"], 0, 100, 20.0, 20.0, 0.4, dict.fromkeys(DAEMONS, 0.2))
     return usual._replace(**changes)  # type: ignore[arg-type]
 
 
@@ -48,11 +48,16 @@ def test_the_ideal_is_what_sleeping_alone_allows() -> None:
 def test_a_driver_costs_what_its_rounds_say() -> None:
     true = {"episode": 1.5, "step": 0.002, "worker_second": 0.4, "second": 5.0}
     rounds, found = [], []
-    for workers, steps, episodes, span_s in ((4, 10, 800, 20.0), (4, 100, 800, 20.0), (4, 10, 40, 20), (16, 10, 90, 9)):
+    for busy_s, steps, episodes, span_s in (
+        (80, 10, 800, 20.0),
+        (70, 100, 800, 20.0),
+        (80, 10, 40, 20),
+        (99, 10, 90, 9),
+    ):
         used = true["episode"] * episodes + true["step"] * episodes * steps
-        used += (true["worker_second"] * workers + true["second"]) * span_s
-        rounds.append(Round(workers, episodes // workers, steps, 1.0))
-        found.append(played(1.0, episodes=episodes, span_s=span_s, driver_s=used / 1e3))
+        used += true["worker_second"] * busy_s + true["second"] * span_s
+        rounds.append(Round(4, episodes // 4, steps, 1.0))
+        found.append(played(1.0, episodes=episodes, span_s=span_s, busy_s=busy_s, driver_s=used / 1e3))
     assert fit(rounds, found) == pytest.approx(true)
 
 

@@ -7,7 +7,7 @@ start does not count. Every node has a replica for each worker that it has room 
 Beside that, on the first cluster, all workers share one replica a node, with single actions and with chunks.
 
 Then the driver: short evaluations with steps, episodes and workers in different proportions. Its CPU time is fitted by
-what an episode costs, what a step, and what a second of a worker's being watched.
+what an episode costs, what a step, and what a second of a busy worker's being watched.
 """
 
 from __future__ import annotations
@@ -134,9 +134,9 @@ def measure_cluster(
             played[app, workers].append(one)
             tell(
                 f"{nodes} nodes, round {number + 1}/{plan.rounds}: {workers} workers ({app}), "
-                f"{one.episodes_per_minute:.1f} episodes/min, {one.wall_s:.1f} s"
+                f"{one.episodes_per_minute or 0.0:.1f} episodes/min, {one.wall_s:.1f} s"
             )
-    single = [one.episodes_per_minute for one in played[OWN, 1]]
+    single = [one.episodes_per_minute or 0.0 for one in played[OWN, 1]]
     return {"nodes": nodes, "rows": [row(plan, app, workers, played[app, workers], single) for app, workers in kinds]}
 
 
@@ -146,7 +146,7 @@ def row(plan: ScalingPlan, app: str, workers: int, played: Sequence[Played], sin
     Linear is that many times a single worker of the round; with chunks, which no single one played, what the sleeping
     alone would allow.
     """
-    rates = [one.episodes_per_minute for one in played]
+    rates = [one.episodes_per_minute or 0.0 for one in played]
     linear = [workers * each for each in single] if app != CHUNKS else [plan.ideal(workers, app)] * len(rates)
     return {
         "app": app,
@@ -201,7 +201,7 @@ def fit(rounds: Sequence[Round], played: Sequence[Played]) -> dict[str, float]:
     names = ["episode", "step", "worker_second", "second"]
     causes = np.array(
         [
-            [each.episodes, each.episodes * one.steps, one.workers * each.span_s, each.span_s]
+            [each.episodes, each.episodes * one.steps, each.busy_s, each.span_s]
             for one, each in zip(rounds, played, strict=True)
         ]
     )

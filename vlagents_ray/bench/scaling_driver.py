@@ -64,13 +64,14 @@ class Round:
 class Played(NamedTuple):
     """What came of it."""
 
-    episodes_per_minute: float  # while all workers were playing
+    episodes_per_minute: float | None  # while all workers were playing; None with a policy in their own processes
     wall_s: float  # of the whole evaluation, workers' start and all
     transports: list[str]
     failures: int  # attempts
     # From the first recorded episode to the last:
     episodes: int
     span_s: float
+    busy_s: float  # that workers were playing, added up
     driver_s: float  # CPU time of this process
     daemons_s: dict[str, float]  # and of Ray's on this node
 
@@ -95,7 +96,7 @@ class Ledger(SilentProgress):
 
 
 def play(one: Round, out: Path) -> Played:
-    """Evaluate; `out` is a new folder. Raises `EnvFailed` if the workers were never all playing."""
+    """Evaluate; `out` is a new folder. Raises `EnvFailed` if the workers of an application were never all playing."""
     policy = PolicyConfig(name="noop", url=None if one.app is None else f"serve://{one.app}")
     options: dict[str, Any] = {"step_ms": one.step_ms, "max_steps": one.steps, "size": one.size}
     config = EvalConfig(
@@ -110,14 +111,16 @@ def play(one: Round, out: Path) -> Played:
     ledger, begun = Ledger(), time.monotonic()
     summary = evaluate(config, agent_factory=local, progress=ledger)
     wall_s, last = time.monotonic() - begun, daemons_s()
-    playing = steady(recorded(out), one.workers)
+    played = recorded(out)
+    first = min(each.ended for each in played)
     return Played(
-        60 * playing.rate / one.steps,
+        None if one.app is None else 60 * steady(played, one.workers).rate / one.steps,
         wall_s,
         summary.transports,
         ledger.failures,
         len(ledger.at_s) - 1,
         ledger.at_s[-1] - ledger.at_s[0],
+        sum(each.ended - max(first, each.begun) for each in played),
         ledger.cpu_s[-1] - ledger.cpu_s[0],
         {name: used - ledger.first.get(name, 0.0) for name, used in last.items()},
     )
