@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import pytest
 import ray
 from ray.exceptions import ActorDiedError, GetTimeoutError
+from ray.serve._private.router import SharedRouterLongPollClient
 
 from vlagents_ray.serve import cluster
 
@@ -20,8 +21,24 @@ def test_a_controller_that_ends_or_that_does_not_answer_is_no_error(
 
     ending = SimpleNamespace(remote=lambda: None)
     controller = SimpleNamespace(graceful_shutdown=SimpleNamespace(options=lambda **_: ending))
-    client = SimpleNamespace(_controller=controller, shutdown_cached_handles=lambda: None, _shutdown=False)
+    client = SimpleNamespace(
+        _controller=controller, handle_cache={}, shutdown_cached_handles=lambda: None, _shutdown=False
+    )
     monkeypatch.setattr(ray, "get", fail)
     cluster._shutdown(client)
     assert client._shutdown
     assert ("has not ended within" in caplog.text) is said
+
+
+def test_a_controller_that_is_about_to_end_is_asked_for_no_more_news(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray would tell the user of a failed task, in one end of four."""
+    stopped: list[str] = []
+    own = SimpleNamespace(stop=lambda: stopped.append("own"))
+    shared = SimpleNamespace(long_poll_client=SimpleNamespace(stop=lambda: stopped.append("shared")))
+    monkeypatch.setattr(SharedRouterLongPollClient, "get_or_create", lambda *_: shared)
+    used = SimpleNamespace(
+        _router=SimpleNamespace(_asyncio_router=SimpleNamespace(long_poll_client=own, _event_loop=1))
+    )
+    unused = SimpleNamespace(_router=None)
+    cluster._stop_listening(SimpleNamespace(_controller=None, handle_cache={"used": used, "unused": unused}))
+    assert stopped == ["own", "shared"]

@@ -180,6 +180,17 @@ def _inside(http: Mapping[str, Any]) -> str:
     return f"{scheme}://{LOOPBACK if http['host'] == EVERYWHERE else http['host']}:{http['port']}"
 
 
+def _stop_listening(client: Any) -> None:
+    """Ask the controller for no more news, lest such a call is under way when it ends: another such report."""
+    from ray.serve._private.router import SharedRouterLongPollClient
+
+    for handle in client.handle_cache.values():
+        router = getattr(handle._router, "_asyncio_router", None)
+        if router is not None:
+            router.long_poll_client.stop()
+            SharedRouterLongPollClient.get_or_create(client._controller, router._event_loop).long_poll_client.stop()
+
+
 def _shutdown(client: Any) -> None:
     """End Serve: replicas drain, HAProxy stops. What `serve.shutdown` does, less its alarm.
 
@@ -189,6 +200,7 @@ def _shutdown(client: Any) -> None:
     import ray
     from ray.serve.context import _set_global_client
 
+    _stop_listening(client)
     client.shutdown_cached_handles()
     last = client._controller.graceful_shutdown.options(max_task_retries=0).remote()
     try:
