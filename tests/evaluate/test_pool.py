@@ -17,6 +17,7 @@ from vlagents_ray.evaluate import EvalConfig, pool
 from vlagents_ray.evaluate.failures import Failure
 from vlagents_ray.evaluate.jobs import EpisodeKey, Job
 from vlagents_ray.evaluate.pool import WorkerPool
+from vlagents_ray.evaluate.rollout import Report
 from vlagents_ray.evaluate.worker import Worker
 
 pytestmark = pytest.mark.usefixtures("cluster")
@@ -58,9 +59,12 @@ def test_workers_play_on_while_there_is_no_room_for_all(config: Config, caplog: 
     job = Job(EpisodeKey(LINE, 0, 0, "settings"), None)  # type: ignore[arg-type]
     waiting = worker(settings, Process.options(num_cpus=64).remote().__ray_ready__.remote())
     playing = worker(settings, jobs=(job,), heard=math.inf, looked=math.inf)  # nobody asks how it gets on
+    reports: list[tuple[Job, Report]] = []
     with WorkerPool(settings, ToZero) as short:
         short._workers = [waiting, playing]
-        wait_for(lambda: list(short.wait(0.1)) or "going on with 1 of 2 workers: the cluster found no" in caplog.text)
+        wait_for(lambda: reports.extend(short.wait(0.1)) or "going on with 1 of 2 workers: the cluster" in caplog.text)
+        assert short._workers == [waiting, playing]
+    assert reports == []
 
 
 def test_a_host_that_does_not_answer_is_waited_for_once(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -94,6 +98,8 @@ def test_a_worker_that_cannot_be_killed_saves_no_other_one(monkeypatch: pytest.M
 def test_who_kills_workers_of_a_ray_that_was_left_meanwhile_starts_no_other_ray(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    asked: list[str] = []  # anything, which Ray takes for a wish to be started
     monkeypatch.setattr(ray, "is_initialized", lambda: False)
-    monkeypatch.setattr(ray, "kill", lambda _: pytest.fail("which Ray takes for a wish to be started"))
+    monkeypatch.setattr(ray, "kill", asked.append)
     pool._kill(["one"])
+    assert asked == []

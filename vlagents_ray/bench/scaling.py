@@ -134,9 +134,9 @@ def measure_cluster(
             played[app, workers].append(one)
             tell(
                 f"{nodes} nodes, round {number + 1}/{plan.rounds}: {workers} workers ({app}), "
-                f"{one.episodes_per_minute or 0.0:.1f} episodes/min, {one.wall_s:.1f} s"
+                f"{one.rate:.1f} episodes/min, {one.wall_s:.1f} s"
             )
-    single = [one.episodes_per_minute or 0.0 for one in played[OWN, 1]]
+    single = [one.rate for one in played[OWN, 1]]
     return {"nodes": nodes, "rows": [row(plan, app, workers, played[app, workers], single) for app, workers in kinds]}
 
 
@@ -146,7 +146,7 @@ def row(plan: ScalingPlan, app: str, workers: int, played: Sequence[Played], sin
     Linear is that many times a single worker of the round; with chunks, which no single one played, what the sleeping
     alone would allow.
     """
-    rates = [one.episodes_per_minute or 0.0 for one in played]
+    rates = [one.rate for one in played]
     linear = [workers * each for each in single] if app != CHUNKS else [plan.ideal(workers, app)] * len(rates)
     return {
         "app": app,

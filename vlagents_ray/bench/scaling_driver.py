@@ -75,6 +75,12 @@ class Played(NamedTuple):
     driver_s: float  # CPU time of this process
     daemons_s: dict[str, float]  # and of Ray's on this node
 
+    @property
+    def rate(self) -> float:
+        """Episodes a minute, of a round with an application."""
+        assert self.episodes_per_minute is not None, "a round without one has no rate"  # noqa: S101
+        return self.episodes_per_minute
+
 
 class Ledger(SilentProgress):
     """When each episode was recorded, and what the driver and the daemons had used by then."""

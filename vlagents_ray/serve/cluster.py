@@ -181,7 +181,7 @@ def _inside(http: Mapping[str, Any]) -> str:
 
 
 def _stop_listening(client: Any) -> None:
-    """Ask the controller for no more news, lest such a call is under way when it ends: another such report."""
+    """Ask the controller for no more news: Ray would report a call that is under way when it ends as a failed task."""
     from ray.serve._private.router import SharedRouterLongPollClient
 
     for handle in client.handle_cache.values():
