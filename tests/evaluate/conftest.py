@@ -10,6 +10,7 @@ from eval_fakes import LINE, PYTHONPATH
 from flat_config import flat_config
 
 from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.joining import start_ray
 
 WORKER_PATH = {"env_vars": {"PYTHONPATH": PYTHONPATH}}
 
@@ -28,6 +29,6 @@ def config(tmp_path: Path) -> Callable[..., EvalConfig]:
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[None]:
     """A local Ray cluster for the tests of one file."""
-    ray.init(num_cpus=4, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+    start_ray(num_cpus=4, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
     yield
     ray.shutdown()

@@ -12,6 +12,7 @@ from eval_fakes import ToZero
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results, evaluate
+from vlagents_ray.joining import start_ray
 
 Config = Callable[..., EvalConfig]
 
@@ -23,7 +24,7 @@ def cluster() -> Iterator[str]:
     """Ray's id of its node."""
     with pytest.MonkeyPatch.context() as patch:
         patch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
-        ray.init(num_cpus=2, num_gpus=1, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
+        start_ray(num_cpus=2, num_gpus=1, include_dashboard=False, log_to_driver=False, logging_level="ERROR")
         yield ray.get_runtime_context().get_node_id()
         ray.shutdown()
 

@@ -10,6 +10,7 @@ from typing import Any
 import psutil
 import pytest
 from flat_config import flat_config
+from ray_processes import words
 
 from tests.integration.conftest import serving
 from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, Results, SilentProgress, evaluate
@@ -58,8 +59,8 @@ class Disaster(SilentProgress):
         self.played += 1
         if self.played % 5 == 0:
             for process in psutil.Process().children(recursive=True):
-                with contextlib.suppress(psutil.NoSuchProcess):
-                    if "Rollout" in process.cmdline()[0]:
+                if any("Rollout" in word for word in words(process)):
+                    with contextlib.suppress(psutil.NoSuchProcess):
                         process.kill()
         if self.played == self.interrupted_after:
             signal.raise_signal(signal.SIGINT)

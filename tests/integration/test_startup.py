@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import signal
 import socket
 import subprocess
 import sys
-import tempfile
 import threading
 import urllib.error
 import urllib.request
@@ -21,7 +19,9 @@ import psutil
 import pytest
 import yaml
 from eval_fakes import wait_for
+from listeners import listeners
 from ray.autoscaler._private.constants import AUTOSCALER_METRIC_PORT
+from ray_processes import ray_folder
 from rpyc_client import Client, call
 
 from tests.integration.conftest import serving
@@ -154,9 +154,7 @@ def test_rays_metrics_stay_off_the_port_that_every_ray_has_for_them() -> None:
     """They answer any path with 200: a server that wanted that port would seem to be there."""
 
     def monitors() -> set[int]:
-        children = psutil.Process().children(recursive=True)
-        found = [p for p in children if any(word.endswith("monitor.py") for word in p.cmdline())]
-        return {c.laddr.port for p in found for c in p.net_connections("inet") if c.status == psutil.CONN_LISTEN}
+        return {one.port for one in listeners(psutil.Process()) if one.process == "monitor.py" and one.kind == "tcp"}
 
     with serving("noop"):
         wait_for(monitors)
@@ -173,19 +171,16 @@ def test_serve_deploy_takes_the_same_file(tmp_path: Path) -> None:
     assert "dialects" in file.read_text()
     assert str(serve_port) in file.read_text()
     bin_dir = Path(sys.executable).parent
-    home = tempfile.mkdtemp(prefix="vr-")  # Unix sockets in it: the path must be short
     environment = os.environ | {"RAY_AUTH_MODE": "disabled"}
 
     def ray(*words: str) -> None:
         subprocess.run(words, check=True, timeout=120, env=environment, capture_output=True)
 
-    before = {p.pid for p in psutil.process_iter()}
-    ray(
-        str(bin_dir / "ray"), "start", "--head", f"--port={gcs}", f"--dashboard-port={dashboard}", "--num-cpus=2",
-        f"--temp-dir={home}", "--min-worker-port=0", "--max-worker-port=0",
-    )  # fmt: skip
-    ours = [p for p in psutil.process_iter() if p.pid not in before and "ray" in " ".join(p.cmdline()).lower()]
-    try:
+    with ray_folder() as home:
+        ray(
+            str(bin_dir / "ray"), "start", "--head", f"--port={gcs}", f"--dashboard-port={dashboard}", "--num-cpus=2",
+            f"--temp-dir={home}", "--min-worker-port=0", "--max-worker-port=0",
+        )  # fmt: skip
         ray(str(bin_dir / "serve"), "deploy", "-a", f"http://127.0.0.1:{dashboard}", str(file))
         url = f"http://127.0.0.1:{serve_port}"
         wait_for(lambda: health(url) == 200)
@@ -196,16 +191,6 @@ def test_serve_deploy_takes_the_same_file(tmp_path: Path) -> None:
             agent.reset(obs, env.instruction, env="tabletop")
             env.step(agent.act(obs))
         wait_for(lambda: _name_at(robots) == "scripted")
-    finally:
-        ours += [p for p in psutil.process_iter() if home in " ".join(_cmdline(p))]
-        family = {child for p in ours if p.is_running() for child in p.children(recursive=True)} | set(ours)
-        for p in family:
-            if p.is_running():
-                p.terminate()
-        _, alive = psutil.wait_procs(list(family), timeout=20)
-        for p in alive:
-            p.kill()
-        shutil.rmtree(home, ignore_errors=True)
 
 
 def _name_at(port: int) -> str | None:
@@ -216,13 +201,6 @@ def _name_at(port: int) -> str | None:
             return str(client.receive()[2][1])
     except (OSError, EOFError):
         return None
-
-
-def _cmdline(process: psutil.Process) -> list[str]:
-    try:
-        return process.cmdline()
-    except psutil.Error:
-        return []
 
 
 def application(args: str) -> str:

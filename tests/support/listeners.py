@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import psutil
+from ray_processes import words
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ def listeners(root: psutil.Process) -> set[Listener]:
             name = "driver" if process == root else _name(process)
             sockets = process.net_connections("inet")
             unix = _unix(process.pid)
-        except psutil.NoSuchProcess:
+        except (psutil.NoSuchProcess, OSError):  # it has ended
             continue
         for one in sockets:
             if one.status == psutil.CONN_LISTEN or (one.type == socket.SOCK_DGRAM and one.laddr and not one.raddr):
@@ -45,9 +46,9 @@ def listeners(root: psutil.Process) -> set[Listener]:
 
 def _name(process: psutil.Process) -> str:
     """Of what runs, whatever it is started by."""
-    words = process.cmdline() or [process.name()]
-    scripts = [Path(word).name for word in words if word.endswith(".py")]
-    program = Path(words[0].split()[0]).name
+    said = words(process) or [process.name()]
+    scripts = [Path(word).name for word in said if word.endswith(".py")]
+    program = Path(said[0].split()[0]).name
     # Ray's workers call themselves by what they do at the moment: "ray::Class.method".
     return scripts[0] if scripts else program.partition(".")[0] if program.startswith("ray::") else program
 

@@ -1,4 +1,4 @@
-"""The processes of one Ray, known by the folder that RAY_TMPDIR names for it."""
+"""Ray's processes: those of one that has a folder of its own (RAY_TMPDIR, --temp-dir) are known by it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+import psutil
 from eval_fakes import wait_for
+
+
+def words(process: psutil.Process) -> list[str]:
+    """Its command line; empty if it has ended or is about to."""
+    try:
+        return process.cmdline()
+    except psutil.Error:
+        return []
 
 
 @contextmanager

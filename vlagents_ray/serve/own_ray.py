@@ -9,11 +9,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.joining import start_ray
 from vlagents_ray.serve.haproxy import Front, haproxy_binary, ingress_environment
 from vlagents_ray.serve.ports import HOST, LOOPBACK, free_port, is_free, keep
 from vlagents_ray.serve.reaper import MARK, reaped
 from vlagents_ray.serve.tls import Tls
-from vlagents_ray.signals import own_sigterm
 
 _MODE = "RAY_AUTH_MODE"
 # Ray asks it whether this machine is one of a cluster, and takes the loopback address for a node's own if not: then
@@ -59,10 +59,7 @@ def own_ray(
         stack.enter_context(_alone())
         if front is not None:
             front.require()
-        with own_sigterm():  # "local": also where this machine is in a cluster, or RAY_ADDRESS names one
-            ray.init(
-                "local", num_cpus=num_cpus, include_dashboard=False, log_to_driver=show_logs, logging_level="WARNING"
-            )
+        start_ray(num_cpus=num_cpus, include_dashboard=False, log_to_driver=show_logs, logging_level="WARNING")
         stack.callback(ray.shutdown)
         # Whoever reaches the object store's socket reads and writes all observations. (The folder would not stay
         # closed: each of Ray's processes opens it to everybody when it starts.)
