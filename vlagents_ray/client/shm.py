@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import math
 import mmap
@@ -101,8 +100,8 @@ class ShmTransport:
 
     def hand_over(self, connection: socket.socket, requests: Sequence[Request], deadline: float) -> None:
         """Put requests where the server reads them, and say so. `TimeoutError`, `OSError` if that fails."""
-        while sum(memory.busy for memory in self._memories) >= LocalAddress.FILES:  # with requests that were given up
-            try:
+        while len(self._memories) == LocalAddress.FILES and all(memory.busy for memory in self._memories):
+            try:  # they are with requests that were given up
                 self.receive(connection)
             except BlockingIOError:
                 self.wait(connection, select.POLLIN, deadline)
@@ -132,18 +131,20 @@ class ShmTransport:
 
     def send(self, connection: socket.socket, message: bytes, deadline: float, descriptor: int | None = None) -> None:
         """A message to the server, with a descriptor that is then closed here. Waits while it reads none."""
-        with contextlib.ExitStack() as closing:
-            if descriptor is not None:
-                closing.callback(os.close, descriptor)
-            sent = 0
-            while not sent:
+        try:
+            while True:
                 try:
                     if descriptor is None:
-                        sent = connection.send(message)
+                        connection.send(message)
                     else:
-                        sent = socket.send_fds(connection, [message], [descriptor])
+                        socket.send_fds(connection, [message], [descriptor])
                 except BlockingIOError:
                     self.wait(connection, select.POLLOUT, deadline)
+                else:
+                    return
+        finally:
+            if descriptor is not None:
+                os.close(descriptor)
 
     def _await(self, connection: socket.socket, requests: Sequence[Request], deadline: float) -> list[Reply]:
         """The replies to these requests, and to no earlier ones.
@@ -192,10 +193,10 @@ class ShmTransport:
 
     def _memory(self, length: int) -> tuple[_Memory, int | None]:
         """Memory that holds `length` bytes and is free, with its descriptor if the server has yet to get it."""
-        free = [memory for memory in self._memories if not memory.busy]
-        for memory in free:
-            if len(memory.map) >= length:
+        for memory in self._memories:
+            if not memory.busy and len(memory.map) >= length:
                 return memory, None
+        free = [memory for memory in self._memories if not memory.busy]
         number = free[0].number if free else len(self._memories)
         size = -(-length * 5 // 4 // _PAGE) * _PAGE
         descriptor = os.memfd_create("vlagents-ray-frames", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)

@@ -69,6 +69,7 @@ class BatchQueue:
         self._tally = Tally()  # loading the policy is no work for a session: as if the thread slept
         self._lock = threading.Lock()
         self._closed = False
+        self._alive = False
         self._asleep = False
         self._dense = False  # do requests come one upon the other?
         self._ears = Ears()
@@ -83,6 +84,7 @@ class BatchQueue:
 
     def start(self) -> None:
         """Start the thread, and return when `prepare` has; what it raised is raised here."""
+        self._alive = True
         self._thread.start()
         self._prepared.wait()
         if self._failure is not None:
@@ -144,7 +146,7 @@ class BatchQueue:
 
     def alive(self) -> bool:
         """Is there a thread to take what is put?"""
-        return self._thread.is_alive()
+        return self._alive
 
     def close(self, timeout_s: float | None = None) -> None:
         """Answer what waits with `PolicyUnavailable`, end the thread after the batch under way."""
@@ -158,7 +160,7 @@ class BatchQueue:
             self._thread.join(timeout_s)
 
     def _wake(self) -> None:
-        if self._asleep:
+        if self._asleep and threading.get_ident() != self._thread.ident:  # which is awake if it is here itself
             self._asleep = False
             self._ears.wake()
 
@@ -167,11 +169,18 @@ class BatchQueue:
             self._prepare()
         except BaseException as error:  # noqa: BLE001 - raised again by start(), on the caller's thread
             self._failure = error
+            self._alive = False
             self._ears.close()
             return
         finally:
             self._tally.wakes()
             self._prepared.set()
+        try:
+            self._serve()
+        finally:
+            self._alive = False
+
+    def _serve(self) -> None:
         while (batch := self._take()) is not None:
             if self._unsent:
                 unsent, self._unsent = self._unsent, []

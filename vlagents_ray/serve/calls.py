@@ -61,7 +61,8 @@ class Sender:
                 round_.put(index, item)
                 continue
             try:
-                self._admit(item, index)
+                if self._caller is not None:
+                    self._admit(self._caller, item, index)
                 ready.append(self._ticket(round_, index, item))
             except VLAgentsError as error:
                 strays = self._engine.strays if isinstance(error, UnknownSession) and item.op == "act" else None
@@ -115,12 +116,10 @@ class Sender:
     def _named(self, session_id: str) -> str:
         return session_id if self._caller is None else f"{self._caller.name}/{session_id}"
 
-    def _admit(self, request: Request, index: int) -> None:
+    def _admit(self, caller: Caller, request: Request, index: int) -> None:
         """What the caller's key says to it. The first of an HTTP request was counted by the guard; to close is free."""
-        if self._caller is None:
-            return
-        self._caller.admit(free=request.op == "close" or (index == 0 and self._counted))
-        if self._caller.rank == "simulation":
+        caller.admit(free=request.op == "close" or (index == 0 and self._counted))
+        if caller.rank == "simulation":
             request.rank = "simulation"
 
     def _ticket(self, round_: Round, index: int, request: Request) -> Ticket:

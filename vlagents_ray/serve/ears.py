@@ -12,7 +12,6 @@ import contextlib
 import logging
 import os
 import select
-import selectors
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -33,11 +32,12 @@ class Ears:
     """Watched files and a wake-up call. One thread owns them, and lends them out now and then."""
 
     def __init__(self) -> None:
-        self._selector = selectors.DefaultSelector()
+        self._poll = select.epoll()  # itself: what `selectors` makes of its events takes as long as a request's way
+        self._ready: dict[int, Callable[[], None]] = {}  # by descriptor
         self._wake_read, self._wake_write = os.pipe()
         os.set_blocking(self._wake_read, False)
         os.set_blocking(self._wake_write, False)
-        self._selector.register(self._wake_read, selectors.EVENT_READ)
+        self._watch(self._wake_read, self._woken)
         self._reader: threading.Thread | None = None  # only a policy that is slow enough needs it
         self._lent = threading.Event()
         self._turn = threading.Lock()  # held while the reader runs callbacks
@@ -46,11 +46,12 @@ class Ears:
 
     def watch(self, file: HasFileno, ready: Callable[[], None]) -> None:
         """Call `ready` whenever `file` can be read. Before the owner's first `hear`, or in a callback."""
-        self._selector.register(file, selectors.EVENT_READ, ready)
+        self._watch(file.fileno(), ready)
 
     def unwatch(self, file: HasFileno) -> None:
-        """The end of `watch`, in a callback."""
-        self._selector.unregister(file)
+        """The end of `watch`, in a callback, before the file is closed."""
+        del self._ready[file.fileno()]
+        self._poll.unregister(file)
 
     def later(self, call: Callable[[], None]) -> None:
         """Have `call` called as a callback is; after `close`, not any more. Any thread."""
@@ -65,8 +66,9 @@ class Ears:
 
     def hear(self, timeout_s: float) -> bool:
         """Wait for a watched file or a wake-up call, run the callbacks of all that is there. False: nothing came."""
-        events = self._selector.select(timeout_s)
-        self._call(events)
+        events = self._poll.poll(timeout_s)
+        if events:
+            self._call(events)
         return bool(events)
 
     def lend(self) -> None:
@@ -90,15 +92,15 @@ class Ears:
             self.wake()
             self._lent.set()
             self._reader.join()
-        self._selector.close()
+        self._poll.close()
         os.close(self._wake_read)
         os.close(self._wake_write)
 
     def _read(self) -> None:
-        # Polls the selector from outside: two threads inside one epoll would take each other's wake-ups. What this
+        # Polls the epoll from outside: two threads inside one epoll would take each other's wake-ups. What this
         # hears when the ears are no longer lent is the owner's: it only goes back to wait for the next loan.
         outside = select.poll()
-        outside.register(self._selector.fileno(), select.POLLIN)
+        outside.register(self._poll, select.POLLIN)
         while True:
             self._lent.wait()
             if self._closed:
@@ -106,25 +108,30 @@ class Ears:
             outside.poll()
             with self._turn:
                 if self._lent.is_set() and not self._closed:
-                    self._call(self._selector.select(0), lent=True)
+                    self._call(self._poll.poll(0), lent=True)
 
-    def _call(self, events: list[tuple[selectors.SelectorKey, int]], lent: bool = False) -> None:
-        for key, _ in events:
+    def _watch(self, descriptor: int, ready: Callable[[], None]) -> None:
+        self._poll.register(descriptor, select.EPOLLIN)
+        self._ready[descriptor] = ready
+
+    def _call(self, events: list[tuple[int, int]], lent: bool = False) -> None:
+        for descriptor, _ in events:
             if lent and not self._lent.is_set():
                 return  # the owner is told of the rest again
-            if key.data is None:
-                with contextlib.suppress(BlockingIOError):
-                    os.read(self._wake_read, 4096)
-                self._call_back()
-                continue
+            ready = self._ready.get(descriptor)
+            if ready is None:
+                continue  # unwatched by one before it
             try:
-                key.data()
+                ready()
             except Exception:
                 logger.exception("a local client's door failed")
-                with contextlib.suppress(KeyError, ValueError):  # it may have been unwatched, or closed, already
-                    self._selector.unregister(key.fileobj)
+                if self._ready.pop(descriptor, None) is not None:
+                    with contextlib.suppress(OSError):  # it may be closed already
+                        self._poll.unregister(descriptor)
 
-    def _call_back(self) -> None:
+    def _woken(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            os.read(self._wake_read, 4096)
         while self._calls:
             try:
                 self._calls.popleft()()

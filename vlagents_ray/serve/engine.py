@@ -330,7 +330,6 @@ class Engine:
         del observations  # which may lie in memory that their sender wants back
         for ticket, _ in acting:
             ticket.request.obs = None
-        self.stats.batch(len(acting), rows)
         if padding:
             model.padding.judge(results[len(acting) :])
             results = results[: len(acting)]
@@ -345,6 +344,7 @@ class Engine:
                 ticket.answer(reply)
         if unsent:
             self.queue.answer_later(unsent)
+        self.stats.batch(len(acting), rows)
 
 
 def _given_up(ticket: Ticket, session: Session) -> bool:

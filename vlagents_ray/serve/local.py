@@ -143,7 +143,9 @@ class LocalClient:
         except OSError as error:
             logger.info("local client: %s", error)
             size, control = 0, []
-        descriptors = [number for _, _, data in control for number in array("i", data[: len(data) // 4 * 4])]
+        descriptors: list[int] = []
+        for _, _, data in control:
+            descriptors += array("i", data[: len(data) // 4 * 4])
         try:
             if not size:
                 self._hang_up()
@@ -237,6 +239,10 @@ class LocalClient:
 
     def _answer(self, visit: Visit, replies: list[Reply]) -> None:
         frame, compact_form = visit.packed(replies)
+        self._send(frame, compact_form)
+        visit.sent(replies)
+
+    def _send(self, frame: bytes, compact_form: bool) -> None:
         flags = LocalAddress.COMPACT if compact_form else 0
         with self._sending:
             if self._ended:

@@ -91,6 +91,10 @@ class _Ring:
         else:
             lanes.append(lane)
 
+    def clear(self) -> None:
+        self.turns.clear()
+        self.lanes.clear()
+
     def next(self) -> _Lane:
         """A session of the owner whose turn it is, who then goes to the end."""
         owner = self.turns.popleft()
@@ -117,7 +121,7 @@ class Waiting:
         self.depth = [0] * len(Rank)  # tickets that wait, by rank, those included that nobody waits for any more
 
     def __len__(self) -> int:
-        return sum(self.depth)
+        return self.depth[0] + self.depth[1]
 
     def __contains__(self, session_id: str) -> bool:
         return session_id in self._sessions
@@ -143,6 +147,8 @@ class Waiting:
 
     def take(self, size: int, now: float) -> tuple[list[Ticket], list[Ticket]]:
         """The next batch, `size` at most, and what was found expired on the way; cancelled ones vanish."""
+        if len(self) == 1 and (lone := self._lone(now)) is not None:
+            return [lone], []
         batch: list[Ticket] = []
         expired: list[Ticket] = []
         again: list[_Lane] = []
@@ -157,6 +163,18 @@ class Waiting:
         for lane in again:
             self._rings[lane[0].rank].add(lane[0].owner, lane)
         return batch, expired
+
+    def _lone(self, now: float) -> Ticket | None:
+        """The only ticket, taken as the loops of `take` would; None if it is not one to be run."""
+        [lane] = self._sessions.values()
+        ticket = lane[0]
+        if ticket.cancelled or ticket.expired(now):
+            return None
+        self._sessions.clear()
+        self._rings[ticket.rank].clear()
+        self.depth[ticket.rank] = 0
+        self._yielded = False
+        return ticket
 
     def clear(self) -> list[Ticket]:
         """Everything, which then no longer waits."""

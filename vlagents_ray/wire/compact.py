@@ -28,6 +28,7 @@ _ALIGN = 64
 _ID_BYTES = 40  # of a request's id
 _MOST = 1024  # layouts of one connection
 _NONE = float("nan")
+_UINT8, _FLOAT32 = np.dtype(np.uint8), np.dtype(np.float32)
 
 COUNT = struct.Struct("<I")
 ITEM = struct.Struct(f"<IIqdd{_ID_BYTES}s")  # layout, bytes of its JSON, step or -1, deadline ms, gripper, request id
@@ -57,45 +58,68 @@ class Layout:
                 at += -(-math.prod(shape) * width // _ALIGN) * _ALIGN
         return cls(session, rank, tuple(placed[0]), tuple(placed[1]), at)
 
+    def placed(self, request: Request, at: int) -> list[tuple[int, np.ndarray]] | None:
+        """Where each array goes if the first one is at `at`; None if it is no act of this layout.
+
+        To compare each array is faster than to write down what they are, which `_key` does.
+        """
+        obs = request.obs
+        if obs is None or not _is_plain(request, obs) or request.rank != self.rank:
+            return None
+        if len(obs.cameras) != len(self.cameras) or len(obs.state) != len(self.state):
+            return None
+        arrays = []
+        for (name, shape, offset), (own, image) in zip(self.cameras, obs.cameras.items(), strict=True):
+            if type(image) is not np.ndarray or own != name or image.shape != shape or image.dtype != _UINT8:
+                return None
+            arrays.append((at + offset, image))
+        for (name, shape, offset), (own, part) in zip(self.state, obs.state.items(), strict=True):
+            if type(part) is not np.ndarray or own != name or part.shape != shape or part.dtype.kind != "f":
+                return None
+            arrays.append((at + offset, part if part.dtype == _FLOAT32 else part.astype(np.float32)))
+        return arrays
+
 
 class Writer:
     """Writes the acts of one connection; remembers which layouts the other side knows."""
 
     def __init__(self) -> None:
         self._known: dict[Any, tuple[int, Layout]] = {}
+        self._latest: dict[str, tuple[int, Layout]] = {}  # of each session, whose next act is likely to be like it
 
     def write(self, requests: Sequence[Request]) -> Written | None:
         """The message and where the arrays go; None if the requests must travel as a frame."""
-        keys = []
-        for request in requests:
-            if (key := _key(request)) is None:
-                return None
-            keys.append(key)
-        if len(self._known) + len(keys) > _MOST:
-            return None
         items, texts = [COUNT.pack(len(requests))], []
         arrays: list[tuple[int, np.ndarray]] = []
+        new: dict[Any, tuple[int, Layout]] = {}
+        latest: dict[str, tuple[int, Layout]] = {}
         at = 0
-        for request, key in zip(requests, keys, strict=True):
-            obs: Obs = request.obs  # type: ignore[assignment]  # it has a key
+        for request in requests:
             text = b""
-            if (known := self._known.get(key)) is None:
-                known = self._known[key] = (len(self._known), Layout.of(*key))
-                text = json.dumps(key).encode()
-                texts.append(text)
+            known = self._latest.get(request.session)
+            placed = None if known is None else known[1].placed(request, at)
+            if known is None or placed is None:
+                if (key := _key(request)) is None:
+                    return None
+                if (known := self._known.get(key) or new.get(key)) is None:
+                    if (number := len(self._known) + len(new)) >= _MOST:
+                        return None
+                    known = new[key] = (number, Layout.of(*key))
+                    text = json.dumps(key).encode()
+                    texts.append(text)
+                latest[request.session] = known
+                placed = known[1].placed(request, at) or []
             number, layout = known
-            arrays += [
-                (at + place[2], image) for place, image in zip(layout.cameras, obs.cameras.values(), strict=True)
-            ]
-            arrays += [
-                (at + place[2], part if part.dtype == np.float32 else part.astype(np.float32))
-                for place, part in zip(layout.state, obs.state.values(), strict=True)
-            ]
+            arrays += placed
             at += layout.size
+            obs: Obs = request.obs  # type: ignore[assignment]  # it has a layout
             step = -1 if request.step is None else request.step
             deadline_ms = _NONE if request.deadline_ms is None else request.deadline_ms
             gripper = _NONE if obs.gripper is None else obs.gripper
             items.append(ITEM.pack(number, len(text), step, deadline_ms, gripper, request.request_id.encode()))
+        if latest:
+            self._known |= new
+            self._latest |= latest
         return Written(b"".join(items + texts), max(at, _ALIGN), arrays)
 
 
@@ -144,15 +168,20 @@ class Reader:
                 if at + layout.size > memory.size:
                     raise MalformedMessage(f"local: {memory.size} bytes of memory, the arrays need more")
                 obs = Obs(
-                    {name: np.ndarray(shape, np.uint8, memory, at + place) for name, shape, place in layout.cameras},
+                    {name: np.ndarray(shape, _UINT8, memory, at + place) for name, shape, place in layout.cameras},
                     None if math.isnan(gripper) else gripper,
-                    {name: np.ndarray(shape, np.float32, memory, at + place) for name, shape, place in layout.state},
+                    {name: np.ndarray(shape, _FLOAT32, memory, at + place) for name, shape, place in layout.state},
                 )
                 at += layout.size
-                request = Request("act", obs, session=layout.session, rank=layout.rank)
-                request.request_id = request_id.rstrip(b"\0").decode()
-                request.step = None if step < 0 else step
-                request.deadline_ms = None if math.isnan(deadline_ms) else deadline_ms
+                request = Request(
+                    "act",
+                    obs,
+                    session=layout.session,
+                    rank=layout.rank,
+                    step=None if step < 0 else step,
+                    request_id=request_id.rstrip(b"\0").decode(),
+                    deadline_ms=None if math.isnan(deadline_ms) else deadline_ms,
+                )
                 requests.append(request)
         except (struct.error, ValueError, KeyError, TypeError) as error:
             if isinstance(error, MalformedMessage | MessageTooLarge):
@@ -185,12 +214,17 @@ class Reader:
         return Layout.of(session, rank, cameras, state)
 
 
+def _is_plain(request: Request, obs: Obs) -> bool:
+    """May it have a layout, as far as that is not up to its arrays?"""
+    if request.op != "act" or obs.info or len(request.request_id) > _ID_BYTES:
+        return False
+    return obs.gripper is None or 0.0 <= obs.gripper <= 1.0  # else an error, which frames are made for
+
+
 def _key(request: Request) -> tuple[Any, ...] | None:
     """What the layout follows from; None if the request must travel as a frame."""
     obs = request.obs
-    if request.op != "act" or obs is None or obs.info or len(request.request_id) > _ID_BYTES:
-        return None
-    if obs.gripper is not None and not 0.0 <= obs.gripper <= 1.0:  # an error, which frames are made for
+    if obs is None or not _is_plain(request, obs):
         return None
     for image in obs.cameras.values():
         if type(image) is not np.ndarray or image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3:
@@ -246,9 +280,10 @@ def read_answers(message: memoryview) -> list[Reply]:
     replies = []
     for answer in ANSWER.iter_unpack(message[COUNT.size : at]):
         request_id, step, flags, dimensions, rows, columns, batch_size, *times = answer
-        shape = (rows, columns) if dimensions == 2 else (columns,)
-        action = np.frombuffer(message, np.float32, math.prod(shape), at).reshape(shape).copy()
+        action = np.frombuffer(message, np.float32, columns if dimensions == 1 else rows * columns, at).copy()
         at += action.nbytes
+        if dimensions == 2:
+            action = action.reshape(rows, columns)
         timing = dict(zip(_TIMES, times, strict=True))
         timing["batch_size"] = batch_size
         reply = Reply(request_id.rstrip(b"\0").decode(), Act(action, bool(flags & _DONE)), step=step, timing=timing)
