@@ -53,7 +53,7 @@ class World:
             return one
 
         while len(self.sizes) < batches:
-            while coming and (coming[0][0] <= now or not len(waiting)):
+            while coming and (coming[0][0] <= now or not waiting.size):
                 now = max(now, come().arrived)
             wait = returning.wait_s(now, waiting)
             if wait > 0:

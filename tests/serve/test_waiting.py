@@ -61,7 +61,7 @@ def test_pipelined_requests_of_one_session_take_one_slot_of_a_batch() -> None:
     waiting = filled(*(ticket("fast") for _ in range(100)), ticket("slow"))
     assert taken(waiting) == ["fast", "slow"]
     assert taken(waiting) == ["fast"]
-    assert len(waiting) == 98
+    assert waiting.size == 98
 
 
 def test_simulations_get_the_slots_that_robots_leave() -> None:
@@ -99,7 +99,7 @@ def test_every_ticket_is_taken_once_and_in_its_sessions_order(seed: int, size: i
             assert len({one.session_id for one in batch}) == len(batch) <= size
             for one in batch:
                 got[one.session_id].append(one)
-    while len(waiting):
+    while waiting.size:
         for one in waiting.take(size, 0.0)[0]:
             got[one.session_id].append(one)
     assert {name: list(map(id, some)) for name, some in put.items()} == {
@@ -111,5 +111,5 @@ def test_every_ticket_is_taken_once_and_in_its_sessions_order(seed: int, size: i
 def test_nothing_is_left_after_clear() -> None:
     waiting = filled(ticket("a"), ticket("a"), ticket("b", rank=Rank.ROBOT))
     assert len(waiting.clear()) == 3
-    assert len(waiting) == 0
+    assert waiting.size == 0
     assert waiting.take(4, 0.0) == ([], [])

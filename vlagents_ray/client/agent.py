@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections import deque
@@ -190,7 +191,10 @@ class RemoteAgent(Agent):
         `total_ms`, which is the sum and what lies between; here `round_trip_ms` and, as the rest of
         it, `wire_ms`: this side's coding, the network, proxies. `batch_size` is no time.
         """
-        return super().act(obs)
+        [act] = self.act_batch([obs], [self])
+        if isinstance(act, Exception):
+            raise act
+        return act
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         """One action for each of several sessions of this connection, in one message each way.
@@ -207,7 +211,7 @@ class RemoteAgent(Agent):
         if len(obs) != len(siblings):
             raise ConfigError(f"act_batch: got {len(obs)} observations for {len(siblings)} sessions")
         requests = [session.act(one) for session, one in zip(siblings, obs, strict=True)]
-        replies = self._call(siblings, requests, min([self._connection.timeout_s, *_deadlines_s(obs)]))
+        replies = self._call(siblings, requests, min(self._connection.timeout_s, _deadline_s(obs)))
         round_trip_ms = (time.perf_counter() - begun) * 1e3
         return [self._take(*each, round_trip_ms) for each in zip(siblings, obs, replies, strict=True)]
 
@@ -244,10 +248,13 @@ class RemoteAgent(Agent):
         return reply.act
 
 
-def _deadlines_s(obs: Sequence[Obs]) -> list[float]:
-    """After how long the senders of observations want no answer any more; of one message, the soonest counts."""
-    stated = [one.info[DEADLINE] for one in obs if DEADLINE in one.info]
-    for value in stated:
-        if not isinstance(value, (int, float)) or not value > 0:
-            raise InvalidObservation(f"info[{DEADLINE!r}]: got {value!r}, want milliseconds above 0")
-    return [value / 1e3 for value in stated]
+def _deadline_s(obs: Sequence[Obs]) -> float:
+    """After how long the sender of the most urgent of the observations wants no answer any more."""
+    soonest_ms = math.inf
+    for one in obs:
+        if DEADLINE in one.info:
+            value = one.info[DEADLINE]
+            if not isinstance(value, (int, float)) or not value > 0:
+                raise InvalidObservation(f"info[{DEADLINE!r}]: got {value!r}, want milliseconds above 0")
+            soonest_ms = min(soonest_ms, value)
+    return soonest_ms / 1e3

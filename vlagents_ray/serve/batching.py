@@ -96,7 +96,7 @@ class BatchQueue:
             if self._closed:
                 raise PolicyUnavailable("the replica is stopping; connect again")
             for ticket in tickets:
-                self._tally.count(len(self._waiting), ticket.loaded or ticket.arrived)
+                self._tally.count(self._waiting.size, ticket.loaded or ticket.arrived)
                 if self._returning.slow:
                     self._returning.came(ticket)
                 self._waiting.add(ticket)
@@ -129,7 +129,7 @@ class BatchQueue:
 
     def depth(self) -> int:
         """Requests that wait for the next batch."""
-        return len(self._waiting)
+        return self._waiting.size
 
     def depth_by_rank(self) -> dict[Rank, int]:
         """The same, by class."""
@@ -138,7 +138,7 @@ class BatchQueue:
     def waited_s(self) -> float:
         """How long all requests together have waited so far; its growth is the mean number that wait."""
         with self._lock:
-            return self._tally.waited_s(len(self._waiting))
+            return self._tally.waited_s(self._waiting.size)
 
     def slept_s(self) -> float:
         """How long the policy's thread has had nothing to do so far; the rest of the time it was busy."""
@@ -217,7 +217,7 @@ class BatchQueue:
             self._gather()
         with self._lock:
             closed, now = self._closed, time.perf_counter()
-            self._tally.count(len(self._waiting), now)
+            self._tally.count(self._waiting.size, now)
             left = self._waiting.clear() if closed else []
             batch, expired = self._waiting.take(self._max, now)
             if batch:
@@ -234,7 +234,7 @@ class BatchQueue:
         """Until something waits, or the queue is closed; also hear all watched files that are ready now."""
         while True:
             with self._lock:
-                here = self._closed or len(self._waiting) > 0
+                here = self._closed or self._waiting.size > 0
                 self._asleep = not here
             if not here:
                 self._tally.sleeps()
@@ -242,7 +242,7 @@ class BatchQueue:
             if not here:
                 self._tally.wakes()
             self._asleep = False
-            if here or len(self._waiting) > 0 or self._closed:
+            if here or self._waiting.size > 0 or self._closed:
                 return True
             if not heard:
                 return False

@@ -119,9 +119,7 @@ class Waiting:
         self._sessions: dict[str, _Lane] = {}
         self._yielded = False  # did the batch before this one hold a slot for an impatient simulation?
         self.depth = [0] * len(Rank)  # tickets that wait, by rank, those included that nobody waits for any more
-
-    def __len__(self) -> int:
-        return self.depth[0] + self.depth[1]
+        self.size = 0  # of all ranks
 
     def __contains__(self, session_id: str) -> bool:
         return session_id in self._sessions
@@ -138,6 +136,7 @@ class Waiting:
     def add(self, ticket: Ticket) -> None:
         """Behind what its session has asked already."""
         self.depth[ticket.rank] += 1
+        self.size += 1
         lane = self._sessions.get(ticket.session_id)
         if lane is not None:
             lane.append(ticket)
@@ -147,7 +146,7 @@ class Waiting:
 
     def take(self, size: int, now: float) -> tuple[list[Ticket], list[Ticket]]:
         """The next batch, `size` at most, and what was found expired on the way; cancelled ones vanish."""
-        if len(self) == 1 and (lone := self._lone(now)) is not None:
+        if self.size == 1 and (lone := self._lone(now)) is not None:
             return [lone], []
         batch: list[Ticket] = []
         expired: list[Ticket] = []
@@ -172,7 +171,7 @@ class Waiting:
             return None
         self._sessions.clear()
         self._rings[ticket.rank].clear()
-        self.depth[ticket.rank] = 0
+        self.depth[ticket.rank] = self.size = 0
         self._yielded = False
         return ticket
 
@@ -182,6 +181,7 @@ class Waiting:
         self._sessions.clear()
         self._rings = [_Ring() for _ in Rank]
         self.depth = [0] * len(Rank)
+        self.size = 0
         return left
 
     def _pick(self, lane: _Lane, now: float, batch: list[Ticket], expired: list[Ticket], again: list[_Lane]) -> None:
@@ -190,6 +190,7 @@ class Waiting:
         while lane:
             ticket = lane.popleft()
             self.depth[ticket.rank] -= 1
+            self.size -= 1
             if ticket.loaded is None:  # else its session holds a checkpoint, which is let go of when it runs
                 if ticket.cancelled:
                     continue
