@@ -148,6 +148,20 @@ def test_each_bad_observation_has_its_error(obs: Obs, error: type[Exception]) ->
         check_observation(obs, POLICY)
 
 
+@pytest.mark.parametrize("size", [1, 63, 64, 65, 4096])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_number_that_is_none_is_found_wherever_it_is(size: int, bad: float) -> None:
+    for at in (0, size // 2, size - 1):
+        part = np.zeros(size, np.float32)
+        check_observation(Obs(state={"joints": part}), None)
+        check_action(part, None)
+        part[at] = bad
+        with pytest.raises(InvalidObservation, match="NaN or infinity"):
+            check_observation(Obs(state={"joints": part}), None)
+        with pytest.raises(InvalidAction, match="NaN or infinity"):
+            check_action(part.reshape(1, -1), None)
+
+
 @pytest.mark.parametrize("action", [[0.0] * 7, np.zeros((8, 7)), np.zeros(7, np.float64)])
 def test_actions_become_float32(action: object) -> None:
     assert check_action(action, POLICY).dtype == np.float32

@@ -231,6 +231,76 @@ def test_closing_ends_the_wait(slow: Callable[..., Slow]) -> None:
     assert one.events == ["error a"]
 
 
+def test_who_was_unwatched_a_moment_ago_is_not_called(caplog: pytest.LogCaptureFixture) -> None:
+    """By the call before, for whom both were ready."""
+    ears = Ears()
+    pairs = [socket.socketpair() for _ in range(2)]
+    called: list[int] = []
+
+    def ready(which: int) -> None:
+        called.append(which)
+        ears.unwatch(pairs[1 - which][0])
+
+    for which, (ours, theirs) in enumerate(pairs):
+        ears.watch(ours, lambda which=which: ready(which))  # type: ignore[misc]
+        theirs.send(b"x")
+    assert ears.hear(1)
+    assert len(called) == 1
+    ears.close()
+    for pair in pairs:
+        for one in pair:
+            one.close()
+    assert not caplog.records
+
+
+def test_a_failed_door_is_not_heard_again(caplog: pytest.LogCaptureFixture) -> None:
+    ears = Ears()
+    ours, theirs = socket.socketpair()
+
+    def fail() -> None:
+        raise OSError("broken")
+
+    ears.watch(ours, fail)
+    theirs.send(b"x")
+    assert ears.hear(1)
+    assert "a local client's door failed" in caplog.text
+    assert not ears.hear(0)
+    ears.close()
+    ours.close()
+    theirs.close()
+
+
+def test_only_other_threads_wake_the_queue(slow: Callable[..., Slow], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A request that the queue's own thread has read finds it awake."""
+    one = slow()
+    ours, theirs = socket.socketpair()
+    woken: list[str] = []
+    wake = one.queue._ears.wake
+
+    def by_whom() -> None:
+        woken.append(threading.current_thread().name)
+        wake()
+
+    monkeypatch.setattr(one.queue._ears, "wake", by_whom)
+
+    def ready() -> None:
+        ours.recv(1)
+        one.put("heard")
+
+    one.queue.watch(ours, ready)
+    one.queue.start()
+    theirs.send(b"x")
+    wait_for(lambda: one.called("answer heard"))
+    assert woken == []
+    wait_for(lambda: one.queue._asleep)
+    one.put("other")
+    wait_for(lambda: one.called("answer other"))
+    assert woken == [threading.current_thread().name]
+    one.queue.close(timeout_s=5)
+    ours.close()
+    theirs.close()
+
+
 def test_no_descriptor_and_no_thread_is_left() -> None:
     files, running = descriptors(), running_threads()
     for lend in (False, True):

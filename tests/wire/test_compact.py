@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import struct
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -60,6 +62,47 @@ def test_acts_come_back_as_they_were_also_when_their_layout_is_known(seen: list[
                     assert theirs[name].dtype == array.dtype
                     assert not theirs[name].flags.writeable
     assert sizes[1] == COUNT.size + len(seen) * ITEM.size < sizes[0]
+
+
+def seeing(side: int, session: str = "s") -> Request:
+    return Request("act", Obs({"front": np.full((side, side, 3), side, np.uint8)}), session=session)
+
+
+def test_a_session_may_change_what_it_sees_even_within_a_message() -> None:
+    writer, reader = Writer(), Reader(Limits())
+    for sides in ((4,), (5,), (4,), (4, 5, 4), (6, 6), (4, 4)):
+        written = writer.write([seeing(side) for side in sides])
+        assert written is not None
+        read = reader.read(memoryview(written.message), placed(written))
+        assert [one.obs.cameras["front"].shape[0] for one in read if one.obs] == list(sides)
+        assert [one.obs.cameras["front"][0, 0, 0] for one in read if one.obs] == list(sides)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"rank": "simulation"}, {"session": "other"}, {"obs": Obs({"hand": np.zeros((4, 4, 3), np.uint8)})},
+     {"obs": Obs({"front": np.zeros((4, 4, 3), np.uint8)}, state={"joints": np.zeros(7)})}, {"obs": Obs()}],
+    ids=["rank", "session", "name", "more", "less"],
+)  # fmt: skip
+def test_what_is_not_like_the_last_act_has_a_layout_of_its_own(change: dict[str, Any]) -> None:
+    writer, reader = Writer(), Reader(Limits())
+    for request in (seeing(4), replace(seeing(4), **change)):
+        written = writer.write([request])
+        assert written is not None
+        assert len(written.message) > COUNT.size + ITEM.size
+        [read] = reader.read(memoryview(written.message), placed(written))
+        assert (read.session, read.rank) == (request.session, request.rank)
+        assert read.obs is not None
+        assert request.obs is not None
+        assert (list(read.obs.cameras), list(read.obs.state)) == (list(request.obs.cameras), list(request.obs.state))
+
+
+def test_nothing_of_a_message_that_travels_as_a_frame_is_taken_for_known() -> None:
+    writer = Writer()
+    assert writer.write([seeing(4), Request("reset", Obs())]) is None
+    written = writer.write([seeing(4)])
+    assert written is not None
+    assert len(Reader(Limits()).read(memoryview(written.message), placed(written))) == 1
 
 
 @pytest.mark.parametrize(
