@@ -29,7 +29,7 @@ _MESSAGE_BYTES = 128 * 1024  # the longest reply that comes in a message, and so
 _PAGE = mmap.PAGESIZE
 _CONTROL = socket.CMSG_SPACE(4)
 _LOOK_S = 150e-6  # for an answer before going to sleep
-_QUICK_S = 250e-6  # for the last answer, waking up included: the next may come while looked for
+_QUICK_S = 600e-6  # for the last answer, waking up included: the next may come while looked for
 
 
 @dataclass(slots=True)

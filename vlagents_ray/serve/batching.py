@@ -30,7 +30,7 @@ __all__ = ["BatchQueue", "HasFileno", "Rank", "Ticket"]
 logger = logging.getLogger(__name__)
 
 _LOOK_S = 100e-6  # for a next request before going to sleep
-_DENSE_S = 200e-6  # since the last one: the next is likely to come as soon
+_DENSE_S = 500e-6  # since the last one: the next is likely to come as soon
 
 
 class BatchQueue:
