@@ -13,7 +13,7 @@
 
 All carry `application`, `deployment`, `replica` and `policy`. Transport is `shm`, `plasma`, `websocket`, `http`
 or `handle`, class is `robot` or `simulation`. Counters are exact; a histogram takes, of each kind of request
-and of the batches, up to 20 values a second, drawn at random.
+and of the batches, up to 100 values a second, drawn at random.
 """
 
 from __future__ import annotations

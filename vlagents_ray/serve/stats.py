@@ -25,7 +25,7 @@ T = TypeVar("T")
 STAGES = ("decode", "queue", "inference", "encode")
 _STAGE_KEYS = [f"{stage}_ms" for stage in STAGES]
 _NOTHING = (0.0,) * len(STAGES)
-SAMPLE = 20
+SAMPLE = 100
 
 Kind = tuple[str, str, str, str]
 """Of requests: op, transport, class, "ok" or the error's code."""
