@@ -56,13 +56,16 @@ def test_prometheus_reads_requests_batches_and_load(server: Server) -> None:
         with pytest.raises(urllib.error.HTTPError, match="404"):
             urllib.request.urlopen(urllib.request.Request(f"{server.url}/v1/act", b"{}", stranger), timeout=10)
         ok = "vlagents_requests_total class={} code=ok op={} transport={}"
+        refused = "vlagents_requests_total class=robot code=unknown_session op=act transport=http"
 
         def complete() -> bool:
             now = scraped()
             return (
                 now.get(ok.format("robot", "act", "shm")) == ACTS
                 and now.get(ok.format("simulation", "act", "handle")) == ACTS
+                and now.get(refused) == 1
                 and now.get("vlagents_latency_ms_count class=simulation op=act transport=handle") == ACTS
+                and now.get("vlagents_batch_size_count") == 2 * ACTS
                 and now.get("vlagents_padding_rows_total") == 2 * ACTS
                 and now.get("vlagents_sessions transport=shm") == now.get("vlagents_sessions transport=handle") == 1
             )
@@ -71,10 +74,8 @@ def test_prometheus_reads_requests_batches_and_load(server: Server) -> None:
         now = scraped()
     assert now[ok.format("robot", "reset", "shm")] == 1
     assert now["vlagents_latency_ms_count class=robot op=act transport=shm"] == ACTS
-    assert now["vlagents_requests_total class=robot code=unknown_session op=act transport=http"] == 1
     for stage in ("decode", "queue", "inference", "encode"):
         assert now[f"vlagents_stage_ms_count stage={stage} transport=shm"] == ACTS
-    assert now["vlagents_batch_size_count"] == 2 * ACTS
     assert now["vlagents_batch_size_bucket le=1.0"] == 2 * ACTS
     assert now["vlagents_queue_depth class=robot"] == now["vlagents_queue_depth class=simulation"] == 0
     assert 0 <= now["vlagents_utilisation"] < 0.5

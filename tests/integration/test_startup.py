@@ -173,15 +173,17 @@ def test_serve_deploy_takes_the_same_file(tmp_path: Path) -> None:
     bin_dir = Path(sys.executable).parent
     environment = os.environ | {"RAY_AUTH_MODE": "disabled"}
 
-    def ray(*words: str) -> None:
-        subprocess.run(words, check=True, timeout=120, env=environment, capture_output=True)
+    def ray(*words: str, check: bool = True) -> bool:
+        done = subprocess.run(words, check=check, timeout=120, env=environment, capture_output=True)
+        return done.returncode == 0
 
     with ray_folder() as home:
         ray(
             str(bin_dir / "ray"), "start", "--head", f"--port={gcs}", f"--dashboard-port={dashboard}", "--num-cpus=2",
             f"--temp-dir={home}", "--min-worker-port=0", "--max-worker-port=0",
         )  # fmt: skip
-        ray(str(bin_dir / "serve"), "deploy", "-a", f"http://127.0.0.1:{dashboard}", str(file))
+        deploy = (str(bin_dir / "serve"), "deploy", "-a", f"http://127.0.0.1:{dashboard}", str(file))
+        wait_for(lambda: ray(*deploy, check=False), 300)  # the dashboard comes a while after `ray start` has ended
         url = f"http://127.0.0.1:{serve_port}"
         wait_for(lambda: health(url) == 200)
         with urllib.request.urlopen(f"{url}/v1/metadata", timeout=5) as answer:
