@@ -102,6 +102,21 @@ def test_a_ray_that_does_not_start_leaves_nothing(
     assert not left
 
 
+def test_a_folder_that_ray_may_not_write_is_said_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """/tmp/ray of another user's: there are no logs then, and no other attempt would do better."""
+    tries: list[object] = []
+
+    def refuse(*_: object) -> None:
+        tries.append(None)
+        raise PermissionError("/tmp/ray")
+
+    monkeypatch.setattr("ray._private.node.Node._init_temp", refuse)
+    with pytest.raises(PermissionError, match="/tmp/ray"), joined("local", num_cpus=1, include_dashboard=False):
+        pytest.fail("started")
+    assert len(tries) == 1
+    assert not ray.is_initialized()
+
+
 def test_a_helper_of_ray_leaves_the_port_alone_that_every_ray_has_for_it() -> None:
     """The second Ray on a machine would try for seconds, and go without."""
     with socket.socket() as taken:

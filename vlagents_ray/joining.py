@@ -66,7 +66,7 @@ def start_ray(**options: Any) -> None:
                 ray.init("local", **options)
         except Exception as error:  # Ray raises a bare one
             node = _node_of(error)
-            if node is None:
+            if node is None or not node.all_processes:  # nothing was started: no matter of time
                 raise
             node.kill_all_processes(check_alive=False, wait=True)  # Ray leaves them
             if isinstance(error, ValueError):  # of the options

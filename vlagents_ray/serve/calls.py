@@ -111,8 +111,7 @@ class Sender:
         return self._named(self._session_id)
 
     def _session(self, request: Request) -> str:
-        session_id = request.session or self._session_id
-        return session_id if self._caller is None else self._named(session_id)
+        return self._named(request.session or self._session_id)
 
     def _named(self, session_id: str) -> str:
         return session_id if self._caller is None else f"{self._caller.name}/{session_id}"

@@ -240,7 +240,7 @@ class LocalClient:
     def _answer(self, visit: Visit, replies: list[Reply]) -> None:
         frame, compact_form = visit.packed(replies)
         self._send(frame, compact_form)
-        visit.sent(replies)
+        visit.record(replies)
 
     def _send(self, frame: bytes, compact_form: bool) -> None:
         flags = LocalAddress.COMPACT if compact_form else 0

@@ -126,13 +126,13 @@ class Visit:
         """The replies as a frame, in which `timing` is complete."""
         self._tell_decoding(replies)
         data = encode_replies(replies, arrived=self.arrived)
-        self.sent(replies)
+        self.record(replies)
         return data
 
     def packed(self, replies: Sequence[Reply]) -> tuple[bytes, bool]:
         """The replies in compact form if they fit, else as a frame, and whether they did; `timing` is complete.
 
-        Call `sent` once they are on their way.
+        `record` them once they are on their way.
         """
         self._tell_decoding(replies)
         compact = write_answers(replies, arrived=self.arrived)
@@ -166,7 +166,7 @@ class Visit:
         reply.timing["decode_ms"] = (self._decoded - self.arrived) * 1e3
         reply.timing["encode_ms"] = (ended - begun) * 1e3
         reply.timing["total_ms"] = (ended - self.arrived) * 1e3
-        self.sent([reply])
+        self.record([reply])
 
     def _tell_decoding(self, replies: Sequence[Reply]) -> None:
         decode_ms = (self._decoded - self.arrived) * 1e3
@@ -174,8 +174,8 @@ class Visit:
             if reply.error is None:
                 reply.timing["decode_ms"] = decode_ms
 
-    def sent(self, replies: Sequence[Reply]) -> None:
-        """What is kept of the requests is kept now, when nobody waits for it."""
+    def record(self, replies: Sequence[Reply]) -> None:
+        """Keep what is kept of the requests; after their answer is sent where that can be, as nobody waits then."""
         if len(replies) != len(self._asked):  # the frame was unreadable as a whole
             self._asked = self._asked[:1]
         for (op, rank), reply in zip(self._asked, replies, strict=True):
