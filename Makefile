@@ -2,9 +2,11 @@
 #
 #   make setup [PYTHON=...] [TORCH_INDEX_URL=...] [TORCH_CUDA=1]     the environment, in .venv
 #   make demo                                                       serve a policy, evaluate it, show the table
-#   make test                                                       lint, types, layers, tests
+#   make check                                                      lint, types, layers, quick tests: no Ray, torch, simulator
+#   make test [TEST_PROCESSES=2]                                    lint, types, layers, families, all tests
 #   make families [FAMILIES="lerobot hf rcs libero openvla …"]                 tests of model families, in .venv-NAME each
-#   make bench                                                      measure, and write the README's figures anew
+#   make docs                                                       the site of docs/, in build/docs, for a browser
+#   make bench                                                      measure, and write the figures of docs/measured.md again
 #
 # Torch comes from wherever pip looks (its settings, PIP_INDEX_URL, PIP_FIND_LINKS). TORCH_INDEX_URL names
 # another index for torch alone: PyTorch's own install page gives the one with CPU-only wheels.
@@ -13,7 +15,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := setup
-.PHONY: setup demo bench test families fmt lint type clean
+.PHONY: setup demo bench check test families docs fmt lint type clean
 
 VENV ?= .venv
 TORCH ?= torch==2.13.0
@@ -22,14 +24,25 @@ TORCH_CUDA ?=
 PYTHON ?= $(shell for python in python3.11 python3; do \
 	$$python -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null && command -v $$python && break; done)
 
+NO_PYTHON := setup: found no Python 3.11; install it, or name one: make setup PYTHON=/path/to/python3.11
+
+# Tests start hundreds of interpreters, and pytest rewrites every test file: without compiled files that is half of the time.
+unexport PYTHONDONTWRITEBYTECODE
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 CONSTRAINTS := $(VENV)/constraints.txt
 STAMP := $(VENV)/.installed
+# `make check`, `lint`, `type` and `fmt` do with a smaller environment where the whole one is not installed.
+TOOLS := $(if $(wildcard $(STAMP)),$(VENV),$(VENV)-check)
+TEST_PROCESSES ?= 2
+# Quick tests wait for a third of their time.
+CHECK_PROCESSES ?= 3
+# Marked so: what wants more than Python, takes long, or wants the machine for itself (pyproject.toml, tests/support/needs.py).
+NOT_QUICK := ray or server or hosts or sim or vulkan or torch or gpu or browser or alone or slow
 # Environments of model families: requirements/NAME.txt, in $(VENV)-NAME. What is tested in each is in tests/families,
 # in folders of the family's name. Those whose code is on no package index want its source, too: OPENPI_SRC, OPENVLA_SRC,
 # OPENVLA_OFT_SRC, OCTO_SRC, DIFFUSION_POLICY_SRC, VJEPA2_SRC.
-FAMILIES ?= lerobot hf rcs libero
+FAMILIES ?= libero lerobot hf rcs
 TESTED_IN_hf := pi0 arro vjepa2_ac
 TORCH_FROM := $(if $(TORCH_INDEX_URL),--index-url $(TORCH_INDEX_URL))
 
@@ -42,46 +55,86 @@ demo: setup
 bench: setup
 	$(BIN)/vlagents-ray bench peers-setup
 	$(BIN)/vlagents-ray bench report
+	$(BIN)/python -m benchmarks.evaluation --peers all --report benchmarks/latest.json
+	$(BIN)/vlagents-ray bench report --from-json
 
-test: lint type families
+check: lint type
+	@echo '== quick tests'
+	$(TOOLS)/bin/pytest -n $(CHECK_PROCESSES) --dist loadfile --no-loadscope-reorder --hypothesis-profile=quick \
+	  -m 'not ($(NOT_QUICK))'
+
+# Lint and types in another make: this one chose their environment before there was a whole one.
+test: setup
+	@$(MAKE) --no-print-directory lint type docs families
 	@echo '== tests'
-	VLAGENTS_RAY_ENVIRONMENTS=$(abspath $(VENV)) $(BIN)/pytest
+	VLAGENTS_RAY_ENVIRONMENTS=$(abspath $(VENV)) $(BIN)/pytest -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder
 
-families: $(FAMILIES:%=family-%)
+# Environments one after the other, as each installs this folder; then the tests of two at once.
+families:
+	@$(MAKE) --no-print-directory $(FAMILIES:%=$(VENV)-%/.installed)
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync $(FAMILIES:%=family-%)
 
 family-%: $(VENV)-%/.installed
 	@echo '== tests of $(or $(TESTED_IN_$*),$*), in $(VENV)-$*'
-	$(VENV)-$*/bin/python -m pytest $(addprefix tests/families/,$(or $(TESTED_IN_$*),$*))
+	$(VENV)-$*/bin/python -m pytest -p no:cacheprovider $(addprefix tests/families/,$(or $(TESTED_IN_$*),$*))
 
-$(VENV)-%/.installed: requirements/%.txt requirements/testing.txt $(STAMP)
+# Made once for each state of the family's requirements, of what a server installs and of what `env make` adds: not removed as a mere step.
+.PRECIOUS: $(VENV)-%/.installed
+$(VENV)-%/.installed: requirements/%.txt requirements/testing.txt $(wildcard requirements/*.cpu.txt) $(VENV)/server.txt \
+    vlagents_ray/policies/base/import_fixes.py
 	$(BIN)/vlagents-ray env make $< $(addprefix --with ,requirements/testing.txt $(wildcard requirements/$*.testing.txt)) \
 	  --into $(VENV)-$*
 	@touch $@
 
-fmt: setup
-	$(BIN)/ruff check --fix .
-	$(BIN)/ruff format .
+# From the sources alone: nothing of what the reference describes is imported.
+docs: $(VENV)-docs/.installed
+	@echo '== site of docs/, into build/docs'
+	NO_MKDOCS_2_WARNING=1 $(VENV)-docs/bin/mkdocs build --quiet --strict
 
-lint: setup
+fmt: $(TOOLS)/.installed
+	$(TOOLS)/bin/ruff check --fix .
+	$(TOOLS)/bin/ruff format .
+
+lint: $(TOOLS)/.installed
 	@echo '== lint'
-	$(BIN)/ruff check .
-	$(BIN)/ruff format --check .
+	$(TOOLS)/bin/ruff check .
+	$(TOOLS)/bin/ruff format --check .
 	@echo '== layers'
-	$(BIN)/lint-imports
+	$(TOOLS)/bin/lint-imports
 
-type: setup
+type: $(TOOLS)/.installed
 	@echo '== types'
-	$(BIN)/mypy
+	$(TOOLS)/bin/mypy
 
 clean:
 	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
-	find vlagents_ray tests -type d -name __pycache__ -prune -exec rm -rf {} +
+	find vlagents_ray benchmarks tests -type d -name __pycache__ -prune -exec rm -rf {} +
 
 # Installed once for each state of pyproject.toml, under the constraints of the torch that came first.
 $(STAMP): pyproject.toml $(CONSTRAINTS)
 	@echo '== installing vlagents-ray into $(VENV)'
 	$(PIP) install --quiet --constraint $(CONSTRAINTS) --editable '.[dev]'
 	$(PIP) check
+	@touch $@
+
+# What a server installs; as old as its last change, whatever else changes in pyproject.toml.
+$(VENV)/server.txt: pyproject.toml | $(STAMP)
+	@$(BIN)/python -c 'import tomllib; project = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
+	  print(*project["dependencies"], *project["optional-dependencies"]["serve"], sep="\n")' >$@.new
+	@cmp -s $@.new $@ && rm $@.new || mv $@.new $@
+
+$(VENV)-check/.installed: pyproject.toml
+	@$(if $(PYTHON),,$(error $(NO_PYTHON)))
+	'$(PYTHON)' -m venv $(VENV)-check
+	@echo '== installing what the quick tests want into $(VENV)-check'
+	$(VENV)-check/bin/python -m pip --disable-pip-version-check install --quiet --editable '.[check]'
+	@touch $@
+
+$(VENV)-docs/.installed: pyproject.toml
+	@$(if $(PYTHON),,$(error $(NO_PYTHON)))
+	'$(PYTHON)' -m venv $(VENV)-docs
+	@echo '== installing what the site wants into $(VENV)-docs'
+	$(VENV)-docs/bin/python -m pip --disable-pip-version-check install --quiet --editable '.[docs]'
 	@touch $@
 
 # Torch first and alone, so that no other package chooses its build; the constraints hold it (and Ray, which
@@ -104,6 +157,6 @@ $(CONSTRAINTS): pyproject.toml | $(BIN)/python
 	@cat $@
 
 $(BIN)/python:
-	@[ -n '$(PYTHON)' ] || { echo 'setup: found no Python 3.11; install it, or name one: make setup PYTHON=/path/to/python3.11' >&2; exit 1; }
+	@$(if $(PYTHON),,$(error $(NO_PYTHON)))
 	'$(PYTHON)' -m venv $(VENV)
 	$(PIP) install --quiet --upgrade 'pip>=24.3'  # older ones download all of torch only to plan

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import gc
 import os
+import shutil
+import signal
+from collections.abc import Generator
 from pathlib import Path
 
+import many  # noqa: F401 - registers profiles
 import pytest
 from assets import assets
-from browser import CHROMIUM
-from cluster_hosts import no_hosts
 from fail_on_skip import pytest_make_collect_report, pytest_runtest_makereport
+from needs import left_out, nothing_else, skip_what_is_missing
+from xdist_workers import own_ray_folder, turn
 
-from vlagents_ray.envs.headless import prepare_rendering
+from vlagents_ray.envs.rendering.headless import prepare_rendering
 
 __all__ = ["pytest_make_collect_report", "pytest_runtest_makereport"]
 
@@ -19,30 +24,57 @@ __all__ = ["pytest_make_collect_report", "pytest_runtest_makereport"]
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("WANDB_MODE", "offline")
+# Ray starts a worker for each CPU before it knows what for: a second of CPU for each of the hundred Rays of a test run.
+os.environ.setdefault("RAY_prestart_worker_first_driver", "0")
+os.environ.setdefault("RAY_enable_worker_prestart", "0")
+# A shell that starts a job in the background has it, and all that it starts, ignore Ctrl-C; tests send it to servers.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 prepare_rendering()
 if (simpler := assets("simpler")) is not None:
     os.environ.setdefault("MS_ASSET_DIR", str(simpler))  # ManiSkill reads it once a process
+_RAY_FOLDER = own_ray_folder()
+
+# What takes longest goes first, so that the processes that share the tests end at about the same time; what wants the
+# machine for itself goes last, when there is nothing left to wait for.
+_ORDER = ("hosts", "server", "ray", "vulkan", "sim", "torch")
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leave out the file if `-m` leaves out all of it."""
+    return left_out(collection_path, config.option.markexpr) or None
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the files in order: a file's tests stay together, and share what it starts."""
+    files: dict[object, int] = {}
+    for item in items:
+        marked = {marker.name for marker in item.iter_markers()}
+        place = next((number for number, name in enumerate(_ORDER) if name in marked), len(_ORDER))
+        if "alone" in marked:
+            place = len(_ORDER) + 1
+        files[item.path] = min(files.get(item.path, place), place)
+    items.sort(key=lambda item: files[item.path])
+
+
+def pytest_collection_finish() -> None:
+    """Keep what was imported and collected, which lives to the end, out of every garbage collection of a test."""
+    gc.freeze()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
-    """Skip what this machine cannot run; the Vulkan device is looked for when the first test wants it."""
-    if item.get_closest_marker("gpu") and not any(Path("/dev").glob("nvidia[0-9]*")):
-        pytest.skip("no NVIDIA GPU")
-    for marker in item.iter_markers("source"):
-        [variable] = marker.args
-        if not os.environ.get(variable):
-            pytest.skip(f"{variable} names no checkout of this family's source")
-    for marker in item.iter_markers("assets"):
-        [simulator] = marker.args
-        if assets(simulator) is None:
-            pytest.skip(f"no assets of {simulator}: VLAGENTS_RAY_ASSETS names their folder")
-    if item.get_closest_marker("hosts") and (reason := no_hosts()):
-        pytest.skip(reason)
-    if item.get_closest_marker("browser") and CHROMIUM is None:
-        pytest.skip("no Chromium")
-    if item.get_closest_marker("vulkan"):
-        from vlagents_ray.envs.maniskill import ManiSkill
+    """Skip what this machine cannot run."""
+    skip_what_is_missing(item)
 
-        missing = ManiSkill.missing()
-        if missing:
-            pytest.skip(missing)
+
+@pytest.hookimpl(wrapper=True, tryfirst=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Wait for the test's turn before its time is taken."""
+    with turn(item), nothing_else(item):
+        return (yield)
+
+
+def pytest_unconfigure() -> None:
+    """Leave nothing behind."""
+    if _RAY_FOLDER is not None:
+        shutil.rmtree(_RAY_FOLDER, ignore_errors=True)

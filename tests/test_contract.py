@@ -8,16 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from vlagents_ray.contract import (
-    ActionSpec,
-    CameraSpec,
-    Contract,
-    StateSpec,
-    check_action,
-    check_observation,
-    differences,
-    require_match,
-)
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec, differences, require_match
 from vlagents_ray.errors import (
     ContractMismatch,
     InvalidAction,
@@ -25,8 +16,10 @@ from vlagents_ray.errors import (
     MalformedMessage,
     MissingCamera,
     MissingState,
+    NotOffered,
 )
 from vlagents_ray.interface import Obs
+from vlagents_ray.validation import check_action, check_observation
 
 POLICY = Contract(
     cameras={"front": CameraSpec(224, 224), "wrist": CameraSpec()},
@@ -106,6 +99,33 @@ def test_the_order_of_the_arms_survives_json_and_is_compared() -> None:
     assert "put the arms' commands into the env's order" in found
 
 
+def test_what_an_act_says_on_demand_survives_json_and_is_left_out_for_those_who_do_not_know_it() -> None:
+    policy = Contract(behaviour=("logprob", "value"))
+    assert Contract.from_json(json.loads(json.dumps(policy.to_json()))) == policy
+    assert "behaviour" not in Contract().to_json()
+
+
+@pytest.mark.parametrize(
+    ("want", "error"),
+    [
+        (["logprob"], None),
+        ([], None),
+        (["value", "logprob"], NotOffered),
+        ("logprob", InvalidObservation),
+        ([1], InvalidObservation),
+    ],
+)
+def test_only_what_the_contract_offers_may_be_wanted(want: object, error: type[Exception] | None) -> None:
+    obs, policy = Obs(info={"want": want}), Contract(behaviour=("logprob",))
+    if error is None:
+        check_observation(obs, policy)
+        return
+    with pytest.raises(error, match="info\\['want'\\]: got "):
+        check_observation(obs, policy)
+    with pytest.raises(InvalidObservation):
+        check_observation(obs, None)
+
+
 @pytest.mark.parametrize(
     "data",
     [
@@ -116,6 +136,7 @@ def test_the_order_of_the_arms_survives_json_and_is_compared() -> None:
         {"action": {"dims": 1}},
         {"action": {"arms": "left"}},
         {"action": {"arms": [1, 2]}},
+        {"behaviour": "logprob"},
     ],
 )
 def test_an_unknown_key_in_a_contract_is_malformed(data: object) -> None:
@@ -176,3 +197,38 @@ def test_an_unusable_action_never_gets_through(action: object) -> None:
 def test_no_numpy_is_left_in_the_json_of_a_contract() -> None:
     told = Contract(action=ActionSpec(dim=1, low=np.float32(-1.0)), control_hz=np.float64(20.0)).to_json()  # type: ignore[arg-type]
     assert (type(told["control_hz"]), type(told["action"]["low"])) == (float, float)
+
+
+class TestAPolicyOfSeveralPartsServedAsOne:
+    """`state` unset, so that one part stands for all numbers that the policy was trained with."""
+
+    ENV = Contract(
+        state={
+            "joints": StateSpec(7, "rad"),
+            "tquat": StateSpec(7, "m+quat_xyzw"),
+            "xyzrpy": StateSpec(6, "m+rad"),
+        },
+        gripper=True,
+    )
+
+    def test_the_parts_with_as_many_numbers_are_named(self) -> None:
+        [told] = differences(Contract(state={"joints": StateSpec(21)}), self.ENV)
+        assert told == (
+            "state 'joints': the policy needs 21 numbers, the env gives 7; if it was trained on several parts, set the "
+            "policy's `state` to them in their order: [joints, tquat, xyzrpy, gripper] has 21 numbers here"
+        )
+
+    def test_all_choices_are_told_where_there_are_several(self) -> None:
+        [told] = differences(Contract(state={"q": StateSpec(8)}), self.ENV)
+        assert "the env gives ['joints', 'tquat', 'xyzrpy']" in told
+        assert "`state` to them in their order: [joints, gripper] or [tquat, gripper] have 8 numbers here" in told
+
+    def test_where_none_fit_the_policy_is_another_ones(self) -> None:
+        [told] = differences(Contract(state={"joints": StateSpec(9)}), self.ENV)
+        assert told.endswith("the env gives 7; is this another task's or robot's policy?")
+
+    def test_where_the_parts_are_set_they_are_not_guessed(self) -> None:
+        told = differences(Contract(state={"joints": StateSpec(21), "xyzrpy": StateSpec(6)}), self.ENV)
+        assert told == [
+            "state 'joints': the policy needs 21 numbers, the env gives 7; is this another task's or robot's policy?"
+        ]

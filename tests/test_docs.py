@@ -3,19 +3,38 @@
 from __future__ import annotations
 
 import re
+import runpy
 from pathlib import Path
 
 import pytest
 import yaml
+from page_commands import PAGES, commands, read_as_typed
 
-from vlagents_ray.cli.evaluation import read_run
+from vlagents_ray.cli.evaluation.command import read_run
 from vlagents_ray.envs import metaworld
-from vlagents_ray.envs.known import known
-from vlagents_ray.envs.protocol import Protocol
+from vlagents_ray.envs.benchmark_protocol import BenchmarkProtocol
+from vlagents_ray.envs.gymnasium_registry import known
+from vlagents_ray.errors import BY_CODE, VLAgentsError
 from vlagents_ray.evaluate import EvalConfig
-from vlagents_ray.serve.environments.config import EnvironmentArgs
+from vlagents_ray.serve.config.python_env import EnvironmentArgs
 
-DOCS = Path(__file__).parents[1] / "docs"
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+README = (ROOT / "README.md").read_text()
+_ON_ONE_MACHINE = {
+    "shared memory": "shm",
+    "plasma": "plasma, Ray actor",
+    "*openpi*": "*openpi*",
+    "WebSocket, default": "websocket, default",
+    "*vlagents, shared memory*": "*vlagents shm*",
+    "*OpenVLA REST*": "*OpenVLA REST*",
+}
+_OVER_THE_LINK = {
+    "WebSocket, default": "websocket, default",
+    "HTTP, JPEG": "http, jpeg",
+    "*vlagents, JPEG*": "*vlagents JPEG*",
+    "*openpi*": "*openpi*",
+}
 BLOCKS = re.findall(r"```yaml\n(.*?)```", (DOCS / "environments.md").read_text(), re.DOTALL)
 
 
@@ -26,6 +45,40 @@ def test_an_environment_as_it_is_documented_is_accepted(block: str) -> None:
         [application] = document["applications"]
         document = application["args"]
     assert EnvironmentArgs(**document["environment"]) != EnvironmentArgs()
+
+
+@pytest.mark.parametrize("page", sorted([ROOT / "SECURITY.md", *DOCS.rglob("*.md")]), ids=lambda page: page.name)
+def test_the_tests_that_a_page_names_exist(page: Path) -> None:
+    named = set(re.findall(r"`(tests/[\w/]+\.py)`", page.read_text()))
+    assert {name for name in named if not (ROOT / name).is_file()} == set()
+    assert named or page.name != "SECURITY.md"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_the_commands_on_a_page_are_such_as_the_command_line_takes(page: Path) -> None:
+    for line, whole in commands(page.read_text()):
+        read_as_typed(line, whole=whole)
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("vlagents-ray serve noop --prot 8000", "--prot"),
+        ("vlagents-ray serve noop --port eight", "eight"),
+        ("vlagents-ray serv noop", "serv"),
+        ("vlagents-ray env make", "requirements"),
+        ("vlagents-ray eval", "FILE"),
+    ],
+)
+def test_a_command_that_is_typed_wrong_is_found(line: str, says: str) -> None:
+    with pytest.raises(ValueError, match=f"(?i){says}"):
+        read_as_typed(line, whole=True)
+
+
+def test_there_are_commands_on_the_pages() -> None:
+    found = [one for page in PAGES for one in commands(page.read_text())]
+    assert len([line for line, whole in found if whole]) > 40
+    assert len(found) > 70
 
 
 def test_there_are_such_blocks() -> None:
@@ -55,9 +108,54 @@ def test_files_of_runs_on_the_benchmarks_pages_and_on_placement_are_accepted() -
         ("gymnasium", known("FetchReach-v4").protocol),
     ],
 )
-def test_a_benchmarks_page_states_the_protocol_that_is_recorded(page: str, protocol: Protocol) -> None:
+def test_a_benchmarks_page_states_the_protocol_that_is_recorded(page: str, protocol: BenchmarkProtocol) -> None:
     text = (DOCS / "benchmarks" / f"{page}.md").read_text()
     rows = dict(re.findall(r"^\| (\w+) \| (.*) \|$", text, re.MULTILINE))
     assert re.match(r"\d+", rows["steps"]).group() == str(protocol.max_steps)  # type: ignore[union-attr]
     assert rows["rate"] == f"{protocol.control_hz:g} Hz"
     assert ("ends the episode" in rows["success"]) is protocol.ends_on_success
+
+
+@pytest.mark.parametrize(("code", "error"), sorted(BY_CODE.items()))
+def test_troubleshooting_has_every_error_with_its_status_and_a_cure(code: str, error: type[VLAgentsError]) -> None:
+    rows = re.findall(r"^\| `(\w+)` \| (\d+) \| `(\w+)` \| (.+) \| (.+) \|$", _read("troubleshooting.md"), re.MULTILINE)
+    assert [row[1:3] for row in rows if row[0] == code] == [(str(error.status), error.__name__)]
+
+
+def test_troubleshooting_has_no_error_that_is_gone() -> None:
+    assert set(re.findall(r"^\| `(\w+)` \| \d+ \|", _read("troubleshooting.md"), re.MULTILINE)) == set(BY_CODE)
+
+
+def test_the_figures_of_the_readme_are_the_measured_ones() -> None:
+    own, link = re.split(r"The same over a link", _read("measured.md"))
+    for table, names, row in (
+        (own, _ON_ONE_MACHINE, r"^\| {} \| (\S+) \|"),
+        (link, _OVER_THE_LINK, r"\| {} \| (\S+) \|$"),
+    ):
+        measured = dict(re.findall(r"^\| (\S[^|]*?) \| (\d+\.\d+) \(", table, re.MULTILINE))
+        for shown, name in names.items():
+            [figure] = re.findall(row.format(re.escape(shown)), README, re.MULTILINE)
+            assert f"{float(measured[name]):.{len(figure.partition('.')[2])}f}" == figure, shown
+
+
+def test_the_pictures_are_those_that_their_script_draws() -> None:
+    drawn = runpy.run_path(str(DOCS / "pictures" / "flows.py"))
+    for name in drawn["FLOWS"]:
+        assert (DOCS / "pictures" / f"{name}.svg").read_text() == drawn["picture"](name), f"run {drawn['__file__']}"
+
+
+def test_every_page_stands_in_the_navigation_of_the_site() -> None:
+    navigation = set(re.findall(r"[\w/]+\.md", (ROOT / "mkdocs.yml").read_text()))
+    pages = {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md")}
+    assert pages == navigation - {page.name for page in ROOT.glob("*.md")}
+
+
+@pytest.mark.parametrize("page", [*ROOT.glob("*.md"), *DOCS.rglob("*.md")], ids=lambda page: page.name)
+def test_what_a_page_links_to_exists(page: Path) -> None:
+    prose = re.sub(r"```.*?```", "", page.read_text(), flags=re.DOTALL)
+    linked = re.findall(r"\]\((?!\w+:)([^)#\s]+)", prose)
+    assert [path for path in linked if not (page.parent / path).exists()] == []
+
+
+def _read(page: str) -> str:
+    return (DOCS / page).read_text()

@@ -11,12 +11,12 @@ import yaml
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from vlagents_ray.cli.evaluation import read_run
+from vlagents_ray.cli.evaluation.command import read_run
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig
-from vlagents_ray.evaluate.cells import expand
-from vlagents_ray.evaluate.config import ClockConfig, StopConfig, TrackingConfig
+from vlagents_ray.evaluate.plan.cases import expand
+from vlagents_ray.evaluate.plan.config import ClockConfig, StopConfig, TrackingConfig
 from vlagents_ray.registry import env_suite, names
-from vlagents_ray.serve.files import read_deployment
+from vlagents_ray.serve.launch.deployment_file import read_deployment
 
 ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / "evaluations").glob("*.yaml"))

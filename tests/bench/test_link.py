@@ -42,8 +42,8 @@ def test_both_namespaces_end_with_a_bench_that_was_killed() -> None:
         assert "run it as root" in str(error)  # noqa: PT017 - a machine without namespaces has only this to show
         return
     code = (
-        "import time\nfrom vlagents_ray.bench.link import Link\n"
-        "with Link('1gbit', None) as link:\n    print(link.prefix[1], flush=True)\n    time.sleep(60)"
+        "import time\nfrom vlagents_ray.bench.link import EmulatedLink\n"
+        "with EmulatedLink('1gbit', None) as link:\n    print(link.prefix[1], flush=True)\n    time.sleep(60)"
     )
     with subprocess.Popen([*command, sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as bench:
         assert bench.stdout is not None
@@ -54,6 +54,8 @@ def test_both_namespaces_end_with_a_bench_that_was_killed() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.server
+@pytest.mark.alone
 def test_round_trips_over_a_link_or_the_reason_why_not(tmp_path: Path) -> None:
     """A slow link, so that the pixels of a call (300 kB) visibly take longer than their JPEG."""
     try:
@@ -62,7 +64,7 @@ def test_round_trips_over_a_link_or_the_reason_why_not(tmp_path: Path) -> None:
         assert "run it as root" in str(error)  # noqa: PT017 - a machine without namespaces has only this to show
         return
     told: list[str] = []
-    found = measure_link(25, rate="100mbit", peers=["openpi"], peers_python=tmp_path / "none", tell=told.append)
+    found = measure_link(25, rate="100mbit", peers=["openpi"], peers_python=tmp_path / "none", progress=told.append)
     assert 50 < found["link"]["measured_mbit_per_s"] <= 100
     medians = {way["way"]: way["median_ms"] for way in found["ways"]}
     assert medians["websocket, raw"] > 301_056 * 8 / 100e6 * 1e3  # the time that its bytes take

@@ -7,10 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from vlagents_ray.bench.clients import observation
 from vlagents_ray.bench.model import SizedConfig, SizedPolicy, build
-from vlagents_ray.bench.observing import observation
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.testing import check_agent
+
+pytestmark = pytest.mark.torch
 
 
 @pytest.fixture(name="policy", scope="module")

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.bench.test_markdown import RESULTS
-from vlagents_ray.bench.plot import check, plot_round_trips
+from tests.bench.test_report import RESULTS
+from vlagents_ray.bench.figures import check_plot_file, plot_round_trips
 from vlagents_ray.errors import ConfigError
 
 
@@ -18,6 +18,6 @@ def test_it_is_drawn(tmp_path: Path, name: str, begins: bytes) -> None:
 
 
 def test_another_suffix_is_refused_before_anything_is_measured() -> None:
-    check(None)
+    check_plot_file(None)
     with pytest.raises(ConfigError, match=r"a\.gif.*\.png"):
-        check(Path("a.gif"))
+        check_plot_file(Path("a.gif"))

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import pytest
 
-from vlagents_ray.bench.client import connect
-from vlagents_ray.bench.observing import observation
+from vlagents_ray.bench.clients import OWN_CLIENTS, connect, observation, own_clients
+from vlagents_ray.bench.line_process import Driver
+from vlagents_ray.bench.peers import installed, peer_clients
 from vlagents_ray.bench.rtt import ROUND, in_turns
-from vlagents_ray.bench.ways import WAYS, Driver, installed, peer_ways, ways
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.images import encode_jpeg
+from vlagents_ray.images.jpeg_png import encode_jpeg
 
 
 class Turns:
@@ -46,12 +46,12 @@ def test_all_take_turns_in_short_rounds_and_nobody_is_always_the_first() -> None
 
 
 def test_ways_have_names_of_their_own() -> None:
-    assert len({way.name for way in WAYS}) == len(WAYS)
-    found, skipped = ways()
-    assert {way.name for way in found} | set(skipped) == {way.name for way in WAYS}
-    assert [way.transport for way in ways(["shm"])[0]] == ["shm", "shm"]
+    assert len({way.name for way in OWN_CLIENTS}) == len(OWN_CLIENTS)
+    found, skipped = own_clients()
+    assert {way.name for way in found} | set(skipped) == {way.name for way in OWN_CLIENTS}
+    assert [way.transport for way in own_clients(["shm"])[0]] == ["shm", "shm"]
     with pytest.raises(ConfigError, match="carrier pigeon"):
-        ways(["carrier pigeon"])
+        own_clients(["carrier pigeon"])
 
 
 def test_a_codec_is_written_in_words() -> None:
@@ -62,15 +62,15 @@ def test_a_codec_is_written_in_words() -> None:
 
 def test_peers_are_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"vlagent'.*want some of"):
-        peer_ways(["vlagent"], tmp_path)
-    assert peer_ways([], tmp_path) == ([], {}, {})
+        peer_clients(["vlagent"], tmp_path)
+    assert peer_clients([], tmp_path) == ([], {}, {})
 
 
 def test_a_peer_that_is_not_installed_is_skipped_by_name_with_the_cure(tmp_path: Path) -> None:
-    found, skipped, _ = peer_ways(["openpi"], tmp_path / "python")
+    found, skipped, _ = peer_clients(["openpi"], tmp_path / "python")
     assert found == []
     assert "peers-setup" in skipped["openpi"]
-    found, skipped, _ = peer_ways(["vlagents"], Path(sys.executable))  # rpyc conflicts with nothing, but is not here
+    found, skipped, _ = peer_clients(["vlagents"], Path(sys.executable))  # rpyc conflicts with nothing, but is not here
     assert found == []
     assert set(skipped) == {"vlagents"}
     assert "vlagents, rpyc not installed" in skipped["vlagents"]

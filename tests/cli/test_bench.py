@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
+
 import pytest
 from typer.testing import CliRunner
 
+from vlagents_ray.cli.bench import _MOVED
 from vlagents_ray.cli.main import app
 
 
@@ -14,7 +17,6 @@ from vlagents_ray.cli.main import app
         (["rtt", "--peers", "nobody"], "nobody"),
         (["rtt", "--transports", "smoke"], "smoke"),
         (["rtt", "--plot", "a.gif"], ".png"),
-        (["hop", "--python", "nowhere"], "nowhere"),
         (["throughput", "--clients", "few"], "few"),
         (["policy", "noop", "--batch", "0"], "from 1"),
         (["policy", "noop", "--state", "joints=some"], "joints"),
@@ -22,12 +24,7 @@ from vlagents_ray.cli.main import app
         (["throughput", "--config", "{"], "JSON"),
         (["throughput", "--config", '{"base_ms": 1}'], "--policy"),
         (["throughput", "--model", "huge"], "size"),
-        (["evaluation", "--episodes", "5"], "multiple of the 2 workers"),
-        (["evaluation", "--peers", "nobody"], "nobody"),
         (["report", "--readme", "nowhere.md"], "nowhere.md"),
-        (["scaling", "--workers", "2,4"], "from 1 on"),
-        (["scaling", "--nodes", "none"], "--nodes"),
-        (["autoscaling", "--plot", "a.gif"], ".png"),
     ],
 )
 def test_mistakes_are_told_in_a_line(words: list[str], text: str) -> None:
@@ -35,3 +32,24 @@ def test_mistakes_are_told_in_a_line(words: list[str], text: str) -> None:
     assert done.exit_code == 2, done.output
     assert text in done.stderr
     assert "Traceback" not in done.output
+
+
+@pytest.mark.parametrize(
+    ("words", "instead"),
+    [
+        (["soak", "--episodes", "1000"], "python -m benchmarks.soak --episodes 1000"),
+        (
+            ["eval", "maniskill/PushCube-v1", "--rounds", "5"],
+            "python -m benchmarks.overhead maniskill/PushCube-v1 --rounds 5",
+        ),
+        (["scaling", "--help"], "python -m benchmarks.scaling"),
+    ],
+)
+def test_what_is_no_user_measurement_any_more_names_the_module_to_run(words: list[str], instead: str) -> None:
+    done = CliRunner().invoke(app, ["bench", *words])
+    assert instead in " ".join(done.output.split())
+    assert done.exit_code == (0 if "--help" in words else 2)
+
+
+def test_every_command_that_moved_is_a_module_of_benchmarks() -> None:
+    assert all(importlib.util.find_spec(f"benchmarks.{module}") for module in _MOVED.values())

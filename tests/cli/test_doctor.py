@@ -9,11 +9,13 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from vlagents_ray.cli import doctor, machine
-from vlagents_ray.cli.doctor import Check
-from vlagents_ray.envs import probe
-from vlagents_ray.envs.egl import EglDevice
+from vlagents_ray.cli.doctor import checks as doctor
+from vlagents_ray.cli.doctor import machine
+from vlagents_ray.cli.doctor.machine import Check
+from vlagents_ray.envs.rendering import render_probe
+from vlagents_ray.envs.rendering.egl import EglDevice
 from vlagents_ray.errors import MissingDependency
+from vlagents_ray.serve.ports import free_port
 
 GB = machine.GB
 
@@ -33,6 +35,8 @@ def table(monkeypatch: pytest.MonkeyPatch, *rows: Check) -> tuple[int, str]:
 
 
 @pytest.mark.slow
+@pytest.mark.ray
+@pytest.mark.sim
 def test_every_check_gives_a_row_of_its_own_and_none_breaks() -> None:
     rows = list(doctor.checks(port=0))
     names = [row.name for row in rows]
@@ -136,8 +140,8 @@ def test_a_machine_on_which_workers_without_a_gpu_could_not_render_is_told(
     monkeypatch: pytest.MonkeyPatch, software: bool, status: str
 ) -> None:
     devices = (EglDevice(0, software=False, cuda=0), *([EglDevice(1, software=True, cuda=None)] if software else []))
-    found = probe.Probe("egl", ok=True, seconds=1.0, device="NVIDIA H200/PCIe/SSE2", devices=devices)
-    monkeypatch.setattr(probe, "egl_probe", lambda: found)
+    found = render_probe.RenderProbe("egl", ok=True, seconds=1.0, device="NVIDIA H200/PCIe/SSE2", devices=devices)
+    monkeypatch.setattr(render_probe, "egl_probe", lambda: found)
     row = doctor.egl()
     assert row.status == status
     assert ("gpus: 0.25" in row.cure) is not software
@@ -187,8 +191,8 @@ def test_open_files_count_as_ray_will_raise_them(soft: int, hard: int, status: s
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_taken_port_names_its_holder_and_another_port() -> None:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        port = server.getsockname()[1]
+    port = free_port()  # no other process takes it meanwhile
+    with socket.create_server(("127.0.0.1", port)):
         row = machine.port_free(port)
     assert row.status == "warn"
     assert f"pid {os.getpid()}" in row.detail

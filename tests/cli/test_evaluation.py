@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import inspect
+import sqlite3
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NoReturn
@@ -11,16 +14,21 @@ import pytest
 from typer.testing import CliRunner
 
 import vlagents_ray.evaluate
-from vlagents_ray.cli import evaluation, watching
+from vlagents_ray.cli.evaluation import command, policies, run, watch
 from vlagents_ray.cli.main import app
-from vlagents_ray.evaluate import EvalConfig, OutOfTime
+from vlagents_ray.evaluate import EvalConfig, OutOfTime, PolicyConfig, Results, SuiteConfig, WorkerConfig
+from vlagents_ray.evaluate.episode.failures import Failure
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.results.store import Store
+from vlagents_ray.evaluate.results.summary import summarize
 
 WORDS = ["eval", "tabletop", "--policy", "http://127.0.0.1:9"]
 
 
 def test_no_retry_is_a_number_of_retries(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     seen: list[EvalConfig] = []
-    monkeypatch.setattr(evaluation, "run_evaluation", lambda config, _address, **_: seen.append(config))
+    monkeypatch.setattr(run, "run_evaluation", lambda config, _address, **_: seen.append(config))
     done = CliRunner().invoke(app, [*WORDS, "--out", str(tmp_path / "out"), "--retries", "0"])
     assert done.exit_code == 0, done.output
     assert [config.retries for config in seen] == [0]
@@ -30,7 +38,7 @@ def test_workers_take_the_resources_that_are_said_unless_the_file_says_more(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     seen: list[EvalConfig] = []
-    monkeypatch.setattr(evaluation, "run_evaluation", lambda config, _address, **_: seen.append(config))
+    monkeypatch.setattr(run, "run_evaluation", lambda config, _address, **_: seen.append(config))
     file = tmp_path / "runs.yaml"
     suites = "{envs: [tabletop]}, {name: b, envs: [tabletop], worker: {threads: 2}}"
     more = "{name: c, envs: [tabletop], worker: {cpus: 3}}"
@@ -46,7 +54,7 @@ def test_a_checkpoint_may_count_at_once_and_the_first_step_be_the_last(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     seen: list[dict[str, Any]] = []
-    monkeypatch.setattr(watching, "watch_training", lambda *_args, **options: seen.append(options))
+    monkeypatch.setattr(watch, "watch_training", lambda *_args, **options: seen.append(options))
     words = [*WORDS, "--out", str(tmp_path / "out"), "--watch", str(tmp_path), "--settle", "0", "--until", "0"]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
@@ -62,12 +70,98 @@ def test_out_of_time_has_an_exit_status_of_its_own(monkeypatch: pytest.MonkeyPat
 
     monkeypatch.setattr(vlagents_ray.evaluate, "evaluate", evaluate)
     monkeypatch.setattr(vlagents_ray.evaluate, "print_summary", lambda *_: None)
-    monkeypatch.setattr(evaluation, "served", lambda config, *_, **__: contextlib.nullcontext(config))
+    monkeypatch.setattr(run, "served", lambda config, *_, **__: contextlib.nullcontext(config))
     words = [*WORDS, "--out", str(tmp_path / "out"), "--end-at", "2027-01-31T18:30+00:00"]
     done = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
     assert done.exit_code == 75, done.output
     assert ends == [1_801_420_200.0]
     assert "out of time after 3 of 9 episodes; go on with --resume" in " ".join(done.stderr.split())
+
+
+@pytest.mark.parametrize(
+    ("env", "policy", "said"),
+    [
+        ("tabletop", ["noop"], "'noop' in 'tabletop': policy and env do not fit: - action.dim: the policy gives 7"),
+        ("libero/libero_spatial/0", ["noop", "--set", "action_dim=4"], "the policy gives 4, the env takes 7"),
+    ],
+)
+def test_a_policy_that_does_not_fit_is_told_before_anything_starts(
+    env: str, policy: list[str], said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(policies, "running_server", lambda *_, **__: pytest.fail("started a server"))
+    words = ["eval", env, "--policy", *policy, "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
+    assert done.exit_code == 1, done.output
+    assert said in " ".join(done.stderr.split())
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_file_of_several_policies_is_refused_with_its_cure(tmp_path: Path) -> None:
+    app_of = "{{name: {0}, route_prefix: /{0}, import_path: 'vlagents_ray.serve.app:build', args: {{policy: noop}}}}"
+    file = tmp_path / "two.yaml"
+    file.write_text(f"applications: [{app_of.format('a')}, {app_of.format('b')}]")
+    done = CliRunner().invoke(app, ["eval", "tabletop", "--policy", str(file), "--out", str(tmp_path / "out")])
+    assert done.exit_code == 2, done.output
+    assert "want one application" in " ".join(done.stderr.split())
+
+
+def lost(out: Path, **changes: Any) -> EvalConfig:
+    """Record every episode of two cells but one, which infrastructure lost."""
+    of_a = [{"name": "a", "url": "http://127.0.0.1:9"}]
+    suites = [{"envs": ["tabletop"], "episodes": 4}]
+    config = EvalConfig.model_validate({"policies": of_a, "suites": suites, "out": out, **changes})
+    with Store(config) as store:
+        store.begin_run(config, {})
+        first, *others = plan(store.cells)
+        failure = Failure("worker", "env_failed", "env step: RuntimeError: it exploded\nand more", "")
+        store.record_attempt(first, failure, retried=False)
+        store.record(EpisodeResult(first.key, "infra_failed", error="env_failed: it exploded"), 4)
+        for job in others:
+            store.record(EpisodeResult(job.key, "done", True, True, 3), 1)
+        store.end_run("complete")
+    return config
+
+
+def end_of(config: EvalConfig, monkeypatch: pytest.MonkeyPatch) -> tuple[int, str]:
+    """The exit status of `eval` and what it said at last, after an evaluation that left these results."""
+    summary = summarize(Results.load(config.out))
+    monkeypatch.setattr(vlagents_ray.evaluate, "evaluate", lambda *_args, **_options: summary)
+    monkeypatch.setattr(command, "config_from_options", lambda *_: config)
+    monkeypatch.setattr(run, "served", lambda config, *_, **__: contextlib.nullcontext(config))
+    done = CliRunner().invoke(app, [*WORDS, "--out", str(config.out)], env={"COLUMNS": "200"})
+    assert "Traceback" not in done.output
+    return done.exit_code, " ".join(done.stderr.split())
+
+
+def test_an_episode_without_a_result_ends_the_command_with_status_1(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    status, said = end_of(lost(tmp_path), monkeypatch)
+    assert status == 1
+    assert said == (
+        "error 1 of 4 episodes have no result: lost to infrastructure, the last one to env_failed: "
+        "env step: RuntimeError: it exploded; the report lists every attempt under Errors, --resume tries them again"
+    )
+
+
+def test_a_cell_that_stopped_early_misses_nothing(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    config = lost(tmp_path, stop={"target": 0.01, "at_least": 1})
+    with Store(config.model_copy(update={"resume": True})) as store:
+        store.record(EpisodeResult(plan(store.cells)[0].key, "done", True, True, 3), 1)
+    [cell] = Results.load(tmp_path).cells
+    assert cell.stopped_at is not None
+    with closing(sqlite3.connect(tmp_path / "results.db")) as db, db:
+        db.execute("DELETE FROM episodes WHERE episode >= ?", (cell.stopped_at,))
+    assert end_of(config, monkeypatch) == (0, "")
+
+
+def test_only_what_was_asked_for_now_is_missed(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    config = lost(tmp_path)
+    other = config.model_copy(update={"resume": True, "suites": [SuiteConfig(envs=["tabletop"], name="b", seeds=[9])]})
+    with Store(other) as store:
+        for job in plan(store.cells):
+            store.record(EpisodeResult(job.key, "done", True, True, 3), 1)
+    assert end_of(other, monkeypatch) == (0, "")
 
 
 @pytest.mark.parametrize(
@@ -82,3 +176,24 @@ def test_options_that_cannot_hold_are_told(words: list[str], text: str, tmp_path
     done = CliRunner().invoke(app, [*WORDS, "--out", str(tmp_path / "out"), *words], env={"COLUMNS": "200"})
     assert done.exit_code == 2, done.output
     assert text in done.stderr
+
+
+def test_each_option_that_is_a_setting_is_one_of_a_single_model() -> None:
+    models = (EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig)
+    places = {
+        option: [model.__name__ for model in models if option in model.model_fields]
+        for option in inspect.signature(command.evaluate_command).parameters
+    }
+    of_the_run_itself = {
+        "what",
+        "watch",
+        "until",
+        "settle",
+        "marker",
+        "dry_run",
+        "end_at",
+        "replica_per_gpu",
+        "address",
+    }
+    assert {option for option, found in places.items() if len(found) != 1} == of_the_run_itself
+    assert all(not places[option] for option in of_the_run_itself)

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import pytest
 from typer.testing import CliRunner, Result
 
 from vlagents_ray import Forbidden, Unauthorized
 from vlagents_ray.cli.main import app
-from vlagents_ray.serve.auth import Keys
+from vlagents_ray.serve.access.api_keys import Keys
+from vlagents_ray.serve.config.deployment import AccessArgs
+from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.server import _access
 
 
 def keys(*words: str) -> Result:
@@ -34,11 +38,23 @@ def test_a_key_is_printed_once_listed_without_it_and_revoked(tmp_path: Path) -> 
         Keys.from_file(file).check(token, "pi0")
 
 
+def test_a_key_may_push_weights_if_it_is_made_for_that(tmp_path: Path) -> None:
+    file = tmp_path / "keys.json"
+    tokens = [keys("new", *words, "--file", str(file)).stdout.strip() for words in (["a", "--scope", "weights"], ["b"])]
+    learner, robot = (Keys.from_file(file).check(token, "pi0") for token in tokens)
+    learner.admit(scope="weights")
+    robot.admit()
+    with pytest.raises(Forbidden, match="lacks the scope 'weights'"):
+        robot.admit(scope="weights")
+    assert "weights" in keys("list", "--file", str(file)).stdout
+
+
 @pytest.mark.parametrize(
     ("words", "text"),
     [
         (["new", "a b"], "letters"),
         (["new", "arm", "--rank", "king"], "robot"),
+        (["new", "arm", "--scope", "root"], "weights"),
         (["new", "arm", "--rate", "-1"], "positive"),
         (["revoke", "arm"], "keys new"),
         (["list"], "keys new"),
@@ -65,3 +81,22 @@ def test_a_server_that_would_not_be_safe_does_not_start(words: list[str], text: 
     done = CliRunner().invoke(app, ["serve", "noop", *words])
     assert done.exit_code == 2, done.output
     assert text in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("stated", "options", "found"),
+    [
+        ({}, (None, False, False), None),
+        ({}, (Path("/k"), False, True), {"keys_file": "/k", "insecure": False, "plain_http": True}),
+        ({"hosts": ["a.b"]}, (None, True, False), {"hosts": ["a.b"], "keys_file": None, "insecure": True}),
+        ({"keys_file": "/k"}, (None, False, True), {"keys_file": "/k", "plain_http": True}),
+        ({"insecure": True}, (Path("/k"), False, False), {"keys_file": "/k", "insecure": False}),
+    ],
+)
+def test_the_command_line_overrules_what_the_file_says_of_keys_and_no_more(
+    stated: dict[str, Any], options: tuple[Path | None, bool, bool], found: dict[str, Any] | None
+) -> None:
+    config = deployment("noop", **({"access": stated} if stated else {}))
+    [app] = _access(config, *options).applications
+    assert app.args.get("access") == found
+    AccessArgs(**(found or {}))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from recorded import record, runs
+from recorded_results import record, runs
 from typer.testing import CliRunner, Result
 
 from vlagents_ray.cli.main import app

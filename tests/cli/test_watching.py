@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
+import yaml
+from eval_fakes import LINE
 
-from vlagents_ray.cli.watching import watch_training
+from vlagents_ray.cli.evaluation import watch
+from vlagents_ray.cli.evaluation.policies import resolve_policies
+from vlagents_ray.cli.evaluation.watch import _watched, watch_training
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.evaluate import EvalConfig, Results, Summary
+from vlagents_ray.evaluate.episode.records import EpisodeResult, Status
+from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.results.store import Store
+from vlagents_ray.evaluate.results.summary import summarize
+from vlagents_ray.policies.base import ModelConfig
+from vlagents_ray.registry import POLICIES, policy_class
+from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH, own_settings, read_deployment
 
 SWEPT = {"name": "swept", "url": "http://127.0.0.1:9", "checkpoint": "/runs/{step}"}
 FIXED = {"name": "fixed", "url": "http://127.0.0.1:9", "checkpoint": "/runs/9"}
@@ -45,3 +58,82 @@ def test_results_of_before_are_told_before_the_first_checkpoint_is_there(tmp_pat
     config = EvalConfig.model_validate({"policies": [SWEPT], "suites": [{"envs": ["tabletop"]}], "out": tmp_path})
     with pytest.raises(ConfigError, match="resume them"):
         watch_training(config, tmp_path / "runs")
+
+
+def test_an_episode_lost_in_any_round_ends_watching_with_status_1_and_no_round_early(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    config = EvalConfig.model_validate({"policies": [SWEPT], "suites": [{"envs": [LINE]}], "out": tmp_path / "o"})
+    played: list[list[int]] = []
+
+    def play(config: EvalConfig) -> Summary:
+        played.append(config.policies[0].steps)
+        with Store(config) as store:
+            store.begin_run(config, {})
+            for job in plan(store.cells):
+                status: Status = "infra_failed" if job.cell.step == 10 and job.key.episode == 3 else "done"
+                store.record(EpisodeResult(job.key, status, status == "done"), 1)
+            store.end_run("complete")
+        return summarize(Results.load(config.out))
+
+    monkeypatch.setattr(watch, "evaluate_and_print", play)
+    monkeypatch.setattr(watch, "rounds", lambda *_: iter([[10], [20, 30]]))
+    monkeypatch.setattr(watch, "served", lambda config, *_: contextlib.nullcontext(config))
+    monkeypatch.setattr(watch, "ray_cluster", lambda _config: contextlib.nullcontext())
+    with pytest.raises(typer.Exit) as ended:
+        watch_training(config, tmp_path)
+    assert played == [[10], [20, 30]]
+    assert ended.value.exit_code == 1
+
+
+FAMILIES = sorted(
+    name for name in POLICIES if issubclass(getattr(policy_class(name), "Config", None) or object, ModelConfig)
+)
+NEEDED = {"openpi": {"config": "pi0_droid"}}  # settings that a family has no default for, beside the checkpoint
+
+
+def swept(family: str, tmp_path: Path, place: str, **settings: Any) -> EvalConfig:
+    """A sweep over one policy, whose settings are in the evaluation's file or in the deployment file."""
+    own = {"checkpoint": "/runs/{step}/pretrained_model", **NEEDED.get(family, {}), **settings}
+    policy: dict[str, Any] = {"name": "swept", "source": family, "config": own}
+    if place == "deployment":
+        file = tmp_path / "policy.yaml"
+        args = {"policy": family, "config": own}
+        file.write_text(yaml.safe_dump({"applications": [{"name": "a", "import_path": IMPORT_PATH, "args": args}]}))
+        policy = {"name": "swept", "source": str(file)}
+    return EvalConfig.model_validate(
+        {"policies": [policy], "suites": [{"envs": ["tabletop"]}], "out": tmp_path / "out"}
+    )
+
+
+@pytest.mark.parametrize("place", ["evaluation", "deployment"])
+@pytest.mark.parametrize("family", FAMILIES)
+class TestTheStepOfABuiltInFamily:
+    def test_it_is_not_missed_before_the_first_checkpoint_is_there(
+        self, family: str, place: str, tmp_path: Path
+    ) -> None:
+        assert _watched(swept(family, tmp_path, place)) == (0, "/runs/{step}/pretrained_model")
+
+    def test_all_other_settings_are_checked_before_that(self, family: str, place: str, tmp_path: Path) -> None:
+        with pytest.raises(ConfigError, match="chekpoint_dir"):
+            _watched(swept(family, tmp_path, place, chekpoint_dir="/runs"))
+        with pytest.raises(ConfigError, match="max_rows"):
+            _watched(swept(family, tmp_path, place, max_rows=0))
+
+    def test_the_first_step_of_a_sweep_is_the_deployments_own(self, family: str, place: str, tmp_path: Path) -> None:
+        config = swept(family, tmp_path, place)
+        policies = [config.policies[0].model_copy(update={"steps": [30, 60]})]
+        _, parts = resolve_policies(config.model_copy(update={"policies": policies}))
+        assert own_settings(parts["swept"].applications[0])["checkpoint_step"] == 30
+
+    def test_without_a_sweep_it_is_missed(self, family: str, place: str, tmp_path: Path) -> None:
+        config = swept(family, tmp_path, place)
+        with pytest.raises(ConfigError, match="checkpoint_step None: give both"):
+            resolve_policies(config)
+        if place == "deployment":
+            with pytest.raises(ConfigError, match="checkpoint_step None: give both"):
+                read_deployment(str(config.policies[0].source))
+
+
+def test_the_families_with_checkpoints_are_found() -> None:
+    assert {"lerobot", "openpi", "openvla", "pi0", "octo", "diffusion_policy"} <= set(FAMILIES)

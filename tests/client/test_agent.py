@@ -5,10 +5,16 @@ from __future__ import annotations
 import pytest
 
 from vlagents_ray import ConfigError, NotReset, Obs, PolicyUnavailable, RemoteAgent
-from vlagents_ray.client.link import Wish
-from vlagents_ray.client.ways import TransportName
+from vlagents_ray.client.credentials import warn_of_plain_http
+from vlagents_ray.client.transports.codec_selection import CodecName
+from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.errors import InvalidInput
-from vlagents_ray.wire.codecs import JPEG, LOSSLESS, RAW, ImageCodec
+from vlagents_ray.images.codecs import (
+    JPEG,
+    LOSSLESS,
+    RAW,
+    ImageCodec,
+)
 
 
 @pytest.mark.parametrize(
@@ -53,7 +59,7 @@ def test_what_does_not_go_together_is_refused_at_once(url: str, transport: Trans
         (ImageCodec("jpeg", 50, "420"), ImageCodec("jpeg", 50, "420")),
     ],
 )
-def test_a_codec_is_forced_or_waits_for_the_link(codec: ImageCodec | Wish, forced: ImageCodec | None) -> None:
+def test_a_codec_is_forced_or_waits_for_the_link(codec: ImageCodec | CodecName, forced: ImageCodec | None) -> None:
     agent = RemoteAgent("http://gpu-box:8000", codec=codec)
     assert agent.codec == forced
     assert agent.link is None
@@ -78,3 +84,25 @@ def test_outside_a_cluster_a_serve_url_says_what_to_do() -> None:
 def test_a_server_that_is_not_there_is_waited_for_only_so_long(transport: TransportName) -> None:
     with pytest.raises(PolicyUnavailable, match=r"not ready within 0\.2 s"):
         RemoteAgent("http://127.0.0.1:9", transport=transport, connect_timeout_s=0.2).reset(Obs())
+
+
+@pytest.mark.parametrize(
+    ("url", "key", "warned"),
+    [
+        ("http://robot-box:8001", "vlr_k", True),
+        ("ws://192.0.2.1:8001", "vlr_k", True),
+        ("https://robot-box:8001", "vlr_k", False),
+        ("http://127.0.0.1:8001", "vlr_k", False),
+        ("http://localhost:8001", "vlr_k", False),
+        ("http://robot-box:8002", "", False),
+    ],
+)
+def test_a_key_that_goes_unencrypted_over_a_network_is_warned_of_once(
+    url: str, key: str, warned: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    warn_of_plain_http.cache_clear()
+    for _ in range(3):
+        RemoteAgent(url, api_key=key)
+    lines = [record.getMessage() for record in caplog.records if "unencrypted" in record.getMessage()]
+    assert len(lines) == warned
+    assert "vlr_k" not in caplog.text

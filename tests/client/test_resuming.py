@@ -10,20 +10,25 @@ from typing import Any
 
 import numpy as np
 import pytest
-from in_process import Replicas
+from in_process_replicas import InProcess, Replicas
 
 from vlagents_ray import (
     Act,
     Agent,
     ConfigError,
     ConnectionLost,
+    DeadlineExceeded,
     InvalidObservation,
     NotReset,
     Obs,
     PolicyFailed,
     PolicyUnavailable,
+    UnknownSession,
 )
+from vlagents_ray.client import connection
 from vlagents_ray.contract import Contract
+from vlagents_ray.errors import NoReplica
+from vlagents_ray.serve.scaling import session_migration
 
 
 class Window(Agent):
@@ -72,7 +77,7 @@ def test_a_session_of_a_replica_that_stops_moves_with_all_it_has(replicas: Calla
     agent = served.agent()
     agent.reset(obs(1), "stack", seed=3)
     drawn = [agent.act(obs(value)).info["random"] for value in (2, 3)]
-    served.engines[0].draining = True
+    served.engines[0].drain()
     for value in (4, 5, 6, 7):
         act = agent.act(obs(value))
         assert "resumed" not in act.info
@@ -98,6 +103,134 @@ def test_a_session_of_a_dead_replica_begins_again_and_sees_its_history(replicas:
     assert act.action.tolist() == [3, 4, 5]
     assert act.info["instruction"] == "stack"
     assert "resumed" not in agent.act(obs(6)).info
+    agent.close()
+
+
+def test_the_first_action_since_says_that_the_session_began_again_though_its_own_act_got_none(
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = replicas(2)
+    agent = served.agent()
+    agent.reset(obs(1), "stack")
+    served.dead.add(0)
+    call, broken = InProcess.call, True
+
+    def too_late(self: InProcess, requests: Any, timeout_s: float) -> Any:
+        replies = call(self, requests, timeout_s)
+        if broken and requests[0].op == "act" and replies[0].act is not None:
+            raise DeadlineExceeded("no answer in time")
+        return replies
+
+    monkeypatch.setattr(InProcess, "call", too_late)
+    with pytest.raises(DeadlineExceeded):
+        agent.act(obs(2))
+    broken = False
+    assert agent.act(obs(3)).info["resumed"]
+    assert "resumed" not in agent.act(obs(4)).info
+    agent.close()
+
+
+@pytest.mark.parametrize("executed", [False, True])
+def test_a_session_that_did_not_begin_again_in_time_says_so_with_the_next_act(
+    executed: bool, replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beside load the reset's deadline passes, and the next act comes while the reset is in the queue, or after it."""
+    served = replicas(2)
+    agent = served.agent()
+    agent.reset(obs(1), "stack")
+    served.dead.add(0)
+    call, late = InProcess.call, [True]
+
+    def too_late(self: InProcess, requests: Any, timeout_s: float) -> Any:
+        if requests[0].op == "reset" and late and late.pop():
+            if executed:
+                call(self, requests, timeout_s)
+            else:
+                served.engines[1].sessions.open(requests[0].session)
+            raise DeadlineExceeded("no answer in time")
+        return call(self, requests, timeout_s)
+
+    monkeypatch.setattr(InProcess, "call", too_late)
+    with pytest.raises(DeadlineExceeded):
+        agent.act(obs(2))
+    assert not late, "it was not to begin again"
+    act = agent.act(obs(3))
+    assert (act.info["resumed"], act.info["instruction"], act.info["acts"]) == (True, "stack", 1)
+    agent.close()
+
+
+def test_an_act_without_time_to_begin_again_exceeds_its_deadline_and_asks_for_no_reset(
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another replica has looked for the session until the deadline, and says then that it is unknown."""
+    served = replicas(2)
+    agent = served.agent()
+    agent.reset(obs(1), "stack")
+    served.dead.add(0)
+    call, late = InProcess.call, [True]
+
+    def unknown(self: InProcess, requests: Any, timeout_s: float) -> Any:
+        replies = call(self, requests, timeout_s)
+        if late and isinstance(replies[0].error, UnknownSession):
+            late.pop()
+            time.sleep(timeout_s)
+        return replies
+
+    monkeypatch.setattr(InProcess, "call", unknown)
+    agent._connection.timeout_s = 1.0
+    with pytest.raises(DeadlineExceeded, match="the next act does"):
+        agent.act(obs(2))
+    assert not late
+    agent._connection.timeout_s = 30.0
+    assert agent.act(obs(3)).info["resumed"]
+    agent.close()
+
+
+def test_an_act_for_which_little_time_is_left_is_not_sent_again(
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would arrive, and be executed, when its caller has given up."""
+    served = replicas(2)
+    agent = served.agent()
+    agent.reset(obs(1), "stack")
+    served.dead.add(0)
+    call, sent = InProcess.call, []
+
+    def slow_reset(self: InProcess, requests: Any, timeout_s: float) -> Any:
+        sent.append(requests[0].op)
+        replies = call(self, requests, timeout_s)
+        if requests[0].op == "reset" and len(sent) < 4:
+            time.sleep(0.9 * timeout_s)
+        return replies
+
+    monkeypatch.setattr(InProcess, "call", slow_reset)
+    agent._connection.timeout_s = 1.0
+    with pytest.raises(DeadlineExceeded, match="did not begin again"):
+        agent.act(obs(2))
+    assert sent == ["act", "act", "reset"]
+    agent._connection.timeout_s = 30.0
+    act = agent.act(obs(3))
+    assert (act.info["resumed"], act.info["instruction"], act.info["acts"]) == (True, "stack", 1)
+    agent.close()
+
+
+def test_a_reset_waits_for_a_replica_while_none_runs_but_not_for_room_at_a_full_one(
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refusals: list[PolicyUnavailable] = [PolicyUnavailable("full"), NoReplica("none runs"), NoReplica("none runs")]
+    call = InProcess.call
+
+    def refuse(self: InProcess, requests: Any, timeout_s: float) -> Any:
+        if refusals:
+            raise refusals.pop()
+        return call(self, requests, timeout_s)
+
+    agent = replicas(1).agent()
+    monkeypatch.setattr(InProcess, "call", refuse)
+    with pytest.raises(PolicyUnavailable, match="full"):
+        agent.reset(obs(1), "stack")
+    refusals.append(NoReplica("none runs"))
+    assert agent.reset(obs(1), "stack")["instruction"] == "stack"
     agent.close()
 
 
@@ -132,13 +265,14 @@ def test_when_nobody_lives_the_loss_is_raised_in_time_and_a_later_act_goes_on(
 ) -> None:
     served = replicas(1)
     agent = served.agent()
-    agent._connection.timeout_s = 0.3
     agent.reset(obs(1), "stack")
     agent.act(obs(2))
     served.dead.add(0)
+    agent._connection.timeout_s = 0.3
     with pytest.raises((ConnectionLost, PolicyUnavailable)):
         agent.act(obs(3))
     served.dead.clear()
+    agent._connection.timeout_s = 30.0
     act = agent.act(obs(4))
     assert act.action.tolist() == [1, 2, 4]
     agent.close()
@@ -175,6 +309,26 @@ def test_an_observation_may_allow_less_time(replicas: Callable[[int], Replicas])
     hasty.info["deadline_ms"] = -1
     with pytest.raises(InvalidObservation, match="deadline_ms"):
         agent.act(hasty)
+    agent.close()
+
+
+@pytest.mark.parametrize(("timeout_s", "way_s"), [(0.1, 0.01), (2.0, 0.2), (30.0, 0.2)])
+def test_the_server_gives_a_call_up_before_its_caller_does(
+    timeout_s: float, way_s: float, replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By a handle, and over HTTP, nobody knows how long a request was under way: it was acted on after its deadline."""
+    agent = replicas(1).agent()
+    agent.reset(obs(1), "stack")
+    call, told = InProcess.call, []
+
+    def note(self: InProcess, requests: Any, limit_s: float) -> Any:
+        told.append((requests[0].deadline_ms / 1e3, limit_s))
+        return call(self, requests, 30.0)
+
+    monkeypatch.setattr(InProcess, "call", note)
+    agent._connection.call([agent._session.act(obs(2))], timeout_s)
+    [(at_the_server_s, here_s)] = told
+    assert here_s - at_the_server_s == pytest.approx(way_s)
     agent.close()
 
 
@@ -221,3 +375,48 @@ def test_one_session_that_fails_leaves_its_neighbours_alone(replicas: Callable[[
         agent.act_batch([obs(0)], [stranger])
     for env in envs:
         env.close()
+
+
+def test_a_replica_that_has_fallen_silent_is_left(
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connection, "SILENT_S", 0.5)
+    monkeypatch.setattr(session_migration, "_ANSWER_S", 0.2)
+    served = replicas(2)
+    agent = served.agent()
+    agent.reset(obs(1), "stack")
+    agent.act(obs(2))
+    served.frozen.add(0)
+    agent._connection.timeout_s = 0.2
+    failed = 0
+    for _ in range(50):
+        try:
+            act = agent.act(obs(3))
+            break
+        except DeadlineExceeded:
+            failed += 1
+    assert failed >= 3  # one late answer says nothing yet
+    assert act.info["resumed"]
+    assert act.action.tolist() == [1, 2, 3]
+    assert "resumed" not in agent.act(obs(4)).info
+    agent.close()
+
+
+def test_a_replica_that_is_only_slow_keeps_the_session_or_gives_it_on(
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connection, "SILENT_S", 0.5)
+    for number, prefer in ((1, 0), (2, 1)):  # it goes to the same one again, or to another one
+        served = replicas(number)
+        agent = served.agent()
+        agent.reset(obs(1), "stack")
+        served.prefer = prefer
+        agent._connection.timeout_s = 0.6
+        model = next(iter(served.engines[0].models._cache.loaded.values()))
+        with model.busy, pytest.raises(DeadlineExceeded):
+            agent.act(obs(2))  # which is being acted on
+        agent._connection.timeout_s = 10.0
+        act = agent.act(obs(3))
+        assert "resumed" not in act.info
+        assert act.info["acts"] == 2
+        agent.close()

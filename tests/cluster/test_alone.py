@@ -7,8 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from vlagents_ray.bench.hosts import hosts, ray_cluster
+from benchmarks.hosts import hosts, ray_cluster
 from vlagents_ray.evaluate import Results
+
+pytestmark = pytest.mark.ray
 
 EVALUATE = [sys.executable, "-c", "from vlagents_ray.cli import main; main()", "eval", "tabletop", "--policy=scripted"]
 

@@ -11,9 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from lasting import Evaluation, cluster_of, serving, until, workers_on
+from long_evaluation import Evaluation, cluster_of, serving, until, workers_on
 
-from vlagents_ray.bench.hosts import Host, hosts, ray_cluster
+from benchmarks.hosts import Host, hosts, ray_cluster
 from vlagents_ray.client.credentials import KEY_VARIABLE
 
 pytestmark = [pytest.mark.hosts, pytest.mark.slow]
@@ -74,6 +74,7 @@ def test_lost_nodes_and_partitions_cost_attempts_alone(tmp_path: Path) -> None:
     run.is_whole(episodes)
 
 
+@pytest.mark.alone
 def test_a_robot_outside_of_the_cluster_keeps_its_loop_beside_an_evaluation(tmp_path: Path) -> None:
     run = Evaluation(tmp_path, episodes=1000, workers=2)
     with (

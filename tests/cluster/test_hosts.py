@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from vlagents_ray.bench.hosts import Host, HostFailed, hosts, ray_cluster
-from vlagents_ray.wire.messages import boot_id
+from benchmarks.hosts import Host, HostFailed, hosts, ray_cluster
+from vlagents_ray.protocol.messages import boot_id
 
 pytestmark = pytest.mark.hosts
 

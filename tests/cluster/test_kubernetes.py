@@ -19,14 +19,14 @@ from pydantic import ValidationError
 from readme_blocks import check_command
 from typer.testing import CliRunner
 
-from vlagents_ray.bench.hosts import HostFailed, hosts, ray_cluster
+from benchmarks.hosts import HostFailed, hosts, ray_cluster
 from vlagents_ray.cli.main import app
 from vlagents_ray.evaluate import EvalConfig
-from vlagents_ray.serve.auth import FILE_VARIABLE
-from vlagents_ray.serve.config import ServerArgs
-from vlagents_ray.serve.files import listens_at, read_deployment
-from vlagents_ray.serve.haproxy import ROBOTS
-from vlagents_ray.serve.keyfile import new_key
+from vlagents_ray.serve.access.api_keys import FILE_VARIABLE
+from vlagents_ray.serve.access.key_store import new_key
+from vlagents_ray.serve.config.deployment import ServerArgs
+from vlagents_ray.serve.launch.deployment_file import listens_at, read_deployment
+from vlagents_ray.serve.launch.haproxy import ROBOTS
 
 ROOT = Path(__file__).parents[2]
 SERVICE = RayService.model_validate(manifest("RayService", "policy"))
@@ -107,13 +107,13 @@ def test_the_embedded_deployment_is_one_that_serve_takes(tmp_path: Path) -> None
     assert listens_at(config) == ("0.0.0.0", port)  # noqa: S104 - a pod's
     [application] = config.applications
     args = ServerArgs(**application.args)
-    assert not args.answer_while_loading
     assert args.autoscaling is not None
     cpu = next(group for group in SERVICE.cluster.worker_group_specs if group.group_name == "cpu")
     room = int(cpu.template["spec"]["containers"][0]["resources"]["limits"]["cpu"]) // args.resources.num_cpus
     assert args.autoscaling.max_replicas <= cpu.max_replicas * room
 
 
+@pytest.mark.ray
 def test_the_run_file_and_the_entrypoint_are_ones_that_eval_takes(tmp_path: Path) -> None:
     run = manifest("ConfigMap", "evaluation-run")["data"]["run.yaml"]
     config = EvalConfig.model_validate(yaml.safe_load(run) | {"out": "runs/x"})

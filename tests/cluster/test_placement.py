@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 from eval_fakes import PYTHONPATH
 
-from vlagents_ray.bench.hosts import Host, RayCluster, hosts, ray_cluster
+from benchmarks.hosts import Host, RayCluster, hosts, ray_cluster
 
 pytestmark = pytest.mark.hosts
 
-PLACED = [sys.executable, "-m", "placed"]
+PLACED = [sys.executable, "-m", "placement_commands"]
 CPUS = 2  # of each node, each of which has room for as many workers
 STORE = {"object_store_memory": "200000000"}
 

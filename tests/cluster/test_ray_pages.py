@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import os
 import shutil
 import signal
 import subprocess
@@ -17,15 +18,16 @@ from eval_fakes import wait_for
 from ray.autoscaler._private.util import prepare_config, validate_config
 from readme_blocks import ENV, PYTHON, Block, blocks
 
-from vlagents_ray.bench.hosts import Host, HostFailed, hosts
-from vlagents_ray.evaluate.results import Results
-from vlagents_ray.serve.haproxy import ROBOTS
+from benchmarks.hosts import Host, HostFailed, hosts
+from vlagents_ray.evaluate.results.reader import Results
+from vlagents_ray.serve.launch.haproxy import ROBOTS, haproxy_binary, ingress_environment
 
 ROOT = Path(__file__).parents[2]
 FILES = sorted((ROOT / "cluster" / "ray").glob("*.yaml"))
 PAGE = blocks((ROOT / "docs" / "cluster" / "ray.md").read_text())
 SCRIPT = ROOT / "cluster" / "ray" / "environment.sh"
 TIMEOUT_S = 240
+HAPROXY = "RAY_SERVE_HAPROXY_BINARY_PATH"
 
 
 def said_of(where: str) -> list[Block]:
@@ -75,7 +77,12 @@ class Machines:
         finally:
             if server.poll() is None:
                 self.first.run(["kill", f"-{signal.SIGINT.value}", number.read_text().strip()])
-            assert server.wait(60) == 0, log.read_text()
+            try:
+                assert server.wait(180) == 0, log.read_text()
+            except subprocess.TimeoutExpired:
+                server.kill()
+                server.wait()
+                pytest.fail(f"serve has not ended: {log.read_text()}")
 
 
 @pytest.mark.hosts
@@ -137,3 +144,45 @@ def test_the_settings_for_ray_start_are_those_of_a_server_of_our_own() -> None:
     done = subprocess.run(["sh", "-eu", "-c", show], capture_output=True, text=True, check=True, env={})
     said = yaml.safe_load(done.stdout)
     assert {name: said[name] for name in variables} == {"RAY_AUTH_MODE": "token", **ROBOTS}
+
+
+def haproxy_files(home: Path, times: int = 1) -> dict[str, Path]:
+    """Where HAProxy's files are by the script, if /tmp is `home` and it is read so often."""
+    script = home / "environment.sh"
+    script.write_text(SCRIPT.read_text().replace("/tmp/", f"{home}/"))
+    environment = {"PATH": ENV["PATH"], "PYTHONPATH": str(ROOT)}
+    read = f". {script}; " * times + "env"
+    done = subprocess.run(["sh", "-euc", read], capture_output=True, text=True, check=True, env=environment)
+    said = dict(line.split("=", 1) for line in done.stdout.splitlines() if line.startswith("RAY_SERVE_HAPROXY_"))
+    return {name: Path(value) for name, value in said.items() if value.startswith("/")}
+
+
+def test_no_other_user_reaches_the_socket_that_commands_haproxy(tmp_path: Path) -> None:
+    """Not in a folder that somebody has made before, nor through a link."""
+    own = ingress_environment(tmp_path, "/bin/true")
+    wanted = {name for name, value in own.items() if value.startswith(str(tmp_path))}
+    (tmp_path / "no-replica.http").unlink()
+    files = haproxy_files(tmp_path, times=2)  # as the page does
+    assert set(files) == wanted
+    assert str(haproxy_binary()) in files[HAPROXY].read_text()  # not itself
+    folder = tmp_path / f"vlr-haproxy-{os.getuid()}"
+    assert {path if path == folder else path.parent for path in files.values()} == {folder}
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert haproxy_files(tmp_path) == files
+    longest = f"/tmp/{folder.name}/{'0' * 56}/{files['RAY_SERVE_HAPROXY_SOCKET_PATH'].name}.1234567.tmp"
+    assert len(longest) <= 107
+
+    folder.chmod(0o755)
+    assert_elsewhere(tmp_path, folder)
+    shutil.rmtree(folder)
+    (tmp_path / "other").mkdir(mode=0o700)
+    folder.symlink_to(tmp_path / "other")
+    assert_elsewhere(tmp_path, folder)
+
+
+def assert_elsewhere(home: Path, folder: Path) -> None:
+    files = haproxy_files(home)
+    new = files["RAY_SERVE_HAPROXY_SOCKET_PATH"].parent
+    assert new.parent == folder.parent
+    assert new != folder
+    assert new.stat().st_mode & 0o777 == 0o700

@@ -11,12 +11,11 @@ from pathlib import Path
 import pytest
 from eval_fakes import PYTHONPATH
 
-from vlagents_ray.bench.child import Child
-from vlagents_ray.bench.hosts import hosts, ray_cluster
-from vlagents_ray.bench.scaling import OWN, ScalingPlan, driving, measure_cluster
-from vlagents_ray.bench.scaling_driver import Fleet, Played, Round
-from vlagents_ray.bench.slept import SLEPT
-from vlagents_ray.bench.ways import our_environment
+from benchmarks.environments import SLEEPING_ENV
+from benchmarks.hosts import hosts, ray_cluster
+from benchmarks.scaling import OWN, ScalingPlan, driving, measure_cluster
+from benchmarks.scaling_driver import Fleet, PlayedEpisodes, ScalingRound
+from vlagents_ray.bench.line_process import LineProcess, our_environment
 from vlagents_ray.evaluate import Results
 
 pytestmark = pytest.mark.hosts
@@ -39,6 +38,7 @@ evaluate(EvalConfig(
 """
 
 
+@pytest.mark.alone
 def test_four_workers_on_two_nodes_play_nearly_four_times_as_much_as_one() -> None:
     """Anything that all wait for would halve it; the bound leaves room for a machine that has other work to do."""
     plan = ScalingPlan(workers=(1, 4), rounds=1, steps=20, seconds=3.0)
@@ -46,7 +46,9 @@ def test_four_workers_on_two_nodes_play_nearly_four_times_as_much_as_one() -> No
         assert size == 2
         rows = {(row["app"], row["workers"]): row for row in measure_cluster(plan, size, driver)["rows"]}
         # Over before the last worker is there, as with the rounds that tell the driver's costs.
-        short = Played(**driver.ask(json.dumps(asdict(Round(4, episodes=2, steps=1, step_ms=1.0, size=32))), 120.0))
+        short = PlayedEpisodes(
+            **driver.request(json.dumps(asdict(ScalingRound(4, episodes=2, steps=1, step_ms=1.0, size=32))), 120.0)
+        )
     assert (short.episodes, short.episodes_per_minute) == (7, None), "after the first"
     own = rows[OWN, 4]
     assert own["of_linear"] > 0.6
@@ -58,13 +60,13 @@ def test_four_workers_on_two_nodes_play_nearly_four_times_as_much_as_one() -> No
 def test_two_drivers_on_one_cluster_play_a_part_each_and_their_results_are_merged(tmp_path: Path) -> None:
     settings = {"address": None, "policy_ms": 5.0, "fleets": {"own": asdict(Fleet(2))}}
     with hosts(2) as both, ray_cluster(both, 4, {"PYTHONPATH": PYTHONPATH}) as cluster:
-        serving = [sys.executable, "-m", "vlagents_ray.bench.scaling_driver"]
+        serving = [sys.executable, "-m", "benchmarks.scaling_driver"]
         settings["address"] = cluster.address
-        with Child("server", cluster.head.command([*serving, json.dumps(settings)]), our_environment()) as server:
-            server.hear(120)
+        with LineProcess("server", cluster.head.command([*serving, json.dumps(settings)]), our_environment()) as server:
+            server.read(120)
             parts = [tmp_path / seed for seed in ("0", "6")]
             drivers = [
-                host.start([sys.executable, "-c", DRIVER, SLEPT, part.name, str(part)])
+                host.start([sys.executable, "-c", DRIVER, SLEEPING_ENV, part.name, str(part)])
                 for host, part in zip(both, parts, strict=True)
             ]
             assert [driver.wait(120) for driver in drivers] == [0, 0]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vlagents_ray.envs import make_env
-from vlagents_ray.envs.batch import BatchEnv, InTurn, make_batch
+from vlagents_ray.envs.batch import BatchEnv, SequentialBatch, make_batch
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import ConfigError, InvalidAction
 from vlagents_ray.interface import Act, Obs
@@ -118,5 +118,5 @@ def test_closing_reaches_every_environment_even_after_one_that_fails() -> None:
     last = Tabletop("lift", **SIZE)
     last.reset(seed=0)
     with pytest.raises(RuntimeError, match="not yet"):
-        InTurn([last, Stubborn("lift", **SIZE)]).close()
+        SequentialBatch([last, Stubborn("lift", **SIZE)]).close()
     assert last._world is None

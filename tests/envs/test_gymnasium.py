@@ -16,6 +16,8 @@ from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, MissingDe
 from vlagents_ray.interface import HIGH_RES
 from vlagents_ray.testing import ContractViolation, check_env
 
+pytestmark = pytest.mark.sim
+
 PUSHT = "gymnasium/gym_pusht/PushT-v0"
 
 

@@ -9,13 +9,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vlagents_ray.contract import CameraSpec, check_observation
+from vlagents_ray.contract import CameraSpec
 from vlagents_ray.envs import make_env
-from vlagents_ray.envs.maniskill import ManiSkill, making
+from vlagents_ray.envs.maniskill import ManiSkill, factory
 from vlagents_ray.envs.maniskill.tasks import INSTRUCTIONS, instruction_for
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset, UnknownEnv
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.testing import check_env
+from vlagents_ray.validation import check_observation
 
 pytestmark = pytest.mark.vulkan
 
@@ -246,8 +247,8 @@ def test_the_gpu_renders_where_sapien_and_torch_can_use_it(
 ) -> None:
     monkeypatch.setattr("sapien.Device", lambda _: object())
     monkeypatch.setattr("torch.cuda.is_available", lambda: torch_has_cuda)
-    assert making.render_backend("auto") == backend
-    assert making.render_backend("cpu") == "cpu"
+    assert factory.render_backend("auto") == backend
+    assert factory.render_backend("cpu") == "cpu"
 
 
 def test_a_task_that_cannot_be_evaluated_is_refused() -> None:

@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from vlagents_ray.envs.batch import InTurn, make_batch
+from vlagents_ray.envs.batch import SequentialBatch, make_batch
 from vlagents_ray.envs.maniskill import ManiSkill
 from vlagents_ray.envs.maniskill.batch import ManiSkillBatch
 from vlagents_ray.errors import ConfigError, NotReset
@@ -125,7 +125,7 @@ def test_several_environments_share_a_simulator_only_on_a_gpu() -> None:
     with pytest.raises(ConfigError, match="record_size"):
         ManiSkillBatch("PushCube-v1", num_envs=1, record_size=(64, 64))
     with make_batch("maniskill/PushCube-v1", 2, **SMALL) as batch:
-        assert isinstance(batch, InTurn)
+        assert isinstance(batch, SequentialBatch)
         assert len(batch.reset(seeds=SEEDS)) == 2
 
 

@@ -39,8 +39,28 @@ def about(axis: int, angle: float) -> np.ndarray:
     return matrix
 
 
-@given(poses, poses)
-def test_the_tools_pose_is_that_of_the_matrices(base: np.ndarray, tool: np.ndarray) -> None:
+def about_axes(yaw: float, pitch: float, roll: float) -> np.ndarray:
+    """The pose whose quaternion wxyz is of Rz(yaw) Ry(pitch) Rx(roll)."""
+    (cy, cp, cr), (sy, sp, sr) = np.cos(np.array([yaw, pitch, roll]) / 2), np.sin(np.array([yaw, pitch, roll]) / 2)
+    quaternion = [
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    ]
+    return np.array([0.0, 0.0, 0.0, *quaternion])
+
+
+angles = st.floats(-np.pi, np.pi)
+upright = st.builds(
+    about_axes,
+    angles,
+    st.builds(lambda sign, off: sign * (np.pi / 2 - off), st.sampled_from((-1, 1)), st.floats(0, 1e-3)),
+    angles,
+)
+
+
+def check(base: np.ndarray, tool: np.ndarray) -> None:
     tquat, xyzrpy = tool_in_base(base, tool)
     rotation = turn(base[3:]).T @ turn(tool[3:])
     position = turn(base[3:]).T @ (tool[:3] - base[:3])
@@ -52,6 +72,16 @@ def test_the_tools_pose_is_that_of_the_matrices(base: np.ndarray, tool: np.ndarr
     np.testing.assert_allclose(about(2, yaw) @ about(1, pitch) @ about(0, roll), rotation, atol=2e-3)
     assert tquat.dtype == xyzrpy.dtype == np.float32
     assert tquat[6] >= 0.0
+
+
+@given(poses, poses)
+def test_the_tools_pose_is_that_of_the_matrices(base: np.ndarray, tool: np.ndarray) -> None:
+    check(base, tool)
+
+
+@given(upright)
+def test_a_tool_that_points_straight_up_or_down_has_angles_that_make_up_its_rotation(tool: np.ndarray) -> None:
+    check(about_axes(0.0, 0.0, 0.0), tool)
 
 
 def box(low: float, high: float, dim: int) -> SimpleNamespace:

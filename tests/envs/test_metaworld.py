@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import pickle
 from collections.abc import Iterator
+from dataclasses import replace
 
-import metaworld
 import numpy as np
 import pytest
-from playing import Always, play
+from in_process_episode import Always, play
 
-from vlagents_ray.contract import CameraSpec, check_observation
+from vlagents_ray.contract import CameraSpec
+from vlagents_ray.envs.base import known_contract
 from vlagents_ray.envs.metaworld import PROTOCOL, MetaWorld
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset, UnknownEnv
 from vlagents_ray.interface import HIGH_RES, Act
 from vlagents_ray.testing import check_env
+from vlagents_ray.validation import check_observation
+
+metaworld = pytest.importorskip("metaworld")
+pytestmark = pytest.mark.sim
 
 STILL = Act(np.zeros(4, np.float32))
 
@@ -41,6 +46,9 @@ def test_each_task_gives_what_its_contract_states(task: str) -> None:
         check_observation(obs, env.contract)
         assert env.contract.cameras == {"corner2": CameraSpec(32, 40)}
         assert env.contract.control_hz == pytest.approx(80.0)
+        assert known_contract(f"metaworld/{task}", {"width": 40, "height": 32}) == replace(
+            env.contract, control_hz=None
+        )
         assert env.instruction == task.removesuffix("-v3").replace("-", " ")
         assert obs.info["sim_state"].shape == (39,)
         assert np.isfinite(reward)

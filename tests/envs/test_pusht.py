@@ -5,14 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-import gym_pusht  # noqa: F401 - registers the environment
 import gymnasium
 import numpy as np
 import pytest
-from playing import Always, play
+from in_process_episode import Always, play
 
 from vlagents_ray.envs import EvalEnv, make_env
 from vlagents_ray.interface import Act
+
+pytest.importorskip("gym_pusht")  # registers the environment
+pytestmark = pytest.mark.sim
 
 NAME = "gymnasium/gym_pusht/PushT-v0"
 # Where the agent is and, as `reset_to_state` takes it, the block: 84.6 % of the target is covered.

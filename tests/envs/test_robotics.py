@@ -6,13 +6,15 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from playing import Always, play
+from in_process_episode import Always, play
 
 from vlagents_ray.envs import EvalEnv, make_env
 from vlagents_ray.errors import MissingState
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.experts import expert_for
 from vlagents_ray.testing import check_env
+
+pytestmark = pytest.mark.sim
 
 NAME = "gymnasium/FetchReach-v4"
 

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vlagents_ray.contract import CameraSpec, check_observation
+from vlagents_ray.contract import CameraSpec
 from vlagents_ray.envs import make_env
 from vlagents_ray.envs.simpler import Simpler
 from vlagents_ray.errors import ConfigError, EnvFailed, NotReset, UnknownEnv
 from vlagents_ray.interface import HIGH_RES, Act, Obs
 from vlagents_ray.policies.experts import expert_for
 from vlagents_ray.testing import check_env
+from vlagents_ray.validation import check_observation
 
 pytestmark = [pytest.mark.vulkan, pytest.mark.assets("simpler")]
 

@@ -7,16 +7,16 @@ import math
 import pytest
 
 from vlagents_ray.envs.tabletop.goals import Goal
-from vlagents_ray.envs.tabletop.world import PUCK_HEIGHT, PUCK_RADIUS, STEP_LIMIT, Pad, Puck, World
+from vlagents_ray.envs.tabletop.world import PUCK_HEIGHT, PUCK_RADIUS, STEP_LIMIT, Pad, Puck, TabletopWorld
 
 OPEN, CLOSED = 1.0, 0.0
 
 
-def world(*pucks: Puck, pad: Pad | None = None) -> World:
-    return World(list(pucks), [pad or Pad("blue", 0.2, 0.0)])
+def world(*pucks: Puck, pad: Pad | None = None) -> TabletopWorld:
+    return TabletopWorld(list(pucks), [pad or Pad("blue", 0.2, 0.0)])
 
 
-def go(scene: World, x: float, y: float, z: float, opening: float) -> None:
+def go(scene: TabletopWorld, x: float, y: float, z: float, opening: float) -> None:
     """Move straight to (x, y, z) and stop there, as far as the world lets the gripper."""
     for _ in range(40):
         offset = (x - scene.x, y - scene.y, z - scene.z)
@@ -24,7 +24,7 @@ def go(scene: World, x: float, y: float, z: float, opening: float) -> None:
         scene.step(*(d / slow for d in offset), opening)
 
 
-def grasp(scene: World, puck: Puck) -> None:
+def grasp(scene: TabletopWorld, puck: Puck) -> None:
     go(scene, puck.x, puck.y, 0.1, OPEN)
     go(scene, puck.x, puck.y, puck.z + 0.005, OPEN)
     go(scene, puck.x, puck.y, puck.z + 0.005, CLOSED)
@@ -146,7 +146,9 @@ def test_pucks_stay_on_the_table() -> None:
 
 
 def test_only_the_named_puck_on_the_named_pad_counts() -> None:
-    scene = World([Puck("red", 0.2, 0.0), Puck("green", 0.0, 0.0)], [Pad("blue", 0.2, 0.0), Pad("red", -0.2, 0.0)])
+    scene = TabletopWorld(
+        [Puck("red", 0.2, 0.0), Puck("green", 0.0, 0.0)], [Pad("blue", 0.2, 0.0), Pad("red", -0.2, 0.0)]
+    )
     reached = {
         (puck, pad): Goal("pick_place", puck, pad).reached(scene)
         for puck in ("red", "green")

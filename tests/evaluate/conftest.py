@@ -10,9 +10,15 @@ from eval_fakes import LINE, PYTHONPATH
 from flat_config import flat_config
 
 from vlagents_ray.evaluate import EvalConfig
-from vlagents_ray.joining import start_ray
+from vlagents_ray.ray_tools.session import start_ray
 
 WORKER_PATH = {"env_vars": {"PYTHONPATH": PYTHONPATH}}
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Mark whatever uses the cluster."""
+    if "cluster" in getattr(item, "fixturenames", ()):
+        item.add_marker("ray")
 
 
 @pytest.fixture

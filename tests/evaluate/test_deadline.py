@@ -9,13 +9,13 @@ from collections.abc import Callable
 import pytest
 from eval_fakes import ToZero
 from flat_config import flat_config
-from set_clock import Clock
+from manual_clock import Clock
 
 from vlagents_ray.evaluate import EvalConfig, OutOfTime, SilentProgress, evaluate
-from vlagents_ray.evaluate.cells import Cell, cells
 from vlagents_ray.evaluate.deadline import CLOSING_S, MARGIN, Deadline
-from vlagents_ray.evaluate.episode import EpisodeResult
-from vlagents_ray.evaluate.jobs import plan
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.cases import EvalCase, cells
+from vlagents_ray.evaluate.plan.jobs import plan
 
 JOBS = plan(cells(flat_config(envs=["tabletop"], episodes=3, out="out")))
 
@@ -54,7 +54,7 @@ class SlowAfterTwo(SilentProgress):
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self._left, self._monkeypatch = 2, monkeypatch
 
-    def episode(self, cell: Cell, result: EpisodeResult) -> None:
+    def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
         self._left -= 1
         if not self._left:
             self._monkeypatch.setattr(Deadline, "leaves_room", False)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import functools
+import json
 import os
 import sqlite3
 from collections.abc import Callable
@@ -11,14 +13,16 @@ from pathlib import Path
 
 import pytest
 from eval_fakes import LINE, OTHER_LINE, ToZero
-from played import play
+from in_process_evaluation import play
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results
-from vlagents_ray.evaluate.episode import EpisodeResult
-from vlagents_ray.evaluate.jobs import plan
+from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.merge import merge
-from vlagents_ray.evaluate.store import Store
+from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.report.html import write_report
+from vlagents_ray.evaluate.results.combine import combined
+from vlagents_ray.evaluate.results.store import Store
 
 Config = Callable[..., EvalConfig]
 
@@ -162,7 +166,121 @@ def test_videos_and_trajectories_go_along_without_taking_room(part: Callable[...
     assert names == {"ep0000_seed0_front.mp4", "ep0001_seed1_front.mp4"}
 
 
+@pytest.mark.parametrize("kind", ["videos", "trajectories"])
+def test_a_file_of_an_episode_that_is_gone_is_said_in_one_sentence_and_nothing_is_written(
+    part: Callable[..., Path], tmp_path: Path, kind: str
+) -> None:
+    a = part("a", env_options={"camera": [32, 32]}, record="all", video="all")
+    [gone] = (a / kind).rglob("ep0003_*.mp4" if kind == "videos" else "ep0003_*.npz")
+    gone.unlink()
+    with pytest.raises(ConfigError, match=rf"{gone.name}: got no file, want .*; copy the folder again"):
+        merge(tmp_path / "out", [a])
+    assert not list((tmp_path / "out").rglob("*.*"))
+    write_report(Results.load(a), tmp_path / "report.html")
+
+
+def named(folder: Path, column: str, path: str) -> Path:
+    """`path` in place of what the first episode says of its files."""
+    value = json.dumps([path]) if column == "videos" else path
+    with closing(sqlite3.connect(folder / "results.db")) as db, db:
+        db.execute(f"UPDATE episodes SET {column} = ? WHERE episode = 0", (value,))  # noqa: S608 - a constant
+    return folder
+
+
+@pytest.mark.parametrize("column", ["videos", "trajectory"])
+@pytest.mark.parametrize(
+    "path", ["/etc/hostname", "../secret/key.mp4", "videos/../../secret/key.mp4", "..", "", "videos/\0.mp4"]
+)
+def test_paths_out_of_a_folder_of_results_are_refused_by_all_that_read_it(
+    part: Callable[..., Path], tmp_path: Path, column: str, path: str
+) -> None:
+    (tmp_path / "secret").mkdir()
+    (tmp_path / "secret" / "key.mp4").write_text("secret")
+    theirs = named(part("theirs"), column, path)
+    for read in (Results.load, lambda folder: merge(tmp_path / "out", [folder])):
+        with pytest.raises(ConfigError, match="as a file of an episode, want a path below the folder of results"):
+            read(theirs)
+    assert not list((tmp_path / "out").rglob("*.mp4"))
+
+
+@pytest.mark.parametrize("of_the_folder", [False, True])
+def test_symbolic_links_lead_no_further_than_their_folder(
+    part: Callable[..., Path], tmp_path: Path, of_the_folder: bool
+) -> None:
+    (tmp_path / "secret").mkdir()
+    (tmp_path / "secret" / "key.mp4").write_text("secret")
+    theirs = named(part("theirs"), "videos", "v/key.mp4")
+    if of_the_folder:
+        (theirs / "v").symlink_to(tmp_path / "secret")
+    else:
+        (theirs / "v").mkdir()
+        (theirs / "v" / "key.mp4").symlink_to(tmp_path / "secret" / "key.mp4")
+    with pytest.raises(ConfigError, match=r"v/key.mp4: is a symbolic link out of the folder .* copy what it leads to"):
+        merge(tmp_path / "out", [theirs])
+    other = part("other", execute=2)  # beside the secret
+    for results in (Results.load(theirs), combined([Results.load(theirs), Results.load(other)])):
+        [path] = [video for cell in results.cells for one in cell.episodes for video in one.videos]
+        with pytest.raises(ConfigError, match="symbolic link out of the folder"):
+            results.file(path)
+        assert base64.b64encode(b"secret").decode() not in report_of(results, tmp_path)
+
+
+def report_of(results: Results, folder: Path) -> str:
+    return write_report(results, folder / "page.html", videos="inline").read_text()
+
+
+def test_links_within_a_folder_and_to_it_are_followed(part: Callable[..., Path], tmp_path: Path) -> None:
+    a = named(part("a"), "videos", "v/key.mp4")
+    (a / "w").mkdir()
+    (a / "w" / "key.mp4").write_text("mine")
+    (a / "v").symlink_to("w")
+    (tmp_path / "alias").symlink_to(a)
+    merge(tmp_path / "out", [tmp_path / "alias"])
+    assert (tmp_path / "out" / "v" / "key.mp4").read_text() == "mine"
+    assert not (tmp_path / "out" / "v").is_symlink()
+
+
+def test_a_difference_from_a_commit_that_is_a_link_is_not_copied(part: Callable[..., Path], tmp_path: Path) -> None:
+    theirs = part("theirs")
+    (theirs / "provenance").mkdir(exist_ok=True)
+    (theirs / "provenance" / "x.diff").symlink_to("/etc/hostname")
+    with pytest.raises(ConfigError, match=r"x\.diff: is a symbolic link out of"):
+        merge(tmp_path / "out", [theirs])
+
+
 def test_results_are_not_merged_into_results(part: Callable[..., Path]) -> None:
     a, b = part("a"), part("b")
     with pytest.raises(ConfigError, match="merge into a new folder"):
         merge(a, [a, b])
+
+
+def with_weights(folder: Path, weights: str | None) -> Path:
+    """All its episodes as if these weights had played them; None: as if it were older than the column."""
+    with closing(sqlite3.connect(folder / "results.db")) as db:
+        if weights is None:
+            db.execute("ALTER TABLE episodes DROP COLUMN weights")
+        else:
+            db.execute("UPDATE episodes SET weights = ?", (weights,))
+        db.commit()
+    return folder
+
+
+def test_other_weights_under_the_same_name_are_not_merged(part: Callable[..., Path], tmp_path: Path) -> None:
+    a, b = with_weights(part("a", 3, 4, 5), "x"), with_weights(part("b", 0, 1, 2), "y")
+    with pytest.raises(ConfigError, match=r"played by several weights under one name: .*'x'.*'y'.*merge those apart"):
+        merge(tmp_path / "out", [a, b])
+    with_weights(b, "x")
+    merge(tmp_path / "same", [a, b, with_weights(part("c", 0, 1), None)])
+    found = {one.result.weights for cell in Results.load(tmp_path / "same").cells for one in cell.episodes}
+    assert found == {"x"}
+
+
+def test_servers_that_tell_other_weights_are_named(tmp_path: Path, config: Config) -> None:
+    folders = [tmp_path / digest for digest in ("x", "y")]
+    for folder in folders:
+        said = {"policy": "act", "checkpoint": "a", "weights": {"digest": folder.name, "revision": None}}
+        with Store(config(out=folder)) as store:
+            store.begin_run(config(out=folder), {})
+            store.note_policy("policy", said)
+    with pytest.raises(ConfigError, match=r"policy 'policy' has weights .*'y'.*before it .*'x'"):
+        merge(tmp_path / "out", folders)

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 from eval_fakes import LINE, OTHER_LINE, ToZero
-from played import play
+from in_process_evaluation import play
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results, evaluate
-from vlagents_ray.evaluate.cells import cells
-from vlagents_ray.evaluate.episode import EpisodeResult
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.replay import compare, find
-from vlagents_ray.evaluate.store import Store
+from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.interface import Act, Obs
 
 Config = Callable[..., EvalConfig]
@@ -67,6 +67,16 @@ def test_without_a_trajectory_it_is_said_that_the_actions_differ(config: Config,
     results = play(config(episodes=2), Noisy)
     first, *_ = again(results, f"{LINE}#1", tmp_path / "again", Noisy)
     assert first.startswith("actions: they differ; from which step on is not known")
+    assert "--record all" in first
+
+
+def test_a_trajectory_that_is_gone_is_said_with_the_difference(config: Config, tmp_path: Path) -> None:
+    results = play(config(episodes=2, record="all"), Noisy)
+    for trajectory in (results.out / "trajectories").rglob("*.npz"):
+        trajectory.unlink()
+    first, *_ = again(results, f"{LINE}#1", tmp_path / "again", Noisy)
+    assert first.startswith("actions: they differ; from which step on is not known, as ")
+    assert first.endswith(".npz, the recorded trajectory, is gone")
 
 
 def test_fewer_actions_are_told_as_such(config: Config, tmp_path: Path) -> None:

@@ -14,11 +14,14 @@ from subprocess import Popen
 
 import pytest
 from eval_fakes import wait_for
-from ray_processes import end, processes, ray_folder, wait_for_end
+from ray_processes import processes, ray_folder, wait_for_end
+from secret_leaks import leaked
 
+from vlagents_ray.client.credentials import KEY_VARIABLE
 from vlagents_ray.evaluate import EvalConfig
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.ray, pytest.mark.slow]
+KEY = f"vlr_{os.urandom(8).hex()}"  # no other test's, which may run beside this one
 
 SCRIPT = """
 import sys
@@ -46,6 +49,7 @@ def start(config: EvalConfig, ray_folder: Path) -> Popen[bytes]:
         "PYTHONPATH": str(env_vars["PYTHONPATH"]),
         "RAY_TMPDIR": str(ray_folder),
         "RAY_USAGE_STATS_ENABLED": "0",
+        KEY_VARIABLE: KEY,
     }
     command = [sys.executable, "-c", SCRIPT, config.model_dump_json()]
     return Popen(command, env=environment, start_new_session=True)
@@ -71,15 +75,14 @@ def test_a_stopped_and_resumed_evaluation_has_each_episode_exactly_once(
     with start(settings, ray_folder) as evaluation:
         wait_for(lambda: all((tmp_path / f"gate-{seed}").exists() for seed in (5, 6)))
         wait_for(lambda: len(episodes(settings)) == 5)  # both workers are in mid-episode
+        assert leaked(KEY, [ray_folder]) == [f"/proc/{evaluation.pid}/environ"]
         if number == signal.SIGKILL:
             evaluation.kill()
         else:
             os.killpg(evaluation.pid, number)  # as a terminal does
         assert evaluation.wait(60) == code
     wait_for_end(ray_folder, "Rollout")
-    if number == signal.SIGKILL:
-        end(ray_folder)
-    wait_for(lambda: not processes(ray_folder))
+    wait_for(lambda: not processes(ray_folder) and not [*ray_folder.iterdir()])
     assert [episode for _, episode, _ in episodes(settings)] == [0, 1, 2, 3, 4]
     if number == signal.SIGINT:
         assert json.loads((settings.out / "summary.json").read_text())["state"] == "interrupted"

@@ -9,9 +9,9 @@ import ray
 from eval_fakes import ToZero, wait_for
 
 from vlagents_ray.evaluate import EvalConfig
-from vlagents_ray.evaluate.cells import cells
-from vlagents_ray.evaluate.jobs import plan
-from vlagents_ray.evaluate.pool import WorkerPool
+from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.workers.pool import WorkerPool
 
 
 @pytest.mark.usefixtures("cluster")

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import importlib.util
 
+import pytest
+
 # folder -> the package without which its tests cannot be imported
 _NEEDS = {
     "arro": "transformers",
@@ -22,3 +24,8 @@ _NEEDS = {
 }
 
 collect_ignore = [folder for folder, package in _NEEDS.items() if importlib.util.find_spec(package) is None]
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Each of them loads torch or JAX, some a simulator; of these folders alone."""
+    item.add_marker("sim")

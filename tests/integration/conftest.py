@@ -11,10 +11,15 @@ from typing import Any
 
 import pytest
 
-from vlagents_ray.serve.cluster import Server, running_server
-from vlagents_ray.serve.files import deployment
+from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.server import Server, running_server
 
 SUPPORT = Path(__file__).parent.parent / "support"
+
+
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Each test of this folder has a real server."""
+    item.add_marker("server")
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -20,19 +20,26 @@ import grpc
 import numpy as np
 import psutil
 import pytest
+import ray
 from certificates import Authority, authority
-from listeners import Listener, listeners
+from eval_fakes import PYTHONPATH
+from flat_config import flat_config
+from listening_sockets import Listener, listeners
+from secret_leaks import leaked
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 from vlagents_ray import ConfigError, ConnectionLost, Forbidden, Obs, RemoteAgent, Unauthorized, VLAgentsError
-from vlagents_ray.client.ways import TransportName
-from vlagents_ray.serve.cluster import running_server
-from vlagents_ray.serve.files import deployment
-from vlagents_ray.serve.keyfile import new_key, revoke
-from vlagents_ray.serve.tls import Tls
-from vlagents_ray.wire.frames import decode_replies, encode_requests
-from vlagents_ray.wire.messages import LocalAddress, Request
+from vlagents_ray.client.credentials import KEY_VARIABLE
+from vlagents_ray.client.transports.select import TransportName
+from vlagents_ray.evaluate import evaluate
+from vlagents_ray.protocol.frames import decode_replies, encode_requests
+from vlagents_ray.protocol.messages import LocalAddress, Request
+from vlagents_ray.ray_tools.reaper import MARK
+from vlagents_ray.serve.access.key_store import new_key, revoke
+from vlagents_ray.serve.access.tls import Tls
+from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.server import running_server
 
 EVERYWHERE = "0.0.0.0"  # noqa: S104 - what this is about
 WAYS: tuple[TransportName, ...] = ("http", "websocket", "shm", "auto")
@@ -133,7 +140,7 @@ def test_a_websocket_is_refused_before_it_is_accepted(served: Served) -> None:
 
 
 @pytest.mark.parametrize("way", ["http", "websocket", "shm", "handle", "plasma"])
-def test_every_door_refuses_what_is_over_the_limits_and_goes_on(served: Served, way: TransportName) -> None:
+def test_every_endpoint_refuses_what_is_over_the_limits_and_goes_on(served: Served, way: TransportName) -> None:
     url = "serve://noop" if way in ("handle", "plasma") else served.url
     with RemoteAgent(
         url, transport=way, api_key=served.tokens["arm"], ca=served.ca.file, codec="raw", timeout_s=20
@@ -157,7 +164,32 @@ def test_whoever_is_in_the_cluster_finds_a_way_that_needs_no_key(served: Served)
         assert agent.transport == "plasma"
 
 
-def test_a_revoked_key_is_shut_out_of_every_door_within_seconds(served: Served) -> None:
+def test_a_key_is_nowhere_but_where_it_is_used(served: Served, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """After it was used by an evaluation, by clients of every kind, and to ask what the server says of itself."""
+    key = served.tokens["arm"]
+    monkeypatch.setenv(KEY_VARIABLE, key)
+    variables = {"SSL_CERT_FILE": str(served.ca.file), "PYTHONPATH": PYTHONPATH}
+    config = flat_config(
+        policy_url=served.url,
+        envs=["eval_fakes:SevenLine"],
+        episodes=1,
+        out=tmp_path / "out",
+        runtime_env={"env_vars": variables},
+    )
+    assert evaluate(config).total.episodes == 1
+    for way in WAYS:
+        with served.agent("arm", transport=way) as agent:
+            agent.reset(Obs(), "x")
+            agent.act(Obs())
+    session = Path(ray._private.worker.global_worker.node.get_session_dir_path())
+    assert "SSL_CERT_FILE" in (session / "logs" / "runtime_env_agent.log").read_text()  # where it would be
+    assert leaked(key, [session, Path(os.environ[MARK]), tmp_path]) == []
+    _, metadata = served.status("/v1/metadata", {"x-api-key": key})
+    assert metadata.startswith(b"{")
+    assert key.encode() not in metadata
+
+
+def test_a_revoked_key_is_shut_out_of_every_endpoint_within_seconds(served: Served) -> None:
     url = served.url.replace("https", "wss") + "/v1/stream"
     with contextlib.ExitStack() as stack:
         agents = {way: stack.enter_context(served.agent("leaver", transport=way)) for way in WAYS}
@@ -180,17 +212,17 @@ def test_a_revoked_key_is_shut_out_of_every_door_within_seconds(served: Served) 
         bystander.act(Obs())
 
 
-def test_the_shared_memory_door_wants_a_key_before_anything_else(served: Served) -> None:
+def test_the_shared_memory_endpoint_wants_a_key_before_anything_else(served: Served) -> None:
     status, body = served.status("/v1/metadata", {"x-api-key": served.tokens["arm"]})
     assert status == 200
     local = json.loads(body)["local"]
     assert local["keyed"]
-    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as door:
-        door.settimeout(10)
-        door.connect(f"\0{local['socket']}")
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as endpoint:
+        endpoint.settimeout(10)
+        endpoint.connect(f"\0{local['socket']}")
         for message in (b"wrong", b"-", encode_requests([Request("reset", Obs())])):
-            door.send(message)
-            (reply,) = decode_replies(door.recv(2**17)[LocalAddress.REPLY.size :])
+            endpoint.send(message)
+            (reply,) = decode_replies(endpoint.recv(2**17)[LocalAddress.REPLY.size :])
             assert isinstance(reply.error, Unauthorized)
 
 
@@ -244,13 +276,12 @@ WHO = [
     (r"haproxy", "tcp", "front", "key"),
     (r"haproxy", "tcp", "local", "machine"),  # Serve's own port, which asks for a key; metrics; statistics
     (r"haproxy", "udp", "any", "nobody"),  # its log goes out there; it does not read
-    (r"haproxy", "unix", r".*/vlagents-ray-[^/]*/.*/admin\.sock.*", "user"),
-    (r"ray::HAProxyManager", "unix", r".*/vlagents-ray-[^/]*/.*/metrics\.sock", "user"),
+    (r"haproxy", "unix", r".*/vlr-[^/]*/.*/admin.*", "user"),
+    (r"ray::HAProxyManager", "unix", r".*/vlr-[^/]*/.*/metrics", "user"),
     (r"ray::HAProxyManager|ray::ServeController|ray::ProxyActor|ray::IDLE.*|driver", "tcp", "local", "token"),
     (r"gcs_server|raylet", "tcp", "local", "token"),
     (r"raylet", "unix", r".*/sockets/(raylet|plasma_store)", "user"),
     (r"ray::DashboardAgent|ray::RuntimeEnvAgent|agent\.py", "tcp", "local", "token"),
-    (r"monitor\.py|dashboard\.py", "tcp", "local", "machine"),  # metrics of Ray itself
     (REPLICA, "tcp", "local", "key"),  # and its worker's own, which wants the token
     (REPLICA, "tcp", "any", "token"),  # calls between deployments: see below
     (REPLICA, "unix", r"@vlagents-ray-[0-9a-f]{32}", "key"),
@@ -272,10 +303,8 @@ def who(one: Listener, front: int) -> str | None:
 
 
 def is_private(path: Path) -> bool:
-    """Does its own mode, or that of a folder that it is in, keep other users out?"""
-    path = path if path.exists() else path.with_name(path.name.removeprefix("."))  # renamed since it was bound
-    path = path if path.exists() else path.parent  # HAProxy's is bound under another name, in a folder of ours
-    return any(not stat.S_IMODE(place.stat().st_mode) & 0o077 for place in (path, *path.parents))
+    """Does a folder that it is in keep other users out? Its own mode does not: they could put another in its place."""
+    return any(not stat.S_IMODE(place.stat().st_mode) & 0o077 for place in path.parents)
 
 
 def test_every_socket_of_a_running_server_is_known_and_closed_to_strangers(served: Served) -> None:

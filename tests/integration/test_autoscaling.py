@@ -12,7 +12,7 @@ from ray import serve
 from tests.integration.conftest import serving
 from tests.integration.test_load import act_until, replicas
 from vlagents_ray import Obs, RemoteAgent
-from vlagents_ray.client.ways import TransportName
+from vlagents_ray.client.transports.select import TransportName
 
 FROM_NONE = {"min_replicas": 0, "max_replicas": 2, "look_back_s": 2, "upscale_delay_s": 0.5, "downscale_delay_s": 1}
 WAYS: list[TransportName] = ["shm", "websocket"]

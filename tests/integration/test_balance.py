@@ -13,9 +13,9 @@ from ray.serve.schema import ServeDeploySchema
 
 from tests.integration.test_sessions import obs, url
 from vlagents_ray import RemoteAgent
-from vlagents_ray.client.ways import TransportName
-from vlagents_ray.serve.cluster import Server, running_server
-from vlagents_ray.serve.files import deployment
+from vlagents_ray.client.transports.select import TransportName
+from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.server import Server, running_server
 
 HELD: dict[TransportName, int] = {"handle": 2, "shm": 2, "websocket": 6}  # of equal connections the oldest go first
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 from ray_processes import processes, ray_folder
 
-from vlagents_ray.bench.ways import ways
+from vlagents_ray.bench.clients import own_clients
 
 COMMAND = str(Path(sys.executable).parent / "vlagents-ray")
 
@@ -32,6 +32,7 @@ def bench(ray_home: Path, *words: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_every_way_is_measured_and_shared_memory_is_the_fastest_to_a_local_process(
     ray_home: Path, tmp_path: Path
 ) -> None:
@@ -41,7 +42,7 @@ def test_every_way_is_measured_and_shared_memory_is_the_fastest_to_a_local_proce
     assert done.returncode == 0, done.stdout + done.stderr
     found = json.loads(file.read_text())
     medians = {way["way"]: way["median_ms"] for way in found["ways"]}
-    assert set(medians) == {way.name for way in ways()[0]}
+    assert set(medians) == {way.name for way in own_clients()[0]}
     assert all(way["calls"] == 50 for way in found["ways"])
     local = {name: ms for name, ms in medians.items() if "actor" not in name}
     assert min(local, key=lambda name: local[name]) == "shm"
@@ -54,6 +55,7 @@ def test_every_way_is_measured_and_shared_memory_is_the_fastest_to_a_local_proce
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 def test_throughput_comes_near_the_bare_policy_and_never_above_it(ray_home: Path, tmp_path: Path) -> None:
     """Written out as a class, `noop` is a policy of unknown speed, which is measured bare; it sleeps, so that the
     two cores of a busy machine do not matter."""

@@ -19,9 +19,10 @@ from tests.integration.test_sessions import TRANSPORTS, url
 from vlagents_ray import ConfigError, Obs, RemoteAgent
 from vlagents_ray.errors import CheckpointFailed, UnknownCheckpoint
 from vlagents_ray.evaluate import evaluate
-from vlagents_ray.evaluate.summary import checkpoint_of
-from vlagents_ray.serve.cluster import Server, running_server
-from vlagents_ray.serve.files import deployment
+from vlagents_ray.evaluate.results.summary import checkpoint_of, weights_of
+from vlagents_ray.policies.base.checkpoint_files import digest
+from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.server import Server, running_server
 
 POLICY = "served_agents:Stored"
 
@@ -47,7 +48,8 @@ def deployed(folder: Path, **beside: Any) -> ServeDeploySchema:
 
 @pytest.fixture(scope="module")
 def server(folder: Path) -> Iterator[Server]:
-    with running_server(deployed(folder), num_cpus=4) as server:
+    """Deployed by Serve, as its file has `deployments`: only so can it change without new replicas."""
+    with running_server(deployed(folder, num_replicas=1), num_cpus=4) as server:
         yield server
 
 
@@ -247,6 +249,9 @@ def test_an_evaluation_says_by_which_checkpoint(fresh: Server, folder: Path, tmp
     settings = {"envs": ["eval_fakes:Line"], "policy_url": fresh.url, "episodes": 2, "video": "none"}
     summary = evaluate(flat_config(**settings, policy_options={"checkpoint_step": 3}, out=tmp_path / "results"))
     assert [checkpoint_of(cell) for cell in summary.results.cells] == [str(folder / "3")]
+    assert [weights_of(cell) for cell in summary.results.cells] == [digest([folder / "3"])]
+    assert digest([folder / "3"]) in (tmp_path / "results" / "report.html").read_text()
+    assert metadata(fresh)["weights"] == {"digest": digest([folder / "1"]), "revision": None}
     assert (summary.total.episodes, summary.total.policy_errors) == (2, 0)
     for option, error in (({"checkpoint_step": 77}, CheckpointFailed), ({"checkpoint": "lat"}, UnknownCheckpoint)):
         out = tmp_path / error.__name__

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 from eval_fakes import wait_for
 from gr00t_client import PolicyClient
-from peers import drive, peers_python
+from peer_environment import drive, peers_python
 from rpyc_client import Client, document
 
 from tests.integration.conftest import serving
-from vlagents_ray.serve.cluster import free_port
-from vlagents_ray.serve.keyfile import new_key
+from vlagents_ray.serve.access.key_store import new_key
+from vlagents_ray.serve.launch.server import free_port
 
 
 def test_with_keys_on_only_who_has_one_is_served_and_a_revoked_one_is_not(tmp_path: Path) -> None:
-    """GR00T's protocol carries a key, vlagents' does not: its door is opened on purpose, or not at all."""
+    """GR00T's protocol carries a key, vlagents' does not: it is served on purpose, or not at all."""
     file = tmp_path / "keys.json"
     key = new_key(file, "arm")
     observation = {"video": {"ego": np.full((1, 1, 8, 8, 3), 3, np.uint8)}, "language": {"task": [["abc"]]}}

@@ -11,12 +11,12 @@ import httpx
 import numpy as np
 import pytest
 import yaml
-from peers import drive, peers_python
+from peer_environment import drive, peers_python
 from websockets.sync.client import connect
 
-from vlagents_ray.serve.cluster import Server, running_server
-from vlagents_ray.serve.files import IMPORT_PATH, read_deployment
-from vlagents_ray.wire import openpi
+from vlagents_ray.serve.dialects.openpi import codec as openpi_codec
+from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH, read_deployment
+from vlagents_ray.serve.launch.server import Server, running_server
 
 CALLS = 12
 DIALECTS = {
@@ -105,12 +105,12 @@ def test_pings_are_answered_while_the_policy_thinks(server: Server) -> None:
     obs = {"observation/image": white, "observation/wrist_image": white, "observation/state": np.zeros(8)}
     with connect(websocket(server), compression=None, ping_interval=None) as socket:
         socket.recv()
-        socket.send(openpi.encode(obs | {"prompt": "task 1"}))
+        socket.send(openpi_codec.encode(obs | {"prompt": "task 1"}))
         for _ in range(10):  # two seconds of thinking, ten round trips
             assert socket.ping().wait(10)
         with pytest.raises(TimeoutError):
             socket.recv(timeout=0)
-        assert openpi.decode(socket.recv(timeout=30))["actions"][0, 0] == 255
+        assert openpi_codec.decode(socket.recv(timeout=30))["actions"][0, 0] == 255
 
 
 def test_all_of_them_at_once_beside_our_own(server: Server, python: Path) -> None:

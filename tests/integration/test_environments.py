@@ -14,18 +14,18 @@ import numpy as np
 import pytest
 import ray
 import yaml
-from environment_folders import ended, layered
 from eval_fakes import LINE, wait_for
 from flat_config import flat_config
+from virtual_environments import ended, layered
 
 from vlagents_ray import Obs, RemoteAgent
-from vlagents_ray.client.ways import TransportName
+from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.evaluate import evaluate
-from vlagents_ray.serve.cluster import Server, running_server
-from vlagents_ray.serve.environments.making import make_environment
-from vlagents_ray.serve.files import read_deployment
+from vlagents_ray.serve.launch.deployment_file import read_deployment
+from vlagents_ray.serve.launch.server import Server, running_server
+from vlagents_ray.serve.python_env.create import make_environment
 
-AGENT = "environment_agents:Telling"
+AGENT = "python_env_agents:Telling"
 VERSIONS = {"old": ("1.26.4", "1.15.0"), "new": (np.__version__, "1.16.0")}  # of numpy and six
 
 

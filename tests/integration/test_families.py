@@ -20,12 +20,12 @@ import numpy as np
 import pytest
 import ray
 import yaml
-from desk import DESK, DeskActor, play
+from family_env import DESK, DeskActor, play
 from flat_config import flat_config
 
 from vlagents_ray.evaluate import evaluate
-from vlagents_ray.serve.cluster import Server, running_server
-from vlagents_ray.serve.files import read_deployment
+from vlagents_ray.serve.launch.deployment_file import read_deployment
+from vlagents_ray.serve.launch.server import Server, running_server
 
 ROOT = Path(__file__).parents[2]
 ENVIRONMENTS = os.environ.get("VLAGENTS_RAY_ENVIRONMENTS") or sys.prefix  # with -NAME after it

@@ -1,4 +1,4 @@
-"""Messages that are nearly right, at every door of a real server: none crashes it, hangs it or makes it grow.
+"""Messages that are nearly right, at every endpoint of a real server: none crashes it, hangs it or makes it grow.
 
 Some thousands in CI; as many as wanted by hand:
 
@@ -24,16 +24,18 @@ import httpx
 import numpy as np
 import psutil
 import pytest
-from mutations import changed, mutated
+from mutated_messages import changed, mutated
 from websockets.exceptions import ConnectionClosedError
 from websockets.sync.client import ClientConnection, connect
 
 from tests.integration.conftest import serving
 from vlagents_ray import Obs, RemoteAgent
-from vlagents_ray.serve.cluster import Server
-from vlagents_ray.wire import openpi, openvla, vla_eval
-from vlagents_ray.wire.frames import CONTENT_TYPE, decode_reply, encode_request
-from vlagents_ray.wire.messages import Request
+from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_reply, encode_request
+from vlagents_ray.protocol.messages import Request
+from vlagents_ray.serve.dialects.openpi import codec as openpi_codec
+from vlagents_ray.serve.dialects.openvla import codec as openvla_codec
+from vlagents_ray.serve.dialects.vla_eval import codec as vla_eval_codec
+from vlagents_ray.serve.launch.server import Server
 
 FRAMES = int(os.environ.get("VLAGENTS_FUZZ_FRAMES", "2800"))
 ANSWER_S = 30.0
@@ -47,7 +49,7 @@ LIBERO = {
     "prompt": "task 4",
 }
 SEEN = {"images": {"front": PICTURE}, "task_description": "task 4", "state": np.ones(3)}
-FENCE = vla_eval.encode(vla_eval.Message("hello", {"protocol_version": 1}, 77))
+FENCE = vla_eval_codec.encode(vla_eval_codec.Message("hello", {"protocol_version": 1}, 77))
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +70,7 @@ def request(op: str) -> bytes:
 
 @dataclass
 class Target:
-    """A door, right messages for it, and what the last of them is answered with."""
+    """An endpoint, right messages for it, and what the last of them is answered with."""
 
     name: str
     path: str  # empty: the replica's own port for WebSockets
@@ -77,18 +79,20 @@ class Target:
     content_type: str = ""  # of an HTTP body; empty: it is a WebSocket
     greeting: bool = False  # the server speaks first
     trees: list[dict[str, Any]] = field(default_factory=list)  # messages before they were encoded
-    encode: Callable[[Any], bytes] = openpi.encode
+    encode: Callable[[Any], bytes] = openpi_codec.encode
     fence: bytes = b""  # a message that is always answered, for where others may not be
     seen: Counter[str] = field(default_factory=Counter)
 
 
 def as_json(tree: dict[str, Any]) -> bytes:
-    return json.dumps(tree, default=lambda array: json.loads(openvla.encode(np.asarray(array), twice=False))).encode()
+    return json.dumps(
+        tree, default=lambda array: json.loads(openvla_codec.encode(np.asarray(array), twice=False))
+    ).encode()
 
 
 def as_vla_eval(tree: dict[str, Any]) -> bytes:
     fields = {"kind": "observation", "payload": {}, "seq": 3} | tree
-    return vla_eval.encode(vla_eval.Message(fields["kind"], fields["payload"], fields["seq"]))
+    return vla_eval_codec.encode(vla_eval_codec.Message(fields["kind"], fields["payload"], fields["seq"]))
 
 
 def frame_pixel(answer: bytes) -> float:
@@ -97,7 +101,7 @@ def frame_pixel(answer: bytes) -> float:
 
 
 def map_pixel(answer: bytes) -> float:
-    return openpi.decode(answer)["actions"][0, 0]
+    return openpi_codec.decode(answer)["actions"][0, 0]
 
 
 TARGETS = [
@@ -107,7 +111,7 @@ TARGETS = [
     Target(
         "openpi",
         "/openpi",
-        [openpi.encode(LIBERO)],
+        [openpi_codec.encode(LIBERO)],
         map_pixel,
         greeting=True,
         trees=[LIBERO],
@@ -115,7 +119,7 @@ TARGETS = [
     Target(
         "roboarena",
         "/roboarena",
-        [openpi.encode({"endpoint": "reset"}), openpi.encode(LIBERO | {"endpoint": "infer"})],
+        [openpi_codec.encode({"endpoint": "reset"}), openpi_codec.encode(LIBERO | {"endpoint": "infer"})],
         map_pixel,
         greeting=True,
         trees=[LIBERO | {"endpoint": "infer", "session_id": "a"}],
@@ -123,8 +127,8 @@ TARGETS = [
     Target(
         "openvla",
         "/act",
-        [b'{"image":%s,"instruction":"task 4","unnorm_key":null}' % openvla.encode(PICTURE, twice=False)],
-        lambda a: openvla.decode(b'{"a":%s}' % a)[0]["a"][0],
+        [b'{"image":%s,"instruction":"task 4","unnorm_key":null}' % openvla_codec.encode(PICTURE, twice=False)],
+        lambda a: openvla_codec.decode(b'{"a":%s}' % a)[0]["a"][0],
         "application/json",
         trees=[{"image": PICTURE, "instruction": "task 4", "unnorm_key": "a"}],
         encode=as_json,
@@ -134,10 +138,10 @@ TARGETS = [
         "/vla-eval",
         [
             FENCE,
-            vla_eval.encode(vla_eval.Message("episode_start", {"task": {"name": "a"}}, 2)),
-            vla_eval.encode(vla_eval.Message("observation", SEEN, 3)),
+            vla_eval_codec.encode(vla_eval_codec.Message("episode_start", {"task": {"name": "a"}}, 2)),
+            vla_eval_codec.encode(vla_eval_codec.Message("observation", SEEN, 3)),
         ],
-        lambda a: vla_eval.decode(a).payload["actions"][0],
+        lambda a: vla_eval_codec.decode(a).payload["actions"][0],
         fence=FENCE,
         trees=[
             {"payload": SEEN},
@@ -221,7 +225,7 @@ def wait_for_answer(target: Target, socket: ClientConnection) -> bytes | str:
         if isinstance(answer, str) and answer != "reset successful":
             note(target, answer)
             socket.recv(timeout=ANSWER_S)  # raises ConnectionClosedError
-        if not target.fence or vla_eval.decode(answer).seq == 77:  # type: ignore[arg-type]
+        if not target.fence or vla_eval_codec.decode(answer).seq == 77:  # type: ignore[arg-type]
             return answer
 
 

@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import threading
+import urllib.request
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,28 +17,30 @@ import numpy as np
 import pytest
 from eval_fakes import wait_for
 from gr00t_client import PolicyClient
+from peer_environment import peers_python
 from peer_versions import package
-from peers import peers_python
 
 from tests.integration.conftest import SUPPORT, serving
-from vlagents_ray.bench.child import Child
-from vlagents_ray.serve.cluster import free_port
+from vlagents_ray.bench.line_process import LineProcess
+from vlagents_ray.serve.launch.server import free_port
 
 ANSWER_S = 120.0  # the client's imports included
 
 
-@dataclass(frozen=True)
+@dataclass
 class Ports:
     vlagents: int
     gr00t: int
+    url: str = ""
 
 
 @pytest.fixture(scope="module")
 def ports() -> Iterator[Ports]:
-    """One replica with both doors."""
+    """One replica, and a gateway with both dialects."""
     ports = Ports(free_port(), free_port())
     dialects = {"vlagents": {"port": ports.vlagents}, "gr00t": {"port": ports.gr00t}}
-    with serving("served_agents:Witness", batch={"max_size": 8}, dialects=dialects):
+    with serving("served_agents:Witness", batch={"max_size": 8}, dialects=dialects) as server:
+        ports.url = server.url
         yield ports
 
 
@@ -48,10 +51,10 @@ class Robot:
         script = str(SUPPORT / "vlagents_robot.py")
         alone = {"PYTHONPATH": os.pathsep.join(map(str, version)), "WANDB_MODE": "offline"}
         words = [str(peers_python()), script, "127.0.0.1", str(port), "Witness", mode]
-        self.child = Child(f"vlagents {mode}", words, alone)
+        self.child = LineProcess(f"vlagents {mode}", words, alone)
 
     def say(self, **wish: Any) -> Any:
-        return self.child.ask(json.dumps(wish), ANSWER_S)
+        return self.child.request(json.dumps(wish), ANSWER_S)
 
     def act(self, pixel: int, instruction: str = "abc", **more: Any) -> list:
         """[action rows] of each call."""
@@ -91,6 +94,16 @@ def at_once(*calls: Callable[[], object]) -> list[object]:
 def close_to(rows: list, pixel: int, acts: int, text: int = 3) -> bool:
     want = [[pixel, 0.5, 0.25, text, acts], [pixel, 0.5, 0.25, text, acts + 1]]
     return bool(np.allclose(rows, want, atol=[2, 1e-6, 1e-6, 0, 0]))  # JPEG moves a pixel a little
+
+
+def test_the_metadata_say_where_the_gateways_listen(ports: Ports) -> None:
+    def told() -> dict[str, str]:
+        with urllib.request.urlopen(f"{ports.url}/v1/metadata") as answer:
+            return {name: one["address"] for name, one in json.load(answer)["dialects"].items()}
+
+    wait_for(
+        lambda: told() == {"gr00t": f"tcp://127.0.0.1:{ports.gr00t}", "vlagents": f"rpyc://127.0.0.1:{ports.vlagents}"}
+    )
 
 
 def test_vlagents_0_3_raw_jpeg_and_shared_memory_at_once(ports: Ports) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import signal
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,9 @@ from ray_processes import words
 
 from tests.integration.conftest import serving
 from vlagents_ray.evaluate import EvalConfig, EvaluationInterrupted, Results, SilentProgress, evaluate
-from vlagents_ray.evaluate.cells import Cell
-from vlagents_ray.evaluate.episode import EpisodeResult
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.cases import EvalCase
+from vlagents_ray.serve.launch.server import Server
 
 pytestmark = pytest.mark.slow
 
@@ -55,7 +57,7 @@ class Disaster(SilentProgress):
         self.played = 0
         self.interrupted_after = interrupted_after
 
-    def episode(self, cell: Cell, result: EpisodeResult) -> None:
+    def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
         self.played += 1
         if self.played % 5 == 0:
             for process in psutil.Process().children(recursive=True):
@@ -77,19 +79,27 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, int], tup
     return found
 
 
-@pytest.mark.parametrize(("workers", "batch", "replicas", "num_envs"), [(2, 8, 1, 1), (4, 8, 2, 1), (2, 8, 1, 5)])
-def test_workers_batches_replicas_and_envs_side_by_side_change_no_result(
-    alone: dict[Any, Any], tmp_path: Path, workers: int, batch: int, replicas: int, num_envs: int
+@pytest.fixture(scope="module")
+def server(alone: dict[Any, Any], request: pytest.FixtureRequest) -> Iterator[Server]:
+    """With so many replicas, for all tests that want as many."""
+    with serving("served_agents:Hesitant", batch={"max_size": 8}, replicas=request.param) as server:
+        yield server
+
+
+@pytest.mark.parametrize("server", [1], indirect=True)
+def test_killed_workers_and_a_resumption_change_no_result(
+    alone: dict[Any, Any], tmp_path: Path, server: Server
 ) -> None:
-    with serving("served_agents:Hesitant", batch={"max_size": batch}, replicas=replicas) as server:
-        evaluate(plan(tmp_path, server.url, workers=workers, num_envs=num_envs))
+    with pytest.raises(EvaluationInterrupted):
+        evaluate(plan(tmp_path, server.url, workers=2, retries=20), progress=Disaster(EPISODES))
+    summary = evaluate(plan(tmp_path, server.url, workers=2, retries=20, resume=True), progress=Disaster())
+    assert summary.total.retries > 0
     assert outcomes(tmp_path) == alone
 
 
-def test_killed_workers_and_a_resumption_change_no_result(alone: dict[Any, Any], tmp_path: Path) -> None:
-    with serving("served_agents:Hesitant") as server:
-        with pytest.raises(EvaluationInterrupted):
-            evaluate(plan(tmp_path, server.url, workers=2, retries=20), progress=Disaster(EPISODES))
-        summary = evaluate(plan(tmp_path, server.url, workers=2, retries=20, resume=True), progress=Disaster())
-    assert summary.total.retries > 0
+@pytest.mark.parametrize(("server", "workers", "num_envs"), [(1, 2, 1), (1, 2, 5), (2, 4, 1)], indirect=["server"])
+def test_workers_batches_replicas_and_envs_side_by_side_change_no_result(
+    alone: dict[Any, Any], tmp_path: Path, server: Server, workers: int, num_envs: int
+) -> None:
+    evaluate(plan(tmp_path, server.url, workers=workers, num_envs=num_envs))
     assert outcomes(tmp_path) == alone

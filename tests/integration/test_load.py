@@ -13,7 +13,7 @@ from ray import serve
 
 from tests.integration.conftest import serving
 from vlagents_ray import Obs, RemoteAgent
-from vlagents_ray.client.ways import TransportName
+from vlagents_ray.client.transports.select import TransportName
 
 CLIENTS, ACTS = 24, 8
 

@@ -13,7 +13,7 @@ from eval_fakes import wait_for
 
 from tests.integration.conftest import serving
 from vlagents_ray import Obs, RemoteAgent
-from vlagents_ray.serve.cluster import Server
+from vlagents_ray.serve.launch.server import Server
 
 ACTS = 30
 
@@ -78,4 +78,5 @@ def test_prometheus_reads_requests_batches_and_load(server: Server) -> None:
         assert now[f"vlagents_stage_ms_count stage={stage} transport=shm"] == ACTS
     assert now["vlagents_batch_size_bucket le=1.0"] == 2 * ACTS
     assert now["vlagents_queue_depth class=robot"] == now["vlagents_queue_depth class=simulation"] == 0
+    assert now["vlagents_policy_version"] == 0
     assert 0 <= now["vlagents_utilisation"] < 0.5

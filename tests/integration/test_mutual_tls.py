@@ -10,12 +10,12 @@ from certificates import authority
 from eval_fakes import wait_for
 
 from vlagents_ray import ConfigError, Obs, RemoteAgent, Unauthorized
-from vlagents_ray.client.ways import TransportName
-from vlagents_ray.serve import own_ray
-from vlagents_ray.serve.cluster import running_server
-from vlagents_ray.serve.files import deployment
-from vlagents_ray.serve.keyfile import new_key
-from vlagents_ray.serve.tls import Tls
+from vlagents_ray.client.transports.select import TransportName
+from vlagents_ray.serve.access.key_store import new_key
+from vlagents_ray.serve.access.tls import Tls
+from vlagents_ray.serve.launch import private_cluster
+from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.server import running_server
 
 WAYS: tuple[TransportName, ...] = ("http", "websocket", "shm", "auto")
 
@@ -49,7 +49,7 @@ def test_a_replica_that_others_would_reach_does_not_start_without_keys() -> None
 
     from vlagents_ray.serve.ports import EVERYWHERE, free_port
 
-    with own_ray.own_ray("127.0.0.1", free_port(), num_cpus=2):
+    with private_cluster.own_ray("127.0.0.1", free_port(), num_cpus=2):
         client = serve_start(http_options={"host": EVERYWHERE, "port": free_port(EVERYWHERE)})
         try:
             client.deploy_apps(deployment("noop"))
@@ -64,7 +64,7 @@ def test_a_replica_that_others_would_reach_does_not_start_without_keys() -> None
 def test_without_haproxy_serve_asks_for_keys_and_encrypts_by_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(own_ray, "haproxy_binary", lambda: None)
+    monkeypatch.setattr(private_cluster, "haproxy_binary", lambda: None)
     ca = authority(tmp_path, "ca")
     token = new_key(tmp_path / "keys.json", "arm")
     tls, config = Tls(*ca.sign("server", "IP:127.0.0.2")), deployment("noop")

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
+import gc
 import os
 import random
 import re
 import select
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,12 +24,16 @@ from eval_fakes import wait_for
 from ray._private import ray_constants
 from ray._private.internal_api import memory_summary
 from ray._private.worker import global_worker
+from readme_blocks import ENV, ROOT
 
 from tests.integration.conftest import serving
 from vlagents_ray import ConnectionLost, Obs, PolicyUnavailable, RemoteAgent
-from vlagents_ray.client.plasma import PlasmaTransport
+from vlagents_ray.client.transports.local import unix_messages
+from vlagents_ray.client.transports.local.plasma import PlasmaTransport
 from vlagents_ray.errors import DeadlineExceeded, MalformedMessage, MessageTooLarge
-from vlagents_ray.wire.messages import PlasmaAddress, Request
+from vlagents_ray.protocol.messages import PlasmaAddress, Request
+from vlagents_ray.ray_tools.reaper import MARK
+from vlagents_ray.serve.launch.server import Server
 
 APP = "Echo"
 STORE = 100 * 10**6
@@ -33,11 +41,87 @@ LIMIT = 40 * 10**6
 
 
 @pytest.fixture(scope="module", autouse=True)
-def served() -> Iterator[None]:
+def served() -> Iterator[Server]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ray_constants, "DEFAULT_OBJECT_STORE_MAX_MEMORY_BYTES", STORE)
-        with serving("served_agents:Echo", limits={"body_bytes": LIMIT}):
-            yield
+        with serving("served_agents:Echo", limits={"body_bytes": LIMIT, "pixels": LIMIT // 3}) as server:
+            yield server
+
+
+LEARNER = """
+import sys
+
+import ray
+import my_env  # beside the script, as a user has it
+
+import vlagents_ray
+from vlagents_ray import Obs, RemoteAgent
+
+
+@ray.remote(num_cpus=0)
+class Env:
+    def play(self):
+        with RemoteAgent("serve://Echo", transport="plasma") as agent:
+            agent.reset(my_env.obs(), "of an actor")
+            act = agent.act(my_env.obs())
+            return agent.transport, act.info["instruction"], act.action.tolist()
+
+
+server = vlagents_ray.join(sys.argv[1], log_to_driver=False)  # others may run here
+assert vlagents_ray.join(sys.argv[1]) == server
+print(server.apps, *ray.get([Env.remote().play.remote() for _ in range(2)]))
+with RemoteAgent("serve://Echo") as agent:
+    agent.reset(my_env.obs(), "of the driver")
+    print(agent.act(my_env.obs()).info["instruction"])
+ray.shutdown()
+"""
+ENV_MODULE = """
+import numpy as np
+from vlagents_ray import Obs
+
+
+def obs():
+    return Obs({"front": np.full((8, 8, 3), 7, np.uint8)})
+"""
+
+
+def test_a_ray_program_of_the_user_joins_the_server_and_its_actors_act_over_plasma(
+    served: Server, tmp_path: Path
+) -> None:
+    """Nothing but its own files, and no variable of the server's process."""
+    (tmp_path / "my_env.py").write_text(ENV_MODULE)
+    script = tmp_path / "learner.py"
+    script.write_text(LEARNER)
+    ran = of_the_user(script, served.url)
+    played = "('plasma', 'of an actor', [7.0])"
+    assert ran.stdout.splitlines() == [f"('{APP}',) {played} {played}", "of the driver"], ran.stderr
+
+
+UNCHANGED = """
+import ray
+
+ray.init("auto", log_to_driver=False)
+print("Echo" in str(ray.util.list_named_actors(all_namespaces=True)))
+"""
+
+
+def test_a_ray_program_that_cannot_be_changed_joins_by_the_variables_of_the_docs(
+    served: Server, tmp_path: Path
+) -> None:
+    [line] = re.findall(r"`(RAY_ENABLE\S+=0) (RAY_AUTH_MODE=token)`", (ROOT / "docs" / "joining.md").read_text())
+    (tmp_path / "learner.py").write_text(UNCHANGED)
+    this = {"RAY_ADDRESS": ray.get_runtime_context().gcs_address}  # others may run here, which "auto" may find first
+    ran = of_the_user(tmp_path / "learner.py", served.url, **this, **dict(one.split("=") for one in line))
+    assert ran.stdout == "True\n", ran.stderr
+
+
+def of_the_user(script: Path, *arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Run a script without a variable of the server's process."""
+    environment = {name: value for name, value in ENV.items() if not name.startswith("RAY_") and name != MARK}
+    return subprocess.run(
+        [sys.executable, str(script), *arguments],
+        cwd=script.parent, env=environment | variables, capture_output=True, text=True, timeout=180, check=False,
+    )  # fmt: skip
 
 
 @pytest.fixture
@@ -45,6 +129,13 @@ def agent() -> Iterator[RemoteAgent]:
     with RemoteAgent(f"serve://{APP}", transport="plasma") as agent:
         agent.reset(frame(), "a task")
         yield agent
+
+
+@pytest.fixture
+def transport() -> Iterator[PlasmaTransport]:
+    """One that is closed even if its test fails."""
+    with contextlib.closing(PlasmaTransport(APP)) as transport:
+        yield transport
 
 
 def frame(size: int = 8, pixel: int = 0, **info: Any) -> Obs:
@@ -110,17 +201,15 @@ def test_an_idle_connection_takes_no_cpu(agent: RemoteAgent) -> None:
     assert used_s() - before < 0.5
 
 
-def test_a_late_reply_is_discarded(agent: RemoteAgent) -> None:
-    transport = PlasmaTransport(APP)
+def test_a_late_reply_is_discarded(transport: PlasmaTransport) -> None:
     transport.connect(30)
     assert transport.call([Request("reset", frame(), request_id="r")], 10)[0].error is None
     with pytest.raises(DeadlineExceeded):
         transport.call([Request("act", frame(pixel=1, sleep_s=0.5), request_id="late")], 0.05)
     with pytest.raises(DeadlineExceeded):  # its channel still holds the first
-        transport.call([Request("act", frame(pixel=2), request_id="too soon")], 0.05)
+        transport.call([Request("act", frame(pixel=2), request_id="too-soon")], 0.05)
     [reply] = transport.call([Request("act", frame(pixel=3), request_id="now")], 10)
     assert (reply.request_id, reply.act and reply.act.action.tolist()) == ("now", [3])
-    transport.close()
 
 
 def test_connections_leave_nothing(agent: RemoteAgent) -> None:
@@ -133,8 +222,10 @@ def test_connections_leave_nothing(agent: RemoteAgent) -> None:
     before = objects(), held(agent)
     for _ in range(30):
         cycle()
-    wait_for(lambda: held(agent)[1] <= before[1][1])
-    assert held(agent)[0] <= before[1][0]
+    # 30 would leave 30 or more. Two: what a process makes once, when it is first needed, such as the thread that
+    # listens while a batch of several sessions is slow.
+    wait_for(lambda: held(agent)[1] <= before[1][1] + 2)
+    wait_for(lambda: held(agent)[0] <= before[1][0] + 2)
     assert objects() <= before[0] + 1  # two at once, where the end of one came after the beginning of the next
 
 
@@ -149,7 +240,7 @@ def test_killed_env_actors_leave_nothing(agent: RemoteAgent) -> None:
             time.sleep(choose.uniform(0.05, 0.15))
         os.kill(pid, signal.SIGKILL)
     wait_for(lambda: held(agent)[1] <= before[1][1] + 2)  # 12 would leave 12 or more; Ray's own come and go
-    assert held(agent)[0] <= before[1][0] + 2
+    wait_for(lambda: held(agent)[0] <= before[1][0] + 2)
     # One is used again and again; of six killed in a storm few are killed in the microseconds of a write.
     assert objects() <= before[0] + 2 + 3
 
@@ -167,8 +258,7 @@ def test_an_env_actor_that_dies_while_it_writes_costs_its_channel_and_nothing_el
             assert other.act(frame(pixel=pixel)).action.tolist() == [pixel]
 
 
-def test_faults_are_answered_and_harm_nobody(agent: RemoteAgent) -> None:
-    transport = PlasmaTransport(APP)
+def test_faults_are_answered_and_harm_nobody(agent: RemoteAgent, transport: PlasmaTransport) -> None:
     transport.connect(30)
     transport.call([Request("reset", frame(), request_id="r")], 10)
     connection, key = transport._open(1), transport._channel.binary()
@@ -179,13 +269,12 @@ def test_faults_are_answered_and_harm_nobody(agent: RemoteAgent) -> None:
         (free, "lease"),
     ):
         connection.send(message)
-        transport.wait(connection, select.POLLIN, time.monotonic() + 10)
-        [reply] = transport.receive(connection)
+        unix_messages._wait(connection, select.POLLIN, time.monotonic() + 10)
+        [reply] = transport._receive(connection)
         error = reply.error
         assert isinstance(error, MalformedMessage)
         assert said in str(error)
     assert agent.act(frame(pixel=1)).action.tolist() == [1]
-    transport.close()
 
 
 def test_what_is_too_large_is_refused_and_said(agent: RemoteAgent) -> None:
@@ -197,7 +286,7 @@ def test_what_is_too_large_is_refused_and_said(agent: RemoteAgent) -> None:
 
 
 def test_auto_takes_plasma_where_the_socket_of_shared_memory_does_not_reach(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("vlagents_ray.client.auto.reaches", lambda _: False)
+    monkeypatch.setattr("vlagents_ray.client.transports.auto.reaches", lambda _: False)
     with RemoteAgent(f"serve://{APP}") as other:
         other.reset(frame(), "x")
         assert other.transport == "plasma"
@@ -208,7 +297,7 @@ def test_auto_takes_plasma_where_the_socket_of_shared_memory_does_not_reach(monk
 def test_auto_goes_on_by_the_handle_where_the_store_has_no_room_for_a_channel(
     monkeypatch: pytest.MonkeyPatch, first: int
 ) -> None:
-    monkeypatch.setattr("vlagents_ray.client.auto.reaches", lambda _: False)
+    monkeypatch.setattr("vlagents_ray.client.transports.auto.reaches", lambda _: False)
     with RemoteAgent(f"serve://{APP}") as other:
         other.reset(frame(first), "x")
         act = other.act(frame(3600, pixel=6))  # 39 MB, so a channel of 64 MB
@@ -222,7 +311,8 @@ def test_a_killed_replica_is_noticed_and_the_next_one_serves() -> None:
     agent = RemoteAgent(f"serve://{APP}", transport="plasma", resume=False)
     pid = agent.reset(frame(), "before")["pid"]
     folder = Path(global_worker.node.plasma_store_socket_name).parent
-    names, before = set(folder.glob("vla*")), objects()
+    names, channel = set(folder.glob("vla*")), agent._connection.transport._channel.hex()
+    gc.disable()  # what the loss's traceback keeps would stay: nothing of the channel may be in it
     os.kill(pid, signal.SIGKILL)
     begun = time.monotonic()
     with pytest.raises(ConnectionLost):
@@ -239,5 +329,6 @@ def test_a_killed_replica_is_noticed_and_the_next_one_serves() -> None:
     assert agent.act(frame()).info["instruction"] == "after"
     assert len(set(folder.glob("vla*"))) == 1
     assert not names & set(folder.glob("vla*"))
-    wait_for(lambda: objects() <= before)  # those that this process wrote to stay until it ends
+    wait_for(lambda: channel not in memory_summary(ray.get_runtime_context().gcs_address))
+    gc.enable()
     agent.close()

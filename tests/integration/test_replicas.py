@@ -13,9 +13,9 @@ from eval_fakes import wait_for
 from tests.integration.conftest import serving
 from tests.integration.test_sessions import obs
 from vlagents_ray import ConnectionLost, NotReset, RemoteAgent
-from vlagents_ray.client.handle import ReplicaNodes
-from vlagents_ray.client.ways import TransportName
-from vlagents_ray.serve.cluster import Server
+from vlagents_ray.client.transports.select import TransportName
+from vlagents_ray.client.transports.serve_handle import ReplicaNodes
+from vlagents_ray.serve.launch.server import Server
 
 
 @pytest.fixture(scope="module")
@@ -48,8 +48,8 @@ def test_http_sessions_stay_on_their_replica(server: Server) -> None:
 def test_a_caller_learns_on_which_nodes_the_replicas_are_and_of_no_application_nothing(server: Server) -> None:
     assert server.apps.keys() == {"Reacher"}
     nodes, here = ReplicaNodes("Reacher"), ray.get_runtime_context().get_node_id()
-    wait_for(lambda: nodes.look() == {here: 3})
-    assert ReplicaNodes("Nobody").look() == {}
+    wait_for(lambda: nodes.query() == {here: 3})
+    assert ReplicaNodes("Nobody").query() == {}
 
 
 @pytest.mark.parametrize("transport", ["handle", "shm", "plasma"])

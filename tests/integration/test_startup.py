@@ -11,7 +11,7 @@ import sys
 import threading
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -19,16 +19,14 @@ import psutil
 import pytest
 import yaml
 from eval_fakes import wait_for
-from listeners import listeners
-from ray.autoscaler._private.constants import AUTOSCALER_METRIC_PORT
 from ray_processes import ray_folder
 from rpyc_client import Client, call
 
 from tests.integration.conftest import serving
 from vlagents_ray import ConfigError, Obs, RemoteAgent
 from vlagents_ray.envs import make_env
-from vlagents_ray.serve.cluster import free_port, running_server
-from vlagents_ray.serve.files import deployment, listens_at, read_deployment
+from vlagents_ray.serve.launch.deployment_file import deployment, listens_at, read_deployment
+from vlagents_ray.serve.launch.server import free_port, running_server
 
 COMMAND = [str(Path(sys.executable).parent / "vlagents-ray")]
 ROOT = Path(__file__).parent.parent.parent
@@ -112,7 +110,7 @@ def test_two_servers_on_one_machine_do_not_meet() -> None:
                     assert agent.act(Obs()).action.shape == (dim,)
 
 
-def test_the_command_line_opens_a_door_for_vlagents_and_closes_it() -> None:
+def test_the_command_line_opens_an_endpoint_for_vlagents_and_closes_it() -> None:
     port, robots = free_port(), free_port()
     with command("serve", "noop", "--port", str(port), "--vlagents-port", str(robots)):
         wait_for(lambda: _name_at(robots) == "noop")
@@ -120,17 +118,17 @@ def test_the_command_line_opens_a_door_for_vlagents_and_closes_it() -> None:
         Client(robots)
 
 
-def test_a_doors_taken_port_fails_the_deployment_and_is_named() -> None:
+def test_an_endpoints_taken_port_fails_the_deployment_and_is_named() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with (
             pytest.raises(ConfigError, match=f"vlagents: cannot listen on 127.0.0.1:{port}"),
             serving("noop", dialects={"vlagents": {"port": port}}),
         ):
-            pytest.fail("served without its door")
+            pytest.fail("served without its endpoint")
 
 
-def test_a_policy_that_does_not_load_says_why_with_a_door_too() -> None:
+def test_a_policy_that_does_not_load_says_why_with_an_endpoint_too() -> None:
     with (
         pytest.raises(ConfigError, match="no checkpoint here"),
         serving("served_agents:Broken", dialects={"vlagents": {"port": free_port()}}),
@@ -150,17 +148,6 @@ def test_a_taken_port_is_said_at_once() -> None:
     assert "choose another --port" in result.stderr
 
 
-def test_rays_metrics_stay_off_the_port_that_every_ray_has_for_them() -> None:
-    """They answer any path with 200: a server that wanted that port would seem to be there."""
-
-    def monitors() -> set[int]:
-        return {one.port for one in listeners(psutil.Process()) if one.process == "monitor.py" and one.kind == "tcp"}
-
-    with serving("noop"):
-        wait_for(monitors)
-        assert AUTOSCALER_METRIC_PORT not in monitors()
-
-
 def test_serve_deploy_takes_the_same_file(tmp_path: Path) -> None:
     """Ray's own tools, on a cluster that Ray's own tools started."""
     serve_port, dashboard, gcs, robots = free_port(), free_port(), free_port(), free_port()
@@ -171,7 +158,17 @@ def test_serve_deploy_takes_the_same_file(tmp_path: Path) -> None:
     assert "dialects" in file.read_text()
     assert str(serve_port) in file.read_text()
     bin_dir = Path(sys.executable).parent
-    environment = os.environ | {"RAY_AUTH_MODE": "disabled"}
+    environment = os.environ | {"RAY_AUTH_MODE": "disabled", "PYTHONPATH": os.pathsep.join(sys.path)}
+    failing = tmp_path / "failing.yaml"
+    failing.write_text(
+        f"http_options: {{port: {serve_port}}}\napplications:\n"
+        "  - {name: broken, route_prefix: /broken, import_path: 'vlagents_ray.serve.app:build',"
+        " args: {policy: 'served_agents:Broken'}}\n"
+        "  - {name: large, route_prefix: /large, import_path: 'vlagents_ray.serve.app:build',"
+        " args: {policy: noop, resources: {num_gpus: 100}}}\n"
+        "  - {name: nowhere, route_prefix: /nowhere, import_path: 'vlagents_ray.serve.app:build',"
+        " args: {policy: noop, environment: {python: /nowhere/bin/python}}}\n"
+    )
 
     def ray(*words: str, check: bool = True) -> bool:
         done = subprocess.run(words, check=check, timeout=120, env=environment, capture_output=True)
@@ -194,9 +191,43 @@ def test_serve_deploy_takes_the_same_file(tmp_path: Path) -> None:
             env.step(agent.act(obs))
         wait_for(lambda: _name_at(robots) == "scripted")
 
+        ray(*deploy[:-1], str(failing))
+        seen: list[str] = []
+        wait_for(lambda: seen.append(_status(dashboard, "broken")[0]) or seen[-1] == "DEPLOY_FAILED", 120)
+        assert "RUNNING" not in seen
+        assert "the policy did not load: FileNotFoundError: no checkpoint here" in _status(dashboard, "broken")[1]
+        assert _status(dashboard, "large")[0] == "DEPLOYING"
+        wait_for(lambda: _status(dashboard, "nowhere")[0] == "DEPLOY_FAILED", 120)
+        first, said = _status(dashboard, "nowhere")[1].strip().splitlines()
+        assert first == "Deploying app 'nowhere' failed with exception:"
+        assert said.startswith("ConfigError: environment.python: no such file, got '/nowhere/bin/python'")
+        for app in ("broken", "large"):
+            for path in ("healthz", "v1/metadata"):
+                status, headers = _answer(f"{url}/{app}/{path}")
+                assert status == 503
+                assert headers["retry-after"] or app == "broken"
+
+
+def _status(dashboard: int, app: str) -> tuple[str, str]:
+    """What `serve status` says of an application, and why."""
+    with urllib.request.urlopen(f"http://127.0.0.1:{dashboard}/api/serve/applications/", timeout=30) as answer:
+        found = json.load(answer)["applications"].get(app)
+    if found is None:
+        return "", ""
+    return found["status"], " ".join([found["message"], *(d["message"] for d in found["deployments"].values())])
+
+
+def _answer(url: str) -> tuple[int, Mapping[str, str]]:
+    try:
+        with urllib.request.urlopen(url, timeout=10) as answer:
+            return answer.status, answer.headers
+    except urllib.error.HTTPError as error:
+        error.close()
+        return error.code, error.headers
+
 
 def _name_at(port: int) -> str | None:
-    """What the vlagents door on that port calls the policy."""
+    """What the vlagents endpoint on that port calls the policy."""
     try:
         with Client(port) as client:
             client.send(call("name"))

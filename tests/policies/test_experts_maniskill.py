@@ -10,15 +10,16 @@ from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.experts import expert_for
 
-EPISODES = 10
+pytestmark = pytest.mark.sim
+
+EPISODES = 4
 
 
 @pytest.mark.vulkan
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["PushCube-v1", "PickCube-v1"])
-def test_the_expert_solves_nine_of_ten_episodes_and_the_cube_stays(task: str) -> None:
+def test_the_expert_solves_the_task_and_the_cube_stays(task: str) -> None:
     name = f"maniskill/{task}"
-    once = at_end = 0
     with ManiSkill(task, width=16, height=16) as env:  # experts do not look at the image
         for seed in range(EPISODES):
             obs, _ = env.reset(seed=seed)
@@ -31,10 +32,7 @@ def test_the_expert_solves_nine_of_ten_episodes_and_the_cube_stays(task: str) ->
                 successes.append(info["success"])
                 assert not terminated
             assert len(successes) == env.max_steps == 50  # the env goes on after success
-            once += any(successes)
-            at_end += successes[-1]
-    assert once >= EPISODES - 1
-    assert at_end >= EPISODES - 1
+            assert successes[-1], f"seed {seed}"
 
 
 @pytest.mark.parametrize("task", ["PushCube-v1", "PickCube-v1"])

@@ -11,9 +11,9 @@ from pydantic import BaseModel
 
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.contract import ActionSpec, Contract
-from vlagents_ray.errors import ConfigError, InvalidObservation, PolicyFailed
+from vlagents_ray.errors import ConfigError, InvalidObservation, NotTrainable, PolicyFailed
 from vlagents_ray.policies.wrapper import Wrapper, build_agent
-from vlagents_ray.serve.sessions import AgentCopies
+from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.testing import check_agent
 
 
@@ -135,3 +135,29 @@ def test_what_keeps_the_inner_agent_from_acting_is_said_by_the_wrapper_too() -> 
 
     with pytest.raises(PolicyFailed, match="the device is lost"):
         Dim(Lost(), DimConfig()).check_health()
+
+
+def test_what_an_agent_says_of_its_weights_is_said_through_a_wrapper() -> None:
+    agent = Bright()
+    agent.weights_id = {"digest": "x", "revision": None}
+    wrapped = Dim.around(agent, {})
+    assert wrapped.weights_id is None
+    wrapped.initialize()
+    assert wrapped.weights_id == {"digest": "x", "revision": None}
+
+
+def test_what_a_learner_trains_is_that_of_the_policy() -> None:
+    class Trained(Bright):
+        trainable = "tree"
+
+        def initialize(self) -> None:
+            super().initialize()
+            self.tree = {"gain": np.zeros(2)}
+
+    agent = Dim(Trained(), DimConfig())
+    agent.initialize()
+    agent.load_parameters({"gain": np.ones(2)})
+    assert agent.parameters()["gain"] is agent.agent.tree["gain"]  # type: ignore[attr-defined]
+    assert agent.parameters()["gain"].tolist() == [1, 1]
+    with pytest.raises(NotTrainable, match="Bright: names no parameters"):
+        Dim(Bright(), DimConfig()).parameters()

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
+import fcntl
 import gc
 import os
+import pty
+import re
 import signal
 import subprocess
 import sys
+import termios
 import threading
 import time
 import weakref
+from typing import Any
 
 import numpy as np
 import pytest
 
 from vlagents_ray import Act, ActionSpec, Agent, CameraSpec, ConfigError, Contract, Obs, PolicyFailed, StateSpec
-from vlagents_ray.client.chunks import ChunkPlayer
+from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.errors import InvalidAction
 from vlagents_ray.robot import Guard, Watchdog, run_loop
+from vlagents_ray.robot.__main__ import _restarting as restarting
 from vlagents_ray.robot.__main__ import main
 from vlagents_ray.robot.pacing import Pacer, empty_loop, jitter, undisturbed
 from vlagents_ray.robot.simulated import SimulatedRobot
@@ -89,16 +95,25 @@ def test_an_empty_loop_measures_the_machine() -> None:
     assert told["ticks"] + told["missed"] == 40
 
 
-def test_the_process_is_left_as_it_was() -> None:
+@pytest.mark.parametrize("frozen", [False, True])
+def test_the_process_is_left_as_it_was(*, frozen: bool) -> None:
     def settings() -> tuple[object, ...]:
         nice = os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
         return gc.isenabled(), gc.get_freeze_count(), sys.getswitchinterval(), nice
 
-    before = settings()
-    with undisturbed() as done:
-        assert not gc.isenabled()
-        assert done
-    assert settings() == before
+    (gc.freeze if frozen else gc.unfreeze)()
+    try:
+        before = settings()
+        heap = [[] for _ in range(100_000)]
+        with undisturbed() as done:
+            assert not gc.isenabled()
+            assert done
+            assert len(gc.get_objects()) < len(heap), "a collection within the loop would go through all of them"
+        after = settings()
+        assert (after[0], *after[2:]) == (before[0], *before[2:])
+        assert (gc.get_freeze_count() >= before[1]) if frozen else (gc.get_freeze_count() == 0)
+    finally:
+        gc.freeze()  # as conftest.py has it
 
 
 @pytest.mark.parametrize("real_time", [False, True])
@@ -157,6 +172,31 @@ def test_with_a_player_the_loop_goes_on_with_a_safe_action() -> None:
     player.close()
     assert robot.commanded == [0, 0.01, 0.02, 0.02, 0.04, 0.05]
     assert report.safe_ticks == 1
+
+
+def test_the_loop_has_no_other_guard_than_its_player() -> None:
+    class Bounded(Going):
+        contract = Contract(action=ActionSpec(dim=2, delta=False))
+
+    robot, guard = Watched(Bounded.contract), Guard(high=0.025)
+    player = ChunkPlayer(Bounded(), deadline_s=30.0, check=guard, safe=np.full(2, 9.0))
+    report = run_loop(robot, player, hz=HZ, until=lambda: len(robot.commanded) >= 6)
+    assert robot.commanded == [0, 0.01, 0.02, 0.02, 0.02, 0.02]  # neither what is planned nor the 9
+    assert report.safe_ticks == 3
+    run_loop(robot, player, hz=HZ, seconds=0.05, guard=guard)
+    with pytest.raises(ConfigError, match="one of them"):
+        run_loop(robot, player, hz=HZ, guard=Guard(high=0.025))
+    player.close()
+
+
+def test_a_safe_action_without_any_guard_passes_the_contracts_bounds() -> None:
+    robot = Watched(Going.contract)
+    player = ChunkPlayer(Going(wrong_at=3), deadline_s=30.0, safe=np.full(2, 9.0))
+    with pytest.raises(InvalidAction, match="above the limit 1"):
+        run_loop(robot, player, hz=HZ, seconds=1)
+    player.close()
+    assert max(robot.commanded) < 0.03
+    assert robot.stops == 1
 
 
 def test_a_chunk_needs_a_player() -> None:
@@ -226,7 +266,180 @@ def test_a_robot_that_the_watchdog_stopped_stays_so_until_the_server_is_heard_ag
     applied = [tick for tick in ticks if at_bark[0] + 1 < tick < at_bark[0] + 19]
     assert applied == []
     assert ticks[-1] >= at_bark[0] + 25  # and goes on then
-    assert sum(n for reason, n in report.safe.items() if "no word of the server" in reason) >= 17
+    assert sum(n for reason, n in report.safe.items() if "no signal from the server" in reason) >= 17
+
+
+class Hardware(Watched):
+    """As far as the loop knows."""
+
+    simulated = False
+
+
+class Silenced(Going):
+    """A server that is silent from its sixth action on until the test ends that."""
+
+    contract = Contract(action=ActionSpec(dim=2, delta=False))
+    silent = True
+    interrupts = 0
+
+    def act(self, obs: Obs) -> Act:
+        act = super().act(obs)
+        return Act(act.action, info={"silent_s": 1e6 if self.silent and self.tick > 5 else 0.0})
+
+    def interrupt(self) -> None:
+        self.interrupts += 1
+
+
+@pytest.mark.parametrize("restart", [None, "manual", "auto"])
+def test_after_a_protective_stop_hardware_moves_only_when_it_is_told(restart: Any) -> None:
+    robot, agent = Hardware(Going.contract), Silenced()
+    told: list[tuple[bool, int]] = []  # whether a restart was granted, and at which tick
+    barked_at: list[int] = []
+
+    def bark(_: str) -> None:
+        robot.stop()
+        barked_at.append(agent.tick)
+        watchdog._limits["server"] = 1e3  # on a busy machine it would bark again
+
+    watchdog = Watchdog(bark, {"server": 0.1})
+
+    def over() -> bool:
+        since = agent.tick - barked_at[0] if barked_at else 0
+        if since == 10:
+            told.append((watchdog.restart(), agent.tick))
+        if since >= 20:
+            agent.silent = False
+        if since == 50:
+            told.append((watchdog.restart(), agent.tick))
+        return since > 80
+
+    report = run_loop(robot, agent, hz=HZ, until=over, watchdog=watchdog, restart=restart)
+    ticks = [round(100 * value) for value in robot.commanded]
+    again = min(tick for tick in ticks if tick > barked_at[0] + 2)
+    assert told[0][0] is False  # while it was silent
+    assert told[1][0] is True
+    assert ticks[-1] >= barked_at[0] + 75
+    if restart == "auto":
+        assert barked_at[0] + 18 <= again < barked_at[0] + 30
+    else:
+        assert again >= told[1][1] - 1
+        assert sum(n for reason, n in report.safe.items() if "waiting for a restart" in reason) >= 20
+    assert agent.interrupts >= again - barked_at[0] - 3  # nothing of what it returned meanwhile was executed
+    assert len(watchdog.barks) == 1
+
+
+def test_a_simulated_robot_restarts_by_itself() -> None:
+    robot, agent = Watched(Going.contract), Silenced()
+    stopped_at: list[int] = []
+
+    def bark(_: str) -> None:
+        agent.silent = False
+        watchdog._limits["server"] = 1e3
+
+    watchdog = Watchdog(bark, {"server": 0.05})
+
+    def over() -> bool:
+        if watchdog.barks and not stopped_at:
+            stopped_at.append(agent.tick)
+        return bool(stopped_at) and agent.tick > stopped_at[0] + 30
+
+    run_loop(robot, agent, hz=HZ, until=over, watchdog=watchdog)
+    assert round(100 * robot.commanded[-1]) > stopped_at[0] + 20
+
+
+def test_an_unknown_restart_is_refused() -> None:
+    with pytest.raises(ConfigError, match="want one of"):
+        run_loop(Watched(), Going(), hz=HZ, restart="later")  # type: ignore[arg-type]
+
+
+def test_a_person_restarts_the_command_by_a_signal() -> None:
+    said: list[str] = []
+    stopped = threading.Event()
+    with Watchdog(lambda _: stopped.set(), {"loop": 0.05}) as watchdog, restarting(watchdog, said.append):
+        assert stopped.wait(30)
+        os.kill(os.getpid(), signal.SIGUSR1)
+        assert watchdog.stopped  # it hangs still
+        watchdog._limits["loop"] = 60.0
+        watchdog.heard("loop")
+        assert watchdog.stopped
+        os.kill(os.getpid(), signal.SIGUSR1)
+        assert not watchdog.stopped
+    assert signal.getsignal(signal.SIGUSR1) == signal.SIG_DFL
+
+
+def test_a_person_restarts_the_command_by_enter_at_its_terminal() -> None:
+    code = """
+import threading
+from vlagents_ray.robot import Watchdog
+from vlagents_ray.robot.__main__ import _restarting
+
+stopped, restarted = threading.Event(), threading.Event()
+
+def say(line):
+    print(line, flush=True)
+    if line == "restarted":
+        restarted.set()
+
+with Watchdog(lambda _: stopped.set(), {"loop": 0.05}) as watchdog, _restarting(watchdog, say):
+    assert stopped.wait(30)
+    watchdog._limits["loop"] = 60.0
+    watchdog.heard("loop")
+    print("stopped", flush=True)
+    assert restarted.wait(30)
+    assert not watchdog.stopped
+"""
+    ours, its = pty.openpty()
+    with subprocess.Popen(
+        [sys.executable, "-c", code],
+        stdin=its,
+        stdout=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0),  # noqa: PLW1509 - nothing else is started meanwhile
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "stopped\n"
+        os.write(ours, b"\n")
+        assert process.stdout.readline() == "restarted\n"
+        assert process.wait(30) == 0
+    os.close(ours)
+    os.close(its)
+
+
+def test_before_the_first_action_and_after_a_stop_the_loops_guard_measures_where_the_robot_stands() -> None:
+    guard = Guard(Going.contract, max_step=0.05, measure=lambda obs: obs.state["joints"])
+    robot = Watched(Going.contract)
+    run_loop(robot, Going(), hz=HZ, seconds=0.05, guard=guard)
+    assert robot.commanded
+    away = Watched(Going.contract)
+    away._joints = away._target = np.full(2, 0.5, np.float32)
+    with pytest.raises(InvalidAction, match=r"after 0\.5"):
+        run_loop(away, Going(), hz=HZ, seconds=0.05, guard=guard)
+    assert away.commanded == []
+
+    moved = Watched(Going.contract)
+    agent = Silenced()
+
+    def bark(_: str) -> None:
+        moved._joints = moved._target = np.full(2, -0.9, np.float32)  # by hand
+        watchdog._limits["server"] = 1e3
+        agent.silent = False
+
+    watchdog = Watchdog(bark, {"server": 0.1})
+    with pytest.raises(InvalidAction, match=r"after -0\.9"):
+        run_loop(moved, agent, hz=HZ, seconds=10.0, guard=guard, watchdog=watchdog)
+
+
+def test_before_the_first_action_no_safe_one_is_commanded() -> None:
+    class Waiting(Going):
+        def act(self, obs: Obs) -> Act:
+            act = super().act(obs)
+            return Act(act.action, info={"safe": "waiting"} if self.tick < 5 else {})
+
+    robot = Watched(Going.contract)
+    report = run_loop(robot, Waiting(), hz=HZ, until=lambda: len(robot.commanded) >= 3)
+    assert robot.commanded[:2] == [0.04, 0.05]
+    assert report.safe == {"waiting": 4}
 
 
 def test_an_action_that_a_hanging_loop_was_late_with_is_not_applied() -> None:
@@ -327,6 +540,104 @@ def test_the_simulated_robot_gives_what_a_contract_asks_for() -> None:
     assert first.gripper is not None
     assert last.gripper is not None
     assert last.gripper > first.gripper
+
+
+class Served(Going):
+    """In place of the agent that the command would connect."""
+
+    transport = "local"
+    contract: Contract | None = Contract(action=ActionSpec(dim=2, delta=False), chunk=1)  # type: ignore[assignment]
+    slow_s = 0.0
+
+    def __init__(self, *_: object, **__: object) -> None:
+        super().__init__()
+
+    def act(self, obs: Obs) -> Act:
+        time.sleep(self.slow_s * (self.tick > 0))
+        return super().act(obs)
+
+
+SHORT = ["http://nowhere", "--seconds", "1", "--baseline", "0"]
+
+
+@pytest.mark.parametrize("mode", ["async", "open_loop", "ensemble"])
+def test_the_command_drives_with_single_actions_as_it_is(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], mode: str
+) -> None:
+    monkeypatch.setattr("vlagents_ray.robot.__main__.RemoteAgent", Served)
+    status = main([*SHORT, "--hz", "10", "--mode", mode])
+    said = re.search(r"ticks without an action of the policy: (\d+) of (\d+)", capsys.readouterr().out)
+    assert said is not None
+    assert int(said[1]) < 0.5 * int(said[2])  # none where the machine is not busy
+    assert status == (1 if int(said[1]) else 0)
+
+
+def test_the_simulated_robot_takes_actions_of_which_nothing_is_stated(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("vlagents_ray.robot.__main__.RemoteAgent", Served)
+    monkeypatch.setattr(Served, "contract", Contract(action=ActionSpec(dim=2)))
+    assert main([*SHORT, "--hz", "10"]) in (0, 1)
+
+
+def test_a_run_of_safe_actions_does_not_look_like_success(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("vlagents_ray.robot.__main__.RemoteAgent", Served)
+    monkeypatch.setattr(Served, "slow_s", 0.3)
+    assert main(SHORT) == 3
+    said = capsys.readouterr()
+    assert "MOSTLY SAFE ACTIONS, exit status 3" in said.out
+    assert (said.out + said.err + caplog.text).count("--deadline-ms") == 1
+
+
+def test_a_setting_that_does_not_fit_is_refused_before_anything_is_timed(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("vlagents_ray.robot.__main__.RemoteAgent", Served)
+    monkeypatch.setattr(Served, "contract", None)
+    assert main(["http://nowhere", "--robot", "vlagents_ray.robot.simulated:SimulatedRobot"]) == 2
+    said = capsys.readouterr()
+    assert "--safe hold" in said.err
+    assert "empty loop" not in said.out
+
+
+@pytest.mark.parametrize(
+    ("options", "wanted"),
+    [
+        (["--hz", "0"], "argument --hz: got '0', want a number above 0"),
+        (["--hz", "nan"], "argument --hz: got 'nan', want a number above 0"),
+        (["--seconds", "-1"], "argument --seconds: got '-1', want a number above 0"),
+        (["--execute", "0"], "argument --execute: got '0', want a whole number from 1"),
+        (["--horizon", "1.5"], "argument --horizon: got '1.5', want a whole number from 1"),
+        (["--max-age-s", "0"], "argument --max-age-s: got '0', want a number above 0"),
+        (["--deadline-ms", "-1"], "argument --deadline-ms: got '-1', want a number from 0"),
+        (["--silent-s", "soon"], "argument --silent-s: got 'soon', want a number above 0"),
+        (["--mode", "open_loop", "--rtc"], "--merge and --rtc: got one of them with --mode open_loop"),
+        (["--robot", "elsewhere:Arm"], "--robot elsewhere:Arm: No module named 'elsewhere'; go to the folder of"),
+    ],
+)
+def test_options_are_checked_before_a_server_is_asked(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], options: list[str], wanted: str
+) -> None:
+    monkeypatch.setattr("vlagents_ray.robot.__main__.RemoteAgent", None)
+    try:
+        status: object = main([*SHORT, *options])
+    except SystemExit as ended:
+        status = ended.code
+    assert status == 2
+    assert wanted in capsys.readouterr().err
+
+
+def test_errors_of_the_library_name_the_commands_options(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("vlagents_ray.robot.__main__.RemoteAgent", Served)
+    monkeypatch.setattr(Served, "contract", Contract(action=ActionSpec(dim=2, delta=True)))
+    assert main([*SHORT, "--safe", "hold"]) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("ConfigError: --safe: got 'hold', which ")
+    assert "give --safe zero, or 'auto'" in said
+    assert main([*SHORT, "--measure", "joints"]) == 2
+    assert capsys.readouterr().err.startswith("ConfigError: --measure: got one for relative actions")
 
 
 def test_the_command_says_what_it_cannot_do(capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,6 +18,8 @@ import pytest
 from eval_fakes import wait_for
 
 from vlagents_ray import ConfigError, Obs
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.dataset_contract import BYTES, INFO, STATISTICS, DatasetContract
 from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.robot.dataset import Dataset
 from vlagents_ray.robot.record import Recorder
@@ -44,6 +46,48 @@ def record(root: Path, frames: int, instruction: str = "stack the cups") -> None
 
 def info(root: Path) -> dict:
     return json.loads((root / "meta/info.json").read_text())
+
+
+def test_two_cameras_never_share_a_video(tmp_path: Path) -> None:
+    for _ in range(2):  # the second time the dataset is opened again
+        with Recorder(tmp_path, FPS) as recorder, recorder.episode("look"):
+            for i in range(4):
+                views = {"left/wrist": 0, "left_wrist": 200, "front": 100}
+                cameras = {name: np.full((SIDE, SIDE, 3), value, np.uint8) for name, value in views.items()}
+                recorder.add(Obs(cameras), action(i), tick=i)
+    seen = {}
+    for path in tmp_path.rglob("file-001.mp4"):
+        with av.open(str(path)) as video:
+            frames = [round(float(frame.to_ndarray(format="rgb24").mean()), -1) for frame in video.decode(video=0)]
+        seen[path.parent.parent.name.rpartition(".")[2]] = frames
+    assert seen == {"left_wrist": [200] * 4, "left_wrist_2": [0] * 4, "front": [100] * 4}
+
+
+def test_a_policy_that_is_trained_on_it_learns_what_its_state_and_cameras_are(tmp_path: Path) -> None:
+    for _ in range(2):  # the second time the dataset is opened again
+        record(tmp_path, 3)
+    about = DatasetContract.from_json(info(tmp_path)[INFO])
+    assert about.state == ("joints", "left/force", "gripper")
+    assert about.cameras == {"observation.images.front": "front", "observation.images.left_wrist": "left/wrist"}
+    assert about.contract == Contract(
+        cameras={"front": CameraSpec(SIDE, SIDE), "left/wrist": CameraSpec(33, 47)},
+        state={"joints": StateSpec(2), "left/force": StateSpec(1)},
+        gripper=True,
+        action=ActionSpec(dim=3),
+        control_hz=FPS,
+    )
+    statistics = json.loads((tmp_path / "meta/stats.json").read_text())
+    assert DatasetContract.from_statistics(statistics[STATISTICS][BYTES]) == about
+    assert statistics["action"]["count"] == [6]
+
+
+def test_the_gripper_is_that_of_the_observation(tmp_path: Path) -> None:
+    seen = Obs(gripper=0.5, state={"gripper": np.array([0.04], np.float32), "joints": np.zeros(2, np.float32)})
+    with Recorder(tmp_path, FPS) as recorder, recorder.episode("grasp"):
+        recorder.add(seen, action(0), tick=0)
+    rows = pq.read_table(tmp_path / "data/chunk-000/file-000.parquet").to_pydict()
+    assert rows["observation.state"] == [[0, 0, 0.5]]
+    assert DatasetContract.from_json(info(tmp_path)[INFO]).state == ("joints", "gripper")
 
 
 def test_an_episode_holds_what_was_seen_and_done(tmp_path: Path) -> None:
@@ -198,7 +242,7 @@ def test_what_info_does_not_count_is_removed(tmp_path: Path) -> None:
 
 def test_a_folder_that_holds_something_else_is_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("...")
-    with pytest.raises(ConfigError, match="no LeRobotDataset"):
+    with pytest.raises(ConfigError, match="not a LeRobotDataset"):
         Recorder(tmp_path, FPS)
 
 

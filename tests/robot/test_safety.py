@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 
-from vlagents_ray import ActionSpec, ConfigError, Contract
+from vlagents_ray import ActionSpec, ConfigError, Contract, Obs
 from vlagents_ray.errors import InvalidAction
 from vlagents_ray.robot import Guard, Watchdog
 
@@ -61,6 +61,27 @@ def test_a_jump_is_refused_and_a_first_action_is_none() -> None:
         guard(row(0.2, 0), row(0, 0))
 
 
+def test_while_the_robot_stands_the_measured_pose_counts_if_it_is_known() -> None:
+    obs = Obs(state={"joints": row(1, 2)})
+    last = row(0, 0)
+    assert Guard().reference(obs, last) is last
+    guard = Guard(measure=lambda obs: obs.state["joints"])
+    for before in (last, None):
+        pose = guard.reference(obs, before)
+        assert pose is not None
+        assert pose.tolist() == [1, 2]
+
+
+def test_a_measured_pose_that_is_none_is_refused() -> None:
+    obs = Obs(state={"joints": row(1, np.nan), "tick": row(1)})
+    with pytest.raises(InvalidAction, match="finite"):
+        Guard(measure=lambda obs: obs.state["joints"]).reference(obs, None)
+    with pytest.raises(ConfigError, match=r"measure: got \(1,\), want \(2,\)"):
+        Guard(measure=lambda obs: obs.state["tick"]).reference(obs, row(0, 0))
+    with pytest.raises(ConfigError, match="measure: got one for relative actions"):
+        Guard(Contract(action=ActionSpec(delta=True)), measure=lambda obs: obs.state["joints"])
+
+
 @pytest.mark.parametrize("max_step", [float("nan"), -0.1, np.array([0.1, np.nan])])
 def test_a_largest_step_that_would_bound_nothing_is_refused(max_step: float | np.ndarray) -> None:
     with pytest.raises(ConfigError, match="max_step"):
@@ -78,6 +99,20 @@ class Barks:
         name, thread = self.heard.get(timeout=BARK_S)
         assert thread == "vlagents-ray-watchdog"
         return name
+
+
+def test_what_was_stopped_stays_so_until_a_restart_after_the_silence() -> None:
+    barks = Barks()
+    with Watchdog(barks, {"server": 0.05}) as watchdog:
+        assert not watchdog.stopped
+        barks.next()
+        assert watchdog.stopped
+        assert not watchdog.restart()  # while it is silent
+        watchdog._limits["server"] = 60.0
+        watchdog.heard("server")
+        assert watchdog.stopped
+        assert watchdog.restart()
+        assert not watchdog.stopped
 
 
 def test_silence_calls_the_stop_hook_once_from_a_thread_of_its_own() -> None:

@@ -1,38 +1,118 @@
-"""When Serve calls an application's first replica running: at once, or when its policy has loaded."""
+"""When Serve calls a replica running: when its policy has loaded, not before, and not if it did not."""
 
 from __future__ import annotations
 
 import asyncio
 import threading
+import traceback
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from ray._common.utils import import_attr
+from ray.serve._private.api import call_user_app_builder_with_args_if_necessary
+from ray.serve.exceptions import RayServeException
 
-from vlagents_ray.serve import deployment
-from vlagents_ray.serve.config import ServerArgs
-from vlagents_ray.serve.deployment import PolicyReplica
+from vlagents_ray.errors import MissingDependency, PolicyFailed
+from vlagents_ray.serve.config.deployment import ServerArgs
+from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH
+from vlagents_ray.serve.replica.app import build
+from vlagents_ray.serve.replica.replica import PolicyReplica
 
 
-@pytest.mark.parametrize("at_once", [True, False])
-def test_a_first_replica_runs_before_its_policy_has_loaded_unless_told_not_to(
-    at_once: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(deployment, "_others_run", lambda: False)
+def replica(start: Any) -> Any:
+    """What starting touches of a replica."""
+    return SimpleNamespace(
+        _args=ServerArgs(policy="noop"),
+        _configured=False,
+        _gateway=None,
+        _engine=SimpleNamespace(start=start, models=SimpleNamespace(configure=lambda _: None)),
+        _rebalancer=SimpleNamespace(start=lambda: None),
+        _follow_others=lambda: asyncio.sleep(0),
+        _watch_shutdown=lambda: asyncio.sleep(0),
+    )
+
+
+def test_a_replica_runs_when_its_policy_has_loaded() -> None:
     loaded = threading.Event()
 
-    async def start() -> bool:
-        replica = SimpleNamespace(  # what starting touches of one
-            _args=ServerArgs(policy="noop", answer_while_loading=at_once),
-            _engine=SimpleNamespace(start=lambda: loaded.wait(60)),
-            _balance=SimpleNamespace(start=lambda: None),
-            _watch_for_the_end=lambda: asyncio.sleep(0),
-        )
-        running = asyncio.ensure_future(PolicyReplica._start(replica))
-        await asyncio.wait({running}, timeout=60 if at_once else 0.5)
-        runs = running.done()
+    async def start() -> list[bool]:
+        one = replica(lambda: loaded.wait(60))
+        one._start = lambda: PolicyReplica._start(one)
+        running = asyncio.ensure_future(PolicyReplica.reconfigure(one, {}, None))
+        await asyncio.wait({running}, timeout=0.3)
+        before = running.done()
         loaded.set()
         await running
-        await asyncio.gather(replica._loading, replica._watching)
-        return runs
+        await one._shutdown_watch
+        return [before, running.done()]
 
-    assert asyncio.run(start()) is at_once
+    assert asyncio.run(start()) == [False, True]
+
+
+def test_a_policy_that_does_not_load_is_a_failed_start() -> None:
+    def fail() -> None:
+        raise PolicyFailed("the policy did not load: no checkpoint here")
+
+    async def start() -> None:
+        one = replica(fail)
+        one._start = lambda: PolicyReplica._start(one)
+        await PolicyReplica.reconfigure(one, {}, None)
+
+    with pytest.raises(PolicyFailed, match="no checkpoint here"):
+        asyncio.run(start())
+
+
+@pytest.mark.parametrize(("cause", "shown"), [(MissingDependency("no jax"), False), (KeyError("jax"), True)])
+def test_only_the_traceback_of_a_policys_own_bug_is_shown(
+    cause: Exception, shown: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    """`serve status` shows what is raised here with its traceback, after which the cause is hard to find."""
+
+    def fail() -> None:
+        raise PolicyFailed("the policy did not load: no jax") from cause
+
+    one = replica(fail)
+    with pytest.raises(PolicyFailed, match="the policy did not load: no jax") as failed:
+        asyncio.run(PolicyReplica._start(one))
+    lines = traceback.format_exception(failed.value)
+    assert ("direct cause" in "".join(lines)) == shown
+    assert ("in fail" in "".join(lines)) == shown
+    assert ("in fail" in caplog.text) != shown, "it is in one of the two"
+
+
+@pytest.mark.parametrize(
+    ("args", "said"),
+    [
+        ({"environment": {"python": "/nowhere/.venv-pi/bin/python"}}, "ConfigError: environment.python: no such file"),
+        ({"batch": {"max_sise": 3}}, "batch.max_sise"),
+    ],
+)
+def test_serve_status_shows_one_sentence_if_an_application_cannot_be_built(args: dict[str, Any], said: str) -> None:
+    """Serve shows the text of its own exceptions, and of any other a traceback of forty lines."""
+    builder = import_attr(IMPORT_PATH)
+    with pytest.raises(RayServeException) as failed:
+        call_user_app_builder_with_args_if_necessary(builder, {"policy": "noop"} | args)
+    assert said in str(failed.value)
+    assert len(str(failed.value).splitlines()) == 1
+    built = call_user_app_builder_with_args_if_necessary(builder, {"policy": "noop", "replicas": 2})
+    assert built._bound_deployment.num_replicas == 2
+
+
+def test_serve_gives_up_after_the_first_failed_start() -> None:
+    policy = build(ServerArgs(policy="noop", replicas=8))._bound_deployment
+    assert policy._deployment_config.max_constructor_retry_count == 1
+
+
+@pytest.mark.parametrize("act_s", [3.0, 60.0, 600.0])
+def test_serve_leaves_a_replica_that_does_not_answer_as_much_time_as_a_call_may_take(act_s: float) -> None:
+    """Its policy may hold the interpreter's lock: Serve's checks are all that limits that."""
+    policy = build(ServerArgs(policy="noop", limits={"act_s": act_s}))._bound_deployment
+    silent_s = 3 * policy._deployment_config.health_check_timeout_s
+    assert act_s <= silent_s <= max(15.0, act_s)
+
+
+@pytest.mark.parametrize("value", [True, False])
+def test_whether_to_answer_while_loading_is_no_choice_any_more(value: bool) -> None:
+    with pytest.warns(FutureWarning, match="remove it from the deployment file"):
+        ServerArgs(policy="noop", answer_while_loading=value)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import socket
 import subprocess
+import sys
 from collections import deque
 from pathlib import Path
 
@@ -11,7 +13,7 @@ import pytest
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve import ports
-from vlagents_ray.serve.haproxy import Front, ingress_environment
+from vlagents_ray.serve.launch.haproxy import PublicListener, ingress_environment
 from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK, free_port, free_ports, is_free, keep
 
 
@@ -37,16 +39,35 @@ def test_haproxys_ports_are_different_ones_that_nobody_has(monkeypatch: pytest.M
 
 def test_no_port_is_given_twice_though_nobody_listens_yet(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ports, "_PORTS", (41_000, 41_100))
-    monkeypatch.setattr(ports, "_given", deque(maxlen=40))
+    monkeypatch.setattr(ports, "_CLAIMS", 40)
+    monkeypatch.setattr(ports, "_claims", deque())
     monkeypatch.setattr(ports, "_kept", set())
     keep(*range(41_000, 41_010))
     given = [free_port() for _ in range(200)]  # more than there are: the oldest are given again
     assert min(given) >= 41_010
     assert all(len(set(given[i : i + 40])) == 40 for i in range(160))
+    while ports._claims:
+        os.close(ports._claims.pop())
+
+
+def test_two_processes_are_given_different_ports(monkeypatch: pytest.MonkeyPatch) -> None:
+    draw = (
+        "import sys; from vlagents_ray.serve import ports; ports._PORTS = (42_000, 42_012)\n"
+        "print(*(ports.free_port() for _ in range(5)), flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen([sys.executable, "-c", draw], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
+        assert other.stdin is not None
+        assert other.stdout is not None
+        theirs = set(map(int, other.stdout.readline().split()))
+        monkeypatch.setattr(ports, "_PORTS", (42_000, 42_012))
+        ours = {free_port() for _ in range(5)}
+        other.stdin.close()
+    assert len(theirs) == len(ours) == 5
+    assert not theirs & ours
 
 
 def test_haproxy_alone_faces_the_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    front = Front("192.0.2.7", 8000, inside=8001)
+    front = PublicListener("192.0.2.7", 8000, inside=8001)
     for key, value in ingress_environment(tmp_path, "/bin/true", front).items():
         monkeypatch.setenv(key, value)
     assert "bind 192.0.2.7:8000\n" in front.settings()

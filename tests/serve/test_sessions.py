@@ -9,12 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from vlagents_ray.errors import PolicyUnavailable, UnknownSession
 from vlagents_ray.interface import Act, Agent, Obs
-from vlagents_ray.serve import sessions
-from vlagents_ray.serve.sessions import AgentCopies, SessionTable
+from vlagents_ray.serve.models import agent_copies
+from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray.serve.sessions import SessionTable
+
+torch = pytest.importorskip("torch")
+pytestmark = pytest.mark.torch
 
 
 class Stateful(Agent):
@@ -141,7 +144,7 @@ def test_what_cannot_be_copied_is_shared_and_said(caplog: pytest.LogCaptureFixtu
 
 
 def test_a_huge_array_is_shared_but_cannot_be_written(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sessions, "SHARED_ARRAY_BYTES", 1000)
+    monkeypatch.setattr(agent_copies, "SHARED_ARRAY_BYTES", 1000)
 
     class Big(Agent):
         def initialize(self) -> None:

@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 from eval_fakes import wait_for
-from numbered import Library, act, ask, begin, reset
+from numbered_checkpoints import Library, act, ask, begin, reset
 
 from vlagents_ray.errors import UnknownSession
-from vlagents_ray.serve.engine import Engine
+from vlagents_ray.serve.engine.engine import Engine
 
 
 @pytest.fixture
@@ -141,7 +141,7 @@ def test_what_a_swap_overtakes_is_told_that_its_session_has_ended(library: Libra
     engine = library.engine()
     try:
         reset(engine, "s")
-        [model] = engine.models._room.loaded.values()
+        [model] = engine.models._cache.loaded.values()
 
         class Overtaken:
             """The lock, which the swap gets first."""
@@ -208,7 +208,7 @@ def test_a_swap_without_room_takes_that_of_a_choice(library: Library) -> None:
         reset(engine, "chosen", checkpoint="c")
         gate = library.hold("b/2")
         swap(engine, "b/2")
-        wait_for(lambda: engine.models._room.shut != "")
+        wait_for(lambda: engine.models._cache.draining != "")
         again = begin(engine, "chosen", checkpoint="c")  # its last episode is over: the room goes to the swap
         library.wait_for("b/2")
         assert reset(engine, "another") == "a/1"

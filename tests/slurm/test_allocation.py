@@ -54,3 +54,7 @@ def test_jobs_that_follow_each_other_share_no_port(job: int) -> None:
     assert len(numbers(ports(job))) == 4
     assert not numbers(ports(job)) & numbers(ports(job + 1))
     assert all(10_000 <= port < 20_000 for port in numbers(ports(job)))
+
+
+def test_rays_own_folder_which_it_opens_to_everybody_is_within_that_of_the_job() -> None:
+    assert options()["temp-dir"] == "/tmp/x/ray"

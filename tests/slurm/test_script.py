@@ -76,7 +76,7 @@ def test_without_slurm_the_script_is_there_to_be_taken_elsewhere(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(ConfigError, match=r"no sbatch here.*eval\.sh"):
+    with pytest.raises(ConfigError, match=r"sbatch is not installed here.*eval\.sh"):
         submit(script(tmp_path / "s"))
     assert (tmp_path / "s" / "eval.sh").is_file()
 

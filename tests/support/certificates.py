@@ -1,4 +1,4 @@
-"""A certificate authority of one's own, made with openssl."""
+"""A private certificate authority, made with openssl."""
 
 from __future__ import annotations
 

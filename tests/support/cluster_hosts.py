@@ -10,7 +10,7 @@ from vlagents_ray.errors import ConfigError
 @functools.cache
 def no_hosts() -> str | None:
     """Why not; None if they can."""
-    from vlagents_ray.bench.hosts import require
+    from benchmarks.hosts import require
 
     try:
         require()

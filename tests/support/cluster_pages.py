@@ -6,7 +6,7 @@ import json
 
 from eval_fakes import wait_for
 
-from vlagents_ray.bench.hosts import RayCluster
+from benchmarks.hosts import RayCluster
 
 STATUS = """
 import json, ray

@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +116,14 @@ class Line(EvalEnv):
             ctypes.PyDLL(None).pause()
         if kind == "gate" and self._folder is not None:
             wait_for((self._folder / "open").exists)
+
+
+class SevenLine(Line):
+    """For policies with seven numbers in an action; it takes the first."""
+
+    @property
+    def contract(self) -> Contract:
+        return replace(super().contract, action=ActionSpec(dim=7))
 
 
 class Clinging(Line):

@@ -6,6 +6,7 @@ GR00T is not on PyPI; this follows its code, and its answers are decoded by nump
 from __future__ import annotations
 
 import io
+import json
 from typing import Any
 
 import msgpack
@@ -28,9 +29,23 @@ def encode_packed(value: Any) -> Any:
     return value
 
 
+def decode_n15(value: Any) -> Any:
+    """N1.5, whose configs are JSON texts."""
+    if "__ModalityConfig_class__" in value:
+        return modality_config(**json.loads(value["as_json"]))
+    return decode(value)
+
+
+def modality_config(delta_indices: list[int], modality_keys: list[str]) -> dict[str, list[Any]]:
+    """Its fields; as the newest client, refuses a modality without keys."""
+    if not modality_keys:
+        raise ValueError("modality_keys must not be empty")
+    return {"delta_indices": delta_indices, "modality_keys": modality_keys}
+
+
 def decode(value: Any) -> Any:
     if "__ModalityConfig_class__" in value:
-        return value["as_json"]
+        return modality_config(**value["as_json"])
     if "__ndarray_class__" in value:
         return np.load(io.BytesIO(value["as_npy"]), allow_pickle=False)
     if b"nd" in value:
@@ -42,11 +57,18 @@ class PolicyClient:
     """`get_action`, `reset`, `ping`, `get_modality_config`."""
 
     def __init__(
-        self, port: int, api_token: str | None = None, timeout_ms: int = 30_000, *, packed: bool = False
+        self,
+        port: int,
+        api_token: str | None = None,
+        timeout_ms: int = 30_000,
+        *,
+        packed: bool = False,
+        n15: bool = False,
     ) -> None:
         self.context = zmq.Context()
         self.api_token = api_token
         self.encode = encode_packed if packed else encode
+        self.decode = decode_n15 if n15 else decode
         self.socket = self.context.socket(zmq.REQ)
         self.socket.setsockopt(zmq.RCVTIMEO, timeout_ms)
         self.socket.setsockopt(zmq.LINGER, 0)
@@ -59,7 +81,7 @@ class PolicyClient:
         if self.api_token:
             request["api_token"] = self.api_token
         self.socket.send(msgpack.packb(request, default=self.encode))
-        response = msgpack.unpackb(self.socket.recv(), object_hook=decode)
+        response = msgpack.unpackb(self.socket.recv(), object_hook=self.decode)
         if isinstance(response, dict) and "error" in response:
             raise RuntimeError(f"Server error: {response['error']}")
         return response

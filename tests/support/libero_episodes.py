@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from vlagents_ray.envs.libero import Libero
-from vlagents_ray.envs.libero.world import World
+from vlagents_ray.envs.libero.simulation import LiberoSimulation
 from vlagents_ray.interface import Act, Obs
 
 STILL = Act(np.array([0, 0, 0, 0, 0, 0, -1], np.float32))
@@ -32,6 +32,6 @@ def fingerprint(seen: list[Obs]) -> str:
     return hashlib.sha256(b"".join(parts)).hexdigest()
 
 
-def world(env: Libero) -> World:
+def world(env: Libero) -> LiberoSimulation:
     assert env._world is not None
     return env._world

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from peers import FOLDER, peers_python
+from peer_environment import FOLDER, peers_python
 
-from vlagents_ray.serve.environments.making import install
+from vlagents_ray.serve.python_env.create import install
 
 
 def package(requirement: str) -> Path:

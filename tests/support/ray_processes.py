@@ -13,6 +13,8 @@ from pathlib import Path
 import psutil
 from eval_fakes import wait_for
 
+from vlagents_ray.ray_tools.reaper import has_open_files, is_titled
+
 
 def words(process: psutil.Process) -> list[str]:
     """Its command line; empty if it has ended or is about to."""
@@ -39,11 +41,12 @@ def processes(folder: Path, named: str = "") -> list[int]:
     for process in Path("/proc").glob("[0-9]*"):
         try:
             command = (process / "cmdline").read_bytes()
-            said = command + (process / "environ").read_bytes()
+            ours = str(folder).encode() in command + (process / "environ").read_bytes()
+            ours = ours or (is_titled(process) and has_open_files(process, str(folder)))
         except OSError:  # it has ended, or is not ours
             continue
         program = command.partition(b"\0")[0]  # what follows may be what setproctitle left of the environment
-        if str(folder).encode() in said and named.encode() in program:
+        if ours and named.encode() in program:
             found.append(int(process.name))
     return found
 

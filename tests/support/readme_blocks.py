@@ -2,14 +2,18 @@
 
 An HTML comment straight above a block says how it is tested. `<!-- test: serve scripted -->` runs it
 with a server of that policy in place of http://gpu-box:8000, `<!-- test -->` or no comment without
-one; ` with peers` at the end of either runs it with the Python that has other systems' clients.
+one; ` with peers` at the end of either runs it with the Python that has other systems' clients, and
+` with ray` says of a block of docs/ that it starts Ray.
 Further lines of such a comment are code that is run before the block:
 
     <!-- test: serve scripted
     obs = Obs(gripper=1.0) -->
 
+`<!-- file: NAME -->` says that the reader saves the block, of whatever language, under that name; the blocks
+after it on the page find the file.
+
 `<!-- not run: REASON -->` says why a block is not run; its commands must at least exist, and
-`vlagents-ray`'s must know their options; those of `vlagents-ray slurm` are made into scripts.
+`vlagents-ray`'s must know their options. Where blocks run, an `sbatch` takes every job and runs none.
 """
 
 from __future__ import annotations
@@ -17,17 +21,22 @@ from __future__ import annotations
 import os
 import re
 import shlex
+import shutil
 import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from peers import peers_python
+from peer_environment import peers_python
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTED_HOST = "gpu-box:8000"
 PYTHON, SHELL = {"python"}, {"bash", "sh", "console"}
-ENV = os.environ | {
+# As a reader has it, without PYTHONPATH; but if that names this checkout, another one may be what is installed.
+_HERE = {"PYTHONPATH": str(ROOT)} if str(ROOT) in os.environ.get("PYTHONPATH", "").split(os.pathsep) else {}
+_READERS = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"} | _HERE
+_BIN = Path(__file__).parent / "bin"  # commands that a reader has, and this machine may not
+ENV = _READERS | {
     "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
     "RAY_USAGE_STATS_ENABLED": "0",
     "COLUMNS": "300",  # so that --help does not cut names off
@@ -46,6 +55,8 @@ class Block:
     server: str | None = None  # the policy that must be served meanwhile
     not_run: str | None = None  # why it is not run
     peers: bool = False  # it is for the peers' Python
+    ray: bool = False  # it starts Ray
+    file: str | None = None  # under which name it is saved, in place of being run
 
     def __str__(self) -> str:
         return f"line-{self.line}"
@@ -61,7 +72,7 @@ def blocks(text: str) -> list[Block]:
     for number, line in enumerate(text.splitlines(), 1):
         if fence is not None:
             if line.strip() == "```":
-                if fence["language"] in PYTHON | SHELL:
+                if fence["language"] in PYTHON | SHELL or (above and above[0][1].lstrip().startswith("<!-- file:")):
                     found.append(_block(fence["language"], above, code))
                 fence, above, code = None, [], []
             else:
@@ -85,34 +96,47 @@ def _block(language: str, above: list[tuple[int, str]], code: list[tuple[int, st
         stripped = [(number, line.replace("<!--", "").replace("-->", "")) for number, line in above]
         mark, setup = stripped[0][1].strip(), stripped[1:]
     kind, _, rest = mark.partition(":")
-    server, reason, peers = None, None, False
-    if kind == "not run" and rest.strip():
+    server, reason, peers, ray, file = None, None, False, False, None
+    if kind == "file" and re.fullmatch(r"\w+\.\w+", rest.strip()):
+        file = rest.strip()
+    elif kind == "not run" and rest.strip():
         reason = rest.strip()
-    elif match := re.fullmatch(r"test(?:: serve (\S+))?( with peers)?", mark):
-        server, peers = match[1], match[2] is not None
+    elif match := re.fullmatch(r"test(?:: serve (\S+))?( with peers)?( with ray)?", mark):
+        server, peers, ray = match[1], match[2] is not None, match[3] is not None
     else:
         raise ValueError(
-            f"line {above[0][0]}: {mark!r}, want 'test', 'test: serve POLICY' ('with peers') or 'not run: REASON'"
+            f"line {above[0][0]}: {mark!r}, want 'test', 'test: serve POLICY' ('with peers', 'with ray'), "
+            f"'file: NAME' or 'not run: REASON'"
         )
     if language == "console":  # what begins with a prompt was typed, the rest is output
         code = [(number, line[2:]) for number, line in code if line.startswith("$ ")]
     kept = dict([*setup, *code])
     first = code[0][0] if code else above[0][0] if above else 0
     source = "\n".join(kept.get(number, "") for number in range(1, max(kept, default=0) + 1))
-    return Block(language, first, source, server, reason, peers)
+    return Block(language, first, source, server, reason, peers, ray, file)
 
 
-def run(block: Block, cwd: Path, host: str = DOCUMENTED_HOST) -> None:
-    """Run the block in `cwd`; a failure shows the README's own line numbers."""
+def checkout(folder: Path) -> None:
+    """Put into `folder` what pages name as paths in a checkout."""
+    for name in ("cluster", "deployments", "evaluations", "requirements"):
+        shutil.copytree(ROOT / name, folder / name)
+
+
+def run(block: Block, cwd: Path, host: str = DOCUMENTED_HOST, *, page: str = "README") -> None:
+    """Run the block in `cwd`; a failure shows the page's own line numbers."""
     source = block.source.replace(DOCUMENTED_HOST, host) + "\n"
-    script = cwd / ("README.py" if block.language in PYTHON else "README.sh")
+    if block.file is not None:
+        (cwd / block.file).write_text(source.lstrip())
+        return
+    script = cwd / f"{page}.{'py' if block.language in PYTHON else 'sh'}"
+    env = ENV | {"PATH": f"{_BIN}{os.pathsep}{ENV['PATH']}", "HOME": str(cwd)}
     script.write_text(source)
     python = str(peers_python()) if block.peers else sys.executable
     command = [python, str(script)] if block.language in PYTHON else ["bash", "-eu", "-o", "pipefail", script]
     done = subprocess.run(
-        command, check=False, cwd=cwd, env=ENV, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=RUN_S
+        command, check=False, cwd=cwd, env=env, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=RUN_S
     )
-    assert done.returncode == 0, f"README {block}: exit status {done.returncode}\n{done.stdout}\n{done.stderr}"
+    assert done.returncode == 0, f"{page} {block}: exit status {done.returncode}\n{done.stdout}\n{done.stderr}"
 
 
 def check_commands(block: Block) -> None:
@@ -129,10 +153,6 @@ def check_commands(block: Block) -> None:
 
 def check_command(words: list[str], where: str) -> None:
     name, *arguments = words
-    if words[:2] == ["vlagents-ray", "slurm"]:  # most of its options are sbatch's, so --help does not have them
-        done = subprocess.run([*words, "--print"], check=False, capture_output=True, text=True, env=ENV, cwd=ROOT)
-        assert done.returncode == 0, f"{where}\n{done.stdout}{done.stderr}"
-        return
     if name == "make":
         command = ["make", "-C", str(ROOT), "--dry-run", *arguments]
     elif name == "vlagents-ray":

@@ -26,17 +26,24 @@ def free_address() -> str:
 
 
 @contextlib.contextmanager
-def serving(policy: str, log: Path, address: str | None = None) -> Iterator[str]:
-    """A server for the length of the context, on a free port unless one is given; yields "host:port" once healthy."""
+def serving(
+    policy: str, log: Path, address: str | None = None, *options: str, cwd: Path | None = None
+) -> Iterator[str]:
+    """A server for the length of the context, on a free port unless one is given; yields "host:port" once healthy.
+
+    With a `cwd` it is as a reader types it there: what tests add to PYTHONPATH is not in it.
+    """
     address = address or free_address()
-    command = ["vlagents-ray", "serve", policy, "--port", address.rpartition(":")[2]]
+    command = ["vlagents-ray", "serve", policy, "--port", address.rpartition(":")[2], *options]
     with log.open("w") as output:
         server = subprocess.Popen(
             [shutil.which(command[0], path=ENV["PATH"]) or command[0], *command[1:]],
             stdin=subprocess.DEVNULL,
             stdout=output,
             stderr=subprocess.STDOUT,
-            env=ENV | {"PYTHONPATH": os.environ.get("PYTHONPATH", "")},  # as tests have set it meanwhile
+            cwd=cwd,
+            # As tests have set it meanwhile.
+            env=ENV if cwd is not None else ENV | {"PYTHONPATH": os.environ.get("PYTHONPATH", "")},
         )
     try:
         deadline = time.monotonic() + START_S

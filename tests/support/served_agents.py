@@ -14,9 +14,11 @@ from typing import Any
 
 import numpy as np
 import psutil
+from eval_fakes import ToZero
 
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
+from vlagents_ray.policies.base.checkpoint import find_checkpoint
 from vlagents_ray.policies.scripted import Scripted
 
 
@@ -45,6 +47,18 @@ class Reacher(Agent):
         )
 
 
+class Trainable(Agent):
+    """Acts with its one parameter, large enough for Ray's object store."""
+
+    trainable = "tree"
+
+    def initialize(self) -> None:
+        self.tree = {"gain": np.zeros(200_000, np.float32)}
+
+    def act(self, obs: Obs) -> Act:
+        return Act(self.tree["gain"][:2].copy())
+
+
 class Remembering(Agent):
     """Looks at the last three observations, and says so in its contract."""
 
@@ -62,6 +76,46 @@ class Remembering(Agent):
         self.observe(obs)
         info = {"instruction": self.instruction, "seed": self.seed, "pid": os.getpid()}
         return Act(np.array(self.seen, np.float32), info=info)
+
+
+class Ledger(Agent):
+    """Writes down each act as its batch begins, in a file of its process: of which episode, for which observation."""
+
+    def __init__(self, folder: str) -> None:
+        self.folder = folder
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
+        self.episode, self.acts = instruction, 0
+        return {"pid": os.getpid()}
+
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        begun = time.monotonic_ns()
+        with open(f"{self.folder}/{os.getpid()}", "a") as file:
+            for one, session in zip(obs, sessions, strict=True):
+                print(begun, session.episode, one.info["episode"], one.info["number"], file=file)  # type: ignore[attr-defined]
+        return super().act_batch(obs, sessions)
+
+    def act(self, obs: Obs) -> Act:
+        time.sleep(0.002)
+        self.acts += 1
+        info = {"episode": self.episode, "number": obs.info["number"], "acts": self.acts, "pid": os.getpid()}
+        return Act(np.zeros(7, np.float32), info=info)
+
+
+class Hanging(Agent):
+    """Never returns from an act when told so: it waits ("sleep"), or keeps the interpreter's lock besides ("lock")."""
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
+        self.acts = 0
+        return {"pid": os.getpid()}
+
+    def act(self, obs: Obs) -> Act:
+        if obs.info.get("hang") == "sleep":
+            threading.Event().wait()
+        if obs.info.get("hang") == "lock":
+            ctypes.PyDLL(None).sleep(10_000)
+        self.acts += 1
+        return Act(np.array([self.acts], np.float32), info={"pid": os.getpid()})
 
 
 class Gated(Agent):
@@ -195,6 +249,7 @@ class Stored(Agent):
         while Path(f"{self.path}.held").exists():
             time.sleep(0.02)
         self.number = float(Path(self.path).read_text()) * self.scale
+        find_checkpoint(self.path)  # which makes it known by its digest
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
         self.steps = 0
@@ -206,6 +261,25 @@ class Stored(Agent):
 
     def close(self) -> None:
         Path(f"{self.path}.closed").touch()
+
+
+class Stochastic(ToZero):
+    """Says on demand how likely its actions were, and always which weights chose them: the version in a file."""
+
+    def __init__(self, version: str) -> None:
+        super().__init__()
+        self._version = Path(version)
+
+    @property
+    def contract(self) -> Contract:
+        return Contract(action=ActionSpec(dim=1), behaviour=("logprob", "value"))
+
+    def act(self, obs: Obs) -> Act:
+        act, position = super().act(obs), float(obs.state["position"][0])
+        said = {"logprob": float(-0.5 * ((act.action[0, 0] + position) / 0.1) ** 2), "value": -abs(position)}
+        act.info["policy"] = {"version": int(self._version.read_text()), "fingerprint": "of a test"}
+        act.info["behaviour"] = {name: said[name] for name in obs.info.get("want", ())}
+        return act
 
 
 class Hesitant(Scripted):

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from eval_fakes import PYTHONPATH, wait_for
 
-from vlagents_ray.bench.hosts import Host, HostFailed, hosts
+from benchmarks.hosts import Host, HostFailed, hosts
 
 _TOOLS = ("munged", "slurmctld", "slurmd", "sbatch", "srun", "scontrol", "squeue", "scancel")
 _READY_S = 60.0

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from vlagents_ray import Act, Obs
-from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec, check_action
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs import EvalEnv
 from vlagents_ray.testing import ContractViolation, check_env
+from vlagents_ray.validation import check_action
 
 
 class GoodEnv(EvalEnv):

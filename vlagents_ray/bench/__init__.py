@@ -1,9 +1,8 @@
 """Measurements that users can repeat on their own machines: `vlagents-ray bench …`.
 
 `rtt` and `link` take round trips of every transport of ours and of other policy servers (`peers/`), in turns;
-`throughput` loads one replica with many clients; `overhead` compares an evaluation with bare environments,
-`evaluation` with the peers' own; `soak` lets one run for long; `report` makes the README's section of it all, judged
-by `targets`. `hosts` makes several hosts of one machine, with a Ray cluster over them: `scaling` has more and more
-workers play on it. `autoscaling` watches replicas while `robots` and rollouts come and go. `ways` knows how each
-client is started: as a process that obeys a line protocol (`child`, `peers/peer.py`), or as a Ray actor.
+`throughput` loads one replica with many clients; `policy` measures one without a server, `model` is one of a real one's
+size; `report` writes the README's section of it all and judges it. `clients` are ours; each runs in a process that
+obeys a line protocol (`line_process`, `peers/peer.py`), or in a Ray actor. What only developers repeat is the folder
+`benchmarks/` of the checkout.
 """

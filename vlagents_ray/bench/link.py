@@ -20,15 +20,21 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from vlagents_ray.bench.child import Child
+from vlagents_ray.bench.clients import OwnClient
+from vlagents_ray.bench.line_process import LineProcess, our_environment
+from vlagents_ray.bench.peers import peer_clients
 from vlagents_ray.bench.peers.peer import die_with_parent, own_stdout
 from vlagents_ray.bench.rtt import measure
-from vlagents_ray.bench.ways import Way, our_environment, peer_ways
 from vlagents_ray.errors import ConfigError, VLAgentsError
 
 RATE = "1gbit"
 PEERS = ("vlagents", "openpi")
-WAYS = (Way("websocket", "raw"), Way("websocket", "jpeg"), Way("websocket", "auto"), Way("http", "jpeg"))
+CLIENTS = (
+    OwnClient("websocket", "raw"),
+    OwnClient("websocket", "jpeg"),
+    OwnClient("websocket", "auto"),
+    OwnClient("http", "jpeg"),
+)
 SHM = "vlagents shm"  # does not cross a network
 _SERVER, _CLIENT = "10.197.44.1", "10.197.44.2"
 _BULK = 64 * 2**20  # bytes, to see what the link carries
@@ -44,11 +50,23 @@ def measure_link(
     delay: str | None = None,
     peers: Sequence[str] = (),
     peers_python: Path = Path("python"),
-    tell: Callable[[str], None] = lambda _: None,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
-    """What `measure_rtt(...).to_json()` gives, and what the link is. `rate` and `delay` are as `tc` takes them.
+    """Measure round trips over a link, and what the link carries.
 
-    Raises `ConfigError` with the cure where this machine or user cannot make network namespaces.
+    Args:
+        calls: Round trips of each client.
+        rate: As `tc` takes it.
+        delay: Each way, as `tc` takes it; None adds none.
+        peers: Names of other policy servers, as in `measure_rtt`.
+        peers_python: The Python in which they are installed.
+        progress: Is called with lines of progress.
+
+    Returns:
+        What `measure_rtt(...).to_json()` returns, and "link".
+
+    Raises:
+        ConfigError: This machine or user cannot make network namespaces; the message has the cure.
     """
     command = [*enter(), sys.executable, "-m", "vlagents_ray.bench.link"]
     settings = {
@@ -58,20 +76,20 @@ def measure_link(
         "peers": list(peers),
         "peers_python": str(peers_python.absolute()),  # not resolved: a virtual environment's Python is a link
     }
-    with Child("the link", [*command, json.dumps(settings)], our_environment(), end_s=_END_S) as inside:
+    with LineProcess("the link", [*command, json.dumps(settings)], our_environment(), end_s=_END_S) as inside:
         while True:
-            said = inside.hear(_RUN_S)
-            if "tell" in said:
-                tell(said["tell"])
-            elif "error" in said:
-                raise ConfigError(said["error"])
+            line = inside.read(_RUN_S)
+            if "progress" in line:
+                progress(line["progress"])
+            elif "error" in line:
+                raise ConfigError(line["error"])
             else:
-                found: dict[str, Any] = said["result"]
+                found: dict[str, Any] = line["result"]
                 return found
 
 
 def enter() -> list[str]:
-    """The command that runs another one in a network namespace of its own, as root or as somebody who looks like it."""
+    """Return the command that runs another one in a network namespace of its own, as root or in a user namespace."""
     if missing := [tool for tool in _TOOLS if shutil.which(tool) is None]:
         raise ConfigError(f"link: {', '.join(missing)} not found; install iproute2 and util-linux")
     refusals = []
@@ -84,7 +102,7 @@ def enter() -> list[str]:
 
 
 def refused(reasons: Sequence[str]) -> str:
-    """What a user without the right is told."""
+    """Return the message to a user who may not make namespaces, with the cure."""
     return (
         f"link: cannot make a network namespace, neither as this user nor in a user namespace ({'; '.join(reasons)}); "
         "run it as root, or let users make them: sysctl kernel.unprivileged_userns_clone=1 (Debian), "
@@ -92,13 +110,13 @@ def refused(reasons: Sequence[str]) -> str:
     )
 
 
-class Link:
+class EmulatedLink:
     """The client's namespace, and the shaped link to it. Made inside the server's namespace."""
 
     def __init__(self, rate: str, delay: str | None) -> None:
-        self._holder = Child("the client's namespace", ["unshare", "--net", "cat"])
+        self._holder = LineProcess("the client's namespace", ["unshare", "--net", "cat"])
         try:
-            self._holder.ask("1", 10)  # an answer: it is there
+            self._holder.request("1", 10)  # an answer: it is there
             target = f"/proc/{self._holder.pid}/ns/net"
             self.prefix = ["nsenter", f"--net={target}"]
             _run(["ip", "link", "set", "lo", "up"])
@@ -116,14 +134,14 @@ class Link:
             self._holder.close()
             raise
 
-    def __enter__(self) -> Link:
+    def __enter__(self) -> EmulatedLink:
         return self
 
     def __exit__(self, *exc: object) -> None:
         self._holder.close()
 
     def megabits(self) -> float:
-        """Mbit/s that TCP gets through, from client to server."""
+        """Measure the Mbit/s that TCP gets through, from client to server."""
         code = f"import socket; s = socket.create_connection(({_SERVER!r}, {{}})); s.sendall(bytes({_BULK}))"
         with socket.create_server((_SERVER, 0)) as server:
             server.settimeout(30)
@@ -140,7 +158,7 @@ class Link:
 
 
 def shaping(rate: str, delay: str | None) -> list[list[str]]:
-    """The `tc qdisc add dev DEV …` for a link of that rate, and that delay each way."""
+    """Return the words of `tc qdisc add dev DEV …` for a link of that rate, and that delay each way."""
     if delay is None:
         return [["root", "tbf", "rate", rate, "burst", "64kb", "latency", "50ms"]]
     return [
@@ -159,21 +177,21 @@ def _run(command: Sequence[str]) -> None:
     raise ConfigError(f"link: `{' '.join(command)}` failed: {reason}")
 
 
-def _inside(calls: int, rate: str, delay: str | None, peers: Sequence[str], peers_python: str, tell: Any) -> Any:
-    """The benchmark, in the server's namespace."""
-    others, absent, versions = peer_ways(peers, Path(peers_python))
+def _inside(calls: int, rate: str, delay: str | None, peers: Sequence[str], peers_python: str, progress: Any) -> Any:
+    """Run the benchmark in the server's namespace."""
+    others, absent, versions = peer_clients(peers, Path(peers_python))
     others = [way for way in others if way.name != SHM]
-    with Link(rate, delay) as link:
+    with EmulatedLink(rate, delay) as link:
         carried = link.megabits()
-        tell(f"the link carries {carried:.0f} Mbit/s")
+        progress(f"the link carries {carried:.0f} Mbit/s")
         found = measure(
-            WAYS, others, calls, Path(peers_python), absent, versions, tell, host=_SERVER, prefix=link.prefix
+            CLIENTS, others, calls, Path(peers_python), absent, versions, progress, host=_SERVER, prefix=link.prefix
         )  # fmt: skip
     return {**found.to_json(), "link": {"rate": rate, "delay": delay, "measured_mbit_per_s": carried}}
 
 
 def _interrupt_with_stdin() -> None:
-    """Ctrl-C for this process when its standard input ends: whoever asked has gone, so everything is taken down."""
+    """Interrupt this process when its standard input ends: its parent has ended, so everything is taken down."""
 
     def wait() -> None:
         while os.read(0, 4096):
@@ -184,7 +202,7 @@ def _interrupt_with_stdin() -> None:
 
 
 def main() -> None:
-    """The process inside: its settings as JSON; lines of JSON with "tell", and one with "result" or "error"."""
+    """Run the process inside; writes lines of JSON with "progress", then one with "result" or "error"."""
     die_with_parent()
     out = own_stdout()
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell may have started all this with it ignored
@@ -194,7 +212,7 @@ def main() -> None:
         print(json.dumps(line), file=out, flush=True)
 
     try:
-        say(result=_inside(**json.loads(sys.argv[1]), tell=lambda text: say(tell=text)))
+        say(result=_inside(**json.loads(sys.argv[1]), progress=lambda text: say(progress=text)))
     except VLAgentsError as error:
         say(error=str(error))
     except KeyboardInterrupt:

@@ -24,7 +24,7 @@ _CHANNELS = 3
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """Of a transformer."""
+    """The size of a transformer."""
 
     layers: int
     width: int
@@ -41,7 +41,7 @@ SIZES: Mapping[str, Size] = {
 
 
 class SizedConfig(BaseModel, extra="forbid"):
-    """How large, and where it runs."""
+    """The size of the network, and where it runs."""
 
     size: Literal["tiny", "pi0", "openvla"] = "tiny"
     device: str = Field(default="cpu", description="cpu, cuda, cuda:1, …")
@@ -54,7 +54,7 @@ class SizedConfig(BaseModel, extra="forbid"):
 
 
 class SizedPolicy(Agent):
-    """Chunks of meaningless actions, (chunk, action_dim), at the cost of a network of that size."""
+    """Returns chunks of meaningless actions, (chunk, action_dim), at the cost of a network of that size."""
 
     Config: ClassVar[type] = SizedConfig
     shared: ClassVar[tuple[str, ...]] = ("config", "model")
@@ -76,11 +76,11 @@ class SizedPolicy(Agent):
         self.model = build(self.config, self.config.device)
 
     def act(self, obs: Obs) -> Act:
-        """A batch of one."""
+        """Run a batch of one."""
         return self.act_batch([obs], [self])[0]
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act]:  # type: ignore[override]
-        """One forward pass: pixels to the device, actions back."""
+        """Run one forward pass: pixels to the device, actions back."""
         torch = require("torch")
         pixels = np.stack([np.stack([one.cameras[name] for name in CAMERAS]) for one in obs])
         with torch.inference_mode():
@@ -90,7 +90,7 @@ class SizedPolicy(Agent):
 
 
 def build(config: SizedConfig, device: str) -> Any:
-    """The network, with random weights. "meta" as the device allocates nothing."""
+    """Make the network, with random weights. "meta" as the device allocates nothing."""
     torch = require("torch")
     size = SIZES[config.size]
     tokens = len(CAMERAS) * (IMAGE // size.patch) ** 2 + config.chunk
@@ -115,7 +115,7 @@ def build(config: SizedConfig, device: str) -> Any:
 
 
 def forward(model: Any, pixels: Any, config: SizedConfig) -> Any:
-    """Actions (B, chunk, D) from pixels (B, cameras, H, W, 3) uint8, both on the model's device."""
+    """Compute actions (B, chunk, D) from pixels (B, cameras, H, W, 3) uint8, both on the device of the model."""
     torch = require("torch")
     batch, patch = len(pixels), SIZES[config.size].patch
     rows = IMAGE // patch

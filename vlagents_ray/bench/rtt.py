@@ -19,25 +19,36 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.bench.observing import observation, save
-from vlagents_ray.bench.statistics import RoundTrips, ratios
-from vlagents_ray.bench.ways import Driver, PeerWay, Way, connected, peer_connected, peer_ways, ways
+from vlagents_ray.bench.clients import OwnClient, connected, observation, own_clients, save_observation
+from vlagents_ray.bench.figures import RoundTrips, lost_db, ratios
+from vlagents_ray.bench.line_process import Driver
+from vlagents_ray.bench.peers import PeerClient, peer_clients, peer_connected
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.serve.cluster import free_port, running_server
-from vlagents_ray.serve.files import deployment
+from vlagents_ray.interface import Obs
+from vlagents_ray.policies.noop import Noop
+from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.server import free_port, running_server
 
-__all__ = ["RoundTripsOfAll", "measure_rtt", "observation"]
-
-POLICY = "vlagents_ray.bench.policy:Measured"
+POLICY = "vlagents_ray.bench.rtt:MeasuredNoop"
 LOOPBACK = "127.0.0.1"
 ROUND = 100  # calls of one way before it is the next one's turn
 UNBROKEN = 200  # rounds' worth of calls without a break: a second or two
 ON_NODE = ("shm", "plasma")
 
 
+class MeasuredNoop(Noop):
+    """The policy of the round trips: `reset` also returns what the images lost on the way.
+
+    That is {"psnr_db"}: of the cameras, against the observation of the benchmark; None if they are the same.
+    """
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        return {"psnr_db": lost_db(obs.cameras, observation().cameras)}
+
+
 @dataclass(frozen=True, slots=True)
 class RoundTripsOfAll:
-    """What was measured, what was not and why."""
+    """The round trips of all clients that were measured, and why others were not."""
 
     ours: tuple[RoundTrips, ...]
     theirs: tuple[RoundTrips, ...] = ()
@@ -47,7 +58,7 @@ class RoundTripsOfAll:
     psnr_db: Mapping[str, float | None] = field(default_factory=dict)  # of what the policy saw, by way; None: all of it
 
     def to_json(self) -> dict[str, Any]:
-        """As plain JSON values."""
+        """Return plain JSON values."""
         return {
             "ways": [{**trips.to_json(), "psnr_db": self.psnr_db.get(trips.name)} for trips in self.ours],
             "peers": [trips.to_json() for trips in self.theirs],
@@ -64,38 +75,38 @@ def measure_rtt(
     transports: Sequence[str] = (),
     peers: Sequence[str] = (),
     peers_python: Path = Path("python"),
-    tell: Callable[[str], None] = lambda _: None,
+    progress: Callable[[str], None] = lambda _: None,
 ) -> RoundTripsOfAll:
-    """`calls` round trips by each way (rounded up to whole rounds), on servers started for them.
+    """Measure `calls` round trips of each client (rounded up to whole rounds), on servers started for them.
 
-    `transports` are those of ours, by default all. `peers` are names from `vlagents_ray.bench.ways.PEERS`, or
+    `transports` are those of ours, by default all. `peers` are names from `vlagents_ray.bench.peers.PEERS`, or
     "all"; one that is not installed for `peers_python` is in `skipped`, with the cure.
     """
-    own, skipped = ways(transports)
-    others, absent, versions = peer_ways(peers, peers_python)
-    return measure(own, others, calls, peers_python, skipped | absent, versions, tell)
+    own, skipped = own_clients(transports)
+    others, absent, versions = peer_clients(peers, peers_python)
+    return measure(own, others, calls, peers_python, skipped | absent, versions, progress)
 
 
 def measure(
-    own: Sequence[Way],
-    others: Sequence[PeerWay],
+    own: Sequence[OwnClient],
+    others: Sequence[PeerClient],
     calls: int,
     peers_python: Path,
     skipped: Mapping[str, str],
     versions: Mapping[str, str],
-    tell: Callable[[str], None],
+    progress: Callable[[str], None],
     *,
     host: str = LOOPBACK,
     prefix: Sequence[str] = (),
 ) -> RoundTripsOfAll:
-    """All ways against servers on `host`; the commands of the clients begin with `prefix`."""
+    """Measure all clients against servers on `host`; the commands of the clients begin with `prefix`."""
     drivers: dict[str, Driver] = {}
     with contextlib.ExitStack() as stack:
         obs = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "observation.npz"
-        save(observation(), obs)
+        save_observation(observation(), obs)
         for peer in others:  # before Ray, whose start is what takes the time
-            way = peer_connected(peer, peers_python, host, free_port(host), obs, prefix)
-            drivers[peer.name] = stack.enter_context(way)
+            client = peer_connected(peer, peers_python, host, free_port(host), obs, prefix)
+            drivers[peer.name] = stack.enter_context(client)
         # Without keys: another host than loopback is one end of a link that only this run knows.
         server = stack.enter_context(running_server(deployment(POLICY), host=host, insecure=host != LOOPBACK))
         [(app, url)] = server.apps.items()
@@ -104,7 +115,7 @@ def measure(
         if not drivers:
             raise ConfigError("nothing to measure: want a transport or a peer")
         said = {name: driver.ready() for name, driver in drivers.items()}
-        found = in_turns(drivers, calls, tell)
+        found = in_turns(drivers, calls, progress)
         steady = [
             RoundTrips(one.name, np.array([drivers[one.name].measure(UNBROKEN * min(ROUND, calls))]))
             for one in own
@@ -120,8 +131,8 @@ def measure(
     )
 
 
-def in_turns(drivers: Mapping[str, Driver], calls: int, tell: Callable[[str], None]) -> dict[str, RoundTrips]:
-    """Rounds of at most 100 calls of each until everyone has made `calls`; the order is drawn anew each time."""
+def in_turns(drivers: Mapping[str, Driver], calls: int, progress: Callable[[str], None]) -> dict[str, RoundTrips]:
+    """Let each client make at most 100 calls in turn until all have made `calls`, in a new random order each time."""
     each = min(ROUND, calls)
     rounds = -(-calls // each)
     taken: dict[str, list[list[float]]] = {name: [] for name in drivers}
@@ -130,5 +141,5 @@ def in_turns(drivers: Mapping[str, Driver], calls: int, tell: Callable[[str], No
         random.Random(number).shuffle(order)
         for name in order:
             taken[name].append(drivers[name].measure(each))
-        tell(f"{(number + 1) * each} of {rounds * each} calls by each way")
+        progress(f"{(number + 1) * each} of {rounds * each} calls by each way")
     return {name: RoundTrips(name, np.array(ms)) for name, ms in taken.items()}

@@ -18,11 +18,10 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.bench.child import Child
-from vlagents_ray.bench.load import ROBOT, SIMULATION, Call, Load
-from vlagents_ray.bench.ways import START_S, Way, our_environment, ways
-from vlagents_ray.serve.cluster import running_server
-from vlagents_ray.serve.files import deployment
+from vlagents_ray.bench.clients import ROBOT, SIMULATION, Call, LoadGenerator, OwnClient, own_clients
+from vlagents_ray.bench.line_process import START_S, LineProcess, our_environment
+from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.server import running_server
 
 DEFAULT_TRANSPORTS = ("plasma", "handle", "shm", "websocket")
 BASE_MS, PER_ITEM_MS = 20.0, 1.0
@@ -30,12 +29,12 @@ SLOW_NOOP = ("noop", {"base_ms": BASE_MS, "per_item_ms": PER_ITEM_MS})
 _PROCESSES = 4  # that the clients share, besides the robot's
 _WARM_S = 0.5
 _LATE_S = 60.0
-_BARE = "vlagents_ray.bench.bare"
+_BARE = "vlagents_ray.bench.policy"
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
-    """What is measured."""
+class ThroughputPlan:
+    """The settings of `measure_throughput`."""
 
     policy: str = SLOW_NOOP[0]
     config: Mapping[str, Any] = field(default_factory=lambda: SLOW_NOOP[1])
@@ -49,7 +48,7 @@ class Plan:
 
     @property
     def ideal(self) -> Callable[[int], float] | None:
-        """Actions a second of K clients if everything but the policy took no time; None if it is to be measured."""
+        """The actions a second of K clients if everything but the policy took no time; None if it is to be measured."""
         if self.policy != "noop":
             return None
         base = float(self.config.get("base_ms", 0.0))
@@ -59,9 +58,9 @@ class Plan:
         return lambda clients: min(clients, self.batch) * 1e3 / (base + each * min(clients, self.batch))
 
 
-def measure_throughput(plan: Plan, tell: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
-    """All that the plan asks for, as plain JSON values."""
-    found, skipped = ways(plan.transports)
+def measure_throughput(plan: ThroughputPlan, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+    """Measure what the plan says; returns plain JSON values."""
+    found, skipped = own_clients(plan.transports)
     chosen = _one_each(found)
     served = deployment(
         plan.policy,
@@ -73,23 +72,25 @@ def measure_throughput(plan: Plan, tell: Callable[[str], None] = lambda _: None)
         bare = None if plan.ideal else stack.enter_context(_bare(plan))
         server = stack.enter_context(running_server(served))
         (app,) = server.apps
-        fleets = {way.transport: stack.enter_context(_fleet(way, server.url, app, max(plan.clients))) for way in chosen}
+        fleets = {one.transport: stack.enter_context(_fleet(one, server.url, app, max(plan.clients))) for one in chosen}
         rates: dict[str, list[float]] = {name: [] for name in fleets}
         bare_rates = []
         for number in range(plan.rounds):
             if bare is not None:
-                bare_rates.append(float(bare.ask(str(plan.seconds), plan.seconds + START_S)))
+                bare_rates.append(float(bare.request(str(plan.seconds), plan.seconds + START_S)))
             for name, fleet in fleets.items():
                 rates[name].append(rate_of(fleet.run(max(plan.clients), plan.seconds)))
-            tell(f"round {number + 1} of {plan.rounds}: {', '.join(f'{n} {r[-1]:.0f}/s' for n, r in rates.items())}")
+            progress(
+                f"round {number + 1} of {plan.rounds}: {', '.join(f'{n} {r[-1]:.0f}/s' for n, r in rates.items())}"
+            )
         best = plan.ideal(max(plan.clients)) if plan.ideal else statistics.median(bare_rates)
         rows = {}
         for name, fleet in fleets.items():
             curve = [_point(plan, fleet, k) for k in plan.clients]
-            tell(f"{name}: clients from {min(plan.clients)} to {max(plan.clients)}")
+            progress(f"{name}: clients from {min(plan.clients)} to {max(plan.clients)}")
             robot = _waiting(fleet.robot_run(max(plan.clients), plan.robot_seconds)) if plan.robot_seconds else None
             if robot is not None:
-                tell(f"{name}: a robot among simulations waits {robot['wait_p50_ms']:.1f} ms")
+                progress(f"{name}: a robot among simulations waits {robot['wait_p50_ms']:.1f} ms")
             median = statistics.median(rates[name])
             rows[name] = {
                 "actions_per_s": median,
@@ -112,7 +113,7 @@ def measure_throughput(plan: Plan, tell: Callable[[str], None] = lambda _: None)
 
 
 class _Part:
-    """Some of the clients: a process or an actor."""
+    """Some of the clients, in one process or actor."""
 
     def __init__(self, start: Callable[[dict[str, Any]], Any], result: Callable[[Any, float], Any]) -> None:
         self.start = start
@@ -127,11 +128,11 @@ class _Fleet:
         self._robot = robot
 
     def run(self, clients: int, seconds: float) -> list[list[Call]]:
-        """So many simulations act for so long, spread over the parts; their calls."""
+        """Let so many simulations act for so long, spread over the parts; returns their calls."""
         return self._together(self._spread(clients), seconds)
 
     def robot_run(self, clients: int, seconds: float) -> list[Call]:
-        """The robot's calls among `clients` - 1 simulations."""
+        """Let a robot act among `clients` - 1 simulations; returns its calls."""
         return self._together([(self._robot, 1), *self._spread(clients - 1)], seconds)[0]
 
     def _spread(self, clients: int) -> list[tuple[_Part, int]]:
@@ -146,64 +147,64 @@ class _Fleet:
 
 
 @contextlib.contextmanager
-def _fleet(way: Way, url: str, app: str, clients: int) -> Iterator[_Fleet]:
+def _fleet(client: OwnClient, url: str, app: str, clients: int) -> Iterator[_Fleet]:
     parts = min(_PROCESSES, clients)
     ranks = [[ROBOT], *([SIMULATION] * size for size in _shares(clients, parts))]
     with contextlib.ExitStack() as stack:
-        make = _actor if way.actor else _process
-        address = f"serve://{app}" if way.actor else url
-        made = [stack.enter_context(make(way, address, one)) for one in ranks]
+        make = _actor if client.actor else _process
+        address = f"serve://{app}" if client.actor else url
+        made = [stack.enter_context(make(client, address, one)) for one in ranks]
         yield _Fleet(made[1:], made[0])
 
 
 @contextlib.contextmanager
-def _process(way: Way, url: str, ranks: list[str]) -> Iterator[_Part]:
-    settings = json.dumps({"url": url, "transport": way.transport, "codec": way.codec, "ranks": ranks})
-    command = [sys.executable, "-m", "vlagents_ray.bench.load", settings]
-    with Child(f"clients by {way.name}", command, our_environment()) as child:
-        child.hear(START_S)
-        yield _Part(lambda spec: child.tell(json.dumps(spec)), lambda _, late: child.hear(late))
+def _process(client: OwnClient, url: str, ranks: list[str]) -> Iterator[_Part]:
+    settings = json.dumps({"url": url, "transport": client.transport, "codec": client.codec, "ranks": ranks})
+    command = [sys.executable, "-m", "vlagents_ray.bench.clients", settings]
+    with LineProcess(f"clients by {client.name}", command, our_environment()) as child:
+        child.read(START_S)
+        yield _Part(lambda spec: child.send(json.dumps(spec)), lambda _, late: child.read(late))
 
 
 @contextlib.contextmanager
-def _actor(way: Way, url: str, ranks: list[str]) -> Iterator[_Part]:
+def _actor(client: OwnClient, url: str, ranks: list[str]) -> Iterator[_Part]:
     import ray
 
-    actor = ray.remote(num_cpus=0)(Load).remote(url, way.transport, way.codec, ranks)
+    actor = ray.remote(num_cpus=0)(LoadGenerator).remote(url, client.transport, client.codec, ranks)
     try:
         ray.get(actor.ready.remote(), timeout=START_S)
         yield _Part(lambda spec: actor.run.remote(**spec), lambda pending, late: ray.get(pending, timeout=late))
     finally:
-        with contextlib.suppress(ray.exceptions.RayError):  # one that never connected has told why already
+        with contextlib.suppress(ray.exceptions.RayError):  # `ready` has raised why it never connected
             ray.get(actor.close.remote(), timeout=START_S)
         ray.kill(actor)
 
 
 @contextlib.contextmanager
-def _bare(plan: Plan) -> Iterator[Child]:
+def _bare(plan: ThroughputPlan) -> Iterator[LineProcess]:
     settings = json.dumps({"policy": plan.policy, "config": dict(plan.config), "batch": plan.batch})
-    with Child("the bare policy", [sys.executable, "-m", _BARE, settings], our_environment()) as child:
-        child.hear(10 * START_S)  # it may have weights to load
+    with LineProcess("the bare policy", [sys.executable, "-m", _BARE, settings], our_environment()) as child:
+        child.read(10 * START_S)  # it may have weights to load
         yield child
 
 
 def _shares(clients: int, parts: int) -> list[int]:
-    """As evenly as it goes, the first parts have one more."""
+    """Split clients as evenly as possible; the first parts have one more."""
     return [clients // parts + (i < clients % parts) for i in range(parts)]
 
 
-def _one_each(found: Sequence[Way]) -> list[Way]:
-    """One way a transport: the first that the table has, where it is not an actor's only; networks as they choose."""
-    first: dict[str, Way] = {}
-    for way in found:
-        kept = first.get(way.transport)
-        if kept is None or (kept.actor and not way.actor) or way.codec == "auto":
-            first[way.transport] = way
+def _one_each(found: Sequence[OwnClient]) -> list[OwnClient]:
+    """Choose one client for each transport: not an actor if possible, over networks with the default codec."""
+    first: dict[str, OwnClient] = {}
+    for one in found:
+        kept = first.get(one.transport)
+        if kept is None or (kept.actor and not one.actor) or one.codec == "auto":
+            first[one.transport] = one
     return list(first.values())
 
 
 def rate_of(calls: Sequence[Sequence[Call]]) -> float:
-    """Actions a second: the slope of the line through all ends of calls.
+    """Return actions a second: the slope of the line through all ends of calls.
 
     They come in batches, so that counting them in a time would be wrong by up to a batch. 0 for fewer than two calls.
     """
@@ -213,7 +214,7 @@ def rate_of(calls: Sequence[Sequence[Call]]) -> float:
     return float(np.polyfit(ends - ends[0], np.arange(len(ends)), 1)[0])
 
 
-def _point(plan: Plan, fleet: _Fleet, clients: int) -> dict[str, Any]:
+def _point(plan: ThroughputPlan, fleet: _Fleet, clients: int) -> dict[str, Any]:
     calls = fleet.run(clients, plan.seconds)
     rate = rate_of(calls)
     flat = [call for one in calls for call in one]
@@ -229,7 +230,7 @@ def _point(plan: Plan, fleet: _Fleet, clients: int) -> dict[str, Any]:
 
 
 def _waiting(calls: Sequence[Call]) -> dict[str, Any] | None:
-    """What the robot waited for: its round trip, and all of it but its own batch's inference. None without a call."""
+    """Return the robot's round trips, and how long it waited beside the inference; None without a call."""
     if not calls:
         return None
     round_trip = np.array([call[1] for call in calls])

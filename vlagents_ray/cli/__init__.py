@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
+import os
 import sys
 
 
 def main() -> None:
-    """Entry point of the console script; says what to install where the light install cannot do it."""
+    """Run the console script; say what to install where only the light install is there."""
     try:
         from vlagents_ray.cli.main import app
     except ModuleNotFoundError as error:
@@ -17,4 +20,18 @@ def main() -> None:
             "For the commands: pip install 'vlagents-ray[serve]', and 'vlagents-ray[sim]' to evaluate.\n"
         )
         sys.exit(1)
+    find_modules_here()
+    atexit.register(gc.freeze)  # else Python looks for garbage in all of Ray once more when it ends, for half a second
     app()
+
+
+def find_modules_here() -> None:
+    """Import modules of the working directory too, as `python -m` and Ray's workers do; not with PYTHONSAFEPATH."""
+    if getattr(sys.flags, "safe_path", False):  # Python 3.10 has no such flag
+        return
+    try:
+        here = os.getcwd()
+    except FileNotFoundError:  # it was removed
+        return
+    if here not in sys.path:
+        sys.path.insert(0, here)

@@ -3,31 +3,42 @@
 from __future__ import annotations
 
 import json
-import sys
+import shlex
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.text import Text
 
-from vlagents_ray.cli.bench_evaluations import bench_eval, bench_evaluation, bench_soak
-from vlagents_ray.cli.bench_scaling import bench_autoscaling, bench_scaling
-from vlagents_ray.cli.console import errors, out, save, tell
-from vlagents_ray.cli.options import DEFAULT_PEERS_PYTHON, PEERS_DIR, Json, PeersPython, Plot
-from vlagents_ray.cli.settings import parse_counts, parse_list, parse_settings
-from vlagents_ray.cli.tables import show_policy, show_round_trips, show_throughput
+from vlagents_ray.cli.console import errors, out, progress, save, table
+from vlagents_ray.cli.options import parse_counts, parse_list, parse_settings
 from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
-    from vlagents_ray.bench.throughput import Plan
+    from vlagents_ray.bench.report import Outcome
+    from vlagents_ray.bench.throughput import ThroughputPlan
 
 bench = typer.Typer(no_args_is_help=True, help="Measure on this machine what the README claims.")
 
+PEERS_DIR = Path(".venv-peers")
+DEFAULT_PEERS_PYTHON = PEERS_DIR / "bin" / "python"
+
+# Options that several commands have.
+Calls = Annotated[int, typer.Option(min=1, help="Round trips by each way.")]
+Seconds = Annotated[float, typer.Option(min=0.1, help="Of each measurement.")]
+Rounds = Annotated[int, typer.Option(min=1)]
+Json = Annotated[Path | None, typer.Option("--json", help="Write the figures here.")]
+Plot = Annotated[Path | None, typer.Option("--plot", help="Draw the figures here: .png, .svg or .pdf.")]
+PeersPython = Annotated[
+    Path, typer.Option(help="The Python of the peers' environment, which `bench peers-setup` makes.")
+]
 Peers = Annotated[str, typer.Option(help="vlagents, openpi, openvla, vla-eval, with commas between them, or 'all'.")]
 
 
 @bench.command("rtt")
 def bench_rtt(
-    calls: Annotated[int, typer.Option(min=1, help="Round trips by each way.")] = 1000,
+    calls: Calls = 1000,
     transports: Annotated[str, typer.Option(help="Of ours: shm,websocket,http,handle,plasma; default: all.")] = "",
     peers: Peers = "",
     peers_python: PeersPython = DEFAULT_PEERS_PYTHON,
@@ -35,13 +46,17 @@ def bench_rtt(
     plot: Plot = None,
 ) -> None:
     """Round trips to a `noop` policy on this machine: every transport, and other policy servers, interleaved."""
-    from vlagents_ray.bench.plot import check, plot_round_trips
+    from vlagents_ray.bench.figures import check_plot_file, plot_round_trips
     from vlagents_ray.bench.rtt import measure_rtt
 
     with errors():
-        check(plot)
+        check_plot_file(plot)
         found = measure_rtt(
-            calls, transports=parse_list(transports), peers=parse_list(peers), peers_python=peers_python, tell=tell
+            calls,
+            transports=parse_list(transports),
+            peers=parse_list(peers),
+            peers_python=peers_python,
+            progress=progress,
         ).to_json()
         show_round_trips(found, "round trip of one act on this machine")
         save(found, json_file)
@@ -51,7 +66,7 @@ def bench_rtt(
 
 @bench.command("link")
 def bench_link(
-    calls: Annotated[int, typer.Option(min=1, help="Round trips by each way.")] = 600,
+    calls: Calls = 600,
     rate: Annotated[str, typer.Option(help="Of the link, as tc writes it.")] = "1gbit",
     delay: Annotated[str | None, typer.Option(help="Each way, as tc writes it: 2ms. Needs the kernel's netem.")] = None,
     peers: Peers = "vlagents,openpi",
@@ -60,34 +75,19 @@ def bench_link(
     plot: Plot = None,
 ) -> None:
     """Round trips over a link of 1 Gbit/s between two network namespaces on this machine."""
+    from vlagents_ray.bench.figures import check_plot_file, plot_round_trips
     from vlagents_ray.bench.link import measure_link
-    from vlagents_ray.bench.plot import check, plot_round_trips
 
     with errors():
-        check(plot)
+        check_plot_file(plot)
         found = measure_link(
-            calls, rate=rate, delay=delay, peers=parse_list(peers), peers_python=peers_python, tell=tell
+            calls, rate=rate, delay=delay, peers=parse_list(peers), peers_python=peers_python, progress=progress
         )  # fmt: skip
         title = f"round trip of one act over {found['link']['measured_mbit_per_s']:.0f} Mbit/s"
         show_round_trips(found, title)
         save(found, json_file)
         if plot is not None:
             plot_round_trips(found, plot, title)
-
-
-@bench.command("hop")
-def bench_hop(
-    calls: Annotated[int, typer.Option(min=1, help="Acts by each way.")] = 2000,
-    python: Annotated[str, typer.Option(help="The child's interpreter; default: this one.")] = sys.executable,
-    json_file: Json = None,
-) -> None:
-    """What a policy in a child process behind the replica costs, against one in the replica."""
-    from vlagents_ray.bench.hop import measure_hop
-
-    with errors():
-        found = measure_hop(calls, python, tell).to_json()
-    show_round_trips(found, "one act, as the batch queue sees it")
-    save(found, json_file)
 
 
 @bench.command("throughput")
@@ -97,8 +97,8 @@ def bench_throughput(
         "1,2,4,8,16,32"
     ),
     batch: Annotated[int, typer.Option(min=1, help="Observations in one forward pass, at most.")] = 16,
-    seconds: Annotated[float, typer.Option(min=0.1, help="Of each measurement.")] = 2.0,
-    rounds: Annotated[int, typer.Option(min=1)] = 3,
+    seconds: Seconds = 2.0,
+    rounds: Rounds = 3,
     robot_seconds: Annotated[float, typer.Option(min=0, help="How long a robot is watched; 0: not at all.")] = 10.0,
     policy: Annotated[
         str | None, typer.Option(help="A registered name or module:Class; default: noop, 20 ms + 1 ms an observation.")
@@ -114,17 +114,17 @@ def bench_throughput(
     json_file: Json = None,
 ) -> None:
     """Actions a second of many clients on one replica, against the ideal, or the bare policy in the same run."""
-    from vlagents_ray.bench.throughput import Plan, measure_throughput
+    from vlagents_ray.bench.throughput import ThroughputPlan, measure_throughput
 
     with errors():
         chosen = _policy(policy, config, model, device)
         counts = parse_counts(clients, "--clients")
         gpus = float(device.startswith("cuda")) if num_gpus is None else num_gpus
-        plan: Plan = Plan(
+        plan: ThroughputPlan = ThroughputPlan(
             **chosen, num_gpus=gpus, batch=batch, clients=counts, seconds=seconds, rounds=rounds,
             robot_seconds=robot_seconds, transports=parse_list(transports),
         )  # fmt: skip
-        found = measure_throughput(plan, tell)
+        found = measure_throughput(plan, progress)
     show_throughput(found)
     save(found, json_file)
 
@@ -133,8 +133,8 @@ def bench_throughput(
 def bench_policy(
     file: Annotated[str, typer.Argument(help="A deployment file, or a registered policy.")],
     batch: Annotated[str, typer.Option(help="Batch sizes, with commas between them.")] = "1,8",
-    seconds: Annotated[float, typer.Option(min=0.1, help="Of each measurement.")] = 2.0,
-    rounds: Annotated[int, typer.Option(min=1)] = 3,
+    seconds: Seconds = 2.0,
+    rounds: Rounds = 3,
     app: Annotated[str | None, typer.Option(help="Of the file, if it holds several.")] = None,
     image: Annotated[int, typer.Option(min=1, help="Pixels a side, where the policy takes any image.")] = 224,
     state: Annotated[
@@ -143,24 +143,17 @@ def bench_policy(
     json_file: Json = None,
 ) -> None:
     """Actions a second of one policy alone, by batch size: bare, and behind its batch queue; without Ray."""
-    from vlagents_ray.bench.policies import PolicyPlan, measure_policy
-    from vlagents_ray.serve.files import server_args
+    from vlagents_ray.bench.policy import PolicyPlan, measure_policy
+    from vlagents_ray.serve.launch.deployment_file import server_args
 
     with errors():
         dims = parse_settings(state, "--state")
         if not all(isinstance(number, int) and number > 0 for number in dims.values()):
             raise ConfigError(f"--state: got {dims}, want a number from 1 on for each part")
         args, batches = server_args(file, app), parse_counts(batch, "--batch")
-        found = measure_policy(PolicyPlan(args, batches, seconds, rounds, image, dims), tell)
+        found = measure_policy(PolicyPlan(args, batches, seconds, rounds, image, dims), progress)
     show_policy(found)
     save(found, json_file)
-
-
-bench.command("eval")(bench_eval)
-bench.command("evaluation")(bench_evaluation)
-bench.command("soak")(bench_soak)
-bench.command("scaling")(bench_scaling)
-bench.command("autoscaling")(bench_autoscaling)
 
 
 @bench.command("peers-setup")
@@ -168,27 +161,28 @@ def bench_peers_setup(
     folder: Annotated[Path, typer.Option("--dir", help="Folder of the environment.")] = PEERS_DIR,
 ) -> None:
     """Install other policy servers, at pinned versions, in a Python environment of their own."""
-    from vlagents_ray.bench.environment import set_up
+    from vlagents_ray.bench.peers import set_up
 
     with errors():
-        python = set_up(folder, tell)
+        python = set_up(folder, progress)
     used = "" if folder == PEERS_DIR else f" --peers-python {python}"
-    out.print(f"ready: vlagents-ray bench rtt --peers all{used}", highlight=False, soft_wrap=True)
+    out.print(f"ready: vlagents-ray bench rtt --peers all{used}")
 
 
 @bench.command("report")
 def bench_report(
-    readme: Annotated[Path, typer.Option(help="Its text between the bench markers is replaced.")] = Path("README.md"),
+    readme: Annotated[
+        Path, typer.Option("--page", "--readme", help="Its text between the bench markers is replaced.")
+    ] = Path("docs/measured.md"),
     json_file: Annotated[Path, typer.Option("--json", help="Keep the figures here.")] = Path("benchmarks/latest.json"),
-    calls: Annotated[int, typer.Option(min=1, help="Round trips by each way.")] = 1000,
+    calls: Calls = 1000,
     seconds: Annotated[float, typer.Option(min=0.1, help="Of each measurement of the throughput.")] = 2.0,
     peers_python: PeersPython = DEFAULT_PEERS_PYTHON,
     from_json: Annotated[bool, typer.Option("--from-json", help="Measure nothing: use the figures in --json.")] = False,
 ) -> None:
     """Measure everything, and write the README's benchmark section anew."""
-    from vlagents_ray.bench.markdown import replaced
-    from vlagents_ray.bench.report import collect, write
-    from vlagents_ray.bench.throughput import Plan
+    from vlagents_ray.bench.report import collect, replaced, write
+    from vlagents_ray.bench.throughput import ThroughputPlan
 
     with errors():
         if not readme.is_file():
@@ -201,10 +195,32 @@ def bench_report(
                 raise ConfigError(f"--json {json_file}: cannot be read ({error})") from error
         else:
             results = collect(
-                peers_python, calls=calls, link_calls=calls, plan=Plan(seconds=seconds), tell=tell
+                peers_python, calls=calls, link_calls=calls, plan=ThroughputPlan(seconds=seconds), progress=progress
             )  # fmt: skip
         write(results, readme, None if from_json else json_file)
-    out.print(f"wrote {readme}", highlight=False)
+    out.print(f"wrote {readme}")
+
+
+# Measurements that only developers repeat, in a checkout: the command that they were, and the module that they are.
+_MOVED = {
+    "eval": "overhead",
+    "evaluation": "evaluation",
+    "hop": "hop",
+    "soak": "soak",
+    "scaling": "scaling",
+    "autoscaling": "autoscaling",
+}
+_ANY = {"allow_extra_args": True, "ignore_unknown_options": True}
+
+
+def _moved(context: typer.Context) -> None:
+    words = shlex.join(["python", "-m", f"benchmarks.{_MOVED[str(context.info_name)]}", *context.args])
+    with errors():
+        raise ConfigError(f"`bench {context.info_name}` is not in the package any more; in a checkout run `{words}`")
+
+
+for _name, _module in _MOVED.items():
+    bench.command(_name, hidden=True, context_settings=_ANY, help=f"Moved: python -m benchmarks.{_module}")(_moved)
 
 
 def _policy(policy: str | None, config: str, model: str | None, device: str) -> dict[str, Any]:
@@ -226,3 +242,77 @@ def _policy(policy: str | None, config: str, model: str | None, device: str) -> 
     if settings:
         raise ConfigError("--config: is for --policy or --model; name one")
     return {}
+
+
+def show_round_trips(found: Mapping[str, Any], title: str) -> None:
+    """Print a row for each client, the fastest first; beside ours, the ratios to the peers."""
+    theirs = [peer["way"] for peer in found["peers"]]
+    rows = table("way", "median ms", "95 % interval", "p99 ms", *(f"/ {name}" for name in theirs))
+    rows.title = f"{title}: two 224x224 RGB cameras, no-op policy"
+    for row in sorted([*found["ways"], *found["peers"]], key=lambda one: float(one["median_ms"])):
+        low, high = row["ci95_ms"]
+        ratios = found["ratios"].get(row["way"], {})
+        cells = []
+        for name in theirs:
+            one = ratios.get(name)
+            cells.append(f"{one['ratio']:.2f} ({one['ci95'][0]:.2f}-{one['ci95'][1]:.2f})" if one else "")
+        rows.add_row(
+            row["way"], f"{row['median_ms']:.3f}", f"{low:.3f} to {high:.3f}", f"{row['p99_ms']:.3f}", *cells,
+            style="dim" if row["way"] in theirs else None,
+        )  # fmt: skip
+    out.print(rows)
+    show_skipped(found)
+
+
+def show_policy(found: Mapping[str, Any]) -> None:
+    """Print a row for each batch size."""
+    rows = table("batch", "bare actions/s", "ms a batch", "queued actions/s", "round trip ms", "mean batch", "peak MiB")
+    chunk = f", {found['chunk']} rows an action" if (found["chunk"] or 1) > 1 else ""
+    rows.title = f"{found['policy']} on {found['device']}{chunk}"
+    for row in found["batches"]:
+        bare, queued = row["bare"], row["queued"]
+        rows.add_row(
+            str(row["batch"]), f"{bare['actions_per_s']:.1f}", f"{bare['batch_ms']:.2f}",
+            f"{queued['actions_per_s']:.1f}", f"{queued['round_trip_ms']:.2f}", f"{queued['mean_batch']:.2f}",
+            f"{row['peak_mib']:.0f}",
+        )  # fmt: skip
+    out.print(rows)
+
+
+def show_throughput(found: Mapping[str, Any]) -> None:
+    """Print a row for each number of clients, and a sentence for each transport."""
+    rows = table("transport", "clients", "actions/s", "of ideal", "mean batch", "p50 ms", "p99 ms")
+    rows.title = f"{found['policy']}, ideal {found['ideal_actions_per_s']:.0f} actions/s ({found['ideal_is']})"
+    for name, row in found["transports"].items():
+        for point in row["curve"]:
+            numbers = [point[key] for key in ("of_ideal", "mean_batch", "p50_ms", "p99_ms")]
+            cells = ["" if number is None else f"{number:.3g}" for number in numbers]
+            rows.add_row(name, str(point["clients"]), f"{point['actions_per_s']:.1f}", *cells)
+        rows.add_section()
+    out.print(rows)
+    for name, row in found["transports"].items():
+        robot = row["robot"]
+        waits = (
+            f"; a robot among simulations waits {robot['wait_p50_ms']:.1f} ms (p99 {robot['wait_p99_ms']:.1f})"
+            if robot
+            else ""
+        )
+        out.print(f"{name}: {row['actions_per_s']:.1f} actions/s, {row['of_ideal']:.3f} of the ideal{waits}")
+    show_skipped(found)
+
+
+def show_outcomes(lines: Sequence[Outcome]) -> None:
+    """Print targets, and whether they are met."""
+    if not lines:
+        return
+    rows = table("", "wanted", "measured", "met")
+    met = {True: Text("yes"), False: Text("no", "red"), None: Text("")}
+    for one in lines:
+        rows.add_row(one.what, one.wanted, one.measured, met[one.met])
+    out.print(rows)
+
+
+def show_skipped(found: Mapping[str, Any]) -> None:
+    """Print what could not be measured, and why."""
+    for name, reason in found["skipped"].items():
+        out.print(Text.assemble((f"skipped {name}", "yellow"), f": {reason}"))

@@ -12,18 +12,47 @@ from typing import Any, NoReturn
 
 import typer
 from pydantic import ValidationError
-from rich.console import Console
-from rich.markup import escape
+from rich.console import Console, ConsoleDimensions
+from rich.table import Table
+from rich.text import Text
 
 from vlagents_ray.errors import ConfigError, VLAgentsError
+from vlagents_ray.settings import wrong_settings
 
-out = Console()
-err = Console(stderr=True)
+
+class PlainConsole(Console):
+    """A console that shows text as it is: `[serve]` is no markup, and a line is as long as it is, for copying.
+
+    What is to be styled is a `Text`, or has a `style`. A table is as wide as the terminal, and breaks words that are
+    too long for its cells; elsewhere it is as wide as it needs to be.
+    """
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(markup=False, highlight=False, soft_wrap=True, **options)
+
+    @property  # type: ignore[misc]
+    def size(self) -> ConsoleDimensions:
+        """The size in columns and lines; a file or a pipe is unbounded."""
+        size = super().size
+        return size if self.is_terminal else size._replace(width=_UNBOUNDED)
+
+
+def table(*columns: str, **options: Any) -> Table:
+    """Make an empty table of which nothing is cut off."""
+    made = Table(**options)
+    for column in columns:
+        made.add_column(column, overflow="fold")
+    return made
+
+
+_UNBOUNDED = 10_000  # columns
+out = PlainConsole()
+err = PlainConsole(stderr=True)
 
 
 @contextlib.contextmanager
 def errors() -> Iterator[None]:
-    """Errors of this package as one message on stderr: exit code 1, 2 for wrong settings, 130 for Ctrl-C.
+    """Print errors of this package as one message on stderr: exit code 1, 2 for wrong settings, 130 for Ctrl-C.
 
     SIGTERM is treated as Ctrl-C, so that what was started is taken down in order.
     """
@@ -31,8 +60,7 @@ def errors() -> Iterator[None]:
     try:
         yield
     except ValidationError as error:
-        lines = [f"- {'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors()]
-        fail("wrong settings:\n" + "\n".join(lines), 2)
+        fail(f"wrong settings: {wrong_settings(error, _model_of(error))}", 2)
     except ConfigError as error:
         fail(str(error), 2)
     except VLAgentsError as error:
@@ -43,15 +71,27 @@ def errors() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
+def _model_of(error: ValidationError) -> type | None:
+    """Return the model that these settings are of, if users write it."""
+    from vlagents_ray.evaluate import EvalConfig
+
+    return EvalConfig if error.title == EvalConfig.__name__ else None
+
+
 def fail(message: str, code: int) -> NoReturn:
-    """Say what went wrong, and end with that exit code."""
-    sys.stdout.flush()
-    err.print(f"[bold red]error[/] {escape(message)}", highlight=False, soft_wrap=True)
+    """Print what went wrong, and end with that exit code."""
+    say_error(message)
     raise typer.Exit(code)
 
 
+def say_error(message: str) -> None:
+    """Print what went wrong, after all other output."""
+    sys.stdout.flush()
+    err.print(Text.assemble(("error", "bold red"), f" {message}"))
+
+
 def fresh(folder: Path) -> Path:
-    """`folder`, or the first of folder-2, folder-3, … that does not exist: nothing mixes with what is older."""
+    """Return `folder`, or the first of folder-2, folder-3, … that does not exist, so that results never mix."""
     candidate, number = folder, 1
     while candidate.exists():
         number += 1
@@ -59,9 +99,9 @@ def fresh(folder: Path) -> Path:
     return candidate
 
 
-def tell(text: str) -> None:
-    """A line of progress, as it is."""
-    out.print(text, highlight=False, markup=False)
+def progress(text: str) -> None:
+    """Print a line of progress."""
+    out.print(text)
 
 
 def save(found: Any, file: Path | None) -> None:

@@ -8,13 +8,17 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
-from rich.table import Table
+from rich.text import Text
 
-from vlagents_ray.cli.console import err, errors, out
+from vlagents_ray.cli.console import err, errors, out, table
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.serve.auth import FILE_VARIABLE
-from vlagents_ray.serve.keyfile import Key, new_key, read_keys, revoke
+from vlagents_ray.serve.access.api_keys import FILE_VARIABLE
+from vlagents_ray.serve.access.key_store import (
+    Key,
+    new_key,
+    read_keys,
+    revoke,
+)
 
 keys = typer.Typer(no_args_is_help=True, help="The API keys of a server: make, list and revoke them.")
 File = Annotated[
@@ -32,26 +36,29 @@ def new(
     rate: Annotated[float | None, typer.Option(help="Requests a second, at each replica.")] = None,
     sessions: Annotated[int | None, typer.Option(min=1, help="Sessions held at once, at each replica.")] = None,
     rank: Annotated[str | None, typer.Option(help="'simulation': none of its requests goes before a robot's.")] = None,
+    scope: Annotated[list[str], typer.Option(help="'weights': it may also push new weights; repeatable.")] = [],  # noqa: B006
     days: Annotated[float | None, typer.Option(help="It expires after so many days.")] = None,
 ) -> None:
     """Make a key. It is shown this once; the file keeps its hash."""
     with errors():
         expires = None if days is None else time.time() + days * _DAY_S
         place = _file(file)
-        token = new_key(place, name, apps=tuple(app), rate=rate, sessions=sessions, rank=rank, expires=expires)
-        err.print(f"key [bold]{escape(name)}[/] added to {escape(str(place))}; it is not shown again:", highlight=False)
-        out.print(token, highlight=False, markup=False, soft_wrap=True)
+        allowed = {"apps": tuple(app), "rate": rate, "sessions": sessions, "rank": rank, "scopes": tuple(scope)}
+        token = new_key(place, name, expires=expires, **allowed)
+        err.print(f"key {name} added to {place}; it is not shown again:")
+        out.print(token)
 
 
 @keys.command("list")
 def list_(file: File = None) -> None:
     """List the keys, and what each allows."""
     with errors():
-        table = Table("name", "for", "requests/s", "sessions", "class", "state")
+        listed = table("name", "for", "requests/s", "sessions", "class", "may also", "state")
         for key in read_keys(_existing(file)):
             limits = ("any" if value is None else f"{value:g}" for value in (key.rate, key.sessions))
-            table.add_row(key.name, ", ".join(key.apps) or "all", *limits, key.rank or "any", _state(key))
-        out.print(table)
+            apps, scopes = ", ".join(key.apps) or "all", ", ".join(key.scopes)
+            listed.add_row(key.name, apps, *limits, key.rank or "any", scopes, _state(key))
+        out.print(listed)
 
 
 @keys.command("revoke")
@@ -59,16 +66,16 @@ def revoke_(name: Name, file: File = None) -> None:
     """Revoke a key. Running servers notice within seconds, and hang up on whoever used it."""
     with errors():
         revoke(_existing(file), name)
-        out.print(f"key {name} revoked", highlight=False, markup=False)
+        out.print(f"key {name} revoked")
 
 
-def _state(key: Key) -> str:
+def _state(key: Key) -> Text:
     if key.revoked:
-        return "[red]revoked[/]"
+        return Text("revoked", "red")
     if key.expires is None:
-        return "[green]valid[/]"
+        return Text("valid", "green")
     date = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(key.expires))
-    return f"[green]until {date}[/]" if key.expires > time.time() else f"[red]expired {date}[/]"
+    return Text(f"until {date}", "green") if key.expires > time.time() else Text(f"expired {date}", "red")
 
 
 def _file(file: Path | None) -> Path:

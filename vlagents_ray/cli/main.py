@@ -1,31 +1,20 @@
-"""The commands; each is thin around a room of the package."""
+"""The commands of `vlagents-ray`; each is thin around a folder of the package. Nothing here loads Ray."""
 
 from __future__ import annotations
 
-import contextlib
-import threading
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from rich.table import Table
 
 from vlagents_ray.cli.bench import bench
-from vlagents_ray.cli.console import errors as _errors
-from vlagents_ray.cli.console import fresh, out
-from vlagents_ray.cli.environments import env
-from vlagents_ray.cli.evaluation import Address, Set, evaluate_command, run_evaluation
-from vlagents_ray.cli.export import export_command
-from vlagents_ray.cli.keys import keys as keys_app
-from vlagents_ray.cli.merge import merge_command
-from vlagents_ray.cli.replay import replay_command
-from vlagents_ray.cli.report import report_command
-from vlagents_ray.cli.settings import parse_settings
+from vlagents_ray.cli.console import errors, fresh, out, progress
+from vlagents_ray.cli.evaluation.command import evaluate_command
+from vlagents_ray.cli.evaluation.results import export_command, merge_command, replay_command, report_command
+from vlagents_ray.cli.keys import keys
+from vlagents_ray.cli.new import new
+from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.cli.slurm import slurm
-from vlagents_ray.errors import ConfigError, VLAgentsError
-from vlagents_ray.serve.cluster import running_server
-from vlagents_ray.serve.files import listens_at, read_deployment, with_dialect
-from vlagents_ray.serve.tls import Tls
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -33,52 +22,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="Serve Vision-Language-Action models with Ray, and evaluate them in parallel simulation.",
 )
-
-
-@app.command()
-def serve(
-    source: Annotated[str, typer.Argument(help="A registered policy, 'module:Class', or a deployment file (.yaml).")],
-    host: Annotated[
-        str | None,
-        typer.Option(help="0.0.0.0, or one address of this machine, lets others in; default: the file's, 127.0.0.1."),
-    ] = None,
-    port: Annotated[int | None, typer.Option(min=1, max=65535, help="Default: the file's, or 8000.")] = None,
-    settings: Set = [],  # noqa: B006 - typer reads it
-    serve_set: Annotated[
-        list[str], typer.Option("--serve-set", metavar="KEY=VALUE", help="A setting of the server: batch.max_size=8.")
-    ] = [],  # noqa: B006
-    vlagents_port: Annotated[
-        int | None, typer.Option(min=1, max=65535, help="Let clients of the package vlagents in at this port, too.")
-    ] = None,
-    address: Address = None,
-    keys: Annotated[
-        Path | None,
-        typer.Option(help="File of the API keys (`vlagents-ray keys new`); default: VLAGENTS_RAY_KEYS_FILE or _KEYS."),
-    ] = None,
-    insecure: Annotated[
-        bool, typer.Option("--insecure", help="Let in whoever reaches the port, without keys.")
-    ] = False,
-    tls_cert: Annotated[Path | None, typer.Option(help="Certificate in PEM: serve https:// and wss://.")] = None,
-    tls_key: Annotated[Path | None, typer.Option(help="Its key, in PEM.")] = None,
-    tls_client_ca: Annotated[
-        Path | None, typer.Option(help="Who signs the certificates that clients must show, in PEM.")
-    ] = None,
-) -> None:
-    """Serve a policy until Ctrl-C."""
-    with _errors():
-        config = read_deployment(source, _server_args(settings, serve_set))
-        if vlagents_port is not None:
-            config = with_dialect(config, "vlagents", {"port": vlagents_port})
-        stated_host, stated_port = listens_at(config)
-        host, port = host or stated_host, port or stated_port
-        access: dict[str, Any] = {
-            "keys_file": keys, "insecure": insecure, "tls": _tls(tls_cert, tls_key, tls_client_ca)
-        }  # fmt: skip
-        with running_server(config, host=host, port=port, address=address, show_logs=True, **access) as server:
-            for name, url in server.apps.items():
-                out.print(f"serving [bold]{name}[/] at {url}  (docs: {url}/docs, Ctrl-C stops)", highlight=False)
-            with contextlib.suppress(KeyboardInterrupt):
-                threading.Event().wait()
+env = typer.Typer(no_args_is_help=True, help="Python environments for policies that the server's own does not suit.")
+app.command("serve")(serve_command)
 
 
 @app.command()
@@ -86,10 +31,11 @@ def demo(
     out_dir: Annotated[Path, typer.Option("--out", help="Folder of the results.")] = Path("runs/demo"),
 ) -> None:
     """The main job in a few minutes: serve the scripted policy, evaluate it in two environments, leave videos."""
+    from vlagents_ray.cli.evaluation.run import run_evaluation
     from vlagents_ray.envs.maniskill import ManiSkill
     from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig
 
-    with _errors():
+    with errors():
         missing = ManiSkill.missing()
         suite = SuiteConfig(envs=["maniskill/PushCube-v1", "maniskill/PickCube-v1"], episodes=10)
         if missing is not None:
@@ -108,59 +54,54 @@ app.command("replay")(replay_command)
 app.command("report")(report_command)
 app.add_typer(bench, name="bench")
 app.add_typer(env, name="env")
-app.add_typer(keys_app, name="keys")
+app.add_typer(keys, name="keys")
+app.add_typer(new, name="new")
 app.add_typer(slurm, name="slurm")
 
 
 @app.command()
 def policies() -> None:
-    """List the policies that can be served by name."""
-    from vlagents_ray.registry import names
+    """List the policies and wrappers: what they are, what is missing here and how to get it, and their settings."""
+    from vlagents_ray.cli.doctor.listing import policy_lines
 
-    table = Table("policy", "class")
-    for name, target in sorted(names("policies").items()):
-        table.add_row(name, target)
-    out.print(table)
+    for line in policy_lines():
+        out.print(line)
 
 
 @app.command()
 def envs() -> None:
     """List the environments, their tasks, and what keeps one from running here."""
-    from vlagents_ray.registry import env_class, names
+    from vlagents_ray.cli.doctor.listing import env_lines
 
-    table = Table("environment", "tasks", "here")
-    for name in sorted(names("envs")):
-        try:
-            cls = env_class(name)
-            missing = cls.missing()
-            tasks = cls.tasks()
-        except VLAgentsError as error:
-            missing, tasks = str(error), []
-        table.add_row(
-            name, ", ".join(tasks) or "any", "[green]ready[/]" if missing is None else f"[yellow]{missing}[/]"
-        )
-    out.print(table)
+    for line in env_lines():
+        out.print(line)
 
 
 @app.command()
 def doctor(port: Annotated[int, typer.Option(help="The port that a server would take.")] = 8000) -> None:
     """Check this machine: Python, Ray, GPU, rendering, shared memory, ports, video; each with the cure."""
-    from vlagents_ray.cli.doctor import run
+    from vlagents_ray.cli.doctor.checks import run
 
     raise typer.Exit(run(out, port))
 
 
-def _tls(certificate: Path | None, key: Path | None, client_ca: Path | None) -> Tls | None:
-    if certificate is None and key is None and client_ca is None:
-        return None
-    if certificate is None or key is None:
-        raise ConfigError("TLS: give both --tls-cert and --tls-key")
-    return Tls(certificate, key, client_ca)
+@env.callback()
+def _group() -> None:
+    """Keep `make` a command of its own."""
 
 
-def _server_args(settings: list[str], serve_set: list[str]) -> dict[str, Any]:
-    args = parse_settings(serve_set, "--serve-set")
-    if "config" in args:
-        raise ConfigError("--serve-set config: the policy's own settings go into --set")
-    config = parse_settings(settings, "--set")
-    return {**args, **({"config": config} if config else {})}
+@env.command("make")
+def make(
+    requirements: Annotated[Path, typer.Argument(help="A requirements file: requirements/lerobot.txt.")],
+    into: Annotated[Path | None, typer.Option(help="Folder; default: .venv- and the file's name.")] = None,
+    more: Annotated[list[Path], typer.Option("--with", help="A further requirements file, repeatable.")] = [],  # noqa: B006
+    python: Annotated[str | None, typer.Option(help="A version (3.12) or an interpreter; default: this one.")] = None,
+    light: Annotated[bool, typer.Option("--light", help="Without Ray, for a child process.")] = False,
+) -> None:
+    """Make a virtual environment with this vlagents-ray and a policy's requirements, and say how to use it."""
+    from vlagents_ray.serve.python_env.create import make_environment
+
+    folder = into or Path(f".venv-{requirements.stem}")
+    with errors():
+        made = make_environment(requirements, folder, more=more, python=python, light=light, progress=progress)
+    out.print(f"ready; in a deployment file, under args:\n\nenvironment:\n  python: {made}")

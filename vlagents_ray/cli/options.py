@@ -1,17 +1,71 @@
-"""Options that several commands of `vlagents-ray bench` have."""
+"""Options that several commands have, and how `KEY=VALUE`, lists and times are parsed."""
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import Annotated
+import datetime
+from collections.abc import Iterable
+from typing import Annotated, Any
 
 import typer
+import yaml
 
-PEERS_DIR = Path(".venv-peers")
-DEFAULT_PEERS_PYTHON = PEERS_DIR / "bin" / "python"
+from vlagents_ray.errors import ConfigError
 
-Json = Annotated[Path | None, typer.Option("--json", help="Write the figures here.")]
-Plot = Annotated[Path | None, typer.Option("--plot", help="Draw the figures here: .png, .svg or .pdf.")]
-PeersPython = Annotated[
-    Path, typer.Option(help="The Python of the peers' environment, which `bench peers-setup` makes.")
+YAML_SUFFIXES = (".yaml", ".yml")
+
+Set = Annotated[list[str], typer.Option("--set", metavar="KEY=VALUE", help="A setting of the policy, repeatable.")]
+Address = Annotated[
+    str | None,
+    typer.Option(
+        help="A running Ray cluster ('auto' finds it), or the URL of a server on this machine, for the one it has; "
+        "default: one for the run, on this machine."
+    ),
 ]
+
+
+def parse_settings(texts: Iterable[str], option: str) -> dict[str, Any]:
+    """Parse `a.b=1` and the like to nested settings; the value is YAML, so `[1, 2]` and `true` work."""
+    settings: dict[str, Any] = {}
+    for text in texts:
+        key, equals, value = text.partition("=")
+        path = key.strip().split(".")
+        if not equals or not all(path):
+            raise ConfigError(f"{option}: got {text!r}, want KEY=VALUE, as in batch.max_size=8")
+        place = settings
+        for name in path[:-1]:
+            place = place.setdefault(name, {})
+            if not isinstance(place, dict):
+                raise ConfigError(f"{option}: {key!r} goes below {name!r}, which has a value already")
+        try:
+            place[path[-1]] = yaml.safe_load(value)
+        except yaml.YAMLError as error:
+            raise ConfigError(f"{option}: the value of {key!r} is not YAML ({error})") from error
+    return settings
+
+
+def parse_list(text: str) -> list[str]:
+    """Split at commas; empty parts are left out."""
+    return [one.strip() for one in text.split(",") if one.strip()]
+
+
+def parse_counts(text: str, option: str) -> list[int]:
+    """Parse numbers from 1 on with commas between them, and return them in ascending order."""
+    try:
+        counts = sorted({int(one) for one in parse_list(text)})
+    except ValueError as error:
+        raise ConfigError(f"{option}: got {text!r}, want numbers with commas between them") from error
+    if not counts or counts[0] < 1:
+        raise ConfigError(f"{option}: got {text!r}, want numbers from 1 on")
+    return counts
+
+
+def parse_time(text: str, option: str) -> float:
+    """Parse seconds since 1970, or a date and time of day (local unless it says otherwise), to seconds since 1970."""
+    try:
+        return float(text)
+    except ValueError:
+        pass
+    try:
+        return datetime.datetime.fromisoformat(text).timestamp()
+    except ValueError as error:
+        raise ConfigError(f"{option}: got {text!r}, want seconds since 1970, or as in 2027-01-31T18:30") from error

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -11,10 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vlagents_ray.cli.console import errors, out
-from vlagents_ray.cli.evaluation import configured, evaluate_command
-from vlagents_ray.cli.reaching import reached
+from vlagents_ray.cli.evaluation.command import config_from_options, evaluate_command
+from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.serve.files import read_deployment
 from vlagents_ray.slurm.options import first_index, split
 from vlagents_ray.slurm.script import Script
 from vlagents_ray.slurm.submission import submit
@@ -79,11 +77,11 @@ def serve(
 
     Once it answers, URL, key and the line for ssh stand in OUT/JOB/server.json and in the job's log.
     """
-    from vlagents_ray.cli.main import serve as command  # which has this one among its own
+    from vlagents_ray.serve.launch.deployment_file import read_deployment
 
     with errors():
-        words, options = split(context.args, _options(command))
-        given = _parsed("serve", command, words)
+        words, options = split(context.args, _options(serve_command))
+        given = _parsed("serve", serve_command, words)
         _refuse(given, _FOUND_OUT, "address", "host")
         _refuse(given, "its server speaks no TLS, the ssh line encrypts", "tls_cert", "tls_key", "tls_client_ca")
         if "array" in options:
@@ -114,17 +112,17 @@ def _submit(script: Script, print_only: bool, parsable: bool) -> None:
         *([f"  way in  {script.folder}/{number}/server.json, once it answers"] if script.name == "serve" else []),
         f"  end it  scancel {job}",
     ]
-    out.print("\n".join(lines), markup=False, highlight=False, soft_wrap=True)
+    out.print("\n".join(lines))
 
 
 def _options(command: Callable[..., None]) -> dict[str, bool]:
-    """The options of a command, and whether each takes a value."""
+    """Return the options of a command, and whether each takes a value."""
     found = _click(command)
     return {name: not param.is_flag for param in found.params if hasattr(param, "is_flag") for name in param.opts}
 
 
 def _parsed(name: str, command: Callable[..., None], words: list[str]) -> dict[str, Any]:
-    """What a command would be called with; wrong words are told as it would tell them."""
+    """Parse what a command would be called with; wrong words are reported as it reports them."""
     params: dict[str, Any] = _click(command).make_context(f"vlagents-ray slurm {name}", list(words)).params
     return params
 
@@ -142,9 +140,9 @@ def _refuse(given: dict[str, Any], why: str, *names: str) -> None:
 
 
 def _cpus(config: EvalConfig) -> float:
-    """That each worker takes of the job's, where there are as many workers as there is room for: a whole one at least.
+    """Return how many CPUs of the job each worker takes, at least one, if the job is filled with workers.
 
-    `ConfigError` where GPUs are what limits them: how many of a job's are for policies, nobody has said.
+    Raises `ConfigError` where GPUs limit their number: how many of a job's are for policies is not known.
     """
     from vlagents_ray.evaluate import most_cpus, most_gpus
 
@@ -156,13 +154,14 @@ def _cpus(config: EvalConfig) -> float:
 
 
 def _evaluation(words: list[str]) -> EvalConfig:
-    """What `eval` would make of the words; raises here what would end the job as soon as it had begun."""
-    from vlagents_ray.evaluate.cells import cells
+    """Build the configuration as `eval` does; raises here what would end the job as soon as it had begun."""
+    from vlagents_ray.cli.evaluation.policies import resolve_policies
+    from vlagents_ray.evaluate.plan.cases import cells
 
     given = _parsed("eval", evaluate_command, words)
     _refuse(given, _FOUND_OUT, "address", "end_at")
     _refuse(given, "`vlagents-ray eval --dry-run` plans without one", "dry_run")
     _refuse(given, "it would wait for a training; have that submit each checkpoint (`submit_evaluation`)", "watch")
-    config = configured(**{name: given[name] for name in inspect.signature(configured).parameters})
-    cells(reached(config, ask=False)[0])
+    config = config_from_options(given)
+    cells(resolve_policies(config, ask=False)[0])
     return config

@@ -1,6 +1,6 @@
-"""What runs on the robot or beside the env: a remote policy as an `Agent`."""
+"""The client, which runs on the robot or beside the environment: a remote policy as an `Agent`."""
 
+from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.client.agent import RemoteAgent
-from vlagents_ray.client.chunks import ChunkPlayer
 
 __all__ = ["ChunkPlayer", "RemoteAgent"]

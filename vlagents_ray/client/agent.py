@@ -1,4 +1,4 @@
-"""RemoteAgent: a policy somewhere else, used like one in this process."""
+"""RemoteAgent: a policy on a server, used like one in this process."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ import os
 import time
 from collections import deque
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from vlagents_ray.client.connection import Connection
 from vlagents_ray.client.credentials import Credentials
-from vlagents_ray.client.link import CodecChoice, Link, Wish
-from vlagents_ray.client.session import Episode, Session, copied, persist
-from vlagents_ray.client.ways import TransportName, choose
+from vlagents_ray.client.session import ClientSession, EpisodeState, call_with_recovery
+from vlagents_ray.client.transports.codec_selection import CodecChoice, CodecName, LinkSpeed
+from vlagents_ray.client.transports.select import TransportName, select_transport
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import (
     ConfigError,
@@ -23,9 +24,14 @@ from vlagents_ray.errors import (
     PolicyFailed,
     UnknownSession,
 )
-from vlagents_ray.interface import DEADLINE, Act, Agent, Obs
-from vlagents_ray.wire.codecs import RAW, ImageCodec
-from vlagents_ray.wire.messages import RANKS, RankName, Reply, Request
+from vlagents_ray.images.codecs import RAW, ImageCodec
+from vlagents_ray.interface import DEADLINE, Act, Agent, Obs, copied
+from vlagents_ray.protocol.messages import (
+    RANKS,
+    RankName,
+    Reply,
+    Request,
+)
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -34,31 +40,12 @@ if TYPE_CHECKING:
 class RemoteAgent(Agent):
     """A policy on a server, as an `Agent`; one object is one session.
 
-    `url` is `http(s)://HOST:PORT[/APP]`, `ws(s)://…` or, inside a Ray cluster, `serve://APP`.
-    `transport` "auto" takes the fastest that there is: shared memory to a server of the same user on
-    this machine, else a WebSocket; inside the cluster a plasma channel to a replica on this node, else
-    a Serve handle. `agent.transport` says which, once connected.
-    Over a network, `codec` "auto" measures the link when the first images are sent (0.3 s at most,
-    unless ten round trips take longer) and writes them as raw pixels, JPEG or PNG, whichever is the
-    fastest to encode, send and decode; "exact" leaves out JPEG, which changes the pixels a little;
-    "raw", "lossless" (PNG), "jpeg" or an `ImageCodec` with quality and subsampling force one.
-    `agent.codec` says which is used, `agent.link` what was measured. Shared memory, plasma and the
-    handle carry raw pixels.
-    `api_key` is for a server that asks for one; by default it is what `VLAGENTS_RAY_API_KEY` holds. With
-    `https://` and `wss://`, `ca` is a PEM file of those who may have signed the server's certificate, where that
-    is not one of the system's, and `certificate` the files of this client's own certificate and its key, for a
-    server that wants to see one.
-    `rank` is the class of its requests: a "robot" goes before a "simulation".
-
-    `connect_timeout_s` is how long `initialize` (called by the first `reset`) waits for a server
-    that is still loading; `timeout_s` is how long a `reset` or `act` may take; an observation's
-    `info["deadline_ms"]` allows its `act` less.
-
-    When the replica stops, dies or has more sessions than others, the session goes on at another one within
-    `timeout_s`: moved with all its state if the old replica still lives, else begun again with the same
-    instruction and options and shown the last observations (`Contract.history` of them; see `Agent.observe`).
-    `act.info["resumed"]` says that the latter happened. No observation is ever acted on twice by one session.
-    With `resume=False` the loss is raised as `ConnectionLost` instead, and the episode needs a new `reset`.
+    When the replica stops, dies or has more sessions than others, the session continues on another replica within
+    `timeout_s`. If the old replica still runs, the session moves with all its state. Otherwise the client begins it
+    again with the same instruction and options and sends the last observations (`Contract.history` of them; see
+    `Agent.observe`); `act.info["resumed"]` then says so. If a replica has not answered for 5 s (in one call, or in
+    several that reached their deadlines), the next call goes to another replica, if one answers. One session never acts
+    twice on an observation.
     """
 
     def __init__(
@@ -68,57 +55,84 @@ class RemoteAgent(Agent):
         transport: TransportName = "auto",
         timeout_s: float = 30.0,
         connect_timeout_s: float = 60.0,
-        codec: ImageCodec | Wish = "auto",
+        codec: ImageCodec | CodecName = "auto",
         rank: RankName = "robot",
         resume: bool = True,
         api_key: str | None = None,
         ca: str | os.PathLike[str] | None = None,
         certificate: tuple[str | os.PathLike[str], str | os.PathLike[str]] | None = None,
     ) -> None:
+        """Set the server; `initialize`, or the first `reset`, connects.
+
+        Args:
+            url: `http(s)://HOST:PORT[/APP]`, `ws(s)://…` or, inside a Ray cluster, `serve://APP`.
+            transport: "auto" takes the fastest available: shared memory to a server of the same user on this
+                machine, else a WebSocket; inside the cluster a plasma channel to a replica on this node, else a Serve
+                handle. The others force one. `agent.transport` says which, once connected.
+            timeout_s: How long a `reset` or `act` may take; an observation's `info["deadline_ms"]` allows its `act`
+                less. 2 to 5 s suit a robot, since a call to a hung replica lasts until its end.
+            connect_timeout_s: How long to wait for a server that is still loading; after 2 s, a warning is logged.
+            codec: How images are encoded for a network. "auto" measures the link when the first ones are sent (0.3 s,
+                more for images of 720p and above, or if ten round trips take longer) and takes raw pixels, JPEG or PNG,
+                whichever is computed to be the fastest to encode, send and decode; "exact" leaves out JPEG, which
+                changes the pixels a little; "raw", "lossless" (PNG), "jpeg" or an `ImageCodec` with quality and
+                subsampling force one. `agent.codec` says which is used, `agent.link` what was measured. Shared memory,
+                plasma and the handle carry raw pixels.
+            rank: The class of the requests: a "robot" goes before a "simulation".
+            resume: False raises the loss of a session as `ConnectionLost`; the episode then needs a new `reset`.
+            api_key: The API key, for a server that requires one; by default the value of `VLAGENTS_RAY_API_KEY`.
+            ca: With `https://` and `wss://`, a PEM file of the authorities that may have signed the server's
+                certificate; by default the system's.
+            certificate: The PEM files of this client's certificate and its key, for a server that requires one.
+
+        Raises:
+            ConfigError: The URL has none of these forms, or does not fit the transport.
+        """
         if rank not in RANKS:
             raise ConfigError(f"rank: got {rank!r}, want one of {list(RANKS)}")
         choice = CodecChoice(codec)
-        way = choose(url, transport, choice, Credentials(api_key, ca, certificate))
-        self._join(Connection(url, way, choice, timeout_s, connect_timeout_s), rank, resume)
+        new_transport = partial(select_transport, url, transport, choice, Credentials(api_key, ca, certificate))
+        renew = new_transport if resume else None
+        self._attach(Connection(url, new_transport(), choice, timeout_s, connect_timeout_s, renew), rank, resume)
 
-    def _join(self, connection: Connection, rank: RankName, resume: bool) -> None:
+    def _attach(self, connection: Connection, rank: RankName, resume: bool) -> None:
         self._connection = connection
         self._rank: RankName = rank
         self._resume = resume
-        self._session = Session(connection, rank)
+        self._session = ClientSession(connection, rank)
 
     def sessions(self, n: int) -> list[Self]:
-        """`n` more sessions on this one's connection, for `reset_batch` and `act_batch`; each to be closed."""
+        """Open `n` more sessions on this agent's connection, for `reset_batch` and `act_batch`; close each of them."""
         made = []
         for _ in range(n):
             agent = object.__new__(type(self))
-            agent._join(self._connection, self._rank, self._resume)
+            agent._attach(self._connection, self._rank, self._resume)
             made.append(agent)
         return made
 
     @property
     def url(self) -> str:
-        """As it was given."""
+        """The server's URL, as it was given."""
         return self._connection.url
 
     @property
     def transport(self) -> str:
-        """What carries the requests: "shm", "plasma", "websocket", "http" or "handle"; "auto" until connected."""
+        """The transport of the requests: "shm", "plasma", "websocket", "http" or "handle"; "auto" until connected."""
         return self._connection.transport.name
 
     @property
     def codec(self) -> ImageCodec | None:
-        """How cameras are written; None until the first images call for a choice."""
+        """The codec of the cameras; None until it is chosen for the first images."""
         return RAW if self.transport in ("shm", "plasma", "handle") else self._connection.codec.codec
 
     @property
-    def link(self) -> Link | None:
-        """Round trip (s) and bandwidth (bytes/s) to the server; None unless they were measured to choose a codec."""
+    def link(self) -> LinkSpeed | None:
+        """Round trip (s) and bandwidth (bytes/s) to the server; None if they were not measured to choose a codec."""
         return self._connection.codec.link
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """What the server says of itself: policy, checkpoint, contract, protocol version."""
+        """The server's metadata: policy, checkpoint, contract, protocol version."""
         self._connection.open()
         return dict(self._connection.metadata or {})
 
@@ -129,7 +143,7 @@ class RemoteAgent(Agent):
         return self._connection.contract
 
     def initialize(self) -> None:
-        """Connect, waiting for the server to become ready; `PolicyUnavailable` if it does not."""
+        """Connect, waiting for the server to become ready; raises `PolicyUnavailable` if it does not."""
         self._connection.open()
 
     def reset(
@@ -140,12 +154,12 @@ class RemoteAgent(Agent):
         contract: Contract | dict[str, Any] | None = None,
         **kwargs: Any,
     ) -> dict[str, Any]:
-        """Begin an episode; `kwargs` reach the policy's `reset`.
+        """Begin an episode; `kwargs` are passed to the policy's `reset`.
 
-        `checkpoint` and `checkpoint_step` do not: they choose among what the server offers (`metadata["checkpoints"]`),
-        and the info that is returned says which it is.
+        `checkpoint` and `checkpoint_step` are not passed on: they select one of the checkpoints that the server offers
+        (`metadata["checkpoints"]`), and the returned info says which one it is.
 
-        With `contract`, the robot's or env's side, the server compares it with the policy's first
+        With `contract`, the contract of the robot or the environment, the server first compares it with the policy's,
         and raises `ContractMismatch` with every difference.
         """
         [info] = self.reset_batch([obs], [instruction], [self], contract=contract, **kwargs)
@@ -160,16 +174,31 @@ class RemoteAgent(Agent):
         sessions: Sequence[RemoteAgent],
         *,
         contract: Contract | dict[str, Any] | None = None,
+        seeds: Sequence[int] | None = None,
         **kwargs: Any,
     ) -> list[dict[str, Any] | Exception]:
-        """`reset` of several sessions of this connection in one message; an exception stands for its own alone."""
+        """Begin episodes of several sessions of this connection in one message.
+
+        Args:
+            obs: The first observation of each session.
+            instructions: The instruction of each session.
+            sessions: Agents that `sessions` of this agent returned, or this agent itself.
+            contract: The contract of the robot or the environment, as in `reset`.
+            seeds: The option `seed` of each session's reset, in place of one for all.
+            kwargs: Options of the policy's `reset`, the same for all sessions.
+
+        Returns:
+            What `reset` returns for each session, or the exception of a session that failed, which affects only that
+            session.
+        """
         siblings = self._siblings(sessions)
         self._connection.open()
         stated = contract.to_json() if isinstance(contract, Contract) else contract
         history = (self._connection.contract.history if self._connection.contract else None) or 1
+        options = [kwargs] * len(siblings) if seeds is None else [{**kwargs, "seed": seed} for seed in seeds]
         episodes = [
-            Episode(copied(first) if self._resume else first, text, kwargs, stated, deque(maxlen=history - 1))
-            for first, text in zip(obs, instructions, strict=True)
+            EpisodeState(copied(first) if self._resume else first, text, own, stated, deque(maxlen=history - 1))
+            for first, text, own in zip(obs, instructions, options, strict=True)
         ]
         for session in siblings:
             session.episode = None
@@ -178,18 +207,19 @@ class RemoteAgent(Agent):
         infos: list[dict[str, Any] | Exception] = []
         for session, episode, reply in zip(siblings, episodes, replies, strict=True):
             if reply.error is None:
-                session.episode = episode
+                session.episode, session.resumed = episode, False
+                session.begun(reply)
                 self._connection.users.add(session)
             infos.append(reply.error or reply.info or {})
         return infos
 
     def act(self, obs: Obs) -> Act:
-        """The next action, (D,) float32, or chunk of actions, (H, D).
+        """Return the next action, (D,) float32, or chunk of actions, (H, D).
 
-        `act.info["timing"]` holds milliseconds by stage: on the server, from the last byte of the
-        request, `decode_ms`, `queue_ms`, `inference_ms` (until the device is done), `encode_ms` and
-        `total_ms`, which is the sum and what lies between; here `round_trip_ms` and, as the rest of
-        it, `wire_ms`: this side's coding, the network, proxies. `batch_size` is no time.
+        `act.info["timing"]` holds times in milliseconds by stage. The server measures from the last byte of the
+        request: `decode_ms`, `queue_ms`, `inference_ms` (until the device is done), `encode_ms`, and `total_ms`, which
+        is their sum and the time between them. The client adds `round_trip_ms` and, as the rest of it, `wire_ms`: its
+        own coding, the network, and proxies. `batch_size` is a number of requests, not a time.
         """
         [act] = self.act_batch([obs], [self])
         if isinstance(act, Exception):
@@ -197,14 +227,14 @@ class RemoteAgent(Agent):
         return act
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        """One action for each of several sessions of this connection, in one message each way.
+        """Return one action for each of several sessions of this connection, with one message in each direction.
 
             envs = agent.sessions(16)
             agent.reset_batch(observations, ["pick up the cube"] * 16, envs)
             acts = agent.act_batch(observations, envs)
 
-        The server runs them in as few batches as its limit allows. An exception in place of an
-        action is that of its session alone.
+        The server runs them in as few batches as its limit allows. An exception in place of an action affects only its
+        own session.
         """
         begun = time.perf_counter()
         siblings = self._siblings(sessions)
@@ -216,40 +246,41 @@ class RemoteAgent(Agent):
         return [self._take(*each, round_trip_ms) for each in zip(siblings, obs, replies, strict=True)]
 
     def close(self) -> None:
-        """End the session. A later `reset` begins another."""
-        self._connection.leave(self._session, self._session.id)
-        self._session = Session(self._connection, self._rank)
+        """End the session. A later `reset` begins another one."""
+        self._connection.end_session(self._session, self._session.id)
+        self._session = ClientSession(self._connection, self._rank)
 
-    def _siblings(self, sessions: Sequence[Agent]) -> list[Session]:
-        found: list[Session] = []
+    def _siblings(self, sessions: Sequence[Agent]) -> list[ClientSession]:
+        found: list[ClientSession] = []
         for agent in sessions:
             if not isinstance(agent, RemoteAgent) or agent._connection is not self._connection:
                 raise ConfigError("sessions: want agents made by sessions() of this one, which share its connection")
             found.append(agent._session)
         return found
 
-    def _call(self, sessions: Sequence[Session], requests: Sequence[Request], timeout_s: float) -> list[Reply]:
+    def _call(self, sessions: Sequence[ClientSession], requests: Sequence[Request], timeout_s: float) -> list[Reply]:
         if self._resume:
-            return persist(self._connection, sessions, requests, timeout_s)
+            return call_with_recovery(self._connection, sessions, requests, timeout_s)
         return self._connection.call(requests, timeout_s)
 
-    def _take(self, session: Session, obs: Obs, reply: Reply, round_trip_ms: float) -> Act | Exception:
+    def _take(self, session: ClientSession, obs: Obs, reply: Reply, round_trip_ms: float) -> Act | Exception:
         episode = session.episode
         if reply.error is not None or reply.act is None or episode is None:
             if isinstance(reply.error, DeadlineExceeded) and episode is not None:
-                episode.step = None  # it may have been acted on
+                episode.step = None  # the policy may have acted on it
             elif isinstance(reply.error, (ConnectionLost, UnknownSession)) and not self._resume:
                 session.episode = None
             return reply.error or PolicyFailed("act: the server's reply holds no action")
-        episode.acted(obs, reply.step)
-        timing = reply.act.info["timing"] = {**reply.timing, "round_trip_ms": round_trip_ms}
+        session.acted(obs, reply)
+        timing = reply.act.info["timing"] = reply.timing
+        timing["round_trip_ms"] = round_trip_ms
         if "total_ms" in timing:
             timing["wire_ms"] = round_trip_ms - timing["total_ms"]
         return reply.act
 
 
 def _deadline_s(obs: Sequence[Obs]) -> float:
-    """After how long the sender of the most urgent of the observations wants no answer any more."""
+    """Return the time, s, after which the most urgent of the observations needs no answer any more."""
     soonest_ms = math.inf
     for one in obs:
         if DEADLINE in one.info:

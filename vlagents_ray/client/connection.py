@@ -1,56 +1,95 @@
-"""The way to a server, shared by all sessions of one `RemoteAgent`, and what the server says of itself."""
+"""The connection to a server, which all sessions of one `RemoteAgent` share, and the server's metadata."""
 
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import ConfigError, ConnectionLost, PolicyUnavailable, UnknownApp, VLAgentsError
-from vlagents_ray.wire.messages import PROTOCOL_VERSION, Reply, Request
+from vlagents_ray.errors import (
+    ConfigError,
+    ConnectionLost,
+    DeadlineExceeded,
+    PolicyUnavailable,
+    UnknownApp,
+    VLAgentsError,
+)
+from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Reply, Request
 
 if TYPE_CHECKING:
-    from vlagents_ray.client.link import CodecChoice
-    from vlagents_ray.client.transport import Transport
+    from vlagents_ray.client.transports.base import Transport
+    from vlagents_ray.client.transports.codec_selection import CodecChoice
 
 _CLOSE_S = 2.0
+# The server gets the deadline of a call less the time of transport: this share of it, and at most so many s.
+_TRANSPORT_SHARE, _TRANSPORT_S = 0.1, 0.2
+SILENT_S = 5.0  # s without any answer, in one or several calls, after which the next call goes to another replica
 
 
 class Connection:
-    """Connects when first needed, and again when the connection broke or the replica sends its sessions elsewhere.
+    """Connects when first needed, and again when the connection broke or the replica asks its clients to reconnect.
 
-    Used by one thread at a time.
+    Only one thread may use it at a time.
     """
 
     def __init__(
-        self, url: str, transport: Transport, codec: CodecChoice, timeout_s: float, connect_timeout_s: float
+        self,
+        url: str,
+        transport: Transport,
+        codec: CodecChoice,
+        timeout_s: float,
+        connect_timeout_s: float,
+        new_transport: Callable[[], Transport] | None = None,
     ) -> None:
+        """Set up the connection, without opening it.
+
+        Args:
+            url: The server's URL.
+            transport: The transport to use.
+            codec: The codec of the cameras.
+            timeout_s: How long a call may take.
+            connect_timeout_s: How long to wait for a server that is not ready.
+            new_transport: Returns a new transport like the first one, for use when a replica no longer answers; None
+                keeps the first.
+        """
         self.url = url
+        self._new_transport = new_transport
+        self._silent_since: float | None = None  # time.monotonic(); no call that began later was answered
+        self._silent = False  # whether that has lasted for `SILENT_S`
+        # The transport to the replica that does not answer, kept until another one answers: its sessions may still be
+        # moved.
+        self._old_transport: Transport | None = None
         self.transport = transport
         self.codec = codec
         self.timeout_s = timeout_s
         self.metadata: dict[str, Any] | None = None
         self.contract: Contract | None = None
-        self.users: set[object] = set()  # whoever has a session here
+        self.users: set[object] = set()  # owners of the sessions
         self._connect_timeout_s = connect_timeout_s
-        self._stale = False  # connect anew before the next request
-        self._sent_away = False  # because the replica said so, and for no other reason
+        self._must_reconnect = False  # connect again before the next request
+        self._asked_to_move = False  # whether that is only because the replica asked for it
         self._prefix = uuid.uuid4().hex[:16]
         self._requests = 0
 
     def request_id(self) -> str:
-        """One that no other request has."""
+        """Return a new unique request id."""
         self._requests += 1
         return f"{self._prefix}-{self._requests:x}"
 
     def open(self, timeout_s: float | None = None) -> None:
-        """Connect, waiting for the server to become ready; `PolicyUnavailable` if it does not."""
-        if self._stale:
-            self.transport.close()
-            self.metadata, self._stale, self._sent_away = None, False, False
+        """Connect, waiting for the server to become ready; raises `PolicyUnavailable` if it does not."""
+        if self._must_reconnect:
+            if self._silent and self._new_transport is not None:
+                self._close_old_transport()
+                self._old_transport, self.transport = self.transport, self._new_transport()
+                self._silent, self._silent_since = False, None
+            else:
+                self.transport.close()
+            self.metadata, self._must_reconnect, self._asked_to_move = None, False, False
         if self.metadata is not None:
             return
         metadata = self.transport.connect(self._connect_timeout_s if timeout_s is None else timeout_s)
@@ -65,44 +104,60 @@ class Connection:
         self.metadata = metadata
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
-        """The replies to requests that travel together; in place of an answer, an error that was met on the way."""
-        deadline = time.monotonic() + timeout_s
+        """Send requests in one message and return their replies; an error on the way stands in place of a reply."""
+        begun = time.monotonic()
         try:
-            if self._stale:
+            if self._must_reconnect:
                 self.open(timeout_s)
-            left_s = max(1e-3, deadline - time.monotonic())
+                timeout_s -= time.monotonic() - begun
+            left_s = max(1e-3, timeout_s)
+            server_deadline_ms = (left_s - min(_TRANSPORT_SHARE * left_s, _TRANSPORT_S)) * 1e3
             for request in requests:
-                request.deadline_ms = left_s * 1e3
+                request.deadline_ms = server_deadline_ms
             replies = self.transport.call(requests, left_s)
+            self._silent_since = None
+            if self._old_transport is not None:
+                self._close_old_transport()
         except VLAgentsError as error:
+            if isinstance(error, DeadlineExceeded):
+                self._silent_since = begun if self._silent_since is None else self._silent_since
+                self._silent = time.monotonic() - self._silent_since >= SILENT_S
+                self._must_reconnect = self._must_reconnect or (self._silent and self._new_transport is not None)
             replies = [Reply(request.request_id, error=error) for request in requests]
-        if len(replies) == len(requests) and not any(map(_matters, replies)):
+        if len(replies) == len(requests) and not any(map(_changes_connection, replies)):
             return replies
         for reply in replies:
-            if isinstance(reply.error, UnknownApp):  # it was there: the server is stopping, or starting again
+            if isinstance(reply.error, UnknownApp):  # it existed: the server is stopping or restarting
                 reply.error = PolicyUnavailable(f"{self.url}: the application is gone ({reply.error})")
-        if len(replies) != len(requests):  # an answer to the frame as a whole
+        if len(replies) != len(requests):  # one reply to the frame as a whole
             whole = replies[0].error or PolicyUnavailable(f"got {len(replies)} replies to {len(requests)} requests")
             replies = [Reply(request.request_id, error=whole) for request in requests]
         broken = any(isinstance(reply.error, (ConnectionLost, PolicyUnavailable)) for reply in replies)
         if broken or any(reply.draining for reply in replies):
-            self._stale, self._sent_away = True, not broken
+            self._must_reconnect, self._asked_to_move = True, not broken
         return replies
 
-    def leave(self, user: object, session: str) -> None:
-        """A session ends, if there was one; the last one hangs up."""
+    def end_session(self, user: object, session: str) -> None:
+        """End the session of `user`, if it was begun; with the last session, close the connection."""
         begun = user in self.users
         self.users.discard(user)
-        told = self.transport.holds_sessions and not self.users  # by hanging up
-        if begun and self.metadata is not None and (self._sent_away or not (told or self._stale)):
+        ended = self.transport.holds_sessions and not self.users  # by closing the connection
+        if begun and self.metadata is not None and (self._asked_to_move or not (ended or self._must_reconnect)):
             close = Request("close", session=session, request_id=self.request_id(), deadline_ms=_CLOSE_S * 1e3)
-            with contextlib.suppress(VLAgentsError):  # it would change nothing: the server forgets idle sessions
-                self.transport.call([close], _CLOSE_S)  # over this connection still: the session is there
+            with contextlib.suppress(VLAgentsError):  # harmless: the server forgets idle sessions
+                self.transport.call([close], _CLOSE_S)  # on the old connection, which holds the session
         if not self.users:
+            self._close_old_transport()
             self.transport.close()
-            self.metadata, self._stale, self._sent_away = None, False, False
+            self.metadata, self._must_reconnect, self._asked_to_move = None, False, False
+
+    def _close_old_transport(self) -> None:
+        """Close the transport to the silent replica that was left; in a thread, since closing it may take long."""
+        if self._old_transport is not None:
+            threading.Thread(target=self._old_transport.close, daemon=True).start()
+            self._old_transport = None
 
 
-def _matters(reply: Reply) -> bool:
-    """Does it say anything of the connection?"""
+def _changes_connection(reply: Reply) -> bool:
+    """Whether the reply changes the state of the connection."""
     return reply.error is not None or reply.draining

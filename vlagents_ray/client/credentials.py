@@ -1,17 +1,23 @@
-"""What a client shows to a server: its API key, and over TLS its certificate; and whom it trusts."""
+"""The credentials of a client: its API key and, over TLS, its certificate and the authorities that it trusts."""
 
 from __future__ import annotations
 
+import contextlib
+import ipaddress
 import logging
 import os
 import ssl
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cache
 from urllib.parse import urlsplit
 
 from vlagents_ray.errors import ConfigError, ConnectionLost, VLAgentsError
 
+logger = logging.getLogger(__name__)
+
 KEY_VARIABLE = "VLAGENTS_RAY_API_KEY"
-WEBSOCKET_LOG = logging.getLogger("vlagents_ray.client.websocket.protocol")
+WEBSOCKET_LOG = logging.getLogger("vlagents_ray.client.transports.websocket.protocol")
 """For websockets, which at DEBUG logs the headers that it sends: all but the key."""
 WEBSOCKET_LOG.addFilter(lambda record: "authorization" not in str(record.args).lower())
 _Path = str | os.PathLike[str]
@@ -19,44 +25,87 @@ _Path = str | os.PathLike[str]
 
 @dataclass(frozen=True, slots=True)
 class Credentials:
-    """Of one client. `certificate` is that of the client and its key; all are PEM files."""
+    """The credentials of one client: its API key, its certificate and key, and the CA; all files are PEM files."""
 
     api_key: str | None = field(default=None, repr=False)
     ca: _Path | None = None
     certificate: tuple[_Path, _Path] | None = None
 
     def __post_init__(self) -> None:
-        """The key comes from the environment if it is not given."""
+        """Take the key from the environment if none is given."""
         key = os.environ.get(KEY_VARIABLE) if self.api_key is None else self.api_key
         if key is not None and not (key.isascii() and key.isprintable() and " " not in key):
             raise ConfigError("api_key: want visible ASCII characters without spaces, as `keys new` printed them")
         object.__setattr__(self, "api_key", key or None)
 
+    def become_default(self) -> None:
+        """Make this key the default of the process, as if its environment had held it."""
+        if self.api_key is not None:
+            os.environ[KEY_VARIABLE] = self.api_key
+
     @property
     def headers(self) -> dict[str, str]:
-        """Those that show the key."""
+        """Return the HTTP headers that carry the key."""
         return {} if self.api_key is None else {"authorization": f"Bearer {self.api_key}"}
 
+    def use_at(self, url: str) -> None:
+        """Warn if the key would go to that URL unencrypted over a network."""
+        parts = urlsplit(url)
+        if self.api_key is not None and parts.scheme in ("http", "ws"):
+            warn_of_plain_http(f"{parts.scheme}://{parts.netloc.rpartition('@')[2]}")
+
     def context(self, url: str) -> ssl.SSLContext | None:
-        """For a connection to that URL; None if it is not encrypted. `ConfigError` if a file is of no use."""
+        """Return the TLS context for a URL; None if the URL is not encrypted.
+
+        Raises `ConfigError` for an unusable file.
+        """
         if urlsplit(url).scheme not in ("https", "wss"):
             return None
         try:
             context = ssl.create_default_context(cafile=self.ca)
             if self.certificate is not None:
                 context.load_cert_chain(*self.certificate)
-        except OSError as error:  # ssl.SSLError is one
+        except OSError as error:  # ssl.SSLError is a subclass
             raise ConfigError(
                 f"TLS: ca={self.ca!r}, certificate={self.certificate!r}: not PEM files that belong together ({error})"
             ) from error
         return context
 
 
-NOBODY = Credentials("")
+ANONYMOUS = Credentials("")
+
+
+@contextlib.contextmanager
+def withheld() -> Iterator[None]:
+    """Remove the key from the environment for a while, so that processes started meanwhile do not inherit it."""
+    key = os.environ.pop(KEY_VARIABLE, None)
+    try:
+        yield
+    finally:
+        if key is not None:
+            os.environ[KEY_VARIABLE] = key
+
+
+def is_loopback(host: str) -> bool:
+    """Whether `host` is an address of this machine that no other machine can reach."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:  # a host name
+        return host == "localhost"
+
+
+@cache
+def warn_of_plain_http(origin: str) -> None:
+    """Log, once for each server, that an API key goes there unencrypted over a network."""
+    if not is_loopback(urlsplit(origin).hostname or ""):
+        logger.warning("%s: the API key goes there unencrypted, and others may read it; use https:// or wss://", origin)
 
 
 def tls_failure(url: str, error: ssl.SSLError) -> VLAgentsError:
-    """What to do about it. Another try helps only where the connection just ended."""
+    """Return the error for a failed TLS handshake, with its cure.
+
+    Only a connection that just ended is worth a retry.
+    """
     if isinstance(error, (ssl.SSLEOFError, ssl.SSLZeroReturnError)):
         return ConnectionLost(f"{url}: the connection ended ({error})")
     if isinstance(error, ssl.SSLCertVerificationError):

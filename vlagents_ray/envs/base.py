@@ -4,28 +4,32 @@ from __future__ import annotations
 
 import inspect
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vlagents_ray.contract import Contract, check_action
-from vlagents_ray.envs.graphics import Renderer, opengl_renderer
-from vlagents_ray.errors import ConfigError, InvalidAction
+from vlagents_ray.contract import Contract
+from vlagents_ray.envs.rendering.graphics import Renderer, opengl_renderer
+from vlagents_ray.errors import ConfigError, InvalidAction, UnknownEnv
 from vlagents_ray.interface import Act, Obs
+from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import env_class, env_task
+from vlagents_ray.settings import require_arguments
+from vlagents_ray.validation import check_action
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    from vlagents_ray.envs.batch import BatchEnv
+Options = Mapping[str, Any]
+Steps = tuple[list[Obs], list[float], list[bool], list[bool], list[dict[str, Any]]]
 
 
-class EvalEnv(ABC):
-    """One environment instance: made once by a worker, reset for each of its episodes.
+class Environment(ABC):
+    """What a single environment and a batch of them have in common.
 
-    An episode is a pure function of its seed and options: two resets with the same ones give the
-    same first observation, whatever happened before, in whichever process.
+    An episode is a pure function of its seed and options: two resets with the same ones give the same first
+    observation, whatever happened before, in whichever process.
     """
 
     max_steps: int
@@ -38,51 +42,19 @@ class EvalEnv(ABC):
     """
 
     looked_at: bool = True
-    """Will anybody see what the next `step` returns? If not, an env may leave the images out, and save rendering them.
+    """Whether the next observation is used; if not, an env may omit its images, which saves rendering them.
 
-    Nobody does between two rows of a chunk, unless videos are made. Nothing else may depend on it.
+    The observations between the rows of a chunk are not used, unless videos are made. Nothing but the images may depend
+    on this.
     """
 
     @property
     @abstractmethod
     def contract(self) -> Contract:
-        """What the env gives (cameras, state, gripper, rate) and takes (actions)."""
-
-    @property
-    @abstractmethod
-    def instruction(self) -> str:
-        """The task in words, for the episode that the last `reset` began."""
-
-    @abstractmethod
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
-        """Begin the episode that `seed` and `options` determine."""
-
-    @abstractmethod
-    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-        """Execute one action, (D,) float32: `(obs, reward, terminated, truncated, info)`.
-
-        `info["success"]` is a bool: is the task solved in this state? The env may go on after
-        success; `terminated` only says that it cannot. Raises `InvalidAction` for an action of the
-        wrong shape and `EnvFailed` when the simulator breaks.
-        """
-
-    @classmethod
-    def tasks(cls) -> list[str]:
-        """The tasks known by name, `[]` if any name is handed to the simulator."""
-        return []
-
-    @classmethod
-    def missing(cls) -> str | None:
-        """What keeps this simulator from running here, with the cure; None if nothing does."""
-        return None
-
-    @classmethod
-    def batched(cls, num_envs: int, **options: Any) -> BatchEnv | None:  # noqa: ARG003 - for those that override it
-        """`num_envs` environments in one simulator, made with the constructor's options; None if that cannot be."""
-        return None
+        """What each environment gives (cameras, state, gripper, rate) and takes (actions)."""
 
     def renderer(self) -> Renderer | None:
-        """What draws its images, once it is made; None if that is no device. Here: this thread's OpenGL context."""
+        """What draws the images, once it is made; None if that is no device. Here: this thread's OpenGL context."""
         return opengl_renderer()
 
     def describe(self) -> dict[str, Any]:
@@ -100,10 +72,173 @@ class EvalEnv(ABC):
         self.close()
 
 
-def make_env(name: str, **options: Any) -> EvalEnv:
-    """An environment by name, e.g. `make_env("maniskill/PushCube-v1", width=224, height=224)`.
+class EvalEnv(Environment):
+    """The interface of an environment, which a worker creates once and resets for each of its episodes.
 
-    Raises `UnknownEnv` for an unknown name and `ConfigError` for an option that the env does not take.
+    An episode is a pure function of its seed and options: two resets with the same ones give the same first
+    observation, in any process and after any other episodes.
+    """
+
+    @property
+    @abstractmethod
+    def instruction(self) -> str:
+        """The task of the current episode in words."""
+
+    @abstractmethod
+    def reset(self, *, seed: int, options: Options | None = None) -> tuple[Obs, dict[str, Any]]:
+        """Begin an episode.
+
+        Args:
+            seed: The seed of the episode.
+            options: The options of the episode, e.g. `init_state` (int); those allowed depend on the env.
+
+        Returns:
+            The first observation, and information about the episode with values that a message can carry.
+
+        Raises:
+            ConfigError: An option is unknown or has a wrong value.
+            EnvFailed: The simulator failed.
+        """
+
+    @abstractmethod
+    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        """Execute an action.
+
+        Args:
+            act: A single action, (D,) float32, in the units of the contract; its array must not be changed.
+
+        Returns:
+            `(obs, reward, terminated, truncated, info)`, with the meaning of Gymnasium's `Env.step`. `info["success"]`
+            is a bool, whether the task is solved in this state. An env may continue after success; `terminated` only
+            says that it cannot. `truncated` says that `max_steps` is reached.
+
+        Raises:
+            InvalidAction: The action has a wrong shape or is not finite.
+            EnvFailed: The simulator failed.
+        """
+
+    @classmethod
+    def tasks(cls) -> list[str]:
+        """List the known tasks; empty if the simulator gets any name."""
+        return []
+
+    @classmethod
+    def require_task(cls, task: str | None) -> None:
+        """Raise `UnknownEnv` if the task is not known, if that can be determined without the simulator.
+
+        Args:
+            task: The part of the env's name after the first slash; None if it has none.
+        """
+
+    @classmethod
+    def known_contract(cls, arguments: Mapping[str, Any]) -> Contract | None:  # noqa: ARG003 - for those that override it
+        """Return the contract of an environment before it is made; None if only the simulator knows it.
+
+        A mismatch with a policy is then an error before anything starts.
+
+        Args:
+            arguments: All arguments of the constructor by name, defaults included.
+        """
+        return None
+
+    @classmethod
+    def missing(cls) -> str | None:
+        """Say why the simulator cannot run here, with the cure; None if it can."""
+        return None
+
+    @classmethod
+    def batched(cls, num_envs: int, **options: Any) -> BatchEnv | None:  # noqa: ARG003 - for those that override it
+        """Make several environments that one simulator runs together.
+
+        Args:
+            num_envs: The number of environments.
+            options: The constructor's options.
+
+        Returns:
+            The environments; None if the simulator cannot run several with these options.
+        """
+        return None
+
+
+class BatchEnv(Environment):
+    """Several environments of one task, which differ in their episodes only.
+
+    They begin and step together: an environment whose episode is over is idle, and its rows have no meaning, until all
+    are over and `reset` begins the next ones. Row i of every argument and result belongs to environment i. Its episode
+    is a pure function of its own seed and options, as an `EvalEnv`'s is, and does not depend on the other environments.
+
+    The images of a camera in one step are rows of one array, (num_envs, height, width, 3) uint8.
+    """
+
+    num_envs: int
+    """How many there are."""
+
+    restarts: bool = False
+    """Whether `restart` begins an episode in one environment while the others go on with theirs."""
+
+    @property
+    @abstractmethod
+    def instructions(self) -> list[str]:
+        """The tasks of the current episodes in words."""
+
+    @abstractmethod
+    def reset(self, *, seeds: Sequence[int], options: Sequence[Options | None] | None = None) -> list[Obs]:
+        """Begin an episode for each seed.
+
+        Args:
+            seeds: The seeds, 1 to `num_envs`; if there are fewer, the remaining environments are idle.
+            options: The options of each episode; None for no options.
+
+        Returns:
+            The first observation of each episode.
+        """
+
+    def restart(self, index: int, *, seed: int, options: Options | None = None) -> Obs:
+        """Begin another episode in one environment that has had one, whatever the others do.
+
+        Args:
+            index: The number of the environment.
+            seed: The seed of the episode.
+            options: The options of the episode; None for no options.
+
+        Returns:
+            The first observation.
+
+        Raises:
+            ConfigError: `restarts` is false.
+        """
+        raise ConfigError(f"env {index}: {type(self).__name__} resets its environments together; use `reset`")
+
+    @abstractmethod
+    def step(self, acts: Sequence[Act | None]) -> Steps:
+        """Execute an action in each episode.
+
+        Args:
+            acts: A single action, (D,) float32, for each episode; None for an idle environment.
+
+        Returns:
+            `(obs, rewards, terminated, truncated, infos)`, one item for each episode (see `EvalEnv.step`).
+
+        Raises:
+            InvalidAction: An action is not valid; none was executed.
+            EnvFailed: The simulator failed, which ends all episodes.
+        """
+
+
+def make_env(name: str, **options: Any) -> EvalEnv:
+    """Make an environment by its name, e.g. `make_env("maniskill/PushCube-v1", width=224, height=224)`.
+
+    Args:
+        name: A registered name, with the task after a slash, or "module:Class".
+        options: The options of the env's constructor.
+
+    Returns:
+        The environment, which the caller closes.
+
+    Raises:
+        UnknownEnv: The name or the task is unknown.
+        ConfigError: The env has no such option, or its value is wrong.
+        MissingDependency: The simulator is not installed.
     """
     cls, arguments = env_arguments(name, options)
     env: EvalEnv = cls(**arguments)
@@ -111,20 +246,45 @@ def make_env(name: str, **options: Any) -> EvalEnv:
 
 
 def env_arguments(name: str, options: Mapping[str, Any]) -> tuple[type[EvalEnv], dict[str, Any]]:
-    """The class of the env `name` and what its constructor is given; raises as `make_env`."""
+    """Return the class of the env `name` and its constructor's arguments; raises the errors of `make_env`."""
     cls = env_class(name)
     task = env_task(name)
     arguments = {"task": task, **options} if task is not None else dict(options)
-    try:
-        inspect.signature(cls).bind(**arguments)
-    except TypeError as error:
-        takes = sorted(set(inspect.signature(cls).parameters) - {"self"})
-        raise ConfigError(f"env {name!r}: {error}; it takes {takes}") from error
+    require_arguments(f"env {name!r}", cls, arguments)
+    if issubclass(cls, EvalEnv):
+        cls.require_task(arguments.get("task"))
     return cls, arguments
 
 
+def known_contract(name: str, options: Mapping[str, Any]) -> Contract | None:
+    """Return the contract of the env `name` without making it; None if it cannot state one yet.
+
+    Raises the errors of `env_arguments`.
+    """
+    if not issubclass(env_class(name), EvalEnv):
+        return None
+    cls, arguments = env_arguments(name, options)
+    bound = inspect.signature(cls).bind(**arguments)
+    bound.apply_defaults()
+    return cls.known_contract(bound.arguments)
+
+
+def require_known(suite: str, task: str | None, known: Sequence[str], others: str = "") -> None:
+    """Raise `UnknownEnv` unless a task is known.
+
+    Args:
+        suite: The suite's name.
+        task: The task.
+        known: The known tasks.
+        others: Further allowed tasks, as the end of a list in words.
+    """
+    if task not in known:
+        meant = did_you_mean(str(task), known)
+        raise UnknownEnv(f"{suite} has no task {task!r}: want one of {list(known)}{others}{meant}")
+
+
 def one_row(act: Act, contract: Contract) -> np.ndarray:
-    """The action as (D,) float32, for `step`; `InvalidAction` if it is anything else."""
+    """Return the action of a step as (D,) float32; raises `InvalidAction` if it is a chunk or not valid."""
     action = check_action(act.action, contract)
     if action.ndim != 1:
         dim = contract.action.dim

@@ -2,95 +2,35 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.envs.base import EvalEnv, env_arguments, one_row
-from vlagents_ray.envs.graphics import Renderer, opengl_renderer
-from vlagents_ray.errors import ConfigError
+from vlagents_ray.envs.base import BatchEnv, EvalEnv, Options, Steps, env_arguments, one_row
+from vlagents_ray.envs.rendering.graphics import Renderer
+from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.interface import Act, Obs
 
-if TYPE_CHECKING:
-    from typing_extensions import Self
-
-Options = Mapping[str, Any]
-Steps = tuple[list[Obs], list[float], list[bool], list[bool], list[dict[str, Any]]]
-
-
-class BatchEnv(ABC):
-    """`num_envs` environments of one task, alike but for their episodes.
-
-    They begin together and go on together: an environment whose episode is over is idle, its rows
-    meaningless, until all are and `reset` begins the next. Row i of whatever is given and returned
-    belongs to environment i. Its episode is a pure function of its own seed and options, as an
-    `EvalEnv`'s is, wherever it stands and whoever its neighbours are.
-
-    All images that a camera took at one time are rows of one array, (num_envs, height, width, 3).
-    """
-
-    num_envs: int
-    """How many there are."""
-
-    max_steps: int
-    """The task's step limit, as an `EvalEnv`'s."""
-
-    init_states: int | None = None
-    """As an `EvalEnv`'s."""
-
-    @property
-    @abstractmethod
-    def contract(self) -> Contract:
-        """What each environment gives and takes."""
-
-    @property
-    @abstractmethod
-    def instructions(self) -> list[str]:
-        """The tasks in words, for the episodes that the last `reset` began."""
-
-    @abstractmethod
-    def reset(self, *, seeds: Sequence[int], options: Sequence[Options | None] | None = None) -> list[Obs]:
-        """Begin as many episodes as there are seeds, each with its own options.
-
-        Of fewer than `num_envs`, the environments left over are idle; nothing is returned for them.
-        """
-
-    @abstractmethod
-    def step(self, acts: Sequence[Act | None]) -> Steps:
-        """Execute one action, (D,) float32, in each episode: `(obs, rewards, terminated, truncated, infos)`.
-
-        None is for an idle environment. Raises `InvalidAction` before anything has moved, and
-        `EnvFailed` when the simulator breaks, which ends all episodes.
-        """
-
-    def renderer(self) -> Renderer | None:
-        """As `EvalEnv.renderer`."""
-        return opengl_renderer()
-
-    def describe(self) -> dict[str, Any]:
-        """What a reader of the results must know, as `EvalEnv.describe`."""
-        return {}
-
-    @abstractmethod
-    def close(self) -> None:
-        """Free the simulator; safe to call twice."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
+__all__ = ["BatchEnv", "Options", "SequentialBatch", "Steps", "episodes_of", "make_batch"]
 
 
 def make_batch(name: str, num_envs: int, **options: Any) -> BatchEnv:
-    """`num_envs` environments by name, in one simulator where the suite can do that with these options.
+    """Make several environments by name, in one simulator if the suite supports that with these options.
 
-    Raises as `make_env`, and `ConfigError` for less than one environment.
+    Args:
+        name: The name of the env, as for `make_env`.
+        num_envs: The number of environments.
+        options: The options of the env's constructor.
+
+    Returns:
+        The environments, which the caller closes.
+
+    Raises:
+        ConfigError: `num_envs` is below 1, or an option is wrong; other errors are those of `make_env`.
     """
     if num_envs < 1:
         raise ConfigError(f"env {name!r}: num_envs is {num_envs}, want at least 1")
@@ -101,14 +41,16 @@ def make_batch(name: str, num_envs: int, **options: Any) -> BatchEnv:
     with ExitStack() as made:
         envs = [made.enter_context(cls(**arguments)) for _ in range(num_envs)]
         made.pop_all()
-        return InTurn(envs)
+        return SequentialBatch(envs)
 
 
-class InTurn(BatchEnv):
-    """Environments that are stepped one after another; what is saved is asking the policy for each."""
+class SequentialBatch(BatchEnv):
+    """Environments that are stepped one after another, while one call of the policy serves all of them."""
+
+    restarts = True
 
     def __init__(self, envs: Sequence[EvalEnv]) -> None:
-        """`envs` are of one task, and closed with this."""
+        """Combine environments of one task, which are closed together with this object."""
         self._envs = list(envs)
         self._playing = 0  # the first so many have an episode
         self._seen: list[Obs] = []  # the last observation of each
@@ -125,47 +67,77 @@ class InTurn(BatchEnv):
 
     def reset(self, *, seeds: Sequence[int], options: Sequence[Options | None] | None = None) -> list[Obs]:
         self._playing = episodes_of(seeds, self.num_envs)
-        given = options or [None] * self._playing
-        self._seen = [
-            env.reset(seed=seed, options=option)[0]
-            for env, seed, option in zip(self._envs[: self._playing], seeds, given, strict=True)
-        ]
-        self._seen = self._together(self._seen)
-        return list(self._seen)
+        given = zip(self._envs, seeds, options or [None] * self._playing, strict=False)
+        self._seen = self._stacked([_begun(*each) for each in given], range(self._playing))
+        return self._seen
+
+    def restart(self, index: int, *, seed: int, options: Options | None = None) -> Obs:
+        self._seen[index] = _begun(self._envs[index], seed, options)
+        return self._seen[index]
 
     def step(self, acts: Sequence[Act | None]) -> Steps:
-        for act in acts:
-            if act is not None:
+        n = len(acts)
+        if n != self._playing:
+            raise ConfigError(f"step: got {n} actions, want {self._playing}, one for each episode or None")
+        moving = {i: act for i, act in enumerate(acts) if act is not None}
+        if n > 1:  # a single environment checks its action itself
+            for act in moving.values():
                 one_row(act, self.contract)
-        rewards, terminated, truncated = ([0.0] * len(acts), [False] * len(acts), [False] * len(acts))
-        infos: list[dict[str, Any]] = [{} for _ in acts]
-        for i, (env, act) in enumerate(zip(self._envs[: self._playing], acts, strict=True)):
-            if act is not None:
-                self._seen[i], rewards[i], terminated[i], truncated[i], infos[i] = env.step(act)
-        self._seen = self._together(self._seen)
-        return list(self._seen), rewards, terminated, truncated, infos
+        seen, rewards, terminated, truncated = list(self._seen), [0.0] * n, [False] * n, [False] * n
+        infos: list[dict[str, Any]] = [{}] * n
+        for i, act in moving.items():
+            self._envs[i].looked_at = self.looked_at
+            answer: Any = self._envs[i].step(act)
+            if not isinstance(answer, tuple) or len(answer) != 5:
+                want = "(Obs, reward, terminated, truncated, info)"
+                raise EnvFailed(f"env step: got {_kind(answer)}, want {want}; see EvalEnv.step")
+            seen[i], rewards[i], terminated[i], truncated[i], infos[i] = answer
+        self._seen = self._stacked(seen, moving)
+        return self._seen, rewards, terminated, truncated, infos
 
     def renderer(self) -> Renderer | None:
         return self._envs[0].renderer()
 
     def describe(self) -> dict[str, Any]:
-        return {**self._envs[0].describe(), "num_envs": self.num_envs}
+        several = {} if self.num_envs == 1 else {"num_envs": self.num_envs}
+        return {**self._envs[0].describe(), **several}
 
     def close(self) -> None:
         with ExitStack() as closing:
             for env in self._envs:
                 closing.callback(env.close)
 
-    def _together(self, seen: Sequence[Obs]) -> list[Obs]:
-        names = seen[0].cameras
-        images = {name: np.stack([obs.cameras[name] for obs in seen]) for name in names}
-        return [replace(obs, cameras={name: images[name][i] for name in names}) for i, obs in enumerate(seen)]
+    def _stacked(self, seen: list[Obs], moved: Collection[int]) -> list[Obs]:
+        """The observations with the images of each camera as rows of one array, if anybody looks at them.
+
+        An idle environment may have left its images out when it last moved; those of one that moved stand for them.
+        """
+        if len(seen) == 1 or not moved or not self.looked_at:
+            return seen
+        shown = seen[min(moved)].cameras
+        if not shown:
+            return seen
+        cameras = [obs.cameras if i in moved else {**shown, **obs.cameras} for i, obs in enumerate(seen)]
+        images = {name: np.stack([one[name] for one in cameras]) for name in shown}
+        return [replace(obs, cameras={name: rows[i] for name, rows in images.items()}) for i, obs in enumerate(seen)]
+
+
+def _begun(env: EvalEnv, seed: int, options: Options | None) -> Obs:
+    answer: Any = env.reset(seed=seed, options=options)
+    if not isinstance(answer, tuple) or len(answer) != 2:
+        raise EnvFailed(f"env reset: got {_kind(answer)}, want (Obs, info); see EvalEnv.reset")
+    obs: Obs = answer[0]
+    return obs
 
 
 def episodes_of(seeds: Sequence[int], num_envs: int) -> int:
-    """How many episodes `seeds` begin; `ConfigError` unless there is room for them."""
+    """Return the number of episodes that `seeds` begin; raises `ConfigError` if there are too many or none."""
     if not 1 <= len(seeds) <= num_envs:
         raise ConfigError(
             f"reset: got {len(seeds)} seeds, want 1 to {num_envs}, one for each environment that is to play"
         )
     return len(seeds)
+
+
+def _kind(answer: object) -> str:
+    return f"a tuple of {len(answer)}" if isinstance(answer, tuple) else type(answer).__name__

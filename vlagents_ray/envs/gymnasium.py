@@ -15,10 +15,10 @@ import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import EvalEnv, one_row
-from vlagents_ray.envs.headless import prepare_rendering
-from vlagents_ray.envs.known import known
+from vlagents_ray.envs.gymnasium_registry import known
 from vlagents_ray.envs.mapping import RENDER, Pick, as_image, bounds, parts, plain, uniform
 from vlagents_ray.envs.recording import record_size_of
+from vlagents_ray.envs.rendering.headless import prepare_rendering
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, NotReset, UnknownEnv
 from vlagents_ray.interface import HIGH_RES, Act, Obs
 from vlagents_ray.registry import require
@@ -55,19 +55,31 @@ class Gymnasium(EvalEnv):
         remake: bool = False,
         record_size: Sequence[int] | None = None,
     ) -> None:
-        """Make the environment `task`, a Gymnasium id, and look at one observation of it.
+        """Make the environment, and check one observation of it.
 
-        module: imported first, because it registers the id; by default the id's namespace.
-        kwargs: for `gymnasium.make`; `render_mode` is "rgb_array" unless it says otherwise.
-        cameras: name -> path of an (H, W, 3) uint8 image in the observation, or "render".
-        state: name -> path of a vector, perhaps with a range: "robot/qpos[0:7]"; see `Pick`.
-        gripper: path of one number; gripper_range: its values (closed, open).
-        success: path of a bool in the step's info, or "terminated".
-        unit_actions: the policy gives [-1, 1], scaled here to the Box.
-        width, height: stretch every image to this size in pixels.
-        max_steps: in place of the registered step limit.
-        remake: make the simulator anew in each reset, for one whose reset leaves something behind.
-        record_size: height and width of the same pictures once more, for the record only.
+        Args:
+            task: The Gymnasium id.
+            module: The module that registers the id; by default the id's namespace.
+            kwargs: Arguments of `gymnasium.make`; `render_mode` is "rgb_array" by default.
+            cameras: name -> path of an (H, W, 3) uint8 image in the observation, or "render".
+            state: name -> path of a vector, optionally with a range: "robot/qpos[0:7]"; see `Pick`.
+            gripper: The path of a number in the observation.
+            gripper_range: The values of that number (closed, open).
+            success: The path of a bool in the step's info, or "terminated".
+            instruction: The task in words.
+            control_hz: The rate of the steps, Hz.
+            unit_actions: Whether actions are in [-1, 1], and scaled here to the Box.
+            width: The width to which every image is stretched, pixels.
+            height: The height to which every image is stretched, pixels.
+            max_steps: The step limit, instead of the registered one.
+            remake: Whether each reset makes the simulator again, for one whose own reset keeps some state.
+            record_size: Height and width of further copies of the images, for recordings only.
+
+        Raises:
+            UnknownEnv: There is no such id.
+            ConfigError: An option does not fit the environment.
+            MissingDependency: The simulator is not installed.
+            EnvFailed: The simulator cannot be made.
         """
         if task is None:
             raise UnknownEnv("gymnasium: got no id, want one, as in 'gymnasium/Pendulum-v1'")
@@ -156,7 +168,7 @@ class Gymnasium(EvalEnv):
         self._steps += 1
         success = self._succeeded(info, bool(terminated))
         stopped = bool(truncated) or self._steps >= self.max_steps
-        # Images too if nobody looks: rendering changes what follows in some (the Fetch tasks' target is moved for it).
+        # Unused images are rendered as well: rendering changes the state of some envs (the target of the Fetch tasks).
         return self._observe(nested), float(reward), bool(terminated), stopped, {**plain(info), "success": success}
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Takes the parts of an `Obs` out of whatever nested observation and spaces a simulator has."""
+"""The mapping of a simulator's nested observations and spaces to the parts of an `Obs`."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ import numpy as np
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import require
 
-RENDER = "render"  # in place of a path: what the environment's own renderer gives
+RENDER = "render"  # instead of a path: the image of the environment's own renderer
 _PATH = re.compile(r"(?P<keys>[^\[\]]*?)(?:\[(?P<start>-?\d*):(?P<stop>-?\d*)\])?")
 
 
 @dataclass(frozen=True, slots=True)
 class Pick:
-    """Where in a nested observation one value lies: its keys from the outside in, then a range."""
+    """The place of a value in a nested observation: its keys from the outside in, then a range."""
 
     text: str
     keys: tuple[str, ...]
@@ -34,7 +34,7 @@ class Pick:
         return cls(text, tuple(key for key in match["keys"].split("/") if key), slice(start, stop))
 
     def value(self, nested: Any) -> Any:
-        """What lies under the keys, without the range; `ConfigError` if there is nothing."""
+        """Return the value under the keys, without the range; raises `ConfigError` if there is none."""
         for key in self.keys:
             if not isinstance(nested, Mapping) or key not in nested:
                 have = sorted(map(str, nested)) if isinstance(nested, Mapping) else type(nested).__name__
@@ -76,9 +76,9 @@ def as_image(value: Any, name: str, size: tuple[int | None, int | None] = (None,
 
 
 def plain(value: Any) -> Any:
-    """`value` as the wire carries it: numpy scalars become Python's, tuples lists, keys strings.
+    """Convert a value to one that a message can carry: numpy scalars to Python's, tuples to lists, keys to strings.
 
-    What it cannot carry (objects, functions) becomes None; mappings leave None out.
+    Other values (objects, functions) become None; mappings omit None.
     """
     if isinstance(value, np.generic):
         value = value.item()
@@ -95,7 +95,7 @@ def plain(value: Any) -> Any:
 
 
 def bounds(space: Any) -> tuple[np.ndarray, np.ndarray, np.dtype[Any]]:
-    """Low and high of a Box (D,), float64, and the type that it wants."""
+    """Return the bounds of a Box (D,), float64, and its dtype."""
     if type(space).__name__ != "Box" or len(space.shape) != 1:
         raise ConfigError(
             f"action space: got {space}, want Box (D,): policies give continuous vectors; "
@@ -105,12 +105,12 @@ def bounds(space: Any) -> tuple[np.ndarray, np.ndarray, np.dtype[Any]]:
 
 
 def uniform(bounds: np.ndarray) -> float | None:
-    """The bound that all components share, or None."""
+    """Return the bound that all components share; None if they differ or are infinite."""
     return float(bounds[0]) if np.isfinite(bounds).all() and (bounds == bounds[0]).all() else None
 
 
 def parts(space: Any, render_mode: str | None) -> tuple[dict[str, str], dict[str, str]]:
-    """The cameras and state parts that an observation space names; a rendered camera if it has no image."""
+    """Return the cameras and state parts of an observation space, with a rendered camera if it has no image."""
     cameras: dict[str, str] = {}
     state: dict[str, str] = {}
     pending = [("", space)]

@@ -8,22 +8,23 @@ from __future__ import annotations
 import importlib.util
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
-from vlagents_ray.envs.base import EvalEnv, one_row
-from vlagents_ray.envs.headless import prepare_rendering
-from vlagents_ray.envs.probe import egl_probe, failing
-from vlagents_ray.envs.protocol import Protocol
+from vlagents_ray.envs.base import EvalEnv, one_row, require_known
+from vlagents_ray.envs.benchmark_protocol import BenchmarkProtocol
 from vlagents_ray.envs.recording import record_size_of
-from vlagents_ray.errors import ConfigError, EnvFailed, NotReset, UnknownEnv
+from vlagents_ray.envs.rendering.headless import prepare_rendering
+from vlagents_ray.envs.rendering.render_probe import egl_probe, failing
+from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
 from vlagents_ray.interface import HIGH_RES, Act, Obs
 from vlagents_ray.registry import require
 
-PROTOCOL = Protocol(
+PROTOCOL = BenchmarkProtocol(
     name="Meta-World",
     source="Meta-World 3.1.1, metaworld.evaluation and MT1",
     max_steps=500,  # the simulator refuses to go further
@@ -34,7 +35,7 @@ PROTOCOL = Protocol(
     ends_on_success=True,
     episodes=50,
 )
-_UPSIDE_DOWN = ("corner2",)  # cameras that Meta-World mounts so; the others stand upright
+_UPSIDE_DOWN = ("corner2",)  # cameras that Meta-World mounts upside down; the others are upright
 
 
 class MetaWorld(EvalEnv):
@@ -66,19 +67,25 @@ class MetaWorld(EvalEnv):
         camera_positions: Mapping[str, Sequence[float]] | None = None,
         record_size: Sequence[int] | None = None,
     ) -> None:
-        """Raises `UnknownEnv`, `ConfigError`, `MissingDependency`, or `EnvFailed` with its cure.
+        """Make the environment.
 
         Args:
             task: Meta-World's name.
-            width: of each image, pixels.
-            height: of each image, pixels.
-            cameras: by MuJoCo's names, e.g. "corner2", "gripperPOV".
+            width: Width of each image, pixels.
+            height: Height of each image, pixels.
+            cameras: MuJoCo's names, e.g. "corner2", "gripperPOV".
             instruction: None is the task's name in words.
             max_steps: 500 at most.
-            goals_seed: of MT1, whose 50 initial states are then the task's; None: each episode's seed draws one.
-            ends_on_success: as in Meta-World's own evaluation; False: success at the end can be measured, too.
-            camera_positions: name -> (x, y, z) m, of cameras that stand elsewhere than in Meta-World.
-            record_size: height and width of further views by the same cameras, for the record only.
+            goals_seed: Seed of MT1, whose 50 initial states are then the task's; None: each episode's seed draws one.
+            ends_on_success: As in Meta-World's own evaluation; False: success at the end can be measured, too.
+            camera_positions: Name -> (x, y, z) m, of cameras that stand elsewhere than in Meta-World.
+            record_size: Height and width of further views by the same cameras, for recordings only.
+
+        Raises:
+            UnknownEnv: There is no such task.
+            ConfigError: An option has a wrong value.
+            MissingDependency: The simulator is not installed.
+            EnvFailed: The simulator or its assets cannot be loaded.
         """
         if not 1 <= max_steps <= PROTOCOL.max_steps:
             raise ConfigError(
@@ -89,8 +96,7 @@ class MetaWorld(EvalEnv):
                 raise ConfigError(f"metaworld: {name} is {value}, want at least 1")
         prepare_rendering()
         known = require("metaworld").ALL_V3_ENVIRONMENTS
-        if task not in known:
-            raise UnknownEnv(f"metaworld has no task {task!r}: want one of {sorted(known)}")
+        self.require_task(task)
         self.max_steps = max_steps
         self._task, self._name = task, f"metaworld/{task}"
         self._instruction = instruction or task.removesuffix("-v3").replace("-", " ")
@@ -99,13 +105,13 @@ class MetaWorld(EvalEnv):
         self._steps: int | None = None
         self._env: Any = None
         self._renderer: Any = None
-        self._record: Any = None  # the renderer of the views for the record
+        self._record: Any = None  # the renderer of views for recordings
         record = record_size_of(record_size, self._name)
         tallest, widest = (max(pair) for pair in zip((height, width), record or (0, 0), strict=True))
         with failing(self._name, "make"):
             self._env = known[task](width=widest, height=tallest)  # the model's frame buffer grows to this size
             have = [self._env.model.camera(i).name for i in range(self._env.model.ncam)]
-            # what Meta-World does for its classes with an observable goal, but drawing from our seed
+            # as Meta-World does for its classes with an observable goal, but with our seed
             self._env._partially_observable = False
             del self._env.sawyer_observation_space  # cached, and clips the goal away
             self._env._freeze_rand_vec = False
@@ -120,8 +126,21 @@ class MetaWorld(EvalEnv):
             raise ConfigError(f"{self._name} has no camera {unknown}: want some of {sorted(have)}")
         for name, position in (camera_positions or {}).items():
             self._env.model.camera(name).pos = position
-        self._contract = Contract(
-            cameras={name: CameraSpec(height, width) for name in cameras},
+        stated = self.known_contract({"cameras": cameras, "width": width, "height": height})
+        self._contract = replace(stated, control_hz=1.0 / self._env.dt)
+        try:
+            with failing(self._name, "make its renderer"):
+                self._renderer = require("mujoco").Renderer(self._env.model, height, width)
+                self._record = require("mujoco").Renderer(self._env.model, *record) if record else None
+        except EnvFailed:
+            self.close()
+            raise
+
+    @classmethod
+    def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
+        """Return the contract without the control rate, which the simulator knows."""
+        return Contract(
+            cameras={name: CameraSpec(arguments["height"], arguments["width"]) for name in arguments["cameras"]},
             state={"xyz": StateSpec(3, "m")},
             gripper=True,
             instruction=True,
@@ -136,15 +155,7 @@ class MetaWorld(EvalEnv):
                 low=-1.0,
                 high=1.0,
             ),
-            control_hz=1.0 / self._env.dt,
         )
-        try:
-            with failing(self._name, "make its renderer"):
-                self._renderer = require("mujoco").Renderer(self._env.model, height, width)
-                self._record = require("mujoco").Renderer(self._env.model, *record) if record else None
-        except EnvFailed:
-            self.close()
-            raise
 
     @property
     def contract(self) -> Contract:
@@ -180,6 +191,11 @@ class MetaWorld(EvalEnv):
             return obs, float(reward), ended, self._steps >= self.max_steps, {"success": success}
 
     @classmethod
+    def require_task(cls, task: str | None) -> None:
+        if known := cls.tasks():
+            require_known("metaworld", task, known)
+
+    @classmethod
     def tasks(cls) -> list[str]:
         if importlib.util.find_spec("metaworld") is None:
             return []
@@ -188,7 +204,7 @@ class MetaWorld(EvalEnv):
 
     @classmethod
     def missing(cls) -> str | None:
-        """The first call in a process renders one frame in a child."""
+        """Say why Meta-World cannot run here; the first call in a process renders one frame in a child."""
         for module in ("metaworld", "mujoco"):
             if importlib.util.find_spec(module) is None:
                 return f"{module} is not installed; pip install 'vlagents-ray[metaworld]'"
@@ -217,7 +233,7 @@ class MetaWorld(EvalEnv):
             env.close()
 
     def _goal(self, options: dict[str, Any]) -> Any:
-        """The initial state that the options name, as Meta-World has it; None without `goals_seed`."""
+        """Return Meta-World's initial state for the reset's options; None without `goals_seed`."""
         index = options.pop("init_state", None) if self._goals is not None else None
         if options:
             raise ConfigError(f"metaworld: unknown reset options {sorted(options)}, want init_state, with goals_seed")

@@ -1,4 +1,4 @@
-"""Views for the record, `info[HIGH_RES]`: the cameras in a size of their own, which the policy never sees."""
+"""Views for recordings, `info[HIGH_RES]`: the same cameras in another size, never sent to the policy."""
 
 from __future__ import annotations
 
@@ -10,9 +10,17 @@ Size = tuple[int, int]  # height, width in pixels
 
 
 def record_size_of(size: Sequence[int] | None, env: str) -> Size | None:
-    """The option `record_size` of `env`, (height, width); `ConfigError` if there can be no such image.
+    """Check the option `record_size` of an env, which is a list in settings files.
 
-    Settings files give it as a list.
+    Args:
+        size: (height, width) in pixels; None if there are no such views.
+        env: The env's name, for the message.
+
+    Returns:
+        The size; None if there are no such views.
+
+    Raises:
+        ConfigError: There can be no image of this size.
     """
     if size is None:
         return None

@@ -1,4 +1,4 @@
-"""SIMPLER's Bridge tasks: digital twins of a real WidowX table, as ManiSkill 3 has them.
+"""SIMPLER's Bridge tasks in ManiSkill 3: digital twins of a real table with a WidowX.
 
 Li et al. 2024, "Evaluating Real-World Robot Manipulation Policies in Simulation",
 https://arxiv.org/abs/2405.05941: visual matching, that is photographs of the real scene behind the
@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, Contract
-from vlagents_ray.envs.base import EvalEnv, one_row
-from vlagents_ray.envs.graphics import Renderer
-from vlagents_ray.envs.headless import prepare_rendering
-from vlagents_ray.envs.maniskill import ManiSkill, making
+from vlagents_ray.envs.base import EvalEnv, one_row, require_known
+from vlagents_ray.envs.maniskill import ManiSkill, factory
 from vlagents_ray.envs.maniskill.simulator import Moment, Simulator
 from vlagents_ray.envs.recording import record_size_of
-from vlagents_ray.errors import ConfigError, EnvFailed, NotReset, UnknownEnv
+from vlagents_ray.envs.rendering.graphics import Renderer
+from vlagents_ray.envs.rendering.headless import prepare_rendering
+from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.registry import require
 
@@ -43,20 +43,20 @@ _DOWNLOADS = " && ".join(f"python -m mani_skill.utils.download_asset {name}" for
 
 
 @dataclass(frozen=True, slots=True)
-class Protocol:
-    """How SIMPLER's own script for ManiSkill 3 evaluates, real2sim_eval_maniskill3.py."""
+class SimplerProtocol:
+    """The protocol of SIMPLER's own script for ManiSkill 3, real2sim_eval_maniskill3.py."""
 
     setting: str = "visual matching"
-    success: str = "at the end"  # of the last state; success once is reported beside it
+    success: str = "at the end"  # of the last state; success at any step is reported as well
     initial_states: str = "by episode id"
     control_mode: str = "arm_pd_ee_target_delta_pose_align2_gripper_pd_joint_pos"
     obs_mode: str = "rgb+segmentation"
     shader: str = "default"
-    gripper_open_above: float = 0.5  # the command is made open or closed, nothing between
+    gripper_open_above: float = 0.5  # the command becomes open or closed, nothing in between
     sticky_gripper_steps: int = 1  # 15 only for the Google robot, whose scenes ManiSkill 3 does not have
 
 
-PROTOCOL = Protocol()
+PROTOCOL = SimplerProtocol()
 
 
 class Simpler(EvalEnv):
@@ -70,11 +70,11 @@ class Simpler(EvalEnv):
 
     Action, (7,), as policies trained on Bridge give it: the gripper's change of position in m along
     the base's axes, its change of roll, pitch and yaw in rad, and the gripper, 1 open, 0 closed. It
-    changes what was commanded before, not where the arm has come to. Rotations reach the
-    controller as SIMPLER's script hands them over: as the numbers of a rotation vector.
+    is relative to the last command, not to the measured pose. Rotations reach the
+    controller as in SIMPLER's script, as the numbers of a rotation vector.
 
     The initial state is `options["init_state"]`, SIMPLER's episode id; without it the seed modulo
-    `init_states`. The seed draws nothing else. The env goes on after success, and never reports
+    `init_states`. The seed draws nothing else. The env continues after success, and never reports
     `terminated`.
     """
 
@@ -90,27 +90,32 @@ class Simpler(EvalEnv):
         shader: str = PROTOCOL.shader,
         record_size: Sequence[int] | None = None,
     ) -> None:
-        """Raises `UnknownEnv`, `ConfigError`, `MissingDependency`, or `EnvFailed` with its cure.
+        """Make the environment.
 
         Args:
             task: ManiSkill's id, one of `Simpler.tasks()`.
-            assets: the folder that holds `data/`; None is `MS_ASSET_DIR`, or ~/.maniskill. ManiSkill
+            assets: The folder that holds `data/`; None is `MS_ASSET_DIR`, or ~/.maniskill. ManiSkill
                 reads it once, so a process has one.
             instruction: None is the task's.
             max_steps: None is the task's own limit, 60, or 120 for the eggplant.
             sim_backend: "physx_cpu" or "physx_cuda".
             render_backend: "cpu", "gpu", or "auto": the GPU if both SAPIEN and torch can use it.
-            shader: ManiSkill's name; the protocol wants "default".
-            record_size: height and width of a further view by the same camera, for the record only.
+            shader: ManiSkill's name; that of the protocol is "default".
+            record_size: Height and width of a further view by the same camera, for recordings only.
+
+        Raises:
+            UnknownEnv: There is no such task.
+            ConfigError: An option has a wrong value.
+            MissingDependency: The simulator is not installed.
+            EnvFailed: The simulator or its assets cannot be loaded.
         """
-        if task not in TWINS:
-            raise UnknownEnv(f"simpler has no task {task!r}: want one of {self.tasks()}")
+        self.require_task(task)
         self._name = f"simpler/{task}"
         record = record_size_of(record_size, self._name)
         prepare_rendering()
         _find_assets(assets)
-        own_limit = making.registered_limit(task)
-        self.max_steps = making.step_limit(self._name, max_steps, own_limit)
+        own_limit = factory.registered_limit(task)
+        self.max_steps = factory.step_limit(self._name, max_steps, own_limit)
         self._deviations = [] if self.max_steps == own_limit else [f"max_steps is {max_steps}, not {own_limit}"]
         if shader != PROTOCOL.shader:
             self._deviations.append(f"shader is {shader}, not {PROTOCOL.shader}")
@@ -142,7 +147,7 @@ class Simpler(EvalEnv):
         return self._simulator.instructions()[0] if self._instruction is None else self._instruction
 
     def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
-        """Begin in the initial state `options["init_state"]`, which is the only option."""
+        """Begin an episode in the initial state `options["init_state"]`, which is the only option."""
         unknown = sorted(set(options or {}) - {"init_state"})
         if unknown:
             raise ConfigError(f"{self._name}: unknown reset options {unknown}, want none or 'init_state'")
@@ -162,12 +167,16 @@ class Simpler(EvalEnv):
         return self._seen(now), now.rewards[0], False, self._steps >= self.max_steps, {"success": now.success[0]}
 
     @classmethod
+    def require_task(cls, task: str | None) -> None:
+        require_known("simpler", task, cls.tasks())
+
+    @classmethod
     def tasks(cls) -> list[str]:
         return sorted(TWINS)
 
     @classmethod
     def missing(cls) -> str | None:
-        """As `ManiSkill.missing`; and the assets, which no package brings."""
+        """Say why SIMPLER cannot run here; its assets are in no package."""
         return ManiSkill.missing() or _missing_assets(_asset_folder())
 
     def renderer(self) -> Renderer | None:
@@ -204,7 +213,7 @@ _ACTION = ActionSpec(
 
 
 def _command(action: np.ndarray) -> np.ndarray:
-    """What ManiSkill's controller is given for an action, (7,) each: rotation vector, gripper -1 closed, 1 open."""
+    """Convert an action to that of ManiSkill's controller, (7,) each: rotation vector, gripper -1 closed, 1 open."""
     roll, pitch, yaw = action[3:6].tolist()
     axis, angle = require("transforms3d.euler").euler2axangle(roll, pitch, yaw)
     gripper = 1.0 if action[6] > PROTOCOL.gripper_open_above else -1.0
@@ -212,10 +221,10 @@ def _command(action: np.ndarray) -> np.ndarray:
 
 
 def _own_lists() -> Any:
-    """The twins' base class, with lists that hold nothing of another twin of this process.
+    """Return the base class of the digital twins, with lists that are not shared with other twins of this process.
 
-    ManiSkill keeps on the class which objects the photograph must not hide, and the photographs: a
-    second twin would hide and show what belongs to the first.
+    ManiSkill keeps the photographs, and the objects that they must not hide, in lists of the class: a second twin would
+    use those of the first one.
     """
     twins = require("mani_skill.envs.tasks.digital_twins.base_env").BaseDigitalTwinEnv
     twins._objects_to_remove_from_greenscreen, twins._rgb_overlay_images = [], {}
@@ -234,7 +243,7 @@ def _missing_assets(folder: Path) -> str | None:
 
 
 def _find_assets(wanted: str | None) -> None:
-    """See that ManiSkill looks in `wanted`, and that the assets are there."""
+    """Make ManiSkill look for assets in `wanted`, and check that they are there."""
     if wanted is not None and "mani_skill" not in sys.modules:
         os.environ["MS_ASSET_DIR"] = wanted
     used = require("mani_skill").ASSET_DIR.parent

@@ -3,41 +3,97 @@
 summary = evaluate(
     EvalConfig(policies=[{"url": "http://localhost:8000"}], suites=[{"envs": ["tabletop"]}], out="runs/first")
 )
+
+Configurations and results are read without Ray; what plays or prints is loaded when it is first asked for.
 """
 
-from vlagents_ray.evaluate.cluster import most_cpus, most_gpus
-from vlagents_ray.evaluate.config import ClockConfig, EvalConfig, PolicyConfig, StopConfig, SuiteConfig, WorkerConfig
-from vlagents_ray.evaluate.progress import Progress, SilentProgress, progress_for
-from vlagents_ray.evaluate.report import print_summary, results_table
-from vlagents_ray.evaluate.results import Results, synchronous_twin
-from vlagents_ray.evaluate.runner import EvaluationInterrupted, OutOfTime, check, evaluate
-from vlagents_ray.evaluate.statistics import Rate, wilson
-from vlagents_ray.evaluate.stopping import confidence_sequence
-from vlagents_ray.evaluate.summary import Group, Summary
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
+from vlagents_ray.evaluate.plan.config import (
+    ClockConfig,
+    EvalConfig,
+    PolicyConfig,
+    StopConfig,
+    SuiteConfig,
+    WorkerConfig,
+)
+from vlagents_ray.evaluate.results.comparison import Comparison, compare
+from vlagents_ray.evaluate.results.reader import Results, synchronous_twin
+from vlagents_ray.evaluate.results.statistics import (
+    Pairs,
+    Rate,
+    SuccessCurve,
+    difference_interval,
+    holm,
+    mcnemar,
+    success_curve,
+    wilson,
+)
+from vlagents_ray.evaluate.results.stopping import confidence_sequence
+from vlagents_ray.evaluate.results.summary import Group, Summary
+
+if TYPE_CHECKING:
+    from vlagents_ray.evaluate.report.progress import Progress, SilentProgress, progress_for
+    from vlagents_ray.evaluate.report.terminal import print_summary, results_table
+    from vlagents_ray.evaluate.run import EvaluationInterrupted, OutOfTime, check, evaluate
+    from vlagents_ray.evaluate.workers.cluster import most_cpus, most_gpus
+
+_LATE = {
+    "EvaluationInterrupted": "run",
+    "OutOfTime": "run",
+    "Progress": "report.progress",
+    "SilentProgress": "report.progress",
+    "check": "run",
+    "evaluate": "run",
+    "most_cpus": "workers.cluster",
+    "most_gpus": "workers.cluster",
+    "print_summary": "report.terminal",
+    "progress_for": "report.progress",
+    "results_table": "report.terminal",
+}
 
 __all__ = [
     "ClockConfig",
+    "Comparison",
     "EvalConfig",
     "EvaluationInterrupted",
     "Group",
     "OutOfTime",
+    "Pairs",
     "PolicyConfig",
     "Progress",
     "Rate",
     "Results",
     "SilentProgress",
     "StopConfig",
+    "SuccessCurve",
     "SuiteConfig",
     "Summary",
+    "Trajectory",
     "WorkerConfig",
     "check",
+    "compare",
     "confidence_sequence",
+    "difference_interval",
     "evaluate",
+    "holm",
+    "mcnemar",
     "most_cpus",
     "most_gpus",
     "print_summary",
     "progress_for",
     "results_table",
+    "success_curve",
     "synchronous_twin",
     "wilson",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _LATE:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_LATE[name]}"), name)

@@ -1,4 +1,4 @@
-"""Results of several machines in one folder: each episode once."""
+"""Merges the results of several machines into one folder, with each episode once."""
 
 from __future__ import annotations
 
@@ -8,18 +8,27 @@ import sqlite3
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
+from glob import escape
 from pathlib import Path
 from typing import Any
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate.config import canonical
-from vlagents_ray.evaluate.files import PROVENANCE, link_or_copy, whole
-from vlagents_ray.evaluate.html import FILE as REPORT
-from vlagents_ray.evaluate.html import write_report
-from vlagents_ray.evaluate.results import Results, episode_of, reading, table
-from vlagents_ray.evaluate.schema import FILE, SCHEMA, VERSION, WORKERS
-from vlagents_ray.evaluate.store import IDENTITY
-from vlagents_ray.evaluate.summary import Summary, summarize, write_summary
+from vlagents_ray.evaluate.artifacts.storage import (
+    PROVENANCE,
+    inside,
+    link_or_copy,
+    require_below,
+    require_there,
+    storing,
+    whole,
+)
+from vlagents_ray.evaluate.plan.config import canonical
+from vlagents_ray.evaluate.report.html import FILE as REPORT
+from vlagents_ray.evaluate.report.html import write_report
+from vlagents_ray.evaluate.results.database import FILE, SCHEMA, VERSION, WORKERS, insert
+from vlagents_ray.evaluate.results.reader import Results, episode_of, reading, table
+from vlagents_ray.evaluate.results.store import changed
+from vlagents_ray.evaluate.results.summary import Summary, summarize, write_summary
 
 _SHOWN = 10  # conflicts in a message
 Row = dict[str, Any]
@@ -27,7 +36,7 @@ Row = dict[str, Any]
 
 @dataclass(slots=True)
 class _Merged:
-    """The tables to be, by their keys; `home` says where an episode's files are."""
+    """The tables of the merged results, by their keys; `home` is the folder of an episode's files."""
 
     runs: list[Row] = field(default_factory=list)
     policies: dict[str, Row] = field(default_factory=dict)
@@ -41,9 +50,22 @@ class _Merged:
 def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False) -> Summary:
     """Put the results of `folders` together in the new folder `out`, which can be resumed.
 
-    An episode with the same outcome in several is there once, as the first has it; one that infrastructure failed
-    gives way to one that was played. Raises `ConfigError` if cells of one name have different settings, if a policy
-    is not the same everywhere, and for an episode with different outcomes, unless `keep_first`.
+    An episode with the same outcome in several folders is taken from the first; one that was played replaces one that
+    infrastructure failed.
+
+    Args:
+        out: A folder without results; it is made if it is missing.
+        folders: Folders of results.
+        keep_first: Of an episode with different outcomes take that of the first folder.
+
+    Returns:
+        The summary of the merged results.
+
+    Raises:
+        ConfigError: Cells of one name have different settings, a policy is not the same everywhere, an episode has
+            different outcomes and `keep_first` is off, or an episode's file is missing or outside of its folder, by its
+            path or by a symbolic link.
+        StorageFailed: The disk is full, or cannot be written to.
     """
     if (out / FILE).exists():
         raise ConfigError(f"{out}: has results; merge into a new folder, and name this one among those to be merged")
@@ -61,26 +83,25 @@ def merge(out: Path, folders: Sequence[Path], *, keep_first: bool = False) -> Su
             f"{len(conflicts)} episodes have different outcomes:\n{shown}\n"
             f"find out why (vlagents-ray replay), or keep those of the folders named first (--keep-first)"
         )
-    _link_files(merged, out, folders)
-    with whole(out / FILE) as part:
-        _write(merged, part)
-    summary = summarize(Results.load(out))
-    write_summary(summary)
+    with storing(out):
+        _link_files(merged, out, folders)
+        with whole(out / FILE) as part:
+            _write(merged, part)
+        summary = summarize(Results.load(out))
+        write_summary(summary)
     write_report(summary.results, out / REPORT)
     return summary
 
 
 def _add_policies(merged: _Merged, folder: Path, db: sqlite3.Connection) -> None:
-    # As in `Store.note_policy`: in a sweep the server's own checkpoint may be any.
     swept = {name for (name,) in db.execute("SELECT DISTINCT policy FROM cells WHERE step IS NOT NULL")}
     for row in table(db, "policies"):
         known = merged.policies.setdefault(row["name"], row)
         before, now = json.loads(known["metadata"]), json.loads(row["metadata"])
-        identity = IDENTITY[:1] if row["name"] in swept else IDENTITY
-        if differing := [what for what in identity if before.get(what) != now.get(what)]:
+        if what := changed(before, now, swept=row["name"] in swept):
             raise ConfigError(
-                f"{folder}: policy {row['name']!r} has {differing[0]} {now.get(differing[0])!r}, that of the folders "
-                f"before it {before.get(differing[0])!r}; give one of them another name in its evaluation"
+                f"{folder}: policy {row['name']!r} has {what} {now.get(what)!r}, that of the folders before it "
+                f"{before.get(what)!r}; give one of them another name in its evaluation"
             )
 
 
@@ -109,7 +130,7 @@ def _name(cell: Row) -> tuple[str, str, str, str]:
 
 
 def _extend(cell: Row, other: Row, folder: Path) -> None:
-    """Plan the seeds of both; of each as many episodes as the one that planned more."""
+    """Plan the seeds of both cells, with the larger of the two numbers of episodes for each seed."""
     seeds, added = json.loads(cell["seeds"]), json.loads(other["seeds"])
     episodes = max(cell["planned"] // len(seeds), other["planned"] // len(added))
     seeds += [seed for seed in added if seed not in seeds]
@@ -123,7 +144,7 @@ def _extend(cell: Row, other: Row, folder: Path) -> None:
 
 
 def _add_episodes(merged: _Merged, folder: Path, db: sqlite3.Connection) -> list[str]:
-    """Also runs, attempts and workers, which are numbered anew; returns what contradicts the folders before it."""
+    """Add episodes, runs, attempts and workers under new numbers; returns contradictions to earlier folders."""
     offset = len(merged.runs)
     runs = {row["run"]: offset + i for i, row in enumerate(table(db, "runs"), 1)}
     merged.runs += [row | {"run": runs[row["run"]]} for row in table(db, "runs")]
@@ -146,27 +167,36 @@ def _differences(known: Row, row: Row) -> str:
 
 
 def _require_one_checkpoint(merged: _Merged) -> None:
-    played: dict[str, dict[str, str]] = {}
-    for row in merged.episodes.values():
-        if row["checkpoint"] is not None:
-            played.setdefault(row["cell"], {}).setdefault(row["checkpoint"], row["key"])
-    for cell, checkpoints in played.items():
-        if len(checkpoints) > 1:
-            raise ConfigError(f"{merged.cells[cell]['env']}: was played by several checkpoints: {checkpoints}")
+    for column, what in (("checkpoint", "checkpoints"), ("weights", "weights under one name")):
+        played: dict[str, dict[str, str]] = {}
+        for row in merged.episodes.values():
+            if (found := row.get(column)) is not None:  # older results have no weights
+                played.setdefault(row["cell"], {}).setdefault(found, row["key"])
+        for cell, several in played.items():
+            if len(several) > 1:
+                raise ConfigError(
+                    f"{merged.cells[cell]['env']}: was played by several {what}: {several}; merge those apart, or give "
+                    f"one of them another policy's `name` in its evaluation"
+                )
 
 
 def _link_files(merged: _Merged, out: Path, folders: Sequence[Path]) -> None:
+    sources: dict[Path, Path] = {}
     for key, row in merged.episodes.items():
         home = merged.home[key]
-        paths = [home / path for path in json.loads(row["videos"])]
+        paths = [require_below(path) for path in json.loads(row["videos"])]
         if row["trajectory"] is not None:
-            numbers = home / row["trajectory"]
-            paths += [*sorted(numbers.parent.glob(f"{numbers.stem}_*.mp4")), numbers]
+            numbers = home / require_below(row["trajectory"])
+            seen = sorted(numbers.parent.glob(f"{escape(numbers.stem)}_*.mp4"))
+            paths += [str(path.relative_to(home)) for path in (*seen, numbers)]
         for path in paths:
-            link_or_copy(path, out / path.relative_to(home))
+            sources[out / path] = require_there(inside(home, path))
     for folder in folders:
-        for path in sorted((folder / PROVENANCE).glob("*.diff")):
-            link_or_copy(path, out / PROVENANCE / path.name)
+        for diff in sorted((folder / PROVENANCE).glob("*.diff")):
+            name = f"{PROVENANCE}/{diff.name}"
+            sources[out / name] = inside(folder, name)
+    for target, source in sources.items():  # all of them are there: nothing is written for one that is not
+        link_or_copy(source, target)
 
 
 def _write(merged: _Merged, path: Path) -> None:
@@ -183,5 +213,4 @@ def _write(merged: _Merged, path: Path) -> None:
         with db:
             for name, rows in tables.items():
                 for row in rows:
-                    columns, marks = ", ".join(row), ", ".join("?" * len(row))
-                    db.execute(f"INSERT INTO {name} ({columns}) VALUES ({marks})", tuple(row.values()))  # noqa: S608 (our own names)
+                    insert(db, name, row)

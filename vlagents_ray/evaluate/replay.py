@@ -1,4 +1,4 @@
-"""The same episode again, from what is recorded of it, compared with that."""
+"""Plays a recorded episode again, and compares the two."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate.cells import cells
-from vlagents_ray.evaluate.config import EvalConfig
-from vlagents_ray.evaluate.results import CellResults, Episode, Results
-from vlagents_ray.evaluate.trajectory import Trajectory
+from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
+from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.config import EvalConfig
+from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results
 
 _FEW = 5  # names in a message
 
@@ -27,13 +27,13 @@ class Recorded:
 
     @property
     def number_and_seed(self) -> tuple[int, int]:
-        """Of the episode, for `evaluate(..., only=...)`."""
+        """(number, seed) of the episode, for `evaluate(..., only=...)`."""
         return self.episode.result.key.episode, self.episode.result.key.seed
 
     def config(self, out: Path, *, policy: dict[str, Any] | None = None) -> EvalConfig:
-        """Settings of an evaluation of this episode's cell alone, into `out`, which keeps video and trajectory.
+        """Settings of an evaluation of this episode's cell alone into `out`, with video and trajectory.
 
-        They are those of the run that it was played in. `policy` replaces settings of the policy.
+        They are those of the run in which it was played. `policy` replaces settings of the policy.
         """
         run = next(run for run in self.results.runs if run.run == self.episode.run)
         config = EvalConfig.model_validate(run.config)
@@ -41,7 +41,7 @@ class Recorded:
         cell = next(one for one in cells(config) if one.name == where)
         given = cell.policy.model_dump() | {"steps": [] if cell.step is None else [cell.step]}
         if cell.policy.source is None:
-            given |= {"config": {}}  # the server's own, which it says again
+            given |= {"config": {}}  # the server has its own configuration, and reports it again
         else:
             given |= {"url": None}  # it was served for that run, and is to be served again
         if policy is not None:
@@ -52,9 +52,9 @@ class Recorded:
 
 
 def find(results: Results, name: str) -> Recorded:
-    """The episode with that key, or the only one that is number N in an env, as "ENV#N".
+    """Find the episode with the key `name`, or the only one with number N in an env, as "ENV#N".
 
-    Raises `ConfigError` if there is none, if there are several, or if infrastructure kept it from ending.
+    Raises `ConfigError` if there is none, if there are several, or if infrastructure failed it.
     """
     found = [
         Recorded(results, cell, one)
@@ -74,10 +74,9 @@ def find(results: Results, name: str) -> Recorded:
 
 
 def compare(recorded: Recorded, replayed: Results) -> list[str]:
-    """In what the replay differs, a sentence each; nothing if it is the same episode.
+    """The differences of the replay, a sentence each; empty if it is the same episode.
 
-    The times that it took are not compared. Actions are, byte for byte. Raises `ConfigError` if infrastructure kept
-    the replay from ending, which says nothing of the episode.
+    Actions are compared byte for byte, durations not at all. Raises `ConfigError` if infrastructure failed the replay.
     """
     [[again]] = [cell.episodes for cell in replayed.cells]
     if again.result.status == "infra_failed":
@@ -89,15 +88,21 @@ def compare(recorded: Recorded, replayed: Results) -> list[str]:
         if before[name] != now[name] and name not in ("key", "actions_sha256")
     ]
     if before["actions_sha256"] != now["actions_sha256"]:
-        found.insert(0, _actions(recorded, replayed.out / str(again.trajectory)))
+        found.insert(0, _actions(recorded, replayed.file(str(again.trajectory))))
     return found
 
 
 def _actions(recorded: Recorded, replayed: Path) -> str:
     path = recorded.episode.trajectory
     if path is None:
-        return "actions: they differ; from which step on is not known, as no trajectory was recorded (record: all)"
-    before = Trajectory.load(recorded.results.out / path).actions
+        return (
+            "actions: they differ; from which step on is not known, as no trajectory was recorded "
+            "(eval --record all, or `record: all` in its file)"
+        )
+    file = recorded.results.file(path)
+    if not file.is_file():
+        return f"actions: they differ; from which step on is not known, as {file}, the recorded trajectory, is gone"
+    before = Trajectory.load(file).actions
     now = Trajectory.load(replayed).actions
     step = _first_difference(before, now)
     if step is None:
@@ -107,7 +112,7 @@ def _actions(recorded: Recorded, replayed: Path) -> str:
 
 
 def _first_difference(before: np.ndarray, now: np.ndarray) -> int | None:
-    """The first row that is not the same byte for byte."""
+    """The index of the first row that differs in any byte; None if there is none."""
     rows = zip(before, now, strict=False)
     return next((i for i, (a, b) in enumerate(rows) if a.tobytes() != b.tobytes()), None)
 

@@ -1,1 +1,4 @@
-"""Policies, one file a family. `vlagents_ray.registry.POLICIES` maps their names to the classes."""
+"""Policies: one file or folder for each model family.
+
+`vlagents_ray.registry.POLICIES` maps their names to the classes.
+"""

@@ -1,6 +1,6 @@
-"""π0 as Hugging Face transformers has it: PaliGemma and an action expert, flow matching.
+"""π0 in Hugging Face transformers: PaliGemma and an action expert with flow matching.
 
-A checkpoint is what `PI0ForConditionalGeneration.save_pretrained` and `PI0Processor.save_pretrained` leave in a folder.
+A checkpoint is the folder of `PI0ForConditionalGeneration.save_pretrained` and `PI0Processor.save_pretrained`.
 Physical Intelligence's own code and checkpoints are `vlagents_ray.policies.openpi`.
 """
 
@@ -19,42 +19,41 @@ from vlagents_ray.errors import ConfigError, InvalidObservation, PolicyFailed
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
-from vlagents_ray.policies.base.checkpoint import find_checkpoint
-from vlagents_ray.policies.base.observing import (
+from vlagents_ray.policies.base.checkpoint import find_checkpoint, from_pretrained
+from vlagents_ray.policies.base.model_inputs import (
     camera_images,
     camera_specs,
     choose_cameras,
     needs_gripper,
+    resize_with_pad,
     state_specs,
     state_vector,
 )
-from vlagents_ray.policies.base.pretrained import from_pretrained
 from vlagents_ray.policies.base.realtime import Guide
-from vlagents_ray.policies.base.resizing import resize_with_pad
 from vlagents_ray.registry import require
 
 CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")  # openpi's names, in the order of the image tokens
 USUAL_CAMERAS = {"base_0_rgb": "front", "left_wrist_0_rgb": "wrist"}
 USUAL_STATE = ("xyz_axis_angle", "gripper_qpos")  # LIBERO
-_EPSILON = 1e-8  # what PI0Processor adds to a standard deviation
+_EPSILON = 1e-8  # added to a standard deviation by PI0Processor
 _STATISTICS = ("state_mean", "state_std", "actions_mean", "actions_std")
 
 
 class Pi0Config(ModelConfig):
-    """Beside what all models have: how the flow is followed, and how long an instruction may be."""
+    """Settings of π0, beside those of all models."""
 
     cameras: dict[str, str] | None = Field(
         default=None,
         description=f"those of {', '.join(CAMERAS)} that it was trained with -> ours; unset: {USUAL_CAMERAS}",
     )
-    steps: int | None = Field(default=None, ge=1, description="of the flow; unset: the checkpoint's, usually 10")
-    max_tokens: int = Field(default=48, ge=1, description="of an instruction, as in training; a longer one is refused")
-    guidance: float = Field(default=5.0, gt=0, description="real-time chunking: the most that the old plan pulls")
+    steps: int | None = Field(default=None, ge=1, description="steps of the flow; unset: the checkpoint's, usually 10")
+    max_tokens: int = Field(default=48, ge=1, description="tokens of an instruction, as in training; more are refused")
+    guidance: float = Field(default=5.0, gt=0, description="real-time chunking: largest weight of the old plan")
 
 
 @dataclass(frozen=True)
-class Loaded:
-    """The model, and what turns observations into its inputs."""
+class LoadedPi0:
+    """The model and its processor."""
 
     network: Any
     processor: Any
@@ -62,14 +61,14 @@ class Loaded:
     dtype: Any
 
     def planned(self, row: Row) -> Row:
-        """The row with its leftover actions as the model sees them."""
+        """Return the row with its leftover actions in the model's units."""
         if row.leftover is None:
             return row
         mean, std = self._statistics()
         return replace(row, leftover=(row.leftover - mean) / std)
 
     def actions(self, flow: np.ndarray) -> np.ndarray:
-        """What the model says, (H, max_action_dim) -> actions (H, D) in their own units."""
+        """Convert the model's output, (H, max_action_dim), to actions (H, D) in the robot's units."""
         mean, std = self._statistics()
         return np.asarray(flow[:, : len(mean)] * std + mean)
 
@@ -79,11 +78,12 @@ class Loaded:
 
 
 class Pi0(ModelPolicy):
-    """Chunks by flow matching, all sessions' in one pass through the vision-language model and the action expert."""
+    """The policy π0: chunks by flow matching, with one forward pass for all sessions of a batch."""
 
     Config: ClassVar[type] = Pi0Config
+    trainable: ClassVar[str | None] = "model.network"
     config: Pi0Config
-    model: Loaded | None
+    model: LoadedPi0 | None
 
     def __init__(self, config: Pi0Config) -> None:
         super().__init__(config)
@@ -92,7 +92,7 @@ class Pi0(ModelPolicy):
 
     @property
     def contract(self) -> Contract:
-        """Dimensions and the chunk's length are known once the checkpoint is loaded."""
+        """The contract; dimensions and the chunk's length are stated once the checkpoint is loaded."""
         loaded = self.model
         return Contract(
             cameras=camera_specs(self.cameras),
@@ -108,8 +108,8 @@ class Pi0(ModelPolicy):
     def state_dim(self) -> int | None:
         return None if self.model is None else len(self.model.processor.state_mean)
 
-    def load(self) -> Loaded:
-        """The model with every parameter of the checkpoint, and its processor with all statistics."""
+    def load(self) -> LoadedPi0:
+        """Load the model with every parameter of the checkpoint, and its processor with all statistics."""
         if self.config.compile:
             raise ConfigError("compile: not done for pi0, whose cache changes its length at each step; leave it out")
         path = find_checkpoint(
@@ -120,13 +120,13 @@ class Pi0(ModelPolicy):
         device = torch_device(self.config.device)
         dtype = torch_dtype(self.config.dtype, device)
         ensure_torchvision()
-        return Loaded(_network(path, device, dtype), _processor(path), device, dtype)
+        return LoadedPi0(_network(path, device, dtype), _processor(path), device, dtype)
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        """Begin an episode. An instruction that is longer than in training is refused, not cut off."""
+        """Begin an episode; an instruction longer than in training is refused, not truncated."""
         info = super().reset(obs, instruction, **kwargs)
         if self.model is not None:
-            tokens = len(self.model.processor.tokenizer(f"{instruction}\n")["input_ids"]) + 1  # and the first one
+            tokens = len(self.model.processor.tokenizer(f"{instruction}\n")["input_ids"]) + 1  # the first is BOS
             if tokens > self.config.max_tokens:
                 raise InvalidObservation(
                     f"instruction: got {tokens} tokens, want at most {self.config.max_tokens}, as in training; "
@@ -135,7 +135,7 @@ class Pi0(ModelPolicy):
         return info
 
     def perceive(self, obs: Obs) -> tuple[list[np.ndarray], np.ndarray]:
-        """Images in the model's order, each (height, width, 3) as its vision tower takes them, and the state."""
+        """Return the images in the model's order, (height, width, 3) in its vision tower's size, and the state."""
         model = self._loaded()
         side = model.processor.image_processor.pad_size
         found = camera_images(obs, self.cameras)
@@ -143,7 +143,7 @@ class Pi0(ModelPolicy):
         return images, state_vector(obs, self.state, self.state_dim)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
-        """One flow for all rows."""
+        """Compute the chunks of all rows with one flow."""
         model, torch = self._loaded(), require("torch")
         shape = (model.network.config.chunk_size, model.network.config.max_action_dim)
 
@@ -156,13 +156,13 @@ class Pi0(ModelPolicy):
             flow = self._follow(self._inputs(rows), noise, None if guide is None else guide.to(convert))
         return [Prediction(model.actions(one)) for one in flow.cpu().numpy()]
 
-    def _loaded(self) -> Loaded:
+    def _loaded(self) -> LoadedPi0:
         if self.model is None:
             raise PolicyFailed("pi0: act before initialize; the checkpoint is not loaded")
         return self.model
 
     def _inputs(self, rows: Sequence[Row]) -> Mapping[str, Any]:
-        """Tokens, images and states, on the device. Every batch is as long as the longest instruction may be."""
+        """Return tokens, images and states on the device, padded to the longest allowed instruction."""
         model = self._loaded()
         frames = [row.frames[-1] for row in rows]
         length = self.config.max_tokens + len(self.cameras) * model.processor.image_seq_length
@@ -184,9 +184,9 @@ class Pi0(ModelPolicy):
         }
 
     def _follow(self, inputs: Mapping[str, Any], noise: Any, guide: Guide | None) -> Any:
-        """From noise (B, H, D) to actions, in Euler steps as `PI0ForConditionalGeneration.sample_actions` takes them.
+        """Integrate noise (B, H, D) to actions, in the Euler steps of `PI0ForConditionalGeneration.sample_actions`.
 
-        The actions are kept in float32 between the steps, whatever the model computes in, as openpi does.
+        The actions are kept in float32 between the steps, also if the model computes in another type, as in openpi.
         """
         model = self._loaded()
         velocity = _velocity(model.network, inputs, model.dtype)
@@ -202,7 +202,7 @@ class Pi0(ModelPolicy):
 
 
 def _cameras(chosen: Mapping[str, str] | None) -> dict[str, str]:
-    """In the order of the model's image tokens. A checkpoint may have been trained without some of them."""
+    """Sort the cameras by the model's image tokens; a checkpoint may be trained without some of them."""
     asked = USUAL_CAMERAS if chosen is None else chosen
     known = [name for name in CAMERAS if name in asked] if asked and set(asked) <= set(CAMERAS) else CAMERAS
     mapping = choose_cameras(chosen, USUAL_CAMERAS, known)
@@ -210,7 +210,7 @@ def _cameras(chosen: Mapping[str, str] | None) -> dict[str, str]:
 
 
 def _velocity(network: Any, inputs: Mapping[str, Any], dtype: Any) -> Callable[[Any, float], Any]:
-    """The flow's velocity at noisy actions (B, H, D) and a time; images and words are read once, here."""
+    """Return the flow's velocity as a function of noisy actions (B, H, D) and time; inputs are encoded once."""
     torch = require("torch")
     mask, state = inputs["attention_mask"], inputs["state"]
     prefix = network.model.embed_prefix(inputs["input_ids"], inputs["pixel_values"], inputs["pixel_attention_mask"])

@@ -1,4 +1,4 @@
-"""Uniformly random actions: the floor that any policy has to beat."""
+"""A policy of uniformly random actions, as a lower bound for the success of others."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ class RandomConfig(BaseModel, extra="forbid"):
 
 
 class Random(Agent):
-    """Actions uniform in [low, high], a pure function of the config's seed and the episode's.
+    """Returns actions that are uniform in [low, high] and depend on the seeds of the config and the episode only.
 
-    Asked for samples (`obs.info["samples"] = N`), it also returns its distribution, as RL fine-tuning needs.
+    For an observation with `info["samples"] = N` it also returns its distribution, as RL fine-tuning needs.
     """
 
     Config: ClassVar[type] = RandomConfig

@@ -1,4 +1,4 @@
-"""Plays back recorded actions: to reproduce a rollout, or to test a robot's wiring."""
+"""A policy that replays recorded actions, to reproduce a rollout or to test the connection of a robot."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, PolicyFailed
 from vlagents_ray.interface import Act, Agent, Obs
 
-_KEYS = ("actions", "action")  # looked for, in this order, where a file holds several arrays
+_KEYS = ("actions", "action")  # names of the array, in this order, if a file has several
 
 
 class ReplayConfig(BaseModel, extra="forbid"):
-    """Which recording, and what happens after its last row."""
+    """Settings of `Replay`: the recording, and the behaviour after its last row."""
 
     path: Path = Field(description="a .npy, .npz or .json file of (T, D) actions")
     key: str | None = Field(default=None, description="the array's name in a .npz or .json file that holds several")
@@ -29,7 +29,7 @@ class ReplayConfig(BaseModel, extra="forbid"):
 
 
 class Replay(Agent):
-    """Row after row of one recording, from its start in each episode."""
+    """Returns the rows of a recording in order, from its start in each episode."""
 
     Config: ClassVar[type] = ReplayConfig
     shared: ClassVar[tuple[str, ...]] = ("config", "actions")
@@ -41,12 +41,12 @@ class Replay(Agent):
 
     @property
     def contract(self) -> Contract:
-        """The recording's width is known once `initialize` has read it."""
+        """The contract; the action's dimension is stated once `initialize` has read the recording."""
         dim = None if self.actions is None else self.actions.shape[1]
         return Contract(action=ActionSpec(dim=dim), chunk=self.config.chunk)
 
     def initialize(self) -> None:
-        """Read the recording; `ConfigError` if it is missing or is not (T, D) finite numbers."""
+        """Read the recording; raises `ConfigError` if it is missing, or not (T, D) finite numbers."""
         self.actions = load_actions(self.config.path, self.config.key)
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
@@ -75,7 +75,18 @@ class Replay(Agent):
 
 
 def load_actions(path: Path, key: str | None = None) -> np.ndarray:
-    """The (T, D) float32 actions in a .npy, .npz or .json file; `ConfigError` says what is wrong."""
+    """Read recorded actions.
+
+    Args:
+        path: A .npy, .npz or .json file.
+        key: The array's name in a .npz or .json file with several.
+
+    Returns:
+        The actions, (T, D) float32.
+
+    Raises:
+        ConfigError: The file is missing, or has no such array of finite numbers.
+    """
     if not path.is_file():
         raise ConfigError(f"recording {path}: no such file")
     readers = {".npy": _read_npy, ".npz": _read_npz, ".json": _read_json}
@@ -90,7 +101,7 @@ def load_actions(path: Path, key: str | None = None) -> np.ndarray:
     if actions.ndim != 2 or actions.size == 0:
         raise ConfigError(f"recording {path}: got shape {actions.shape}, want (T, D) with T and D at least 1")
     if not np.isfinite(actions).all():
-        raise ConfigError(f"recording {path}: holds NaN or infinity, want finite numbers")
+        raise ConfigError(f"recording {path}: has NaN or infinity, want finite numbers")
     return actions
 
 

@@ -1,4 +1,4 @@
-"""Experts that solve the simulators' tasks without learning, behind one policy."""
+"""A policy of scripted experts, which solve the simulators' tasks without learning."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from vlagents_ray.policies.experts import Expert, expert_for
 
 
 class ScriptedConfig(BaseModel, extra="forbid"):
-    """Which expert acts where the client does not say which env it runs."""
+    """Settings of `Scripted`: the env to assume if a client does not name its own."""
 
     task: str | None = Field(default=None, description="an env's full name, e.g. 'tabletop' or 'maniskill/PushCube-v1'")
 
 
 class Scripted(Agent):
-    """Picks an expert for each session by the name of its env; see `policies.experts.EXPERTS`."""
+    """Chooses an expert for each session by the name of its env (see `policies.experts.EXPERTS`)."""
 
     Config: ClassVar[type] = ScriptedConfig
     shared: ClassVar[tuple[str, ...]] = ("config",)
@@ -30,15 +30,17 @@ class Scripted(Agent):
 
     @property
     def contract(self) -> Contract:
-        """States nothing: what is needed and given is the chosen expert's, session by session."""
+        """An empty contract, as each session has another expert."""
         return Contract()
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin an episode of the env `kwargs["env"]`, or of the config's `task`.
 
-        Raises `InvalidInput` if neither says which, `ContractMismatch` if there is no expert for it.
+        Raises:
+            InvalidInput: Neither of them is given.
+            ContractMismatch: There is no expert for the env.
         """
-        self._expert = None  # the last episode's must not act in one that failed to begin
+        self._expert = None  # the previous episode's expert must not act if this fails
         env = kwargs.get("env") or self.config.task
         if not isinstance(env, str):
             raise InvalidInput(

@@ -1,4 +1,4 @@
-"""Agents around agents: what changes the observations of any policy, and building a policy with its wrappers."""
+"""Wrappers, which change the observations of any policy, and the construction of a policy with its wrappers."""
 
 from __future__ import annotations
 
@@ -10,13 +10,17 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.registry import policy_class, wrapper_class
+from vlagents_ray.settings import wrong_settings
 
 
 class Wrapper(Agent, abc.ABC):
-    """An agent that shows another one changed observations.
+    """An agent that passes changed observations to another one.
 
-    `Config` and `shared` are as in any agent; a session has its own copy of the wrapper and of what is inside.
-    `__init__` takes the agent inside and, where there is a `Config`, an instance of it.
+    `Config` and `shared` are those of any agent. A session has its own copy of the wrapper and of the inner agent.
+
+    Args:
+        agent: The inner agent.
+        config: An instance of `Config`, if the class has one.
     """
 
     def __init__(self, agent: Agent, config: Any = None) -> None:
@@ -25,43 +29,80 @@ class Wrapper(Agent, abc.ABC):
 
     @classmethod
     def around(cls, agent: Agent, settings: Mapping[str, Any]) -> Wrapper:
-        """Wrap `agent`. An unknown setting raises `ConfigError`."""
+        """Wrap an agent.
+
+        Args:
+            agent: The agent.
+            settings: The wrapper's settings in the deployment file.
+
+        Returns:
+            The wrapper.
+
+        Raises:
+            ConfigError: A setting is unknown or has a wrong value.
+        """
         try:
             return cls(agent) if cls.Config is None and not settings else cls(agent, cls.Config(**settings))  # type: ignore[misc]
         except (TypeError, ValueError) as error:
-            raise ConfigError(f"wrapper {cls.__name__}: {error}") from error
+            message = wrong_settings(error, cls.Config) if isinstance(error, ValueError) else error
+            raise ConfigError(f"wrapper {cls.__name__}: {message}") from error
 
     @abc.abstractmethod
     def begin(self, obs: Obs, instruction: str | None) -> Obs:
-        """Begin an episode: the first observation, as the policy shall see it."""
+        """Begin an episode.
+
+        Args:
+            obs: The first observation.
+            instruction: The task in words.
+
+        Returns:
+            The observation for the inner agent.
+        """
 
     @abc.abstractmethod
     def change_batch(self, obs: Sequence[Obs], sessions: Sequence[Wrapper]) -> list[Obs | Exception]:
-        """The observations of several sessions, as the policy shall see them; an exception fails its own alone."""
+        """Change the observations of several sessions.
+
+        Args:
+            obs: One observation for each session.
+            sessions: The sessions' copies of the wrapper.
+
+        Returns:
+            The observations for the inner agent; an exception in the place of one fails that session's request alone.
+        """
 
     @property
     def contract(self) -> Contract | None:
-        """The inner agent's."""
+        """The contract of the inner agent, unless the wrapper changes it."""
         return self.agent.contract
 
     def shared_objects(self) -> list[Any]:
-        """Its own, and the inner agent's."""
+        """Return the shared objects of the wrapper and of the inner agent."""
         return [*super().shared_objects(), *self.agent.shared_objects()]
+
+    def parameters(self) -> dict[str, Any]:
+        """Return what a learner trains of the inner agent."""
+        return self.agent.parameters()
+
+    def load_parameters(self, named: Mapping[str, Any]) -> None:
+        """Let the inner agent act with these values."""
+        self.agent.load_parameters(named)
 
     def initialize(self) -> None:
         """Load the inner agent."""
         self.agent.initialize()
+        self.weights_id = self.agent.weights_id
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        """Begin an episode of both."""
+        """Begin an episode of the wrapper and of the inner agent."""
         return self.agent.reset(self.begin(obs, instruction), instruction, **kwargs)
 
     def observe(self, obs: Obs) -> None:
-        """Show the inner agent an observation that no action is wanted for."""
+        """Pass the changed observation to the inner agent's `observe`."""
         self.agent.observe(self._change(obs))
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        """One batch here, and one of the inner agent."""
+        """Change the observations, and compute the inner agent's actions for those without an exception."""
         changed = self.change_batch(obs, sessions)  # type: ignore[arg-type]
         good = [i for i, one in enumerate(changed) if not isinstance(one, Exception)]
         acts = self.agent.act_batch([changed[i] for i in good], [sessions[i].agent for i in good])  # type: ignore[misc, attr-defined]
@@ -71,7 +112,7 @@ class Wrapper(Agent, abc.ABC):
         return results
 
     def check_health(self) -> None:
-        """Ask the inner agent."""
+        """Check the health of the inner agent."""
         self.agent.check_health()
 
     def close(self) -> None:
@@ -88,7 +129,19 @@ class Wrapper(Agent, abc.ABC):
 def build_agent(
     policy: str, config: Mapping[str, Any], wrappers: Sequence[str | Mapping[str, Mapping[str, Any]]] = ()
 ) -> Agent:
-    """The policy of that name with its settings, inside its wrappers; the first of them is the nearest to the robot."""
+    """Make a policy with its wrappers.
+
+    Args:
+        policy: The policy's name, or "module:Class".
+        config: The policy's settings.
+        wrappers: The names of wrappers, or {name: settings}; the first one gets the robot's observations.
+
+    Returns:
+        The outermost wrapper, or the policy if there are none.
+
+    Raises:
+        ConfigError: A name or a setting is unknown or wrong.
+    """
     agent: Agent = policy_class(policy).from_config(config)
     for entry in reversed(wrappers):
         named = {entry: {}} if isinstance(entry, str) else dict(entry)

@@ -1,4 +1,4 @@
-"""On the robot's own computer: the control loop, what makes it safe, and recording. As light as `client`."""
+"""The control loop of a robot, with its guard, watchdog and recorder; its dependencies are those of `client`."""
 
 from vlagents_ray.robot.loop import LoopReport, Robot, run_loop
 from vlagents_ray.robot.safety import Guard, Watchdog

@@ -1,47 +1,65 @@
-"""`python -m vlagents_ray.robot URL`: let a served policy drive a robot, or a simulated one, and say how it went."""
+"""`python -m vlagents_ray.robot URL`: let a served policy drive a robot, or a simulated one, and print a report.
+
+Exit status: 0 if every tick had an action of the policy, 1 if not, 3 if fewer than half had, 2 if it could not run.
+"""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
 import importlib
+import os
+import re
+import select
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, get_args
 
+import numpy as np
+
+from vlagents_ray.chunking.buffer import ENSEMBLE, MERGES
+from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.client.agent import RemoteAgent
-from vlagents_ray.client.chunks import ChunkPlayer
-from vlagents_ray.client.plan import ENSEMBLE, MERGES
-from vlagents_ray.errors import ConfigError, VLAgentsError
-from vlagents_ray.robot.loop import LoopReport, Robot, run_loop
+from vlagents_ray.errors import ConfigError, MissingState, VLAgentsError
+from vlagents_ray.interface import Obs
+from vlagents_ray.robot.loop import LoopReport, Restart, Robot, run_loop
 from vlagents_ray.robot.pacing import empty_loop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import Guard, Watchdog
 from vlagents_ray.robot.simulated import SimulatedRobot
 
+MOSTLY_SAFE = 3  # exit status
+WAIT_S = 1.0  # deadline of a tick in the modes that wait for an answer; half of the default of --silent-s
+_TYPED_S = 0.2
 _HEADER = ("", "ticks", "missed", "within 2 ms", "p50 ms", "p99 ms", "max ms")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Returns the exit status: 0 if every tick had an action of the policy, 1 if not, 2 if it could not run."""
-    options = _parser().parse_args(arguments)
+    """Run the command, and return its exit status."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    if options.mode != "async" and (options.merge != "newest" or options.rtc):
+        parser.error(f"--merge and --rtc: got one of them with --mode {options.mode}, want --mode async")
     try:
-        with _told_to_end():
+        with _ended_by_signals():
             report = _run(options)
     except VLAgentsError as error:
-        print(f"{type(error).__name__}: {error}", file=sys.stderr)  # noqa: T201
+        print(f"{type(error).__name__}: {_by_options(str(error), parser)}", file=sys.stderr)  # noqa: T201
         return 2
+    if report.mostly_safe is not None:
+        return MOSTLY_SAFE
     return 1 if report.safe_ticks else 0
 
 
 @contextlib.contextmanager
-def _told_to_end() -> Iterator[None]:
-    """Let SIGTERM (systemd's) and SIGHUP (a terminal that is closed) end the loop, which stops the robot, as Ctrl-C."""
+def _ended_by_signals() -> Iterator[None]:
+    """Let SIGTERM (systemd) and SIGHUP (a closed terminal) end the loop as Ctrl-C does, which stops the robot."""
 
     def end(number: int, _: object) -> None:
-        signal.signal(number, signal.SIG_IGN)  # once is enough: a second one would break the stop off
+        signal.signal(number, signal.SIG_IGN)  # a second signal would interrupt the stop
         sys.exit(128 + number)
 
     with contextlib.ExitStack() as undo:
@@ -54,12 +72,17 @@ def _told_to_end() -> Iterator[None]:
 
 def _run(options: argparse.Namespace) -> LoopReport:
     say: Callable[[str], None] = lambda line: print(line, flush=True)  # noqa: E731, T201
+    deadline_s = options.deadline_ms / 1e3 if options.deadline_ms is not None else WAIT_S * (options.mode != "async")
+    robot_class = _load(options.robot) if options.robot else None
     with contextlib.ExitStack() as stack:
         agent = RemoteAgent(
             options.url, transport=options.transport, timeout_s=options.timeout_s
         )  # the player closes it
         agent.initialize()
         contract = agent.contract
+        stated = contract is not None and contract.action.relative is not None
+        if options.safe == "auto" and not options.robot and not stated:
+            options.safe = "hold"  # the simulated robot uses such actions as absolute targets
         player = stack.enter_context(
             ChunkPlayer(
                 agent,
@@ -67,17 +90,24 @@ def _run(options: argparse.Namespace) -> LoopReport:
                 execute=options.execute,
                 merge=options.merge,
                 real_time_chunking=options.rtc,
-                deadline_s=options.deadline_ms / 1e3,
+                deadline_s=deadline_s,
                 horizon=options.horizon,
                 max_age_s=options.max_age_s,
                 safe=options.safe,
-                check=Guard(contract, max_step=options.max_step),
+                check=Guard(contract, max_step=options.max_step, measure=_measure(options.measure)),
             )
         )
-        robot: Robot = _load(options.robot)() if options.robot else SimulatedRobot(contract)
+        player.initialize()  # refuses settings that do not fit, before anything is timed or moves
+        robot: Robot = SimulatedRobot(contract) if robot_class is None else robot_class()
         recorder = stack.enter_context(Recorder(options.record, options.hz)) if options.record else None
-        hangs_s = max(0.2, 5 / options.hz) + options.deadline_ms / 1e3
-        watchdog = Watchdog(lambda _: robot.stop(), {"server": options.silent_s, "loop": hangs_s})
+        hangs_s = max(0.2, 5 / options.hz) + deadline_s
+
+        def stop(reason: str) -> None:
+            robot.stop()
+            say(f"stopped by the watchdog: {reason}")
+
+        watchdog = Watchdog(stop, {"server": options.silent_s, "loop": hangs_s})
+        stack.enter_context(_restarting(watchdog, say))
         if options.baseline > 0:
             say(_line(_HEADER))
             say(_row("empty loop", empty_loop(options.hz, options.baseline, real_time=options.real_time)))
@@ -88,6 +118,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
             seconds=options.seconds,
             instruction=options.instruction,
             watchdog=watchdog,
+            restart=options.restart,
             recorder=recorder,
             real_time=options.real_time,
         )
@@ -97,9 +128,11 @@ def _run(options: argparse.Namespace) -> LoopReport:
         say(
             f"from a tick until its action is applied: p50 {report.work_p50_ms:.2f} ms, p99 {report.work_p99_ms:.2f} ms"
         )
-        say(f"ticks without an action of the policy: {report.safe_ticks}")
+        say(f"ticks without an action of the policy: {report.safe_ticks} of {report.jitter['ticks']:.0f}")
         for reason, ticks in sorted(report.safe.items(), key=lambda one: -one[1])[:5]:
             say(f"  {ticks} x {reason}")
+        if report.mostly_safe is not None:  # `run_loop` has logged why, and the cure
+            say(f"MOSTLY SAFE ACTIONS, exit status {MOSTLY_SAFE}")
         for bark in report.barks:
             say(f"watchdog: {bark}")
         say(f"against jitter: {', '.join(report.means)}")
@@ -108,29 +141,151 @@ def _run(options: argparse.Namespace) -> LoopReport:
     return report
 
 
+@contextlib.contextmanager
+def _restarting(watchdog: Watchdog, say: Callable[[str], None]) -> Iterator[None]:
+    """Let a person restart motion after a stop: by Enter at a terminal, or by SIGUSR1."""
+
+    over = threading.Event()
+
+    def at_terminal() -> None:
+        while not over.is_set():
+            if not _line_typed(sys.stdin.fileno()):
+                continue
+            stopped = watchdog.stopped
+            if not watchdog.restart():
+                say(f"not restarted: still no signal from the {' and the '.join(watchdog.silent)}")
+            elif stopped:
+                say("restarted")
+
+    with contextlib.ExitStack() as undo:
+        if sys.stdin is not None and sys.stdin.isatty() and hasattr(os, "tcgetpgrp"):
+            thread = threading.Thread(target=at_terminal, name="vlagents-ray-restart", daemon=True)
+            thread.start()
+            undo.callback(thread.join)
+            undo.callback(over.set)
+        if threading.current_thread() is threading.main_thread() and hasattr(signal, "SIGUSR1"):
+            before = signal.signal(signal.SIGUSR1, lambda *_: watchdog.restart() and None)
+            undo.callback(signal.signal, signal.SIGUSR1, before)
+        yield
+
+
+def _line_typed(terminal: int) -> bool:
+    """Whether Enter was pressed within 0.2 s; in the background nothing is read, as that would suspend the process."""
+    try:
+        ready, _, _ = select.select([terminal], [], [], _TYPED_S)
+        if not ready or os.tcgetpgrp(terminal) != os.getpgrp():
+            time.sleep(_TYPED_S if ready else 0)
+            return False
+        if typed := os.read(terminal, 1024):
+            return b"\n" in typed
+    except OSError:
+        pass
+    time.sleep(_TYPED_S)  # the terminal is closed, or not this process's
+    return False
+
+
+def _measure(part: str | None) -> Callable[[Obs], np.ndarray] | None:
+    def measured(obs: Obs) -> np.ndarray:
+        if part not in obs.state:
+            raise MissingState(str(part), obs.state)
+        return obs.state[part]
+
+    return None if part is None else measured
+
+
+def _number(kind: type[float] | type[int] = float, *, least: float = 0, above: bool = False) -> Callable[[str], float]:
+    """Return a function with which argparse reads a number not below `least`, or above it."""
+
+    def read(text: str) -> float:
+        try:
+            value = kind(text)
+        except ValueError:
+            value = kind(least) - 1
+        if not (value > least if above else value >= least):
+            what = "a whole number" if kind is int else "a number"
+            raise argparse.ArgumentTypeError(f"got {text!r}, want {what} {'above' if above else 'from'} {least:g}")
+        return value
+
+    return read
+
+
+def _by_options(message: str, parser: argparse.ArgumentParser) -> str:
+    """Replace the names of arguments in an error message of the library by the options that set them."""
+    options = {action.dest: action.option_strings[0] for action in parser._actions if action.option_strings}
+    options |= {"real_time_chunking": "--rtc", "deadline_s": "--deadline-ms"}
+    names = "|".join(options)
+    message = re.sub(rf"^({names})(?=:| )", lambda found: options[found[1]], message)
+    return re.sub(
+        rf"\b({names})=(?:'(\w+)'|(\w+))", lambda found: f"{options[found[1]]} {found[2] or found[3]}", message
+    )
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m vlagents_ray.robot", description=__doc__)
     add = parser.add_argument
     add("url", help="the server, as for RemoteAgent: http://gpu-box:8000")
-    add("--hz", type=float, default=50.0, help="control rate (%(default)s)")
-    add("--seconds", type=float, default=60.0, help="how long (%(default)s)")
-    add("--instruction", help="what the robot is told to do")
-    add("--robot", metavar="MODULE:CLASS", help="a robot of yours, made without arguments; default: a simulated one")
+    add("--hz", type=_number(above=True), default=50.0, help="control rate (%(default)s)")
+    add("--seconds", type=_number(above=True), default=60.0, help="how long (%(default)s)")
+    add("--instruction", help="the task in words")
+    add(
+        "--robot",
+        metavar="MODULE:CLASS",
+        help="your class of the robot, created without arguments; default: a simulated one",
+    )
     add("--mode", choices=("open_loop", "ensemble", "async"), default="async", help="see ChunkPlayer (%(default)s)")
-    add("--execute", type=int, metavar="N", help="rows of a chunk to execute before asking again")
-    add("--horizon", type=int, metavar="N", help="rows of a chunk that may be executed at all")
-    add("--max-age-s", type=float, metavar="S", help="how old the observation behind an action may be")
-    add("--merge", choices=(*MERGES, ENSEMBLE), default="newest", help="of chunks that overlap (%(default)s)")
-    add("--rtc", action="store_true", help="real-time chunking: send what is left of the plan, and the delay")
-    add("--deadline-ms", type=float, default=0.0, help="how long a tick may wait for an action (%(default)s)")
-    add("--safe", choices=("auto", "hold", "zero"), default="auto", help="without an action (%(default)s: by contract)")
-    add("--max-step", type=float, help="largest change of an action's number from one tick to the next")
-    add("--silent-s", type=float, default=2.0, help="stop the robot when the server is silent this long (%(default)s)")
-    add("--timeout-s", type=float, default=10.0, help="give a request up after this long (%(default)s)")
+    add("--execute", type=_number(int, least=1), metavar="N", help="rows of a chunk to execute before asking again")
+    add("--horizon", type=_number(int, least=1), metavar="N", help="rows of a chunk that may be executed at all")
+    add(
+        "--max-age-s",
+        type=_number(above=True),
+        metavar="S",
+        help="largest age of the observation from which an action was computed",
+    )
+    add(
+        "--merge", choices=(*MERGES, ENSEMBLE), default="newest", help="how overlapping chunks are merged (%(default)s)"
+    )
+    add("--rtc", action="store_true", help="real-time chunking: send the rest of the plan, and the delay")
+    add(
+        "--deadline-ms",
+        type=_number(),
+        help=f"how long a tick may wait for an action (async: 0, else {WAIT_S * 1e3:.0f})",
+    )
+    add(
+        "--safe",
+        choices=("auto", "hold", "zero"),
+        default="auto",
+        help="the action of a tick without one of the policy (%(default)s: by contract)",
+    )
+    add("--max-step", type=_number(), help="largest change of a number of the action from one tick to the next")
+    add("--measure", metavar="PART", help="part of the state with the measured pose, for --max-step, e.g. joints")
+    add(
+        "--restart",
+        choices=get_args(Restart),
+        help="how motion restarts after a stop by the watchdog: by Enter or SIGUSR1, or by itself "
+        "(default: manual; auto for a simulated robot)",
+    )
+    add(
+        "--silent-s",
+        type=_number(above=True),
+        default=2.0,
+        help="stop the robot when the server is silent this long (%(default)s)",
+    )
+    add(
+        "--timeout-s",
+        type=_number(above=True),
+        default=10.0,
+        help="time after which a request is given up (%(default)s)",
+    )
     add("--transport", choices=("auto", "shm", "websocket", "http"), default="auto", help="(%(default)s)")
     add("--record", metavar="DIR", help="record a LeRobotDataset v3.0 there; needs the extra 'record'")
     add("--real-time", action="store_true", help="ask for SCHED_FIFO in place of a nice value")
-    add("--baseline", type=float, default=5.0, metavar="S", help="first time an empty loop this long (%(default)s)")
+    add(
+        "--baseline",
+        type=_number(),
+        default=5.0,
+        metavar="S",
+        help="first measure an empty loop for this long (%(default)s)",
+    )
     return parser
 
 
@@ -141,7 +296,10 @@ def _load(name: str) -> Any:
     try:
         return getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
-        raise ConfigError(f"--robot {name}: {error}; is its folder in PYTHONPATH?") from error
+        raise ConfigError(
+            f"--robot {name}: {error}; go to the folder of its module ({os.getcwd()} is this one), add that to "
+            f"PYTHONPATH, or install it"
+        ) from error
 
 
 def _row(name: str, jitter: dict[str, float]) -> str:

@@ -1,9 +1,9 @@
-"""A LeRobotDataset v3.0 on disk: Parquet and MP4, written an episode at a time.
+"""A LeRobotDataset v3.0 on disk: Parquet and MP4, written one episode at a time.
 
-The layout, names and columns are those of LeRobot 0.4.4 (`lerobot/datasets/utils.py`, `lerobot_dataset.py`), which
-may put many episodes into a file and need not; here each has files of its own, so that an episode is there as a
-whole or not at all. Files get their names when they are whole, `meta/info.json` last; what is left of an
-episode that `info.json` does not count is removed when the dataset is opened again.
+The layout, names and columns are those of LeRobot 0.4.4 (`lerobot/datasets/utils.py`, `lerobot_dataset.py`). LeRobot
+may put many episodes into a file; here each episode has its own files, so that it is either complete or absent. Files
+are renamed to their names when they are complete, `meta/info.json` last. Files of an episode that `info.json` does not
+count are removed when the dataset is opened again.
 """
 
 from __future__ import annotations
@@ -17,9 +17,10 @@ from typing import Any
 
 import numpy as np
 
+from vlagents_ray.dataset_contract import INFO, STATISTICS
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import require
-from vlagents_ray.robot.episode import ACTION, Episode, Finished
+from vlagents_ray.robot.episode import ACTION, Finished, RobotEpisode
 from vlagents_ray.robot.statistics import Stats, joined, of_values
 
 VERSION = "v3.0"
@@ -30,7 +31,7 @@ UNFINISHED = "unfinished"  # folder of the running episode
 
 
 class Dataset:
-    """A dataset to which episodes are added; opened again, it goes on where it was."""
+    """A dataset to which episodes are added; opening an existing one continues it."""
 
     def __init__(self, root: Path, fps: float, robot_type: str | None = None) -> None:
         self.root = root
@@ -58,23 +59,23 @@ class Dataset:
         if (root / "meta/info.json").exists():
             self._open(rate)
         elif root.is_dir() and any(path.name != UNFINISHED for path in root.iterdir()):
-            raise ConfigError(f"{root}: is no LeRobotDataset, and not empty; record into a new folder")
+            raise ConfigError(f"{root}: not a LeRobotDataset, and not empty; record into a new folder")
         self._sweep()
 
     @property
     def episodes(self) -> int:
-        """How many there are."""
+        """The number of episodes."""
         return int(self.info["total_episodes"])
 
-    def begin(self, instruction: str) -> Episode:
-        """An episode to be filled, and then given to `save` or abandoned."""
+    def begin(self, instruction: str) -> RobotEpisode:
+        """Begin an episode, to which frames are added; it is then passed to `save`, or abandoned."""
         folder = self.root / UNFINISHED
         shutil.rmtree(folder, ignore_errors=True)
         folder.mkdir(parents=True)
-        return Episode(folder, instruction, self.info["fps"], self.info["features"] or None)
+        return RobotEpisode(folder, instruction, self.info["fps"], self.info["features"] or None)
 
     def save(self, episode: Finished) -> None:
-        """Make an episode part of the dataset."""
+        """Add an episode to the dataset."""
         number, frames = self.episodes, len(episode.rows[ACTION])
         place = {"chunk_index": number // FILES_IN_CHUNK, "file_index": number % FILES_IN_CHUNK}
         first = int(self.info["total_frames"])
@@ -107,8 +108,9 @@ class Dataset:
         stats = joined(self._stats, stats)
         total = {"total_episodes": number + 1, "total_frames": first + frames, "total_tasks": len(self.tasks)}
         info = self.info | total | {"features": episode.features, "splits": {"train": f"0:{number + 1}"}}
+        info[INFO] = episode.about.to_json()
         plain = {key: {name: v.tolist() for name, v in one.items()} for key, one in stats.items()}
-        self._json(plain, "meta/stats.json")
+        self._json(plain | episode.about.to_statistics(first + frames), "meta/stats.json")
         self._json(info, "meta/info.json")
         self.info, self._stats = info, stats
 
@@ -119,12 +121,13 @@ class Dataset:
                 raise ConfigError(f"{self.root}: has {key} {info.get(key)!r}, want {mine!r}; record into a new folder")
         self.info = info
         stats = json.loads((self.root / "meta/stats.json").read_text())
+        stats.pop(STATISTICS, None)
         self._stats = {key: {name: np.array(value) for name, value in one.items()} for key, one in stats.items()}
         table = self._pq.read_table(self.root / "meta/tasks.parquet")
         self.tasks = table.column("__index_level_0__").to_pylist()
 
     def _sweep(self) -> None:
-        """Remove what a crash left: the running episode, and one that was about to be counted."""
+        """Remove the files that a crash left: those of the running episode, and of one not counted yet."""
         shutil.rmtree(self.root / UNFINISHED, ignore_errors=True)
         number = self.episodes
         stray = FILE.format(chunk_index=number // FILES_IN_CHUNK, file_index=number % FILES_IN_CHUNK)
@@ -137,7 +140,7 @@ class Dataset:
         pa = self._pa
         columns = {}
         for key, values in rows.items():
-            if features[key]["shape"] == [1]:  # one number, which LeRobot reads as no list
+            if features[key]["shape"] == [1]:  # LeRobot reads a single number as a scalar, not as a list
                 columns[key] = pa.array(values.reshape(-1), getattr(pa, _ARROW[features[key]["dtype"]])())
             else:
                 flat = pa.array(np.ascontiguousarray(values, np.float32).ravel())
@@ -145,7 +148,7 @@ class Dataset:
         return pa.table(columns)
 
     def _tasks_table(self) -> Any:
-        """As pandas writes a frame whose index are the tasks, which is how LeRobot reads it."""
+        """Make the table that pandas writes for a frame whose index are the tasks, as LeRobot reads it."""
         pa, name = self._pa, "__index_level_0__"
         text: dict[str, Any] = {"pandas_type": "unicode", "numpy_type": "object"}
         columns: list[dict[str, Any]] = [
@@ -182,7 +185,7 @@ _ARROW = {"float64": "float64", "float32": "float32", "int64": "int64", "bool": 
 
 
 def _move(part: Path, path: Path) -> None:
-    """Give a whole file its name, after it has reached the disk."""
+    """Rename a complete file to its name, after it has reached the disk."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with part.open("rb") as file:
         os.fsync(file.fileno())

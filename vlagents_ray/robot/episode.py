@@ -1,52 +1,63 @@
-"""One episode of a recording under way: videos on disk, numbers in memory."""
+"""The running episode of a recording: its videos are on disk, its numbers in memory."""
 
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.dataset_contract import GRIPPER, DatasetContract
 from vlagents_ray.errors import InvalidObservation
+from vlagents_ray.images.mp4 import Mp4
 from vlagents_ray.interface import Obs
-from vlagents_ray.mp4 import Mp4
+from vlagents_ray.naming import distinct
 from vlagents_ray.robot.statistics import ImageStatistics, Stats
 
 IMAGES, STATE, ACTION = "observation.images.", "observation.state", "action"
-MOMENTS = {  # what each recorded frame has beside the observation and the action
+MOMENTS = {  # further columns of each recorded frame
     "captured_at": "float64",  # s since 1970
-    "tick": "int64",  # of the control loop; gaps are frames that were missed or dropped
-    "safe": "bool",  # the action was the safe one, not the policy's
+    "tick": "int64",  # of the control loop; gaps are missed or dropped frames
+    "safe": "bool",  # whether the action is a safe one, not the policy's
 }
-INDEX = {  # what the dataset adds to each
+INDEX = {  # columns that the dataset adds to each frame
     "timestamp": "float32",  # s, frame_index / fps
     "frame_index": "int64",
     "episode_index": "int64",
     "index": "int64",
     "task_index": "int64",
 }
-_KEY_FRAMES = 2  # LeRobot's own, for quick access to any frame
+_KEY_FRAMES = 2  # frames between key frames, as LeRobot has for quick access to any frame
 
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """An episode as a dataset takes it: N frames, and files that become the dataset's."""
+    """A complete episode of N frames, whose files are moved into the dataset."""
 
     instruction: str
     features: dict[str, Any]  # as in `meta/info.json`
     rows: dict[str, np.ndarray]  # (N, D) float32, or (N,) of the feature's dtype
-    images: dict[str, Stats]  # of the videos' frames
-    videos: dict[str, Path]  # MP4s with N frames or more, of which the first N count
+    images: dict[str, Stats]  # statistics of the videos' frames
+    videos: dict[str, Path]  # MP4 files with at least N frames, of which the first N count
+    about: DatasetContract  # the same for each episode of a dataset
 
 
-class Episode:
-    """What is added frame by frame, and saved by the dataset when it is over."""
+class RobotEpisode:
+    """A running episode, to which frames are added."""
 
     def __init__(self, folder: Path, instruction: str, fps: float, features: dict[str, Any] | None) -> None:
-        """`features` are the dataset's, which the frames must have; None in a dataset's first episode."""
+        """Begin an episode in a folder.
+
+        Args:
+            folder: The folder for its videos.
+            instruction: The task in words.
+            fps: The rate of the frames, Hz.
+            features: The dataset's features, which the frames must have; None in the first episode.
+        """
         self.instruction = instruction
         self.features: dict[str, Any] = features or {}
         self.rows: dict[str, list[Any]] = {}
@@ -54,13 +65,26 @@ class Episode:
         self.images: dict[str, ImageStatistics] = {}
         self._folder = folder
         self._fps = fps
+        self._about = DatasetContract(Contract())
 
     def add(self, obs: Obs, action: np.ndarray, captured_at: float, tick: int, safe: bool) -> None:
-        """Append a frame; `InvalidObservation` if it is not like those before it."""
+        """Append a frame.
+
+        Args:
+            obs: The observation.
+            action: The action, (D,).
+            captured_at: The time of the observation, s since 1970.
+            tick: The tick of the control loop.
+            safe: Whether the action is a safe one, not the policy's.
+
+        Raises:
+            InvalidObservation: Cameras or shapes differ from those of the frames before.
+        """
         values, names = state_vector(obs.state, None if obs.gripper is None else np.array(obs.gripper))
         if not self.rows:
             self._first(obs, names, len(action))
-        if {camera_key(name) for name in obs.cameras} != self.videos.keys():
+        keys = camera_keys(obs.cameras)
+        if set(keys.values()) != self.videos.keys():
             raise InvalidObservation(
                 f"recording: got cameras {sorted(obs.cameras)}, want those of {sorted(self.videos)}"
             )
@@ -69,9 +93,8 @@ class Episode:
             if shape != wanted:
                 raise InvalidObservation(f"recording: got {name} of {shape}, want {wanted} as in the first frame")
         for name, image in obs.cameras.items():
-            key = camera_key(name)
-            self.videos[key][1].add(image)
-            self.images[key].add(image)
+            self.videos[keys[name]][1].add(image)
+            self.images[keys[name]].add(image)
         frame = {ACTION: np.asarray(action, np.float32), "captured_at": captured_at, "tick": tick, "safe": safe}
         if len(values):
             frame[STATE] = values
@@ -79,7 +102,7 @@ class Episode:
             self.rows.setdefault(key, []).append(value)
 
     def finish(self) -> Finished:
-        """What was added, its videos whole."""
+        """Complete the videos, and return the episode."""
         for _, video in self.videos.values():
             video.finish()
         return Finished(
@@ -88,18 +111,20 @@ class Episode:
             {key: np.stack(values) for key, values in self.rows.items()},
             {key: images.result() for key, images in self.images.items()},
             {key: path for key, (path, _) in self.videos.items()},
+            self._about,
         )
 
     def abandon(self) -> None:
-        """Give up what was recorded of it."""
+        """Remove the episode's files."""
         for _, video in self.videos.values():
             video.abandon()
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def _first(self, obs: Obs, names: list[str], action_dim: int) -> None:
         features: dict[str, Any] = {}
+        keys = camera_keys(obs.cameras)
         for name, image in sorted(obs.cameras.items()):
-            key = camera_key(name)
+            key = keys[name]
             path = self._folder / f"{key}.mp4"
             video = Mp4(path, image.shape, self._fps, key_frames=_KEY_FRAMES)
             self.videos[key], self.images[key] = (path, video), ImageStatistics()
@@ -113,15 +138,41 @@ class Episode:
             odd = sorted(k for k in self.features.keys() | features.keys() if self.features.get(k) != features.get(k))
             raise InvalidObservation(f"recording: {odd} differ from the dataset's; record into a new folder")
         self.features = features
+        parts = parts_of(obs.state, obs.gripper is not None)
+        own = [part for part in parts if part != GRIPPER or obs.gripper is None]
+        self._about = DatasetContract(
+            Contract(
+                cameras={name: CameraSpec(*image.shape[:2]) for name, image in obs.cameras.items()},
+                state={part: StateSpec(len(obs.state[part])) for part in own},
+                gripper=obs.gripper is not None,
+                action=ActionSpec(dim=action_dim),
+                control_hz=self._fps,
+            ),
+            tuple(parts),
+            {key: name for name, key in keys.items()},
+        )
 
 
-def camera_key(name: str) -> str:
-    """A camera's feature; LeRobot allows no slash in it."""
-    return IMAGES + name.replace("/", "_")
+def parts_of(state: Iterable[str], gripper: bool) -> list[str]:
+    """Return the parts of the proprioception in the order of `observation.state`.
+
+    If an observation has `Obs.gripper`, "gripper" means this, and a part of the state of the same name is left out.
+    """
+    return [*sorted(part for part in state if part != GRIPPER or not gripper), *([GRIPPER] if gripper else [])]
+
+
+def camera_keys(names: Iterable[str]) -> dict[str, str]:
+    """Return a distinct feature name for each camera."""
+    return {name: IMAGES + key for name, key in distinct(names, without_slash).items()}
+
+
+def without_slash(name: str) -> str:
+    """Replace the slashes in a name, as LeRobot allows none in a feature's name."""
+    return name.replace("/", "_")
 
 
 def video_feature(height: int, width: int, fps: float) -> dict[str, Any]:
-    """Of a camera whose videos have that size, in pixels, and rate, in Hz."""
+    """Describe the feature of a camera whose videos have this size, in pixels, and rate, in Hz."""
     size = {"video.height": height, "video.width": width, "video.fps": fps, "video.channels": 3}
     kind = {"video.codec": "h264", "video.pix_fmt": "yuv420p", "video.is_depth_map": False, "has_audio": False}
     names = ["height", "width", "channels"]
@@ -129,22 +180,37 @@ def video_feature(height: int, width: int, fps: float) -> dict[str, Any]:
 
 
 def vector_feature(names: list[str]) -> dict[str, Any]:
-    """Of as many numbers as there are names."""
+    """Describe a feature of several numbers, one for each name."""
     return {"dtype": "float32", "shape": [len(names)], "names": names}
 
 
 def number_features(dtypes: Mapping[str, str]) -> dict[str, Any]:
-    """Of one number each."""
+    """Describe features of one number each."""
     return {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in dtypes.items()}
 
 
-def state_vector(parts: Mapping[str, np.ndarray], gripper: np.ndarray | None) -> tuple[np.ndarray, list[str]]:
-    """All proprioception side by side, (..., D) float32, as LeRobot's policies take it, and what its numbers are.
+def state_vector(
+    parts: Mapping[str, np.ndarray], gripper: np.ndarray | None, order: Iterable[str] | None = None
+) -> tuple[np.ndarray, list[str]]:
+    """Concatenate the parts of the proprioception, as LeRobot's policies expect them.
 
-    `parts` are (..., d) each, the gripper's opening (...,).
+    Args:
+        parts: The parts by name, (..., d) each.
+        gripper: The gripper's opening, (...,); None if there is none.
+        order: The names of the parts to concatenate; all by default.
+
+    Returns:
+        The numbers, (..., D) float32, and a name for each of the D.
     """
-    parts = dict(sorted(parts.items()))
-    names = [f"{part}_{i}" for part, values in parts.items() for i in range(values.shape[-1])]
-    columns = [*parts.values(), *([] if gripper is None else [gripper[..., np.newaxis]])]
+    chosen = parts_of(parts, gripper is not None) if order is None else order
+    columns: list[np.ndarray] = []
+    names: list[str] = []
+    for part in chosen:
+        if part == GRIPPER and gripper is not None:
+            columns.append(gripper[..., np.newaxis])
+            names.append(GRIPPER)
+        else:
+            columns.append(parts[part])
+            names += [f"{part}_{i}" for i in range(parts[part].shape[-1])]
     values = np.concatenate(columns, axis=-1) if columns else np.zeros(0)
-    return values.astype(np.float32), names + ["gripper"] * (gripper is not None)
+    return values.astype(np.float32), names

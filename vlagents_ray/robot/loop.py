@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import logging
 import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 
@@ -18,46 +19,75 @@ from vlagents_ray.robot.pacing import KEPT_TICKS, SPIN_S, Pacer, jitter, undistu
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import Guard, Watchdog
 
-_REASONS = 100  # that a report tells apart
+Restart = Literal["manual", "auto"]
+logger = logging.getLogger(__name__)
+
+_REASONS = 100  # counted apart in a report
 _COLLECT_S = 2.0
 
 
 class Robot(Protocol):
-    """What the loop drives."""
+    """The interface of a robot that the control loop drives.
+
+    A simulated robot may have the attribute `simulated = True`: it starts again by itself after a stop (see `restart`
+    of `run_loop`).
+    """
 
     def observe(self) -> Obs:
-        """What the sensors say now; must not wait longer than a fraction of a tick."""
+        """Return the current sensor readings, within a fraction of a tick."""
         ...
 
     def apply(self, action: np.ndarray) -> None:
-        """Command one action, (D,) float32; must not wait for the motion."""
+        """Command an action without waiting for the motion.
+
+        Args:
+            action: The action, (D,) float32, in the units of the policy's contract.
+        """
         ...
 
     def stop(self) -> None:
-        """Come to rest, whatever the state; may be called more than once, and from another thread."""
+        """Bring the robot to rest from any state; may be called repeatedly, and from another thread."""
         ...
 
 
 @dataclass(slots=True)
 class LoopReport:
-    """How a run of the loop went."""
+    """The outcome of a run of the control loop: its timing, and the ticks without an action of the policy."""
 
     hz: float
     jitter: dict[str, float] = field(default_factory=dict)  # see `vlagents_ray.robot.pacing.jitter`
-    work_p50_ms: float = 0.0  # from when a tick was due until its action was applied
+    work_p50_ms: float = 0.0  # from the time a tick was due until its action was applied
     work_p99_ms: float = 0.0
-    safe: dict[str, int] = field(default_factory=dict)  # reason -> ticks with the safe action, or none
-    barks: list[str] = field(default_factory=list)  # of the watchdog
+    safe: dict[str, int] = field(default_factory=dict)  # reason -> ticks with the safe action or without any
+    barks: list[str] = field(default_factory=list)  # the watchdog's reasons to stop the robot
     done: bool = False  # the policy considered its task finished
-    means: list[str] = field(default_factory=list)  # what was done against jitter
+    means: list[str] = field(default_factory=list)  # the measures taken against jitter
 
     @property
     def safe_ticks(self) -> int:
-        """Ticks without an action of the policy."""
+        """The number of ticks without an action of the policy."""
         return sum(self.safe.values())
 
+    @property
+    def mostly_safe(self) -> str | None:
+        """A warning with its cure if more than half of the ticks had no action of the policy; else None."""
+        ticks = int(self.jitter.get("ticks", 0))
+        if 2 * self.safe_ticks <= ticks:
+            return None
+        reason = max(self.safe, key=lambda one: self.safe[one])
+        return (
+            f"the policy hardly drove the robot: {self.safe_ticks} of {ticks} ticks had no action of it, most often: "
+            f"{reason}. If answers come too late, use a lower rate (hz), a policy with longer chunks, or let a tick "
+            "wait for its answer (deadline_s, --deadline-ms)"
+        )
+
     def count(self, reason: str) -> None:
-        """One more tick without an action of the policy. Reasons may hold numbers: not all of them are told apart."""
+        """Count a tick without an action of the policy.
+
+        Args:
+            reason: The reason. After a hundred different ones, which may contain numbers, new ones are counted
+                together.
+        """
         if reason not in self.safe and len(self.safe) >= _REASONS:
             reason = "other reasons"
         self.safe[reason] = self.safe.get(reason, 0) + 1
@@ -73,28 +103,58 @@ def run_loop(
     reset_options: dict[str, Any] | None = None,
     guard: Guard | None = None,
     watchdog: Watchdog | None = None,
+    restart: Restart | None = None,
     recorder: Recorder | None = None,
     real_time: bool = False,
     spin_s: float = SPIN_S,
     until: Callable[[], bool] = lambda: False,
 ) -> LoopReport:
-    """Reset `agent`, then let it drive `robot` at `hz` for `seconds`, until it is done, or until `until()`.
+    """Reset an agent and let it drive a robot at a fixed rate, until it is done or the time is over.
 
-    The schedule is absolute, so nothing drifts; a tick that is over before it could begin is left out and counted.
-    Every action passes `guard` (default: one of the agent's contract) or ends the loop: an agent that is to go on
-    with a safe action instead is a `ChunkPlayer(..., check=guard)`. However the loop ends, `robot.stop()` is called.
+    The schedule is absolute, so there is no drift; a tick that is over before it could begin is skipped and counted as
+    missed. `robot.stop()` is called however the loop ends. If more than half of the ticks had no action of the policy,
+    `LoopReport.mostly_safe` is logged as a warning. Signals such as SIGTERM end the loop if the caller turns them into
+    an exception.
 
-    `watchdog` hears "loop" at every tick and "server" as long as the agent's answers come (`act.info["silent_s"]`);
-    it watches while the loop runs. After it barked, the robot is stopped and commanded nothing until what was silent
-    is heard again; an action that a hanging loop was late with is not applied. `recorder` gets an episode; one that
-    ends by an exception is kept, too. A signal such as SIGTERM is the caller's to turn into an exception.
+    Args:
+        robot: The robot.
+        agent: The policy. Its actions must be single rows, (D,); a `ChunkPlayer` turns chunks into rows.
+        hz: The control rate, Hz.
+        seconds: The length of the run, s; None runs until the policy or `until` ends it.
+        instruction: The task in words.
+        reset_options: Further arguments of `agent.reset`.
+        guard: A check that every action has to pass; an action that does not ends the loop. The default is the agent's
+            own `check`, as a chunk player has, which continues with a safe action instead; or else a guard of the
+            agent's contract.
+        watchdog: Runs during the loop. Each tick is a sign of life of "loop", and the agent's answers
+            (`act.info["silent_s"]`) are those of "server". After it has stopped the robot, nothing is commanded until
+            motion is restarted. A chunk player then has discarded its plan (`ChunkPlayer.interrupt`), so that the first
+            command is computed from new observations; a guard with `measure` compares it with the measured pose.
+        restart: With "manual" motion is restarted by a call of `watchdog.restart()`, made by a person who sees the
+            robot; it has no effect while the silence lasts. With "auto" the end of the silence restarts it. The default
+            is "auto" for a simulated robot and "manual" for any other.
+        recorder: Records the run as one episode, also if it ends by an exception.
+        real_time: Run the thread with SCHED_FIFO (see `vlagents_ray.robot.pacing.undisturbed`).
+        spin_s: How long before each tick the thread spins instead of sleeping, s.
+        until: Ends the loop when it returns True; called before each tick.
+
+    Returns:
+        The timing of the loop, and the reasons of the ticks without an action of the policy.
+
+    Raises:
+        ConfigError: `hz`, `seconds` or `restart` has a wrong value, or `guard` differs from the agent's own.
+        InvalidAction: An action is a chunk, or does not pass the guard.
     """
+    if restart is None:
+        restart = "auto" if getattr(robot, "simulated", False) else "manual"
+    if restart not in get_args(Restart):
+        raise ConfigError(f"restart: got {restart!r}, want one of {list(get_args(Restart))}")
     if seconds is not None and not seconds > 0:
         raise ConfigError(f"seconds: got {seconds}, want above 0, or None")
     report = LoopReport(hz)
     barks = len(watchdog.barks) if watchdog is not None else 0
     agent.initialize()
-    guard = guard or Guard(agent.contract)
+    guard = _guard(agent, guard)
     with contextlib.ExitStack() as stack:
         try:
             agent.reset(_observed(robot), instruction, **(reset_options or {}))
@@ -103,11 +163,13 @@ def run_loop(
             report.means = stack.enter_context(undisturbed(real_time=real_time))
             if watchdog is not None:
                 stack.enter_context(watchdog)
-            _drive(robot, agent, guard, watchdog, recorder, report, Pacer(hz, spin_s), seconds, until)
+            _drive(robot, agent, guard, watchdog, restart, recorder, report, Pacer(hz, spin_s), seconds, until)
         finally:
-            robot.stop()  # before anything else ends
+            robot.stop()  # before the watchdog and the recorder end
     if watchdog is not None:
         report.barks = watchdog.barks[barks:]
+    if report.mostly_safe is not None:
+        logger.warning("%s", report.mostly_safe)
     return report
 
 
@@ -116,6 +178,7 @@ def _drive(
     agent: Agent,
     guard: Guard,
     watchdog: Watchdog | None,
+    restart: Restart,
     recorder: Recorder | None,
     report: LoopReport,
     pacer: Pacer,
@@ -126,10 +189,14 @@ def _drive(
     collected = time.monotonic()
     ticks = None if seconds is None else pacer.ticks_in(seconds)
     last: np.ndarray | None = None
-    stopped = False  # by the watchdog
+    guarded = getattr(agent, "check", None) is guard  # the agent has checked the action before `act` returns
+    interrupt = getattr(agent, "interrupt", lambda: None)
+    standing = True  # before the first action, and after a stop until the next one
     try:
         while not report.done and not until():
-            if time.monotonic() - collected > _COLLECT_S:  # in the idle time: it is off, and failed requests are cycles
+            if (
+                time.monotonic() - collected > _COLLECT_S
+            ):  # while idle, as automatic collection is off and failed requests leave cycles
                 gc.collect()
                 collected = time.monotonic()
             tick = pacer.wait()
@@ -140,25 +207,31 @@ def _drive(
             act = agent.act(obs)
             if act.action.ndim != 1:
                 raise InvalidAction(f"action: got {act.action.shape}, want one row; wrap the agent in a ChunkPlayer")
-            action = guard(act.action, last)
             report.done = act.done
-            silent: list[str] = []
+            reason = act.info.get(SAFE)
             if watchdog is not None:
-                silent = watchdog.silent
+                stop = _why_stopped(watchdog)  # before this tick counts as a sign of life: it may be late
                 watchdog.heard("loop")
                 watchdog.heard("server", act.info.get(SILENT, 0.0))
-            if silent:
-                if not stopped:
-                    robot.stop()  # again: the watchdog's may have come just before the last action
-                stopped = True
-                report.count(f"stopped by the watchdog: no word of the {' and the '.join(silent)}")
-                continue
-            stopped, last = False, action
-            robot.apply(action)
-            work_s.append(pacer.since_tick_s())
-            reason = act.info.get(SAFE)
+                if stop is not None:
+                    if not standing:
+                        robot.stop()  # again, as the watchdog may have stopped it just before the last action
+                    standing = True
+                    interrupt()
+                    report.count(stop)
+                    if restart == "auto":
+                        watchdog.restart()
+                    continue
             if reason is not None:
                 report.count(reason)
+                if standing:  # a robot at rest gets no command
+                    continue
+            action = act.action
+            if not guarded:
+                action = guard(action, guard.reference(obs, last) if standing else last)
+            standing, last = False, action
+            robot.apply(action)
+            work_s.append(pacer.since_tick_s())
             if recorder is not None:
                 recorder.add(obs, action, tick=tick, safe=reason is not None)
     finally:
@@ -166,6 +239,23 @@ def _drive(
         if work_s:
             report.work_p50_ms = float(np.median(work_s)) * 1e3
             report.work_p99_ms = float(np.quantile(work_s, 0.99)) * 1e3
+
+
+def _why_stopped(watchdog: Watchdog) -> str | None:
+    if not watchdog.stopped:
+        return None
+    silent = watchdog.silent
+    cause = f"no signal from the {' and the '.join(silent)}" if silent else "waiting for a restart (Watchdog.restart)"
+    return f"stopped by the watchdog: {cause}"
+
+
+def _guard(agent: Agent, given: Guard | None) -> Guard:
+    """Return the guard that actions have to pass; the agent is initialized, so it knows its contract."""
+    own = getattr(agent, "check", None)
+    own = own if isinstance(own, Guard) else None
+    if given is not None and own is not None and own is not given:
+        raise ConfigError("guard: got one besides the agent's own check=, want one of them; leave one out")
+    return given or own or Guard(agent.contract)
 
 
 def _observed(robot: Robot) -> Obs:

@@ -1,4 +1,4 @@
-"""Ticks at a fixed rate, how punctual they were, and what this process can do for that."""
+"""Ticks at a fixed rate, statistics of their lateness, and measures of this process against it."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ import numpy as np
 from vlagents_ray.errors import ConfigError
 
 SPIN_S = 0.001
-"""A sleeping thread is woken late by some tens of microseconds, on a busy machine by more: the end is not slept."""
+"""The last part of a wait, s, in which the thread spins: a sleeping thread wakes tens of microseconds late or more."""
 ON_TIME_S = 0.002
 KEPT_TICKS = 200_000
-"""Of which the lateness is kept: a loop may run for days."""
-_SWITCH_S = 0.0005  # how long another thread may keep the interpreter when the loop's is due; Python's is 5 ms
+"""The number of ticks whose lateness is kept, as a loop may run for days."""
+_SWITCH_S = 0.0005  # the longest time that another thread keeps the interpreter; Python's default is 5 ms
 _NICE = -10
 _FIFO = 10
 
 
 class Pacer:
-    """The ticks of a schedule that is fixed when it begins: tick k is due at begin + k * period, so nothing drifts.
+    """A schedule of ticks without drift: tick k is due at begin + k * period.
 
-    A tick that is over before it could begin is left out, and counted as missed.
+    A tick that is over before it could begin is skipped and counted as missed.
     """
 
     def __init__(self, hz: float, spin_s: float = SPIN_S) -> None:
@@ -37,14 +37,14 @@ class Pacer:
             raise ConfigError(f"hz: got {hz}, want a rate above 0")
         self.period_s = 1.0 / hz
         self.missed = 0
-        self.ticks = 0  # that began
-        self.late_s: deque[float] = deque(maxlen=KEPT_TICKS)  # of the last ones that began
+        self.ticks = 0  # ticks that began
+        self.late_s: deque[float] = deque(maxlen=KEPT_TICKS)  # lateness of the last ticks that began
         self._spin_s = spin_s
         self._begin = time.perf_counter()
         self._tick = -1
 
     def wait(self) -> int:
-        """Return at the next tick, with its number."""
+        """Wait for the next tick, and return its number."""
         self._tick += 1
         now = time.perf_counter()
         behind = math.floor((now - self._begin) / self.period_s) - self._tick
@@ -55,30 +55,36 @@ class Pacer:
         if due - now > self._spin_s:
             time.sleep(due - now - self._spin_s)
         while (now := time.perf_counter()) < due:
-            time.sleep(0)  # gives the interpreter and the core to whoever wants them
+            time.sleep(0)  # lets other threads have the interpreter and the core
         self.late_s.append(now - due)
         self.ticks += 1
         return self._tick
 
     def forget(self, end: int) -> None:
-        """Leave the tick that just began, and those missed from `end` on, out of what is counted."""
+        """Exclude the tick that just began, and those missed from `end` on, from the statistics."""
         self.late_s.pop()
         self.ticks -= 1
         self.missed -= self._tick - end
 
     def since_tick_s(self) -> float:
-        """Time since this tick was due."""
+        """Return the time since this tick was due, s."""
         return time.perf_counter() - self._begin - self._tick * self.period_s
 
     def ticks_in(self, seconds: float) -> int:
-        """How many are due in that time."""
+        """Return the number of ticks that are due within a time, s; at least one."""
         return max(1, round(seconds / self.period_s))
 
 
 def jitter(late_s: Sequence[float], missed: int, ticks: int | None = None) -> dict[str, float]:
-    """Of ticks: how many, how many were missed, which share began within 2 ms of when they were due, how late in ms.
+    """Compute the statistics of a loop's punctuality.
 
-    `late_s` may be that of the last of `ticks` only, for which they stand then.
+    Args:
+        late_s: The lateness of ticks, s; of a long loop, that of the last ones.
+        missed: The number of ticks that were skipped.
+        ticks: The number of ticks that began; by default as many as in `late_s`.
+
+    Returns:
+        `ticks`, `missed`, the share `on_time` that began within 2 ms, and the lateness `p50_ms`, `p99_ms` and `max_ms`.
     """
     late_ms = np.array(late_s or [math.nan]) * 1e3
     ticks = len(late_s) if ticks is None else ticks
@@ -93,7 +99,7 @@ def jitter(late_s: Sequence[float], missed: int, ticks: int | None = None) -> di
 
 
 def empty_loop(hz: float, seconds: float, *, real_time: bool = False) -> dict[str, float]:
-    """The jitter of a loop that does nothing: what this machine can do."""
+    """Measure the jitter of a loop that does nothing, as the best that this machine can do."""
     with undisturbed(real_time=real_time):
         pacer = Pacer(hz)
         ticks = pacer.ticks_in(seconds)
@@ -104,24 +110,25 @@ def empty_loop(hz: float, seconds: float, *, real_time: bool = False) -> dict[st
 
 @contextlib.contextmanager
 def undisturbed(*, real_time: bool = False) -> Iterator[list[str]]:
-    """Keep this process's own disturbances from the calling thread; yields what was done, in words.
+    """Reduce the delays of the calling thread by its own process; yields the measures taken, in words.
 
-    The garbage collector is put off until the end, or until it is called: a collection of a large heap takes tens of
-    milliseconds; what is there already is left out, what is not in cycles is freed as ever. Other threads give the
-    interpreter back within 0.5 ms, and where the user may (root, or `ulimit -e`), the thread goes before others of
-    this machine. `real_time` asks for SCHED_FIFO instead, before everything that is not real-time (`ulimit -r`).
+    Automatic garbage collection is off within the context, as a collection of a large heap takes tens of milliseconds;
+    objects that exist before are excluded from explicit collections. Other threads yield the interpreter within 0.5 ms.
+    If the user may set it (root, or `ulimit -e`), the thread has a higher priority than others on the machine. With
+    `real_time` it has SCHED_FIFO instead, before all threads that are not real-time (`ulimit -r`).
 
-    Measured on 2 cores at 50 Hz, p99 of lateness: beside two busy processes 2.8 ms as it is, 0.6 ms with the
-    priority, 0.02 ms with SCHED_FIFO; beside a busy Python thread of the same process 5.3 ms as it is, 1.3 ms so.
+    Lateness, p99, measured on 2 cores at 50 Hz: beside two busy processes 2.8 ms without measures, 0.6 ms with the
+    priority, 0.02 ms with SCHED_FIFO; beside a busy Python thread of the same process 5.3 ms without, 1.3 ms with them.
     """
-    collects, switch_s = gc.isenabled(), sys.getswitchinterval()
+    collects, switch_s, frozen = gc.isenabled(), sys.getswitchinterval(), gc.get_freeze_count() > 0
     gc.collect()
     gc.freeze()
     gc.disable()
     sys.setswitchinterval(_SWITCH_S)
     done = ["garbage collection off", "switch interval 0.5 ms"]
     with contextlib.ExitStack() as undo:
-        undo.callback(gc.unfreeze)
+        if not frozen:  # else by the process itself, which `unfreeze` would undo
+            undo.callback(gc.unfreeze)
         if collects:
             undo.callback(gc.enable)
         undo.callback(sys.setswitchinterval, switch_s)
@@ -130,7 +137,7 @@ def undisturbed(*, real_time: bool = False) -> Iterator[list[str]]:
 
 
 def _prioritise(real_time: bool, undo: contextlib.ExitStack) -> str:
-    if not sys.platform.startswith("linux"):  # where both calls are about a thread
+    if not sys.platform.startswith("linux"):  # only there do both calls act on a thread
         return "no priority (only on Linux)"
     thread = threading.get_native_id()
     try:
@@ -143,5 +150,5 @@ def _prioritise(real_time: bool, undo: contextlib.ExitStack) -> str:
         os.setpriority(os.PRIO_PROCESS, thread, _NICE)
         undo.callback(os.setpriority, os.PRIO_PROCESS, thread, nice)
     except PermissionError:
-        return "no priority (may not: see ulimit -e and -r)"
+        return "no priority (not permitted: see ulimit -e and -r)"
     return f"nice {_NICE}"

@@ -1,4 +1,4 @@
-"""What stands between a policy and a robot's motors."""
+"""Checks between a policy and a robot: a guard for each action, and a watchdog for silence."""
 
 from __future__ import annotations
 
@@ -10,14 +10,29 @@ import numpy as np
 
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidAction
+from vlagents_ray.interface import Obs
 
 
 class Guard:
-    """Lets an action through or raises `InvalidAction`; never changes one, as a clipped action is another motion.
+    """A check that accepts an action or raises `InvalidAction`; it never clips one, as that would be another motion.
 
-    Checked are shape and dimension, that all numbers are finite, the contract's bounds and one's own (`low`,
-    `high`: a number, or (D,) for each column), and with `max_step` (likewise) how far an action may be from the
-    one before it, for absolute targets.
+    The guard checks the action's shape, that its numbers are finite and within the bounds, and that an absolute target
+    is not too far from the previous one. There is no previous action before the first one, and after a stop the arm
+    need not be where the last action commanded it. With `measure` these actions are compared with the measured pose.
+    Without it the first action may be anywhere within the bounds, and one after a stop is compared with the last
+    action.
+
+    Args:
+        contract: The policy's contract, for the action's dimension and bounds; None checks neither.
+        low: Lower bound, for all numbers of an action or (D,), in the action's units; the stricter of this and the
+            contract's applies.
+        high: Upper bound, as `low`.
+        max_step: Largest difference between two consecutive actions, for all numbers or (D,); None checks none.
+        measure: Returns the measured pose in an observation, (D,) in the action's order and units, e.g.
+            `lambda obs: obs.state["joints"]`; not for relative actions.
+
+    Raises:
+        ConfigError: A bound is NaN, `max_step` is negative, or `measure` is given for relative actions.
     """
 
     def __init__(
@@ -27,6 +42,7 @@ class Guard:
         low: float | np.ndarray | None = None,
         high: float | np.ndarray | None = None,
         max_step: float | np.ndarray | None = None,
+        measure: Callable[[Obs], np.ndarray] | None = None,
     ) -> None:
         spec = contract.action if contract is not None else ActionSpec()
         self._dim = spec.dim
@@ -35,9 +51,49 @@ class Guard:
         self._max_step = None if max_step is None else np.asarray(max_step, np.float64)
         if self._max_step is not None and not (self._max_step >= 0).all():  # with NaN any step would pass
             raise ConfigError(f"max_step: got {max_step}, want 0 or above, or None")
+        if measure is not None and spec.relative:
+            raise ConfigError(
+                "measure: got one for relative actions, which cannot be compared with a pose; leave it out"
+            )
+        self._measure = measure
+
+    def reference(self, obs: Obs, last: np.ndarray | None) -> np.ndarray | None:
+        """Return the pose with which the first action, or the first one after a stop, is compared.
+
+        Args:
+            obs: The current observation.
+            last: The last commanded action, (D,); None before the first one.
+
+        Returns:
+            The measured pose, (D,) float32; `last` if the guard has no `measure`.
+
+        Raises:
+            ConfigError: `measure` returns another number of values than an action has.
+            InvalidAction: `measure` returns NaN or infinity, so that no action can be checked.
+        """
+        if self._measure is None:
+            return last
+        pose = np.asarray(self._measure(obs), np.float32)
+        wanted = self._dim if last is None else len(last)
+        if pose.ndim != 1 or wanted not in (None, len(pose)):
+            raise ConfigError(f"measure: got {pose.shape}, want ({wanted or 'D'},), as an action is")
+        if not np.isfinite(pose).all():
+            raise InvalidAction(f"measure: got {pose.tolist()}, want finite numbers; the robot's sensors are broken")
+        return pose
 
     def __call__(self, action: np.ndarray, last: np.ndarray | None = None) -> np.ndarray:
-        """`action`, (D,) float32, if it may reach the robot; `last` is what was commanded before."""
+        """Return an action if it may reach the robot.
+
+        Args:
+            action: The action, (D,) float32.
+            last: The action or pose from which `max_step` counts, (D,); None skips that check.
+
+        Returns:
+            The action, unchanged.
+
+        Raises:
+            InvalidAction: The action has a wrong shape, is not finite, exceeds a bound, or is too far from `last`.
+        """
         action = np.asarray(action)
         if action.ndim != 1 or action.dtype.kind != "f" or self._dim not in (None, len(action)):
             wanted = f"({self._dim if self._dim is not None else 'D'},) float32"
@@ -50,6 +106,10 @@ class Guard:
                 limit = float(np.broadcast_to(bound, action.shape)[i])
                 raise InvalidAction(f"action[{i}]: got {action[i]:g}, {name} the limit {limit:g}; see the contract")
         if self._max_step is not None and last is not None:
+            if last.shape != action.shape:
+                raise InvalidAction(
+                    f"action: got {action.shape} after {np.shape(last)}, want as many numbers as before"
+                )
             excess = np.abs(action.astype(np.float64) - last) - self._max_step
             if (excess > 0).any():
                 i = int(np.argmax(excess))
@@ -62,7 +122,7 @@ class Guard:
 def _bounds(
     name: str, stricter: Callable[[float, float], float], stated: float | None, own: float | np.ndarray | None
 ) -> np.ndarray | None:
-    """The stricter of both, as float32, in which actions come: 0.1 is let through where the bound is 0.1."""
+    """Return the stricter of both bounds as float32, the type of actions, so that a bound of 0.1 accepts 0.1."""
     given = [np.asarray(one, np.float32) for one in (stated, own) if one is not None]
     if not given:
         return None
@@ -72,13 +132,21 @@ def _bounds(
 
 
 class Watchdog:
-    """Calls `stop(reason)` once when something has been silent for too long, and again after it was heard meanwhile.
+    """A thread that stops the robot when a source, such as the server or the control loop, is silent for too long.
 
         Watchdog(robot.stop, {"server": 1.0, "loop": 0.2})  # s
 
-    It has a thread of its own, so that it also barks when the control loop hangs; `stop` is called on that
-    thread. Watching begins at `start` (or `with`), and a source counts as heard then. An error that `stop`
-    raises is kept in `error`, and the watchdog goes on watching.
+    `stop` is called once for each silence, on the watchdog's own thread, so that a control loop that hangs is noticed.
+    The time limits begin to run at `start` (or `with`). After a stop, `stopped` is true until `restart` is called, by a
+    person or by the control loop (see `run_loop`). If `stop` raises an exception, it is kept in `error`, and the
+    watchdog continues.
+
+    Args:
+        stop: Stops the robot; it gets the reason as text, which is also appended to `barks`.
+        silent_s: The sources by name, and how long each may be silent, s.
+
+    Raises:
+        ConfigError: A time limit is not above 0.
     """
 
     def __init__(self, stop: Callable[[str], None], silent_s: Mapping[str, float]) -> None:
@@ -91,11 +159,17 @@ class Watchdog:
         self._limits = dict(silent_s)
         self._heard = dict.fromkeys(silent_s, 0.0)
         self._barked: set[str] = set()
+        self._stopped = False
         self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
 
     def heard(self, name: str, ago_s: float = 0.0) -> None:
-        """`name` was heard `ago_s` seconds ago; one that is not watched is ignored."""
+        """Note a sign of life of a source.
+
+        Args:
+            name: The source; a name that is not watched is ignored.
+            ago_s: How long ago the sign was seen, s.
+        """
         at = time.monotonic() - ago_s
         heard = self._heard.get(name)
         if heard is None or at <= heard:
@@ -108,22 +182,39 @@ class Watchdog:
 
     @property
     def silent(self) -> list[str]:
-        """What it barked about and has not heard since."""
+        """The sources whose silence stopped the robot and that are still silent, by name."""
         with self._changed:
             return sorted(self._barked)
 
+    @property
+    def stopped(self) -> bool:
+        """Whether the robot was stopped and motion has not been restarted since."""
+        return self._stopped
+
+    def restart(self) -> bool:
+        """Allow motion again after a stop; may be called from any thread and from a signal handler.
+
+        Returns:
+            Whether motion is allowed. It is not while a source is silent (see `silent`); call this again afterwards.
+        """
+        with self._changed:
+            if not self._barked:
+                self._stopped = False
+            return not self._stopped
+
     def start(self) -> None:
-        """Watch from now on."""
+        """Start the thread and the time limits of all sources; does nothing if they run."""
         with self._changed:
             if self._thread is not None:
                 return
             self._heard = dict.fromkeys(self._limits, time.monotonic())
             self._barked.clear()
+            self._stopped = False
             self._thread = threading.Thread(target=self._watch, name="vlagents-ray-watchdog", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
-        """Watch no more. A `stop` under way is waited for."""
+        """End the thread, after a call of `stop` that is under way."""
         with self._changed:
             thread, self._thread = self._thread, None
             self._changed.notify_all()
@@ -150,11 +241,12 @@ class Watchdog:
                     name = min(waiting, key=lambda n: waiting[n]) if waiting else None
                     if name is not None and waiting[name] <= 0:
                         self._barked.add(name)
+                        self._stopped = True
                         reason = f"{name}: silent for {now - self._heard[name]:.2f} s"
                     else:
                         self._changed.wait(None if name is None else waiting[name])
             self.barks.append(reason)
             try:
                 self._stop(reason)
-            except Exception as error:  # noqa: BLE001 - the next silence must be noticed too
+            except Exception as error:  # noqa: BLE001 - the next silence must stop the robot as well
                 self.error = error

@@ -1,4 +1,4 @@
-"""A robot without hardware: what it takes to try the loop, the recording and a server."""
+"""A simulated robot, to try the control loop, recording and a server without hardware."""
 
 from __future__ import annotations
 
@@ -9,16 +9,19 @@ from vlagents_ray.interface import Obs
 
 _SIDE = 224  # px
 _DOT = 16
-_SMOOTHING = 0.5  # share of the way to its target that a joint goes in a tick
+_SMOOTHING = 0.5  # share of the distance to its target that a joint moves in a tick
 
 
 class SimulatedRobot:
-    """An arm whose joints follow their commands, and two cameras that see it as a dot on a still picture.
+    """An arm whose joints follow their commands, and whose cameras show it as a dot on a still image.
 
-    It takes what the policy's contract says: `dim` numbers, absolute targets or deltas of the joints, the
-    last of them the gripper if the contract says how it is opened. It gives the cameras, of the size, and the
-    parts of the state, which are joints, that the contract names; else `front`, `wrist` and `joints`.
+    Actions are those of the policy's contract: `dim` numbers, deltas of the joints or absolute targets (also if neither
+    is stated), the last of them the gripper if the contract states how it is opened. Observations have the cameras,
+    with their sizes, and the parts of the state, filled with the joints, that the contract names; without a contract
+    they have the cameras `front` and `wrist` and the part `joints`.
     """
+
+    simulated = True
 
     def __init__(self, contract: Contract | None = None) -> None:
         contract = contract or Contract()
@@ -34,7 +37,7 @@ class SimulatedRobot:
         self.stopped = False
 
     def observe(self) -> Obs:
-        """The state now; arrays of its own each time."""
+        """Return the current state, in new arrays each time."""
         self._joints = self._joints + _SMOOTHING * (self._target - self._joints)
         state = {
             name: np.resize(self._joints, dim if dim is not None else len(self._joints)).astype(np.float32)
@@ -43,16 +46,16 @@ class SimulatedRobot:
         return Obs({name: self._seen(still) for name, still in self._pictures.items()}, self._opening(), state)
 
     def apply(self, action: np.ndarray) -> None:
-        """Set the joints' targets, rad."""
+        """Set the targets of the joints, rad."""
         self.applied += 1
         self.stopped = False
-        if self._action.delta:
+        if self._action.relative:
             self._target = self._target + action
         else:
             self._target = action.copy()
 
     def stop(self) -> None:
-        """Stay where it is."""
+        """Make the current position of the joints their target."""
         self._target = self._joints.copy()
         self.stopped = True
 
@@ -74,7 +77,7 @@ class SimulatedRobot:
 
 
 def _picture(height: int, width: int) -> np.ndarray:
-    """Something that a camera might see, for the codecs: gradients with a little noise. (H, W, 3) uint8."""
+    """Make an image of gradients with a little noise, (H, W, 3) uint8, which codecs compress like a camera's."""
     y, x = np.mgrid[:height, :width]
     noise = np.random.default_rng(0).integers(0, 8, (height, width))
     return np.stack([x * 200 // width + noise, y * 200 // height + noise, (x + y) % 160 + noise], -1).astype(np.uint8)

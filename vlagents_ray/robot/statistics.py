@@ -9,11 +9,11 @@ import numpy as np
 Stats = dict[str, np.ndarray]  # "min", "max", "mean", "std", "count", "q01", ...
 
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
-_PIXEL_STRIDE = 4  # in both directions; LeRobot samples, too
+_PIXEL_STRIDE = 4  # in both directions; LeRobot samples pixels as well
 
 
 def of_values(values: np.ndarray) -> Stats:
-    """Of one episode's rows, (N, D) -> (D,) each; `count` is (1,)."""
+    """Compute the statistics of one episode's rows, (N, D) -> (D,) each; `count` is (1,)."""
     values = values.astype(np.float64)
     return {
         "min": values.min(0),
@@ -26,21 +26,21 @@ def of_values(values: np.ndarray) -> Stats:
 
 
 class ImageStatistics:
-    """Of one camera in one episode: by channel, of pixels in [0, 1], (3, 1, 1) each."""
+    """The statistics of one camera in one episode, by channel, of pixels in [0, 1], (3, 1, 1) each."""
 
     def __init__(self) -> None:
         self._counts = np.zeros((3, 256), np.int64)
         self._images = 0
 
     def add(self, image: np.ndarray) -> None:
-        """Count a part of the image's pixels, (H, W, 3) uint8."""
+        """Count a sample of the pixels of an image, (H, W, 3) uint8."""
         seen = image[::_PIXEL_STRIDE, ::_PIXEL_STRIDE]
         for channel in range(3):
             self._counts[channel] += np.bincount(seen[..., channel].ravel(), minlength=256)
         self._images += 1
 
     def result(self) -> Stats:
-        """As `of_values`."""
+        """Return the statistics of all images, with the keys of `of_values`."""
         levels = np.arange(256) / 255
         share = self._counts / self._counts.sum(1, keepdims=True)
         mean = share @ levels
@@ -60,7 +60,7 @@ class ImageStatistics:
 
 
 def joined(a: Mapping[str, Stats], b: Mapping[str, Stats]) -> dict[str, Stats]:
-    """Of both together; quantiles are averaged by count, as LeRobot does."""
+    """Combine the statistics of two sets of frames; quantiles are averaged by count, as LeRobot does."""
     return {key: _joined(a[key], b[key]) if key in a else b[key] for key in b}
 
 

@@ -1,48 +1,72 @@
-"""TCP ports that nobody listens on."""
+"""TCP ports: finding free ones, and reserving one for a server that starts later."""
 
 from __future__ import annotations
 
+import os
 import random
 import socket
+import time
 from collections import deque
+from typing import Any
 
 from vlagents_ray.errors import ConfigError
 
-LOOPBACK, EVERYWHERE = "127.0.0.1", "0.0.0.0"  # noqa: S104 - compared, and tried
-HOST = "VLAGENTS_RAY_HOST"  # in the environment of a replica: where its server listens, if not where Serve does
-_BLOCKS = (20_000, 24_000)
-_PORTS = (24_000, 32_700)  # of HAProxy and the like: below those that the system gives to whoever asks for any
-_given: deque[int] = deque(maxlen=4_000)  # the latest
-_kept: set[int] = set()
+LOOPBACK, EVERYWHERE = "127.0.0.1", "0.0.0.0"  # noqa: S104 - only compared, and bound for a moment
+HOST = "VLAGENTS_RAY_HOST"  # environment variable of a replica: its server's address, if not the one of Serve
+_BLOCKS = (20_000, 24_000)  # range of the ports for replicas
+_PORTS = (24_000, 32_700)  # range of the ports for HAProxy and others, below the system's ephemeral ports
+_CLAIMS = 256  # largest number of ports that this process claims at once, the latest ones
+_RELEASE_S = 2.0  # time limit for a server that is being replaced to close its port
+_claims: deque[int] = deque()  # descriptors of the claims; the kernel closes them with the process
+_kept: set[int] = set()  # ports that `free_port` never returns
 _random = random.SystemRandom()
 
 
 def free_port(host: str = LOOPBACK) -> int:
-    """A TCP port that nobody listens on at this moment, and none that was given lately or is kept.
+    """Return a TCP port that is free at the moment, and was neither returned recently nor passed to `keep`.
 
-    Whoever has that one may not listen yet. The system's own generator of random numbers draws, so
-    that processes which seed Python's alike do not draw the same ports.
+    The server for an earlier port may not listen yet, so this process claims each port that it returns. While this
+    process runs, and until it has returned `_CLAIMS` further ports, the function returns that port to no other process
+    on this machine. Ports are drawn with the system's random generator, so that processes with equal seeds for Python's
+    generator do not draw the same ports.
     """
     for _ in range(100):
         port = _random.randrange(*_PORTS)
-        if port not in _given and port not in _kept and is_free(host, port):
-            _given.append(port)
+        if port not in _kept and is_free(host, port) and _claim(port):
             return port
     raise ConfigError(f"no free port between {_PORTS[0]} and {_PORTS[1]}")
 
 
+def _claim(port: int) -> bool:
+    """Claim a port for this process; False if it is claimed already.
+
+    The claim is an abstract Unix socket named after the port, which the kernel lets only one process bind, and closes
+    when that process ends.
+    """
+    claim = socket.socket(socket.AF_UNIX)
+    try:
+        claim.bind(f"\0vlagents-ray-port-{port}")
+    except OSError:
+        claim.close()
+        return False
+    _claims.append(claim.detach())
+    if len(_claims) > _CLAIMS:
+        os.close(_claims.popleft())
+    return True
+
+
 def keep(*ports: int) -> None:
-    """These are somebody's, who may not listen yet: `free_port` gives them to nobody."""
+    """Exclude ports from `free_port`, since they belong to servers that may not listen yet."""
     _kept.update(ports)
 
 
 def free_ports(number: int) -> list[int]:
-    """Different ones, free on every address of this machine: HAProxy listens to all for its metrics and statistics."""
+    """Return distinct ports that are free on all addresses, as HAProxy's metrics and statistics listen on all."""
     return sorted(free_port(EVERYWHERE) for _ in range(number))
 
 
 def free_block(size: int) -> int:
-    """The first of `size` ports for the replicas; the first is free, and Ray steps over taken ones."""
+    """Return the first of `size` consecutive ports for the replicas; it is free, and Ray skips any others in use."""
     for _ in range(100):
         base = _random.randrange(*_BLOCKS, size)
         if is_free(LOOPBACK, base):
@@ -51,7 +75,7 @@ def free_block(size: int) -> int:
 
 
 def is_free(host: str, port: int) -> bool:
-    """Can this process listen there?"""
+    """Return whether this process can listen on that port."""
     with socket.socket() as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -59,3 +83,37 @@ def is_free(host: str, port: int) -> bool:
         except OSError:
             return False
         return True
+
+
+def reserve(name: str, host: str, port: int, timeout_s: float = _RELEASE_S) -> socket.socket:
+    """Return a socket that is bound to the port for the dialect `name`, and does not listen yet.
+
+    Raises:
+        ConfigError: Another process still uses the port after `timeout_s`, or this machine has no such address.
+    """
+    family, _, _, _, address = _resolve(name, host, port)
+    deadline = time.monotonic() + timeout_s
+    while True:
+        listener = socket.socket(family, socket.SOCK_STREAM)
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            listener.bind(address)
+        except OSError as error:
+            listener.close()
+            if time.monotonic() < deadline:
+                time.sleep(0.1)
+                continue
+            raise ConfigError(
+                f"{name}: cannot listen on {host}:{port} ({error.strerror}); choose another port or host "
+                f"in dialects.{name}"
+            ) from error
+        return listener
+
+
+def _resolve(name: str, host: str, port: int) -> Any:
+    try:
+        return socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)[0]
+    except OSError as error:
+        raise ConfigError(
+            f"{name}: {host!r} is no address of this machine ({error}); change dialects.{name}.host"
+        ) from error

@@ -1,194 +1,117 @@
-"""Sessions: one robot or one env each, with state of its own and shared weights.
+"""Sessions: each serves one robot or one env, with private state and shared weights.
 
-A policy is initialized once a replica. Every `reset` begins with a pristine copy of that
-initialized agent, so that neither another session nor the session's own past changes an episode.
-A copy shares what is heavy or cannot be copied and has its own of everything else:
-
-- shared: attributes named in `Agent.shared`, torch parameters, JAX arrays (immutable), functions,
-  classes, modules, and objects that refuse to be copied (locks, sockets, native handles);
-- shared and made read-only: numpy arrays over 64 MiB, so that writing into one raises instead of
-  leaking into other sessions;
-- copied: all other attributes, whatever their depth.
-
-A session can move to another replica of the same policy: what it has of its own travels, what it
-shares is found there again, by its place among the shared objects.
+The private state of a session is a copy of the loaded agent (`vlagents_ray.serve.models.agent_copies`). A session can
+move to another replica of the same policy, together with that copy.
 """
 
 from __future__ import annotations
 
-import hashlib
-import io
 import logging
-import pickle
-import sys
 import threading
 import time
-import types
-from collections import Counter
-from collections.abc import Callable, Container, Iterable
+from collections import Counter, OrderedDict
+from collections.abc import Callable, Container, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
-
-import numpy as np
+from typing import Generic, Protocol, TypeVar
 
 from vlagents_ray.errors import PolicyUnavailable, TooManyRequests, UnknownSession
 from vlagents_ray.interface import Agent
+from vlagents_ray.serve.queue.fair_queue import PendingRequest
+from vlagents_ray.serve.weights.versions import WeightsVersion
 
-if TYPE_CHECKING:
-    from vlagents_ray.serve.model import Model
-    from vlagents_ray.serve.waiting import Ticket
+M = TypeVar("M")  # type of a loaded model
 
 logger = logging.getLogger(__name__)
 
-SHARED_ARRAY_BYTES = 64 * 2**20
-_BY_REFERENCE = (types.FunctionType, types.BuiltinFunctionType, types.ModuleType, type, logging.Logger)
-_PLAIN = (
-    *(type(None), bool, int, float, complex, str, bytes, bytearray, list, tuple, dict, set, frozenset),
-    pickle.PickleBuffer,  # the inside of a numpy array
-)
+_REMEMBERED = 4096  # number of remembered sessions that left, whose older states are refused (some 500 bytes each)
+_ANY = 2**63  # number of moves with which a version is newer than any other state of its step
+_UNSEEN = 2**20  # largest number of acts at other replicas that neither the client nor this replica knows of
+_MOST_STEP = 2**62  # steps from here on are ignored if a client reports them
 
 
-class _Shared:
-    """The objects that the sessions of a replica share, in the order in which pickling met them."""
-
-    def __init__(self) -> None:
-        self.objects: list[Any] = []
-        self.refused: set[str] = set()
-        self._numbers: dict[int, int] = {}
-        torch = sys.modules.get("torch")
-        self._parameter: type | None = torch.nn.Parameter if torch is not None else None
-
-    def number(self, obj: Any) -> int | None:
-        """The place of an object, if it is shared."""
-        return self._numbers.get(id(obj))
-
-    def add(self, obj: Any) -> int:
-        """Share an object from now on."""
-        number = self._numbers.get(id(obj))
-        if number is None:
-            number = self._numbers[id(obj)] = len(self.objects)
-            self.objects.append(obj)
-        return number
-
-    def must_have(self, obj: Any) -> bool:
-        """Is this one that copies share whether named or not? A large array becomes read-only."""
-        if isinstance(obj, _BY_REFERENCE) or (self._parameter is not None and isinstance(obj, self._parameter)):
-            return True
-        if isinstance(obj, np.ndarray):
-            if obj.nbytes < SHARED_ARRAY_BYTES:
-                return False
-            obj.flags.writeable = False
-            return True
-        if type(obj).__module__.partition(".")[0] in ("jax", "jaxlib"):
-            return True
-        try:
-            obj.__reduce_ex__(pickle.HIGHEST_PROTOCOL)
-        except Exception:  # noqa: BLE001 - whatever an object raises when asked, it cannot be copied
-            self.refused.add(f"{type(obj).__module__}.{type(obj).__qualname__}")
-            return True
-        return False
-
-    def fingerprint(self) -> str:
-        """Equal in replicas whose shared objects correspond, place by place, as far as their kinds tell."""
-        kinds = [
-            (type(obj).__module__, type(obj).__qualname__, getattr(obj, "__qualname__", ""), str(_shape(obj)))
-            for obj in self.objects
-        ]
-        return hashlib.sha256(repr(kinds).encode()).hexdigest()
+class Outdated(UnknownSession):
+    """The replica has, or had, a state of the session that is at least as new as the arriving one."""
 
 
-class _Pickler(pickle.Pickler):
-    """Pickles an agent in memory, leaving out what is shared; with `found`, also what should be."""
-
-    def __init__(self, file: io.BytesIO, shared: _Shared, *, find: bool) -> None:
-        super().__init__(file, protocol=pickle.HIGHEST_PROTOCOL)
-        self._shared = shared
-        self._find = find
-
-    def persistent_id(self, obj: Any) -> int | None:
-        """The place of a shared object, or None for what is copied."""
-        number = self._shared.number(obj)
-        if number is None and self._find and type(obj) not in _PLAIN and self._shared.must_have(obj):
-            number = self._shared.add(obj)
-        return number
-
-
-class _Unpickler(pickle.Unpickler):
-    def __init__(self, data: bytes, shared: _Shared) -> None:
-        super().__init__(io.BytesIO(data))
-        self._objects = shared.objects
-
-    def persistent_load(self, pid: Any) -> Any:
-        return self._objects[pid]
-
-
-class AgentCopies:
-    """Makes copies of an initialized agent, each independent of the others."""
-
-    def __init__(self, agent: Agent) -> None:
-        self._shared = _Shared()
-        for item in agent.shared_objects():
-            if type(item) not in _PLAIN or item:
-                self._shared.add(item)
-        self._pristine = self._dump(agent, find=True)
-        self.fingerprint = self._shared.fingerprint()
-        if self._shared.refused:
-            logger.warning(
-                "%s: sessions share objects of %s, which cannot be copied; if one of them holds an episode's "
-                "state, create it in reset() instead of initialize()",
-                type(agent).__name__,
-                sorted(self._shared.refused),
-            )
-
-    def make(self) -> Agent:
-        """A pristine copy: what the agent was when `initialize` returned."""
-        return self.load(self._pristine)
-
-    def dump(self, agent: Agent) -> bytes:
-        """What a copy has of its own, for `load` in another replica; raises whatever pickling it raises."""
-        return self._dump(agent, find=False)
-
-    def load(self, data: bytes) -> Agent:
-        """The copy that `dump` wrote here, or in a replica with the same fingerprint."""
-        agent: Agent = _Unpickler(data, self._shared).load()
-        return agent
-
-    def _dump(self, agent: Agent, *, find: bool) -> bytes:
-        file = io.BytesIO()
-        _Pickler(file, self._shared, find=find).dump(agent)
-        return file.getvalue()
-
-
-def _shape(obj: Any) -> tuple[int, ...] | None:
-    shape = getattr(obj, "shape", None)
-    return tuple(shape) if isinstance(shape, tuple) else None
+Version = tuple[int, int]
+"""Version of a session's state: its step, and its number of moves. The greater version is the newer one."""
 
 
 @dataclass(slots=True)
-class Session:
-    """One robot's or env's side of a policy."""
+class Session(Generic[M]):
+    """The state of a policy for one robot or env."""
 
     id: str
-    agent: Agent | None = None  # None until its first `reset` succeeded
-    model: Model | None = None  # what `agent` is a copy of; `vlagents_ray.serve.models` and its room alone set it
-    over: bool = False  # in no table any more
-    resetting: Ticket | None = None  # its reset under way, as long as that waits for its checkpoint
-    owner: str = ""  # the connection that it ends with; empty: it ends when closed, or idle for long
-    steps: int = 0  # acts since its last reset
-    transport: str = ""  # the door that it came through
-    connection: str = ""  # that its last request came by, if one carries several sessions; else its own
-    used: float = field(default_factory=time.monotonic)
+    agent: Agent | None = None  # None until the first `reset` succeeded
+    model: M | None = None  # model of which `agent` is a copy; only the model manager and its cache set it
+    weights: WeightsVersion | None = None  # version of the model's weights with which it acts
+    follows: bool = True  # whether it takes the newest version of the weights, otherwise the pinned one
+    over: bool = False  # whether the session has ended, so that no table contains it
+    resetting: PendingRequest | None = None  # reset that waits for its checkpoint
+    owner: str = ""  # connection with which it ends; if empty, it ends when it is closed or idle for long
+    steps: int = 0  # step of its state: drawn at each reset, above all earlier steps, and incremented by each act
+    first: int = 0  # step drawn at the last reset that was run
+    expected: int = 0  # step drawn for the latest reset, which may still be queued
+    moves: int = 0  # number of moves between replicas since the last reset
+    announced: bool = False  # whether the other replicas know that it is here, so that they keep no older state
+    transport: str = ""  # transport of its last request
+    connection: str = ""  # connection of its last request, if that carries several sessions; otherwise its own
+    used: float = field(default_factory=time.monotonic)  # time of its last request, s
+
+    @property
+    def version(self) -> Version:
+        """Version of the session's state; a reset that is under way counts as completed."""
+        return max((self.steps, self.moves), (self.expected, 0))
+
+    def wrong_step(self, step: int) -> UnknownSession:
+        """Return the error for an act of another step, which would act twice or leave one out."""
+        return UnknownSession(
+            f"session {self.id!r}: is at step {self.steps} here, at {step} as its client knows; an answer was lost, "
+            f"or this is another episode: reset it"
+        )
 
 
-class SessionTable:
-    """The sessions of a replica, by id. Thread-safe."""
+class SessionFinder(Protocol):
+    """Fetches sessions from other replicas: `vlagents_ray.serve.scaling.session_migration.SessionMigrator`."""
 
-    def __init__(self, limit: int, idle_s: float) -> None:
-        self.ended: Callable[[Session], None] = lambda _: None  # called with each that is forgotten, under the lock
-        self._sessions: dict[str, Session] = {}
+    def fetch(self, session_id: str, then: Callable[[], None], caller: str = "") -> bool:
+        """Fetch a session, then call `then`, found or not; False without a call if `caller` has too many searches."""
+
+    def announce(self, session_id: str, step: int) -> None:
+        """Announce to the other replicas that the session began an episode here at that step, so theirs are older."""
+
+
+class SessionTable(Generic[M]):
+    """The sessions of a replica, by id. Thread-safe.
+
+    A session's state never goes back: a replica keeps the newest state that it has seen, and refuses older ones.
+    Steps are drawn from the wall clock, so that a step drawn at another replica exceeds all steps drawn before. A step
+    is always above those that the session's client and this replica have seen, even if the clocks are wrong.
+    """
+
+    def __init__(
+        self,
+        limit: int,
+        idle_s: float,
+        clock: Callable[[], int] = time.time_ns,
+        ended: Callable[[Session[M]], None] = lambda _: None,
+    ) -> None:
+        """Create an empty table.
+
+        Args:
+            limit: Largest number of sessions.
+            idle_s: Time without a request after which a session may be dropped, s.
+            clock: Wall clock, ns.
+            ended: Called with each session that is removed, under the table's lock.
+        """
+        self._ended = ended
+        self._sessions: dict[str, Session[M]] = {}
         self.limit = limit
-        self.opened = 0  # so far
+        self.opened = 0  # number of sessions opened so far
         self._idle_s = idle_s
+        self._clock = clock
+        self._drawn = 0  # latest step drawn
+        self._left: OrderedDict[str, Version] = OrderedDict()  # version by session up to which states are refused
         self._lock = threading.Lock()
 
     def __len__(self) -> int:
@@ -197,8 +120,8 @@ class SessionTable:
     def __contains__(self, session_id: str) -> bool:
         return session_id in self._sessions
 
-    def get(self, session_id: str) -> Session:
-        """The session, or `UnknownSession`."""
+    def get(self, session_id: str) -> Session[M]:
+        """Return the session, and mark it used; raises `UnknownSession` if it is not here."""
         session = self._sessions.get(session_id)
         if session is None:
             raise UnknownSession(
@@ -215,10 +138,19 @@ class SessionTable:
         transport: str = "",
         connection: str = "",
         quota: tuple[str, int | None] | None = None,
-    ) -> Session:
-        """The session, made if it is new, now `owner`'s; `PolicyUnavailable` when the replica is full.
+    ) -> Session[M]:
+        """Return the session, which is created if it is new.
 
-        `quota` says how many there may be whose names begin so; `TooManyRequests` for one more.
+        Args:
+            session_id: Id of the session.
+            owner: Connection with which the session ends; empty if it has none.
+            transport: Transport of the request.
+            connection: Connection of the request, if it carries several sessions.
+            quota: A prefix of session ids, and the largest number of sessions with it (None: no limit).
+
+        Raises:
+            PolicyUnavailable: The replica holds as many sessions as it may.
+            TooManyRequests: The quota is used up.
         """
         with self._lock:
             session = self._sessions.get(session_id)
@@ -238,6 +170,78 @@ class SessionTable:
         session.owner, session.transport, session.connection = owner, transport, connection
         return session
 
+    def begin(self, session: Session[M], known: int | None) -> int:
+        """Draw the step at which the session's next episode begins, above `known`, the step that its client reports."""
+        with self._lock:
+            before = max(session.version, self._left.get(session.id, (0, 0)))[0]
+            if known is not None and known < _MOST_STEP:
+                before = max(before, known)
+            self._drawn = max(self._clock(), self._drawn + 1)
+            session.expected = max(self._drawn, before + _UNSEEN)
+            return session.expected
+
+    def undo(self, session_id: str, first: int) -> None:
+        """Undo `begin` for a reset that was cancelled: the current episode continues, here or at another replica."""
+        with self._lock:
+            session = self._sessions.get(session_id)
+            if session is None or session.expected != first or session.steps == first:
+                return
+            session.expected = session.first
+            if session.steps == 0:  # the reset was the session's first one here
+                del self._sessions[session_id]
+                self._ended(session)
+
+    def is_past(self, session_id: str, first: int) -> bool:
+        """Return whether the session has passed an episode that was to begin at that step, here or elsewhere."""
+        with self._lock:
+            session = self._sessions.get(session_id)
+            return self._left.get(session_id, (0, 0))[0] >= first or (session is not None and session.steps > first)
+
+    def require_room(self, session_id: str) -> None:
+        """Raise `PolicyUnavailable` if the session is not here and the replica holds as many sessions as it may."""
+        with self._lock:
+            if session_id not in self._sessions and len(self._sessions) >= self.limit:
+                raise PolicyUnavailable(f"this replica holds {self.limit} sessions, its limit")
+
+    def enter(self, arriving: Session[M]) -> None:
+        """Add a session from another replica, in place of an older state of it.
+
+        Its old replica has released it already, so it is added even if the table has become full meanwhile.
+
+        Raises:
+            Outdated: This replica has, or had, a state that is at least as new.
+        """
+        with self._lock:
+            here = self._sessions.get(arriving.id)
+            newest = max(self._left.get(arriving.id, (0, 0)), (0, 0) if here is None else here.version)
+            if arriving.version <= newest:
+                raise Outdated(f"session {arriving.id!r}: a newer state of it is here, or has been; reset it")
+            if here is None:
+                self.opened += 1
+            else:
+                self._ended(here)
+            self._sessions[arriving.id] = arriving
+
+    def held(self, session_ids: Iterable[str]) -> dict[str, Version]:
+        """Return the versions of those sessions that are here and have an episode."""
+        with self._lock:
+            here = [self._sessions[session_id] for session_id in session_ids if session_id in self._sessions]
+            return {session.id: session.version for session in here if session.agent is not None}
+
+    def versions(self) -> dict[str, Version]:
+        """Return the versions of all sessions, including those whose first reset is under way."""
+        with self._lock:
+            return {session.id: session.version for session in self._sessions.values()}
+
+    def drop_older(self, steps: Mapping[str, int]) -> None:
+        """Close sessions with states before these steps, at which other replicas began episodes; refuse such states."""
+        with self._lock:
+            for session_id, step in steps.items():
+                session = self._sessions.get(session_id)
+                if session is not None and session.version < (step, 0):
+                    self._forget(session_id)
+                self._remember(session_id, (step - 1, _ANY))
+
     def _require_below(self, prefix: str, limit: int) -> None:
         if sum(name.startswith(prefix) for name in self._sessions) >= limit:
             self._drop_idle()
@@ -247,43 +251,56 @@ class SessionTable:
             )
 
     def close(self, session_id: str) -> None:
-        """Forget the session; unknown ids are none."""
+        """Close the session; unknown ids are ignored."""
         with self._lock:
             self._forget(session_id)
 
-    def close_owned(self, owner: str, session_ids: Iterable[str]) -> None:
-        """Forget those of the sessions that are still `owner`'s."""
+    def release(self, session_id: str, version: Version) -> bool:
+        """Release the session to another replica, which has a copy of that version; False if its version differs."""
+        with self._lock:
+            session = self._sessions.get(session_id)
+            if session is None or session.version != version:
+                return False
+            self._forget(session_id, version)
+            return True
+
+    def close_owned(self, connection: str, session_ids: Iterable[str]) -> None:
+        """Close those of the sessions that still end with the connection."""
         with self._lock:
             for session_id in session_ids:
                 session = self._sessions.get(session_id)
-                if session is not None and session.owner == owner:
+                if session is not None and session.owner == connection:
                     self._forget(session_id)
 
-    def close_those_of(self, model: Model) -> None:
-        """Forget all that act by that model."""
+    def close_those_of(self, model: M) -> None:
+        """Close all sessions of that model."""
         with self._lock:
             for session in [session for session in self._sessions.values() if session.model is model]:
                 self._forget(session.id)
 
+    def all(self) -> list[Session[M]]:
+        """Return all sessions. It takes no lock, so that callers may hold theirs."""
+        return list(self._sessions.values())
+
     def by_transport(self) -> dict[str, int]:
-        """How many came through which door."""
+        """Return the number of sessions by transport."""
         with self._lock:
             return Counter(session.transport for session in self._sessions.values())
 
     def by_connection(self, transports: Container[str], within_s: float) -> Counter[str]:
-        """How many of those that were used lately came by which connection, over these transports."""
+        """Return the number of sessions by connection, over these transports and used within the last `within_s`."""
         since = time.monotonic() - within_s
         with self._lock:
             sessions = list(self._sessions.values())
         return Counter(s.connection for s in sessions if s.transport in transports and s.used >= since)
 
     def ids(self) -> list[str]:
-        """All sessions."""
+        """Return the ids of all sessions."""
         with self._lock:
             return list(self._sessions)
 
     def drop_idle(self) -> None:
-        """Forget sessions that sent nothing for longer than the idle time."""
+        """Close sessions without a request for longer than the idle time."""
         with self._lock:
             self._drop_idle()
 
@@ -292,7 +309,13 @@ class SessionTable:
         for session_id in [s.id for s in self._sessions.values() if s.used < oldest]:
             self._forget(session_id)
 
-    def _forget(self, session_id: str) -> None:
+    def _forget(self, session_id: str, left: Version | None = None) -> None:
         session = self._sessions.pop(session_id, None)
         if session is not None:
-            self.ended(session)
+            self._remember(session_id, left or (session.steps, _ANY))
+            self._ended(session)
+
+    def _remember(self, session_id: str, version: Version) -> None:
+        self._left[session_id] = max(version, self._left.pop(session_id, version))
+        if len(self._left) > _REMEMBERED:
+            self._left.popitem(last=False)

@@ -1,5 +1,5 @@
-"""Slurm: evaluations and servers as jobs, and the hook for training scripts, which needs the light install only."""
+"""Evaluations and servers as Slurm jobs, and the hook for training scripts, which needs the light install only."""
 
-from vlagents_ray.slurm.hook import submit_evaluation
+from vlagents_ray.slurm.training_hook import submit_evaluation
 
 __all__ = ["submit_evaluation"]

@@ -19,7 +19,7 @@ srun --nodes="$SLURM_JOB_NUM_NODES" --ntasks="$SLURM_JOB_NUM_NODES" --ntasks-per
   --cpu-bind=none --kill-on-bad-exit=1 --wait=0 --open-mode=append --output="$logs/ray-%N.log" \
   "$python" -m vlagents_ray.slurm.node &
 ray=$!
-"$python" -m vlagents_ray.slurm.head "${arguments[@]}" &
+"$python" -m vlagents_ray.slurm.job_main "${arguments[@]}" &
 command=$!
 
 wait -n "$ray" "$command"

@@ -1,4 +1,4 @@
-"""Ray on one node of a job, as long as the step lasts: `python -m vlagents_ray.slurm.node`."""
+"""Runs Ray on one node of a job until the step ends: `python -m vlagents_ray.slurm.node`."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from types import FrameType
 from vlagents_ray.slurm.allocation import HEAD, Allocation
 
 _SHORT = "/tmp"  # noqa: S108 - the names of Ray's sockets are limited to 107 bytes
-_AT_ONCE = {"RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S": "0"}  # Ray would wait 30 s for work that nobody goes on with
-_HEAD_S = 120.0  # that the head may take to listen
+_AT_ONCE = {"RAY_GRACEFUL_SHUTDOWN_DRAIN_TIMEOUT_S": "0"}  # Ray would drain for 30 s, without use here
+_HEAD_S = 120.0  # time limit for the head to listen
 
 
 def main() -> int:
-    """Run it, and clean up behind it; returns its exit status at the head, whose end is the end of the step."""
+    """Run Ray and remove its files; the exit status of the head's Ray is that of the step."""
     allocation = Allocation.here()
     head = os.environ[HEAD]
     if allocation.node:
@@ -28,7 +28,7 @@ def main() -> int:
     environment = os.environ | {"AUTOSCALER_METRIC_PORT": str(allocation.ports.metrics), **_AT_ONCE}
     asked = threading.Event()
     with tempfile.TemporaryDirectory(prefix=f"vlr-{allocation.job}-", dir=_SHORT, ignore_cleanup_errors=True) as folder:
-        ray = subprocess.Popen(allocation.ray_start(head, folder), env=environment)  # noqa: S603 - made there
+        ray = subprocess.Popen(allocation.ray_start(head, folder), env=environment)  # noqa: S603 - our own command
 
         def end(_number: int, _frame: FrameType | None) -> None:
             asked.set()
@@ -39,11 +39,11 @@ def main() -> int:
     if asked.is_set():
         return 0
     sys.stdout.write(f"Ray ended with {status}\n")
-    return 0 if allocation.node else status  # without another node the job goes on with those that are left
+    return 0 if allocation.node else status  # the job continues without a node that is not the head
 
 
 def wait_for_head(host: str, port: int, timeout_s: float = _HEAD_S) -> None:
-    """Until Ray's head listens. Exits with what to look at if it does not in time."""
+    """Wait until Ray's head listens; after `timeout_s` the process exits with a message."""
     deadline = time.monotonic() + timeout_s
     while True:
         try:
@@ -51,7 +51,7 @@ def wait_for_head(host: str, port: int, timeout_s: float = _HEAD_S) -> None:
         except OSError as error:
             if time.monotonic() > deadline:
                 sys.exit(
-                    f"Ray's head at {host}:{port} is not there after {timeout_s:g} s ({error}); see its node's log"
+                    f"Ray's head at {host}:{port} does not listen after {timeout_s:g} s ({error}); see its node's log"
                 )
             time.sleep(0.5)
         else:

@@ -1,7 +1,7 @@
-"""One command line for two programs: which of its words are sbatch's.
+"""The split of a command line into the command's own arguments and options of sbatch.
 
-The rule: an option that the command itself knows is its own, every other one is sbatch's, by sbatch's names. What is no
-option belongs to the option before it or else to the command.
+An option that the command defines is its own; every other option is sbatch's. An argument that is not an option belongs
+to the option before it, or else to the command.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 from vlagents_ray.errors import ConfigError
 
-# Those of sbatch (22.05 to 24.11) that stand alone, or take a value only with "=".
+# Options of sbatch (22.05 to 24.11) without a value, or with a value after "=" only.
 _ALONE = {
     "contiguous", "exclusive", "get-user-env", "hold", "ignore-pbs", "nice", "no-kill", "no-requeue", "overcommit",
     "oversubscribe", "propagate", "quiet", "reboot", "requeue", "spread-job", "stepmgr", "test-only", "use-min-nodes",
@@ -24,21 +24,29 @@ _SHORT = {
     "m": "distribution", "o": "output", "p": "partition", "q": "qos", "s": "oversubscribe", "t": "time",
     "w": "nodelist", "x": "exclude",
 }  # fmt: skip
-# A Ray cluster is one process a node, started by the script.
+# The script starts one process of Ray on each node, so these options are refused.
 _OURS = {
     "ntasks": "--nodes and --cpus-per-task", "ntasks-per-node": "--nodes and --cpus-per-task", "n": "--nodes",
     "ntasks-per-gpu": "--gpus-per-node", "ntasks-per-core": "--cpus-per-task", "ntasks-per-socket": "--cpus-per-task",
-    "gpus-per-task": "--gpus-per-node", "wrap": "nothing of it: the script is written for you",
+    "gpus-per-task": "--gpus-per-node", "wrap": "no `--wrap`, as the script is written for you",
     "wait": "`squeue`, and --dependency in the jobs that wait", "W": "`squeue`, and --dependency in the jobs that wait",
     "input": "a deployment or a file of runs", "i": "a file of runs",
 }  # fmt: skip
 
 
 def split(words: Sequence[str], known: Mapping[str, bool]) -> tuple[list[str], dict[str, str | None]]:
-    """The command's own words, and sbatch's options by their long names (None: it stands alone).
+    """Split a command line.
 
-    `known`: the command's options ("--policy"), and whether each takes a value. `ConfigError` for words of
-    sbatch's that would not work.
+    Args:
+        words: The arguments.
+        known: The command's options ("--policy"), and whether each has a value.
+
+    Returns:
+        The command's own arguments, and sbatch's options by their long names; the value of an option without one is
+        None.
+
+    Raises:
+        ConfigError: An option of sbatch cannot be used here, or lacks its value.
     """
     own: list[str] = []
     sbatch: dict[str, str | None] = {}
@@ -60,17 +68,17 @@ def split(words: Sequence[str], known: Mapping[str, bool]) -> tuple[list[str], d
 
 
 def _sbatch(word: str, name: str, value: str | None) -> tuple[str, str | None]:
-    """The long name of an option of sbatch, and the value that is in the same word."""
+    """Return the long name of an option of sbatch, and its value in the same argument."""
     option = name[2:]
     if not word.startswith("--"):
         letter = word[1]
         option, value = _SHORT.get(letter, letter), word[2:] or None
     if option in _OURS:
-        raise ConfigError(f"{word}: sbatch's, but one Ray runs on each node; want {_OURS[option]}")
+        raise ConfigError(f"{word}: got an option that does not fit one Ray process on each node; want {_OURS[option]}")
     if not word.startswith("--") and len(option) == 1:
-        raise ConfigError(f"{word}: no option of this command, nor a short one of sbatch's that can be given here")
+        raise ConfigError(f"{word}: got an option that is neither this command's nor a short one of sbatch")
     if not re.fullmatch(r"[a-z][a-z0-9-]*", option):
-        raise ConfigError(f"{word}: got no option's name, want --NAME=VALUE")
+        raise ConfigError(f"{word}: got an invalid option name, want --NAME=VALUE")
     return option, value
 
 
@@ -82,7 +90,7 @@ def _next(words: Iterable[str], option: str) -> str:
 
 
 def first_index(array: str) -> str:
-    """The first task of an `--array`: "4-9%2" has 4."""
+    """Return the first task of an `--array`: 4 of "4-9%2"."""
     found = re.match(r"\d+", array)
     if found is None:
         raise ConfigError(f"--array: got {array!r}, want numbers, as in 0-15, 1,3,7 or 0-99%4")

@@ -1,4 +1,4 @@
-"""The script of a job: sbatch's options, what this job is, and `job.sh`, which is the same for all."""
+"""The script of a job: options of sbatch, settings of the job, and `job.sh`, which is the same for all jobs."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ from dataclasses import dataclass
 from pathlib import Path
 
 BODY = Path(__file__).with_name("job.sh")
-UNFINISHED = 75  # exit status of `vlagents-ray eval` that ran out of time: try again (EX_TEMPFAIL of sysexits.h)
+UNFINISHED = 75  # exit status of `vlagents-ray eval` when its time is over (EX_TEMPFAIL of sysexits.h)
 
 
 @dataclass(frozen=True, slots=True)
 class Script:
-    """A job. Its texts may hold %a, the number of a task of `--array`."""
+    """A job; its strings may contain %a, the number of a task of `--array`."""
 
     name: str
-    folder: Path  # of the script, and of the job's logs; on a file system that all nodes share
-    arguments: Sequence[str]  # of `vlagents_ray.slurm.head`
-    options: Mapping[str, str | None]  # of sbatch, over those that are set here
-    resubmit: int = 0  # times, when it ran out of time
-    setup: Path | None = None  # shell lines that come before everything else
+    folder: Path  # for the script and the job's logs, on a file system that all nodes share
+    arguments: Sequence[str]  # of `vlagents_ray.slurm.job_main`
+    options: Mapping[str, str | None]  # of sbatch; they override the defaults
+    resubmit: int = 0  # how often the job is submitted again when its time is over
+    setup: Path | None = None  # a file of shell lines that run first
 
     @property
     def file(self) -> Path:
-        """Where it is written to."""
+        """The file of the script."""
         return self.folder / f"{self.name}.sh"
 
     @property
     def log(self) -> str:
-        """Where sbatch is to write the job's output, by its pattern."""
+        """The file of the job's output, as a pattern of sbatch."""
         return self.options.get("output") or str(self.folder.absolute() / "%j.log")
 
     def text(self) -> str:
-        """As sbatch takes it."""
-        usual = {
+        """Return the content of the script."""
+        defaults = {
             "job-name": f"vlagents-ray-{self.name}",
             "nodes": "1",
             "ntasks-per-node": "1",
@@ -47,7 +47,7 @@ class Script:
         }
         words = [
             f"--{option}" if value is None else f"--{option}={_quoted(value)}"
-            for option, value in (usual | dict(self.options)).items()
+            for option, value in (defaults | dict(self.options)).items()
         ]
         settings = {
             "python": sys.executable,
@@ -69,5 +69,5 @@ class Script:
 
 
 def _quoted(value: str) -> str:
-    """For a line of #SBATCH, where double quotes keep a value together."""
+    """Quote a value with spaces for a line of #SBATCH."""
     return f'"{value}"' if any(sign.isspace() for sign in value) else value

@@ -1,4 +1,4 @@
-"""Hands scripts to sbatch."""
+"""The submission of scripts by sbatch."""
 
 from __future__ import annotations
 
@@ -12,28 +12,39 @@ from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.slurm.script import Script
 
 RECORD = "job.json"
-_KEPT = {"SLURM_CONF", "SLURM_CLUSTERS"}  # where Slurm is; the others are of the job that this process is in
+_KEPT = {
+    "SLURM_CONF",
+    "SLURM_CLUSTERS",
+}  # the location of Slurm; the others belong to this process's own job
 _SBATCH_S = 120.0
 
 
 class SubmissionFailed(VLAgentsError):
-    """sbatch took the job not; the message has its words."""
+    """sbatch rejected the job; the message quotes it."""
 
 
 def submit(script: Script) -> str:
-    """Write the script, have it queued, and return the job's number; all of that stands in `job.json` beside it.
+    """Write a script, submit it, and record the job in `job.json` beside the script.
 
-    `ConfigError` where there is no Slurm, `SubmissionFailed` if sbatch says no.
+    Args:
+        script: The script.
+
+    Returns:
+        The job's number.
+
+    Raises:
+        ConfigError: sbatch is not installed.
+        SubmissionFailed: sbatch rejected the job, or did not answer.
     """
     file = write(script)
     try:
-        done = subprocess.run(  # noqa: S603 - the user's own words
-            ["sbatch", "--parsable", str(file)],  # noqa: S607 - where the user has it
+        done = subprocess.run(  # noqa: S603 - the user's own arguments
+            ["sbatch", "--parsable", str(file)],  # noqa: S607 - found by PATH
             capture_output=True, text=True, check=False, timeout=_SBATCH_S, env=outside_of_jobs(os.environ),
         )  # fmt: skip
     except FileNotFoundError as error:
         raise ConfigError(
-            f"no sbatch here: run this where jobs are submitted, or take {file} (--print shows it) there"
+            f"sbatch is not installed here: run this where jobs are submitted, or copy {file} there (--print shows it)"
         ) from error
     except subprocess.TimeoutExpired as error:
         raise SubmissionFailed(f"sbatch {file}: no answer in {_SBATCH_S:g} s; look with `squeue --me`") from error
@@ -47,7 +58,7 @@ def submit(script: Script) -> str:
 
 
 def write(script: Script) -> Path:
-    """Write the script to its place; returns that."""
+    """Write a script to its file, and return the file."""
     file = script.file.absolute()
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(script.text())
@@ -56,8 +67,8 @@ def write(script: Script) -> Path:
 
 
 def outside_of_jobs(environ: Mapping[str, str]) -> dict[str, str]:
-    """The environment without what Slurm has set for a job that this process is part of, such as a training.
+    """Return the environment without the variables of the job to which this process belongs, such as a training.
 
-    sbatch hands its environment on, and steps of the new job would take those for their own options.
+    sbatch passes its environment on, and steps of the new job would read these variables as their options.
     """
     return {name: value for name, value in environ.items() if not name.startswith("SLURM_") or name in _KEPT}

@@ -1,4 +1,4 @@
-"""The suites that every policy and environment here passes, for your own as well.
+"""Test suites for policies and environments, which all those of this package pass and yours can use as well.
 
     from vlagents_ray.testing import check_agent, check_env
 
@@ -8,7 +8,7 @@
     def test_my_policy_keeps_its_contract():
         check_agent(MyPolicy())
 
-Each raises `ContractViolation` with the first thing that is wrong, and closes what it was given.
+Each raises `ContractViolation` with the first violation that it finds, and closes the agent or environment.
 """
 
 from vlagents_ray.testing.agents import check_agent

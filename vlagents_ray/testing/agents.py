@@ -1,4 +1,4 @@
-"""What an `Agent` promises, checked on an instance."""
+"""`check_agent`: a test suite for the interface of `Agent`."""
 
 from __future__ import annotations
 
@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.contract import Contract, check_action
+from vlagents_ray.contract import Contract
 from vlagents_ray.errors import InvalidAction
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.testing.comparing import ContractViolation, require_same, require_wireable
 from vlagents_ray.testing.observations import random_observation
+from vlagents_ray.validation import check_action
 
 _SESSIONS = 3
 
@@ -26,18 +27,21 @@ def check_agent(
     steps: int = 3,
     atol: float = 1e-5,
 ) -> None:
-    """Raise `ContractViolation` if `agent` breaks a promise of `Agent`; initializes and closes it.
+    """Check that an agent implements the interface of `Agent`; initializes and closes it.
 
-    Runs three sessions, copies of the initialized agent, with their own observation, instruction
-    and seed: each alone, then in turns, then in batches of 1, 2 and 3. None may notice the others.
+    Three sessions, copies of the initialized agent, run with an observation, an instruction and a seed each: one after
+    the other, then in turn, then in batches of 1, 2 and 3. Their actions must not depend on the other sessions.
 
     Args:
-        agent: an instance, not initialized yet.
-        obs: what the sessions see, in turn; by default random values that fit the contract.
-        instructions: what they are told, in turn.
-        reset_kwargs: for each `reset`, beside `seed`.
-        steps: calls of `act` a session.
-        atol: how far actions of a batch may be off those of a lone session.
+        agent: The agent, not initialized yet.
+        obs: The observations of the sessions, in turn; by default random values that fit the contract.
+        instructions: The instructions of the sessions, in turn.
+        reset_kwargs: Further arguments of each `reset`, beside `seed`.
+        steps: The number of calls of `act` in a session.
+        atol: The largest difference between an action in a batch and the same action of a session alone.
+
+    Raises:
+        ContractViolation: The agent does not implement the interface; the message says where.
     """
     agent.initialize()
     contract = agent.contract
@@ -88,7 +92,7 @@ def check_agent(
 
 
 class _Suite:
-    """Begins sessions and asks them, checking what goes in and what comes out."""
+    """Begins sessions and calls them, and checks their arguments and results."""
 
     def __init__(
         self,
@@ -105,7 +109,7 @@ class _Suite:
         self._reset_kwargs = reset_kwargs
 
     def begin(self, i: int) -> Agent:
-        """Session `i`: a copy of the agent that shares what the class says may be shared, reset."""
+        """Begin session `i`: copy the agent except for its shared objects, and reset the copy."""
         shared = {id(value): value for value in self._agent.shared_objects() if value is not None}
         try:
             session = copy.deepcopy(self._agent, dict(shared))

@@ -1,4 +1,4 @@
-"""What both suites need: their error, and comparisons that say where two values differ."""
+"""The error of both test suites, and comparisons that say where two values differ."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ _SCALARS = (bool, int, float, str, bytes)
 
 
 class ContractViolation(VLAgentsError):
-    """A policy or an environment does not do what its interface promises; the message says what."""
+    """A policy or an environment does not implement its interface; the message says where."""
 
 
 def require_wireable(value: object, where: str) -> None:
-    """Raise `ContractViolation` unless the wire can carry `value`."""
+    """Raise `ContractViolation` unless a message can carry `value`."""
     if value is None or type(value) in _SCALARS:
         return
     if isinstance(value, np.ndarray):
@@ -34,13 +34,23 @@ def require_wireable(value: object, where: str) -> None:
             require_wireable(item, f"{where}[{i}]")
     else:
         raise ContractViolation(
-            f"{where}: got {type(value).__module__}.{type(value).__qualname__}, which the wire cannot carry; "
+            f"{where}: got {type(value).__module__}.{type(value).__qualname__}, which a message cannot carry; "
             f"want None, bool, int, float, str, bytes, numpy arrays, lists and dicts of them"
         )
 
 
 def difference(a: object, b: object, where: str, atol: float = 0.0) -> str | None:
-    """Where `a` and `b` first differ, in words; None if they are the same."""
+    """Describe the first difference between two values.
+
+    Args:
+        a: A value: an `Obs`, an `Act`, an array, or a mapping or list of them.
+        b: The other value.
+        where: The values' name, for the description.
+        atol: The largest difference of numbers in arrays that count as equal.
+
+    Returns:
+        The description; None if the values are equal.
+    """
     a, b = _as_dict(a), _as_dict(b)
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         return _array_difference(a, b, where, atol)
@@ -60,7 +70,7 @@ def difference(a: object, b: object, where: str, atol: float = 0.0) -> str | Non
 def _as_dict(value: object) -> object:
     if isinstance(value, Obs):
         return {name: getattr(value, name) for name in ("cameras", "gripper", "state", "info")}
-    if isinstance(value, Act):  # without its info, which may hold times
+    if isinstance(value, Act):  # without its info, which may contain times
         return {"action": value.action, "done": value.done}
     return value
 
@@ -77,7 +87,7 @@ def _array_difference(a: np.ndarray, b: np.ndarray, where: str, atol: float) -> 
 
 
 def require_same(a: Any, b: Any, where: str, because: str, atol: float = 0.0) -> None:
-    """Raise `ContractViolation` with the difference and `because` unless `a` and `b` are the same."""
+    """Raise `ContractViolation` with the difference and the reason `because` unless two values are equal."""
     found = difference(a, b, where, atol)
     if found:
         raise ContractViolation(f"{found}; {because}")

@@ -1,4 +1,4 @@
-"""What an `EvalEnv` promises, checked on an instance."""
+"""`check_env`: a test suite for the interface of `EvalEnv`."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.contract import Contract, check_observation
+from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import EvalEnv
 from vlagents_ray.errors import InvalidAction, InvalidObservation
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.testing.comparing import ContractViolation, require_same, require_wireable
+from vlagents_ray.validation import check_observation
 
 
 def check_env(
@@ -25,18 +26,21 @@ def check_env(
     same_steps: bool = True,
     step_limit: bool = True,
 ) -> None:
-    """Raise `ContractViolation` if `env` breaks a promise of `EvalEnv`; closes it.
+    """Check that an environment implements the interface of `EvalEnv`; closes it.
 
-    Plays `steps` random actions in an episode of each of the two `seeds`, then the first again.
+    Random actions are executed in an episode of each of the two seeds, and then in the first episode again.
 
     Args:
-        env: an instance, not reset yet.
-        steps: actions an episode.
-        seeds: of two episodes that differ.
-        options: for each `reset`.
-        same_steps: the same actions must lead to the same observations, not only the same seed to
-            the same start; False for a simulator that is not reproducible to the bit.
-        step_limit: play one episode to `env.max_steps`; False if that takes too long.
+        env: The environment, not reset yet.
+        steps: The number of actions in an episode.
+        seeds: The seeds of two different episodes.
+        options: The options of each `reset`.
+        same_steps: Whether the same actions must lead to the same observations, and not only the same seed to the same
+            first observation; False for a simulator that is not reproducible to the bit.
+        step_limit: Whether one episode runs until `env.max_steps`; False if that takes too long.
+
+    Raises:
+        ContractViolation: The environment does not implement the interface; the message says where.
     """
     contract = _check_static(env)
     actions = _random_actions(contract, steps)
@@ -74,8 +78,8 @@ def check_env(
 @dataclass(slots=True)
 class _Rollout:
     instruction: str
-    given: list[Obs]  # as the env gave them
-    seen: list[Obs]  # copies made at once
+    given: list[Obs]  # the env's own objects
+    seen: list[Obs]  # copies of them, made at once
     outcomes: list[Any]
 
 
@@ -97,8 +101,8 @@ def _random_actions(contract: Contract, count: int) -> list[np.ndarray]:
     spec = contract.action
     low = -1.0 if spec.low is None else spec.low
     high = 1.0 if spec.high is None else spec.high
-    drawn = np.random.default_rng(0).uniform(low, high, (count, spec.dim or 1))
-    return list(drawn.astype(np.float32))
+    actions = np.random.default_rng(0).uniform(low, high, (count, spec.dim or 1))
+    return list(actions.astype(np.float32))
 
 
 def _rollout(
@@ -128,7 +132,7 @@ def _reset(env: EvalEnv, contract: Contract, seed: int, options: Mapping[str, An
     if not isinstance(env.instruction, str):
         raise ContractViolation(f"instruction: got {_kind(env.instruction)}, want a str")
     if contract.instruction and not env.instruction:
-        raise ContractViolation("instruction: is empty, but the contract says that the env gives one")
+        raise ContractViolation("instruction: is empty, but the contract states that the env has one")
     return obs
 
 
@@ -181,13 +185,13 @@ def _check_unseen(
     actions: list[np.ndarray],
     seen: _Rollout,
 ) -> None:
-    """Play what was `seen` again, with nobody looking before its last step."""
+    """Repeat the episode `seen` with `looked_at` False before the last step; only images may be absent."""
     _reset(env, contract, seed, options)
     last = len(seen.outcomes) - 1
     for i, (action, expected) in enumerate(zip(actions, seen.seen[1:], strict=False)):
         env.looked_at = i == last
         obs, reward, terminated, truncated, info = env.step(Act(action.copy()))
-        because = "whether anybody looks may spare images and change nothing else"
+        because = "`looked_at` may omit images and must change nothing else"
         a, b = (one if i == last else Obs({}, one.gripper, one.state) for one in (expected, obs))
         require_same(a, b, f"the observation after step {i}", because)
         outcome = [reward, terminated, truncated, info["success"]]

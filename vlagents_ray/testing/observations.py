@@ -1,4 +1,4 @@
-"""Observations for a policy that nobody has recorded any for."""
+"""Random observations, for policies without recorded ones."""
 
 from __future__ import annotations
 
@@ -16,13 +16,16 @@ _DIM = 7
 def random_observation(
     contract: Contract | None, seed: int, *, side: int = _SIDE, dims: Mapping[str, int] | None = None
 ) -> Obs:
-    """Values that fit `contract`; where it states nothing, one camera and one part of the proprioception.
+    """Make a random observation that fits a contract.
 
     Args:
-        contract: the policy's.
-        seed: equal seeds give equal observations.
-        side: of images for which any size will do, pixels.
-        dims: numbers in those parts of the proprioception for which the contract does not say.
+        contract: The policy's contract; if it states no cameras or state, the observation has one of each.
+        seed: The seed of the random generator.
+        side: Height and width of images whose size the contract does not state, pixels.
+        dims: The dimensions of parts of the proprioception that the contract does not state.
+
+    Returns:
+        The observation; equal seeds give equal observations.
     """
     rng = np.random.default_rng(seed)
     cameras: Mapping[str, CameraSpec] = {"front": CameraSpec()}

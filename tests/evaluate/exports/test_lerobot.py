@@ -2,22 +2,31 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import weakref
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import av
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from eval_fakes import LINE, OTHER_LINE
-from played import play
+from in_process_evaluation import play
+from scipy.spatial.transform import Rotation
+from wrist_roll_env import ROLLER, TILTED_ROLLER, Roller, Turner
 
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.dataset_contract import BYTES, INFO, STATISTICS, DatasetContract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
 from vlagents_ray.evaluate.exports import to_lerobot
-from vlagents_ray.evaluate.trajectory import Trajectory
 from vlagents_ray.policies.scripted import Scripted
+from vlagents_ray.robot.dataset import Dataset
+from vlagents_ray.robot.episode import Finished
 
 Config = Callable[..., EvalConfig]
 CAMERA = {"camera": [32, 48]}
@@ -65,15 +74,185 @@ def test_envs_that_differ_are_exported_one_by_one(config: Config, tmp_path: Path
     results = play(settings)
     with pytest.raises(ConfigError, match=r"has other features.*images.front.*--env"):
         to_lerobot(results, tmp_path / "both")
+    assert list(tmp_path.glob("both*")) == [], "the first env was written, and is no dataset of both"
     assert to_lerobot(results.only(env=OTHER_LINE), tmp_path / "one") == 1
 
 
 def test_without_trajectories_the_cure_is_said(config: Config, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="record: all"):
+    with pytest.raises(ConfigError, match=r"--record all or failures \(`record: all`"):
         to_lerobot(play(config(episodes=1)), tmp_path / "dataset")
+
+
+@pytest.mark.parametrize("end", ["npz", "mp4"])
+def test_a_file_that_is_gone_is_said_in_one_sentence(config: Config, tmp_path: Path, end: str) -> None:
+    results = play(config(episodes=2, record="all", env_options=CAMERA))
+    [gone] = (results.out / "trajectories").rglob(f"ep0001_*.{end}")
+    gone.unlink()
+    with pytest.raises(ConfigError, match=rf"{gone.name}: got no file, want .*; copy the folder again"):
+        to_lerobot(results, tmp_path / "dataset")
+    assert list(tmp_path.glob("dataset*")) == []
+
+
+def test_after_an_export_that_failed_the_same_command_works(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results = play(config(episodes=2, record="all"))
+    save, saved = Dataset.save, []
+
+    def disk_full_at_the_second(dataset: Dataset, episode: Finished) -> None:
+        if saved:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        saved.append(episode)
+        save(dataset, episode)
+
+    monkeypatch.setattr(Dataset, "save", disk_full_at_the_second)
+    with pytest.raises(OSError, match="No space"):
+        to_lerobot(results, tmp_path / "new" / "dataset")
+    assert list((tmp_path / "new").iterdir()) == []
+    monkeypatch.undo()
+    assert to_lerobot(results, tmp_path / "new" / "dataset") == 2
+
+
+def test_an_empty_folder_may_be_there_already(config: Config, tmp_path: Path) -> None:
+    (tmp_path / "dataset").mkdir()
+    assert to_lerobot(play(config(episodes=1, record="all")), tmp_path / "dataset") == 1
+    assert info(tmp_path / "dataset")["total_episodes"] == 1
+
+
+def test_trajectories_are_in_memory_one_at_a_time(
+    config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    results = play(config(episodes=4, record="all"))
+    load = Trajectory.load
+    loaded: list[weakref.ref[np.ndarray]] = []
+    alive: list[int] = []
+
+    def counted(path: Path) -> Trajectory:
+        trajectory = load(path)
+        actions = trajectory.actions
+        loaded.append(weakref.ref(actions if actions.base is None else actions.base))  # views keep the base alive
+        alive.append(sum(one() is not None for one in loaded))
+        return trajectory
+
+    monkeypatch.setattr(Trajectory, "load", counted)
+    assert to_lerobot(results, tmp_path / "dataset") == 4
+    assert max(alive) <= 2  # the last one, until the next one is read
 
 
 def test_nothing_is_written_into_a_folder_that_holds_something(config: Config, tmp_path: Path) -> None:
     results = play(config(episodes=1, record="all"))
     with pytest.raises(ConfigError, match="not empty"):
         to_lerobot(results, tmp_path)
+
+
+def info(root: Path) -> dict[str, Any]:
+    return dict(json.loads((root / "meta/info.json").read_text()))
+
+
+def rows(root: Path, number: int) -> dict[str, Any]:
+    return dict(pq.read_table(root / f"data/chunk-000/file-{number:03d}.parquet").to_pydict())
+
+
+def test_cameras_and_parts_of_the_state_are_chosen_in_that_order(config: Config, tmp_path: Path) -> None:
+    results = play(config(envs=[ROLLER], episodes=1, record="all"), Turner)
+    to_lerobot(results, tmp_path / "d", cameras=["wrist"], state=["gripper", "joints"])
+    features = info(tmp_path / "d")["features"]
+    assert [key for key in features if "images" in key] == ["observation.images.wrist"]
+    assert features["observation.state"]["names"] == ["gripper", "joints_0", "joints_1"]
+    assert {key for key in features if key.startswith("observation.state.")} == {"observation.state.joints"}
+    assert rows(tmp_path / "d", 0)["observation.state"][0] == pytest.approx([1.0, 0.1, 0.0])
+    assert not (tmp_path / "d/videos/observation.images.base").exists()
+
+
+@pytest.mark.parametrize(
+    ("chosen", "text"),
+    [
+        (
+            {"cameras": ["wrst"]},
+            r"cameras: .*Roller has no 'wrst', want some of \['base', 'wrist'\]; did you mean 'wrist'",
+        ),
+        ({"state": ["joints", "torque"]}, "state: .*Roller has no 'torque', want some of .*'gripper', 'joints'"),
+        ({"state": ["joints", "joints"]}, "each of them once"),
+    ],
+)
+def test_what_the_episodes_do_not_have_cannot_be_chosen(
+    config: Config, tmp_path: Path, chosen: dict[str, Any], text: str
+) -> None:
+    results = play(config(envs=[ROLLER], episodes=1, record="all"), Turner)
+    with pytest.raises(ConfigError, match=text):
+        to_lerobot(results, tmp_path / "d", **chosen)
+    assert not (tmp_path / "d").exists()
+
+
+def test_only_what_was_solved_goes_into_it(config: Config, tmp_path: Path) -> None:
+    results = play(config(envs=[ROLLER], episodes=4, record="all"), Turner)
+    assert to_lerobot(results, tmp_path / "all") == 4
+    assert to_lerobot(results, tmp_path / "solved", successes=True) == 2
+    assert all(any(rows(tmp_path / "solved", number)["next.success"]) for number in range(2))
+    unsolved = play(config(envs=[ROLLER], episodes=1, seed=1, record="all", out=tmp_path / "unsolved"), Turner)
+    with pytest.raises(ConfigError, match="in none of the 1 recorded episodes was the task solved"):
+        to_lerobot(unsolved, tmp_path / "none", successes=True)
+
+
+def test_an_episode_ends_where_nothing_moves_any_more_after_it_was_solved(config: Config, tmp_path: Path) -> None:
+    results = play(config(envs=[ROLLER], episodes=2, record="all"), Turner)
+    to_lerobot(results, tmp_path / "d", cut_idle=True)
+    first, second = rows(tmp_path / "d", 0), rows(tmp_path / "d", 1)
+    assert [action[0] for action in first["action"]] == pytest.approx([Roller.TURN] * 6 + [0.0])
+    assert first["next.done"] == [False] * 6 + [True]
+    assert first["next.success"][-1]
+    assert len(second["action"]) == Roller.max_steps, "it was not solved"
+
+
+def test_angles_are_written_without_jumps_and_info_says_about_what(config: Config, tmp_path: Path) -> None:
+    results = play(config(envs=[ROLLER], episodes=2, record="all"), Turner)
+    recorded = Trajectory.load(results.out / str(results.cells[0].episodes[0].trajectory)).state["xyzrpy"][:-1]
+    assert np.abs(np.diff(recorded[:, 3])).max() > np.pi
+    to_lerobot(results, tmp_path / "d")
+    angles = info(tmp_path / "d")[INFO]["angles"]
+    assert list(angles) == ["5"]  # joints, joints, x, y, z, roll: the other angles do not jump
+    written = rows(tmp_path / "d", 0)
+    roll = np.array(written["observation.state"])[:, 5]
+    assert np.abs(np.diff(roll)).max() == pytest.approx(Roller.TURN, abs=1e-5)
+    assert np.abs(roll - angles["5"]).max() < np.pi / 2
+    np.testing.assert_array_equal(np.array(written["observation.state.xyzrpy"])[:, 3], roll)
+    about = DatasetContract.from_json(info(tmp_path / "d")[INFO])
+    np.testing.assert_allclose(about.wrapped(np.insert(recorded, 0, [[0], [0]], axis=1))[:, 5], roll, atol=1e-6)
+
+
+def test_rotation_vectors_are_written_without_jumps_and_are_the_same_rotations(config: Config, tmp_path: Path) -> None:
+    results = play(config(envs=[TILTED_ROLLER], episodes=2, record="all"), Turner)
+    recorded = Trajectory.load(results.out / str(results.cells[0].episodes[0].trajectory)).state["xyz_axis_angle"][:-1]
+    assert np.linalg.norm(np.diff(recorded[:, 3:], axis=0), axis=1).max() > np.pi
+    to_lerobot(results, tmp_path / "d")
+    about = DatasetContract.from_json(info(tmp_path / "d")[INFO])
+    assert list(about.angles) == [5]
+    written = rows(tmp_path / "d", 0)
+    vectors = np.array(written["observation.state"])[:, 5:8]
+    assert np.linalg.norm(np.diff(vectors, axis=0), axis=1).max() == pytest.approx(Roller.TURN, abs=1e-5)
+    np.testing.assert_allclose(
+        Rotation.from_rotvec(vectors).as_matrix(), Rotation.from_rotvec(recorded[:, 3:]).as_matrix(), atol=1e-5
+    )
+    served = about.wrapped(
+        np.concatenate([np.zeros((len(recorded), 2)), recorded, np.ones((len(recorded), 1))], axis=1)
+    )
+    np.testing.assert_allclose(served[:, 5:8], vectors, atol=1e-6)
+    alone = np.array(written["observation.state.xyz_axis_angle"])
+    np.testing.assert_array_equal(alone, np.array(written["observation.state"])[:, 2:8])
+
+
+def test_the_contract_of_a_policy_goes_along_in_info_and_in_the_statistics(config: Config, tmp_path: Path) -> None:
+    results = play(config(envs=[ROLLER], episodes=2, record="all"), Turner)
+    to_lerobot(results, tmp_path / "d", cameras=["wrist"], state=["joints", "gripper"])
+    about = DatasetContract.from_json(info(tmp_path / "d")[INFO])
+    assert about.state == ("joints", "gripper")
+    assert about.cameras == {"observation.images.wrist": "wrist"}
+    assert about.contract == Contract(
+        cameras={"wrist": CameraSpec(16, 16)},
+        state={"joints": StateSpec(2, "rad")},
+        gripper=True,
+        action=ActionSpec(dim=2, delta=True, space="joint", gripper_open=1.0, gripper_closed=-1.0),
+        control_hz=10.0,
+    )
+    statistics = json.loads((tmp_path / "d/meta/stats.json").read_text())
+    assert DatasetContract.from_statistics(statistics[STATISTICS][BYTES]) == about

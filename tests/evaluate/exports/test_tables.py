@@ -12,13 +12,13 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 from eval_fakes import LINE, OTHER_LINE
-from played import play
+from in_process_evaluation import play
 
 from vlagents_ray.evaluate import EvalConfig, Results
-from vlagents_ray.evaluate.episode import EpisodeResult
+from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.exports import COLUMNS, to_csv, to_json, to_parquet
-from vlagents_ray.evaluate.jobs import plan
-from vlagents_ray.evaluate.store import Store
+from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.results.store import Store
 
 Config = Callable[..., EvalConfig]
 PAGE = Path(__file__).parents[3] / "docs" / "evaluation" / "results.md"

@@ -13,10 +13,12 @@ from typing import Any
 import psutil
 import pytest
 from eval_fakes import LINE
-from played import play
+from in_process_evaluation import play
 
 from vlagents_ray.evaluate import EvalConfig, Results
-from vlagents_ray.evaluate.trackers import Tracking
+from vlagents_ray.evaluate.trackers import TrackerFeed
+
+pytestmark = pytest.mark.torch
 
 Config = Callable[..., EvalConfig]
 
@@ -30,8 +32,8 @@ def told(config: Config) -> Callable[..., Results]:
         settings = config(track=[tracker], tracking={"project": "tests"}, **options)
         results = play(settings)
         for _ in range(2):
-            with Tracking(settings) as tracking:
-                tracking.look()
+            with TrackerFeed(settings) as tracking:
+                tracking.update()
         return results
 
     return tell

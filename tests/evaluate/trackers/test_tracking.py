@@ -9,11 +9,11 @@ from typing import ClassVar
 
 import pytest
 from eval_fakes import LINE, OTHER_LINE, ToZero
-from played import play
+from in_process_evaluation import play
 
 from vlagents_ray.errors import MissingDependency
 from vlagents_ray.evaluate import EvalConfig, evaluate
-from vlagents_ray.evaluate.trackers import Tracking, tracking
+from vlagents_ray.evaluate.trackers import TrackerFeed, tracking
 from vlagents_ray.evaluate.trackers.base import About, TrackerRun
 
 Config = Callable[..., EvalConfig]
@@ -59,8 +59,8 @@ def listening(monkeypatch: pytest.MonkeyPatch) -> None:
 def tell(config: EvalConfig) -> list[tuple[str, int | None, dict[str, float]]]:
     """What is told of the results as they are, and nothing of before."""
     Listener.told.clear()
-    with Tracking(config) as told:
-        told.look()
+    with TrackerFeed(config) as told:
+        told.update()
     return list(Listener.told)
 
 
@@ -122,7 +122,7 @@ def test_a_tracker_that_fails_is_a_warning_and_the_others_go_on(
     play(settings)
     assert len(tell(settings)) == 2
     [record] = caplog.records
-    assert record.getMessage() == "tensorboard: RuntimeError: no such project; it is told no more"
+    assert record.getMessage() == "tensorboard: RuntimeError: no such project; nothing more is logged to it"
 
 
 @pytest.mark.usefixtures("cluster")
@@ -140,4 +140,4 @@ def test_a_missing_package_is_said_before_anything_starts(config: Config, monkey
     monkeypatch.undo()
     monkeypatch.setitem(sys.modules, "wandb", None)
     with pytest.raises(MissingDependency, match=r"pip install 'vlagents-ray\[wandb\]'"):
-        Tracking(config(track=["wandb"]))
+        TrackerFeed(config(track=["wandb"]))

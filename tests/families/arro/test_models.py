@@ -14,7 +14,7 @@ from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.arro import Arro
 from vlagents_ray.policies.arro.parts import make_part
-from vlagents_ray.serve.sessions import AgentCopies
+from vlagents_ray.serve.models.agent_copies import AgentCopies
 
 PHRASES = [["red cube", "the bowl"], ["blue"], ["lift the red cube put on the bowl"]]
 SIZES = [(48, 64), (48, 64), (72, 56)]

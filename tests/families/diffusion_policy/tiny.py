@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.policies.base.accelerator import ensure_torchvision
-from vlagents_ray.policies.base.source import use_source
+from vlagents_ray.policies.base.model_code import use_source
 
 HORIZON, OBS_STEPS, ACTION_STEPS, OBS, ACTION, SIDE = 8, 2, 4, 4, 2, 48
 SCHEDULER = {

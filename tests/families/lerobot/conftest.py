@@ -15,7 +15,7 @@ import torch
 from tests.families.lerobot import tiny
 from vlagents_ray import Obs
 from vlagents_ray.policies.lerobot import LeRobot
-from vlagents_ray.serve.sessions import AgentCopies
+from vlagents_ray.serve.models.agent_copies import AgentCopies
 
 torch.set_num_threads(1)  # the models are too small for more: threads would wait for one another
 # Only a transformers with openpi's changes has this module, and only it runs pi0 and pi0.5.

@@ -4,35 +4,24 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
-import torch
 from eval_fakes import LINE
 from flat_config import flat_config
-from lerobot.datasets import lerobot_dataset
+from in_process_evaluation import play
+from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
-from played import play
 
+from vlagents_ray.dataset_contract import BYTES, STATISTICS, DatasetContract
+from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
 from vlagents_ray.evaluate.exports import to_lerobot
-from vlagents_ray.evaluate.trajectory import Trajectory
 
 
-def decode(path: Path, timestamps: list[float], tolerance_s: float, _backend: str) -> torch.Tensor:
-    """The pictures at these times, (N, 3, H, W) in [0, 1], which newer versions of torchvision do not give LeRobot."""
-    with av.open(str(path)) as container:
-        frames = [(float(frame.time), frame.to_ndarray(format="rgb24")) for frame in container.decode(video=0)]
-    nearest = [min(frames, key=lambda frame: abs(frame[0] - wanted)) for wanted in timestamps]
-    assert all(abs(found - wanted) < tolerance_s for (found, _), wanted in zip(nearest, timestamps, strict=True))
-    return torch.from_numpy(np.stack([image for _, image in nearest])).permute(0, 3, 1, 2) / 255
-
-
-def test_lerobot_reads_what_an_evaluation_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lerobot_dataset, "decode_video_frames", decode)
+def test_lerobot_reads_what_an_evaluation_recorded(tmp_path: Path) -> None:
     options = {"envs": [LINE], "episodes": 3, "env_options": {"camera": [32, 48], "state_dim": 2}}
     results = play(flat_config(**options, record="all", video="none", out=tmp_path / "out"))
     to_lerobot(results, tmp_path / "dataset")
-    dataset = LeRobotDataset("evaluation/line", root=tmp_path / "dataset", video_backend="pyav")
+    dataset = LeRobotDataset("evaluation/line", root=tmp_path / "dataset")
     assert (dataset.num_episodes, dataset.num_frames, dataset.fps) == (3, 30, 10)
     frames = iter(dataset)
     for episode in results.cells[0].episodes:
@@ -51,3 +40,19 @@ def test_lerobot_reads_what_an_evaluation_recorded(tmp_path: Path, monkeypatch: 
             assert 255 * float(image[0].mean()) == pytest.approx(20 * i, abs=6)
     assert dataset.meta.stats["action"]["count"] == [30]
     assert dataset.meta.features["action"]["spec"]["dim"] == 1
+
+
+def test_lerobots_tools_leave_out_episodes_and_merge_datasets_of_ours(tmp_path: Path) -> None:
+    datasets = []
+    for number, seed in enumerate((0, 10)):
+        options = {"envs": [LINE], "episodes": 3, "seed": seed, "env_options": {"camera": [32, 48], "state_dim": 2}}
+        results = play(flat_config(**options, record="all", video="none", out=tmp_path / f"out{number}"))
+        to_lerobot(results, tmp_path / f"dataset{number}")
+        datasets.append(LeRobotDataset(f"evaluation/line{number}", root=tmp_path / f"dataset{number}"))
+    merged = merge_datasets(datasets, "evaluation/merged", tmp_path / "merged")
+    assert merged.num_episodes == 6
+    [own, both] = [DatasetContract.from_statistics(one.meta.stats[STATISTICS][BYTES]) for one in (datasets[0], merged)]
+    assert own == both
+    fewer = delete_episodes(datasets[0], [1], tmp_path / "fewer", "evaluation/fewer")
+    assert fewer.num_episodes == 2
+    assert fewer.meta.stats["observation.state.position"]["mean"].shape == (2,), "by which the parts are told"

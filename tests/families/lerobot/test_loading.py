@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -56,6 +57,15 @@ def settings(**changed: Any) -> Change:
     return spoil
 
 
+def step(added: dict[str, Any]) -> Change:
+    def spoil(folder: Path) -> None:
+        file = folder / f"{POST}.json"
+        saved = json.loads(file.read_text())
+        file.write_text(json.dumps({**saved, "steps": [*saved["steps"], added]}))
+
+    return spoil
+
+
 @pytest.mark.parametrize(
     ("spoil", "text"),
     [
@@ -79,6 +89,8 @@ def settings(**changed: Any) -> Change:
         (settings(chunk_size="many"), "chunk_size"),
         (settings(use_peft=True), "merge_and_unload"),
         (settings(dim_model=64), "cannot load"),
+        (step({"class": "subprocess.Popen", "config": {"args": ["/bin/true"]}}), "trust_remote_code: true"),
+        (step({"class": "lerobot.processor.pipeline.importlib"}), "trust_remote_code: true"),
     ],
 )
 def test_a_spoilt_checkpoint_is_refused(spoil: Change, text: str, copied: Callable[[str], Path]) -> None:
@@ -86,6 +98,55 @@ def test_a_spoilt_checkpoint_is_refused(spoil: Change, text: str, copied: Callab
     spoil(folder)
     with pytest.raises(ConfigError, match=text):
         opened(folder)
+
+
+STEP_OF_ITS_OWN = """
+from pathlib import Path
+from lerobot.processor import ProcessorStep
+
+class Own(ProcessorStep):
+    def __init__(self, proof):
+        Path(proof).touch()
+    def __call__(self, transition):
+        return transition
+    def transform_features(self, features):
+        return features
+"""
+
+
+def test_a_step_of_the_checkpoints_own_runs_only_if_it_is_trusted(
+    copied: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    (tmp_path / "own_steps.py").write_text(STEP_OF_ITS_OWN)
+    folder, proof = copied("act"), tmp_path / "proof"
+    step({"class": "own_steps.Own", "config": {"proof": str(proof)}})(folder)
+    with pytest.raises(ConfigError, match=r"own_steps\.Own.*trust_remote_code: true"):
+        opened(folder)
+    assert "own_steps" not in sys.modules
+    assert not proof.exists()
+    opened(folder, trust_remote_code=True)
+    assert proof.exists()
+
+
+def test_a_step_that_takes_code_from_the_hub_by_itself_is_refused(
+    copied: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """LeRobot's own tokenizer of actions passes `trust_remote_code=True` with a name that the checkpoint gives."""
+    folder, proof, hub = copied("act"), tmp_path / "proof", tmp_path / "hub"
+    monkeypatch.setattr("transformers.dynamic_module_utils.HF_MODULES_CACHE", str(tmp_path / "modules"))
+    hub.mkdir()
+    (hub / "processor_config.json").write_text(
+        json.dumps({"processor_class": "Own", "auto_map": {"AutoProcessor": "own.Own"}})
+    )
+    (hub / "own.py").write_text(f"from pathlib import Path\nPath({str(proof)!r}).touch()\nclass Own: ...")
+    step({"registry_name": "action_tokenizer_processor", "config": {"action_tokenizer_name": str(hub)}})(folder)
+    with pytest.raises(ConfigError, match=r"Python code of the checkpoint.*trust_remote_code: true"):
+        opened(folder)
+    assert not proof.exists()
+    with pytest.raises(ConfigError, match="processors do not load"):  # it is no processor
+        opened(folder, trust_remote_code=True)
+    assert proof.exists()
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from pushed_weights import check_pushed_weights
 
 from tests.families.lerobot import tiny
 from tests.families.lerobot.conftest import FILTERS, TASKS, Load, Made, begun, view
@@ -132,3 +133,11 @@ def test_other_names_for_cameras_and_state(loaded: Load, made: Made) -> None:
     session = begun(loaded("act"))
     policy.reset(renamed, "go")
     np.testing.assert_array_equal(policy.act(renamed).action, session.act(plain).action)
+
+
+@pytest.mark.parametrize("kind", sorted(tiny.KINDS))
+def test_acts_with_pushed_weights(kind: str, made: Made) -> None:
+    policy = LeRobot.from_config({"checkpoint": str(made(kind))})
+    policy.initialize()
+    assert policy.parameters().keys() == policy.model.kind.policy.state_dict().keys()  # those of LeRobot's trainer
+    check_pushed_weights(policy, lambda: begun(policy, 1).act(view(1)).action)

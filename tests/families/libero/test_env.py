@@ -12,8 +12,9 @@ import pytest
 from libero_episodes import STILL, begin, fingerprint, play, world
 
 from vlagents_ray.contract import CameraSpec
+from vlagents_ray.envs.base import known_contract
 from vlagents_ray.envs.libero import Libero
-from vlagents_ray.envs.libero.protocol import SUITES
+from vlagents_ray.envs.libero.benchmark_protocol import SUITES
 from vlagents_ray.envs.libero.tasks import find_task
 from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, NotReset, UnknownEnv
 from vlagents_ray.interface import Act
@@ -106,6 +107,7 @@ def test_a_description_states_task_versions_and_protocol(bowl: Libero) -> None:
     assert facts["protocol"]["deviations"] == ["image_size: (64, 64), the protocol says (256, 256)"]
     assert facts["protocol"]["max_steps"] == bowl.max_steps == 220
     assert bowl.contract.cameras == {"front": CameraSpec(64, 64), "wrist": CameraSpec(64, 64)}
+    assert bowl.contract == known_contract("libero/libero_spatial/0", {"width": 64, "height": 64})
 
 
 @pytest.mark.parametrize("action", [np.zeros(6), np.zeros((2, 7)), np.full(7, np.nan)])

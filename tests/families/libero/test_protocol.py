@@ -9,7 +9,7 @@ import pytest
 
 from vlagents_ray.envs.libero import Libero
 from vlagents_ray.envs.libero.assets import find_assets
-from vlagents_ray.envs.libero.protocol import SUITES, Protocol
+from vlagents_ray.envs.libero.benchmark_protocol import SUITES, LiberoProtocol
 from vlagents_ray.envs.libero.robot import to_simulator
 from vlagents_ray.errors import EnvFailed, UnknownEnv
 
@@ -26,7 +26,7 @@ def test_the_step_limits_are_those_of_openpi_and_openvla() -> None:
 
 
 def test_the_conventions_of_an_episode_are_theirs_too() -> None:
-    protocol = Protocol.of("libero_10")
+    protocol = LiberoProtocol.of("libero_10")
     assert (protocol.settling_steps, protocol.settling_action) == (10, (0, 0, 0, 0, 0, 0, -1))
     assert protocol.image_size == (256, 256)
     assert protocol.cameras == {"front": "agentview", "wrist": "robot0_eye_in_hand"}
@@ -36,8 +36,8 @@ def test_the_conventions_of_an_episode_are_theirs_too() -> None:
 
 
 def test_what_a_user_changes_is_named_in_the_record() -> None:
-    assert Protocol.of("libero_goal").to_json("libero_goal")["deviations"] == []
-    changed = Protocol.of("libero_goal", simulator_seed=0, max_steps=10, settling_steps=None)
+    assert LiberoProtocol.of("libero_goal").to_json("libero_goal")["deviations"] == []
+    changed = LiberoProtocol.of("libero_goal", simulator_seed=0, max_steps=10, settling_steps=None)
     assert changed.to_json("libero_goal")["deviations"] == [
         "max_steps: 10, the protocol says 300",
         "simulator_seed: 0, the protocol says 7",
@@ -74,7 +74,7 @@ def test_a_gripper_in_a_policys_own_numbers_becomes_the_simulators(
     own: dict[str, float], commands: dict[float, int]
 ) -> None:
     """LIBERO's own, and OpenVLA's, whose evaluation takes -sign(2 g - 1)."""
-    protocol = Protocol.of("libero_spatial", **own)
+    protocol = LiberoProtocol.of("libero_spatial", **own)
     for said, command in commands.items():
         action = np.array([0.1, -0.2, 0.3, 0, 0, 0.5, said], np.float32)
         simulated = to_simulator(action, protocol)

@@ -12,8 +12,8 @@ from tests.families.openpi.marks import MARKS
 from vlagents_ray import Obs
 from vlagents_ray.errors import InvalidObservation, MissingCamera
 from vlagents_ray.interface import DELAY, LEFTOVER
+from vlagents_ray.serve.mapping.presets import presets
 from vlagents_ray.testing import check_agent
-from vlagents_ray.wire.presets import PRESETS
 
 pytestmark = MARKS
 
@@ -50,7 +50,7 @@ def theirs(kind: str, seed: int) -> dict[str, Any]:
 
 def seen(kind: str, seed: int, **info: Any) -> Obs:
     """The same, as it reaches the policy: through the mapping of that client."""
-    obs, _ = PRESETS[MAPPINGS[kind]].obs({**theirs(kind, seed), "prompt": "as reset says"})
+    obs, _ = presets()[MAPPINGS[kind]].obs({**theirs(kind, seed), "prompt": "as reset says"})
     obs.info.update(info)
     return obs
 
@@ -88,7 +88,7 @@ def test_it_keeps_what_an_agent_promises(loaded: Any, checkpoint: Any) -> None:
 
 def test_contracts_fit_the_mappings_of_their_clients(loaded: Any) -> None:
     for kind, mapping in MAPPINGS.items():
-        assert PRESETS[mapping].lacks(loaded(kind).contract) == []
+        assert presets()[mapping].lacks(loaded(kind).contract) == []
 
 
 def test_a_session_that_fails_leaves_its_neighbours_alone(loaded: Any) -> None:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.policies.base.source import use_source
+from vlagents_ray.policies.base.model_code import use_source
 from vlagents_ray.policies.openpi.training import FOLDERS, SOURCE
 
 use_source("openpi", SOURCE, within=FOLDERS)

@@ -19,7 +19,7 @@ from tests.families.openvla.upstream import module
 from vlagents_ray import Obs
 from vlagents_ray.errors import InvalidObservation, MissingCamera, MissingState
 from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
-from vlagents_ray.policies.openvla import pictures
+from vlagents_ray.policies.openvla import preprocessing
 from vlagents_ray.policies.openvla.oft import OpenVLAOFT
 from vlagents_ray.testing import check_agent
 
@@ -100,7 +100,10 @@ class Upstream:
     def act(self, obs: Obs, words: str, key: str = "bridge_orig") -> np.ndarray:
         """(8, 7)."""
         prompt = f"In: What action should the robot take to {words.lower()}?\nOut:"
-        images = [Image.fromarray(pictures.middle(pictures.resized(obs.cameras[name]))) for name in ("front", "wrist")]
+        images = [
+            Image.fromarray(preprocessing.middle(preprocessing.resized(obs.cameras[name])))
+            for name in ("front", "wrist")
+        ]
         both = [self.processor(prompt, image) for image in images]
         ranges = self.network.norm_stats[key]["proprio"]
         low, high = np.array(ranges["q01"]), np.array(ranges["q99"])

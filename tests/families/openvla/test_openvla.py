@@ -17,7 +17,7 @@ from tests.families.openvla.conftest import LIBRARIES, WORDS, begun, seen
 from tests.families.openvla.upstream import module
 from vlagents_ray.errors import InvalidObservation, MissingCamera
 from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
-from vlagents_ray.policies.openvla import pictures
+from vlagents_ray.policies.openvla import preprocessing
 from vlagents_ray.policies.openvla.policy import OpenVLA
 from vlagents_ray.testing import check_agent
 
@@ -136,7 +136,7 @@ def test_samples_share_their_sessions_prompt(policy: OpenVLA, monkeypatch: pytes
 def test_pictures_may_be_those_of_libero(loaded: Callable[..., Any]) -> None:
     cropping = loaded("openvla", center_crop=True)
     obs = seen(0)
-    want = cropping.model.pixels(pictures.middle(pictures.resized(obs.cameras["front"])))
+    want = cropping.model.pixels(preprocessing.middle(preprocessing.resized(obs.cameras["front"])))
     assert torch.equal(cropping.perceive(obs), want)
     assert not torch.equal(cropping.perceive(obs), loaded("openvla").perceive(obs))
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from pushed_weights import check_pushed_weights
 from safetensors.torch import load_file, save_file
 
 from tests.families.pi0 import tiny
@@ -233,3 +234,9 @@ def test_statistics_are_those_that_were_saved(whole: Path) -> None:
     policy = Pi0.from_config({"checkpoint": str(whole)})
     policy.initialize()
     assert (begun(policy, 0).act(seen(0)).action > 50).all()
+
+
+def test_it_acts_with_pushed_weights(folder: Path) -> None:
+    policy = Pi0.from_config({"checkpoint": str(folder)})
+    policy.initialize()
+    check_pushed_weights(policy, lambda: begun(policy, 0).act(seen(0)).action)

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 import pytest
-from playing import Always, play
+from in_process_episode import Always, play
 
 from vlagents_ray.contract import CameraSpec
 from vlagents_ray.envs.rcs import Rcs

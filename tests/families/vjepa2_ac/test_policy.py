@@ -16,7 +16,7 @@ from vlagents_ray import Act, Obs
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, MissingState
 from vlagents_ray.interface import DISTRIBUTION, GOAL_IMAGE, SAMPLES
 from vlagents_ray.policies.vjepa2_ac import VJepa2Ac
-from vlagents_ray.serve.sessions import AgentCopies
+from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.testing import check_agent
 
 pytestmark = [

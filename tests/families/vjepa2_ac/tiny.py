@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from vlagents_ray.policies.base.accelerator import ensure_torchvision
-from vlagents_ray.policies.base.source import use_source
+from vlagents_ray.policies.base.model_code import use_source
 
 SIDE, PATCH, WIDTH, HEADS = 32, 16, 48, 2
 SETTINGS: dict[str, Any] = {

@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 import pytest
-from in_process import Replicas
+from in_process_replicas import Replicas
 
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.contract import CameraSpec, Contract
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, NotReset
 from vlagents_ray.policies.arro import Arro
-from vlagents_ray.policies.arro.parts import Found
+from vlagents_ray.policies.arro.parts import Detection
 from vlagents_ray.policies.wrapper import build_agent
-from vlagents_ray.serve.sessions import AgentCopies
+from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.testing import check_agent
 
 BACKGROUND = (0, 0, 60)
@@ -56,8 +56,8 @@ class OwnDetector:
     def load(self) -> None:
         pass
 
-    def detect(self, images: Any, phrases: Any) -> list[list[Found]]:
-        return [[Found(asked[0], np.array(box, np.float32), 1.0) for box in self._boxes] for asked in phrases]
+    def detect(self, images: Any, phrases: Any) -> list[list[Detection]]:
+        return [[Detection(asked[0], np.array(box, np.float32), 1.0) for box in self._boxes] for asked in phrases]
 
 
 def arro(agent: Agent | None = None, **settings: Any) -> Any:

@@ -5,10 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import torch
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
+
+torch = pytest.importorskip("torch")
+pytestmark = pytest.mark.torch
 
 
 def test_a_step_takes_its_place_in_the_path(tmp_path: Path) -> None:

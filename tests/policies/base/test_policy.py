@@ -13,7 +13,7 @@ from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.errors import InvalidAction, InvalidObservation, MissingState, NotReset
 from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, Act
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
-from vlagents_ray.policies.base.observing import state_specs, state_vector
+from vlagents_ray.policies.base.model_inputs import state_specs, state_vector
 from vlagents_ray.testing import check_agent
 
 HORIZON, DIM = 4, 2

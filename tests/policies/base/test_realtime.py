@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from vlagents_ray.policies.base.policy import Row
 from vlagents_ray.policies.base.realtime import Guide
-from vlagents_ray.policies.base.row import Row
 
 HORIZON, DIM, STEPS = 8, 3, 10
 TARGET = 2.0  # of the model, for each number of each row

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.policies.base.source import use_source
+from vlagents_ray.policies.base.model_code import use_source
 
 NAME, VARIABLE = "model_of_somebody", "MODEL_OF_SOMEBODY_SRC"
 

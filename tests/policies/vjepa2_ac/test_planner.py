@@ -6,12 +6,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from scipy.spatial.transform import Rotation
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.vjepa2_ac import VJepa2Ac, VJepa2AcConfig
 from vlagents_ray.policies.vjepa2_ac.planner import DRAWN, moved, plan
+
+torch = pytest.importorskip("torch")
+pytestmark = pytest.mark.torch
 
 
 def config(**settings: Any) -> VJepa2AcConfig:

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import pytest
-from dialect_house import ALL, serving
+from dialect_server import ALL, serving
 from served_agents import Mirror
 from starlette.testclient import TestClient
 
-from vlagents_ray.serve.engine import Engine
+from vlagents_ray.serve.engine.engine import Engine
 
 
-@pytest.fixture(scope="module", name="house")
+@pytest.fixture(scope="module", name="context")
 def everything() -> Iterator[tuple[TestClient, Engine]]:
-    with serving(Mirror(chunk=2), ALL) as house:
-        yield house
+    with serving(Mirror(chunk=2), ALL) as context:
+        yield context

@@ -1,6 +1,6 @@
-"""What every script here needs: the line protocol, and an end that comes with the bench's.
+"""What every script here needs: the line protocol, and that it ends with the benchmark.
 
-A driver says one line of JSON when it is connected and warm. Then each line that it reads is a number
+A client writes one line of JSON when it is connected and warm. Then each line that it reads is a number
 of calls to make, which it answers with a JSON list of their milliseconds. The end of its standard input
 ends it, as does the death of its parent. Standard library and numpy only: it runs in other environments.
 """
@@ -33,14 +33,14 @@ def die_with_parent() -> None:
 
 
 def own_stdout() -> TextIO:
-    """The standard output for the protocol alone; what anything else prints goes to standard error."""
+    """Return the standard output, for the protocol alone; what anything else prints goes to standard error."""
     out = os.fdopen(os.dup(1), "w")
     os.dup2(2, 1)
     return out
 
 
 def end_with_stdin() -> None:
-    """In a server: end this process as soon as its standard input ends."""
+    """End this process, a server, as soon as its standard input ends."""
 
     def wait() -> None:
         while os.read(0, 4096):
@@ -51,7 +51,7 @@ def end_with_stdin() -> None:
 
 
 def timed(prepare: Callable[[], Any], call: Callable[[Any], object], calls: int) -> list[float]:
-    """Milliseconds of each of `calls` calls; what `prepare` does, making the observation, is not counted."""
+    """Make `calls` calls; returns the milliseconds of each, without those of `prepare`, which makes the observation."""
     taken = []
     for _ in range(calls):
         obs = prepare()
@@ -70,27 +70,27 @@ def obey(lines: Iterable[str], out: TextIO, measure: Callable[[int], list[float]
 
 
 def observation(path: str) -> dict[str, np.ndarray]:
-    """The bench's observation: `camera_0`, … (H, W, 3) uint8 RGB; `joints` (7,) float32; `gripper` () float64."""
+    """Load the observation: `camera_0`, … (H, W, 3) uint8 RGB; `joints` (7,) float32; `gripper` () float64."""
     with np.load(path, allow_pickle=False) as arrays:
         return {name: arrays[name] for name in arrays.files}
 
 
 def _stdin_has_ended() -> bool:
-    """Has whoever started this process gone? It may have before the kernel was asked to tell."""
+    """Return whether the parent of this process has ended, maybe before `die_with_parent` was called."""
     poller = select.poll()
     poller.register(0, select.POLLIN)
     return any(events & select.POLLHUP for _, events in poller.poll(0))
 
 
 def wait_for_port(host: str, port: int) -> None:
-    """Until somebody listens there; `TimeoutError` after a minute. Ends this process if its standard input ends."""
+    """Wait until a server listens there; `TimeoutError` after a minute. Ends this process if its input ends."""
     deadline = time.monotonic() + _START_S
     while True:
         try:
             socket.create_connection((host, port), timeout=5).close()
         except OSError:
             if time.monotonic() > deadline:
-                raise TimeoutError(f"nobody listens on {host}:{port}") from None
+                raise TimeoutError(f"no server listens on {host}:{port}") from None
             if _stdin_has_ended():
                 sys.exit(0)
             time.sleep(0.1)
@@ -103,9 +103,9 @@ def run(
     drive: Callable[[str, int, str, str, TextIO], None],
     evaluate: Callable[[str, int, dict[str, Any]], None] | None = None,
 ) -> None:
-    """The commands of a script: `serve HOST PORT`, `drive HOST PORT OBS.npz MODE`, `evaluate HOST PORT PLAN`.
+    """Run the command of a script: `serve HOST PORT`, `drive HOST PORT OBS.npz MODE`, `evaluate HOST PORT PLAN`.
 
-    PLAN is JSON; `evaluate` says a line when all its episodes are played and everything that it started has ended.
+    PLAN is JSON; `evaluate` writes a line when all its episodes are played and everything that it started has ended.
     """
     die_with_parent()
     out = own_stdout()

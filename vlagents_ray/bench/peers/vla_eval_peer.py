@@ -26,24 +26,24 @@ from vla_eval.model_servers.serve import serve as serve_forever
 from vla_eval.protocol.numpy_codec import set_image_format
 
 
-class Noop(PredictModelServer):
-    """Seven zeros."""
+class VlaEvalNoop(PredictModelServer):
+    """A model of vla-eval that answers each observation with seven zeros."""
 
     def predict(self, obs: dict[str, Any], ctx: Any) -> dict[str, Any]:
         return {"actions": np.zeros(7, np.float32)}
 
 
-class Tabletop(StepBenchmark):
+class VlaEvalTabletop(StepBenchmark):
     """The environment that all are measured with; each shard imports it by name."""
 
     def __init__(self, seed: int, env: dict[str, Any]) -> None:
-        from vlagents_ray.bench.noted import Noted
+        from benchmarks.environments import TimedTabletop
         from vlagents_ray.interface import Act
 
         super().__init__()
         set_image_format("raw")
         self._seed = seed
-        self._env, self._act = Noted(**env), Act
+        self._env, self._act = TimedTabletop(**env), Act
 
     def get_tasks(self) -> list[dict[str, Any]]:
         return [{"name": "tabletop"}]
@@ -65,7 +65,7 @@ class Tabletop(StepBenchmark):
 
 def serve(host: str, port: int) -> None:
     """As its `run_server` does."""
-    serve_forever(Noop(), host, port)
+    serve_forever(VlaEvalNoop(), host, port)
 
 
 def drive(host: str, port: int, path: str, mode: str, out: TextIO) -> None:
@@ -95,10 +95,10 @@ def drive(host: str, port: int, path: str, mode: str, out: TextIO) -> None:
 
 
 def evaluate(host: str, port: int, plan: dict[str, Any]) -> None:
-    """Server, shards, export."""
+    """Start the server, play the shards, and export their results."""
     folder = Path(plan["folder"])
     benchmark = {
-        "benchmark": "vla_eval_peer:Tabletop",
+        "benchmark": "vla_eval_peer:VlaEvalTabletop",
         "episodes_per_task": plan["episodes"],
         "max_steps": plan["env"]["max_steps"],
         "params": {"seed": plan["seed"], "env": plan["env"]},

@@ -30,7 +30,7 @@ NAME = "bench_noop"
 ENV = "bench_tabletop"
 
 
-class Noop(Agent):
+class VlagentsNoop(Agent):
     """Decodes the observation and returns seven zeros. `run-eval` names a device, whatever the policy."""
 
     def __init__(self, device: str | None = None, checkpoint_step: int | None = None) -> None:
@@ -41,14 +41,14 @@ class Noop(Agent):
         return self._single_step_act("robot", np.zeros(7, np.float32))
 
 
-class Tabletop(EvalEnv):
+class VlagentsTabletop(EvalEnv):
     """The environment that all are measured with."""
 
     def do_import(self) -> None:
-        from vlagents_ray.bench.noted import Noted
+        from benchmarks.environments import TimedTabletop
         from vlagents_ray.interface import Act
 
-        self._make, self._act = Noted, Act
+        self._make, self._act = TimedTabletop, Act
 
     def make_gym(self) -> Any:
         return self._make(**self.env_kwargs)
@@ -78,13 +78,13 @@ class Tabletop(EvalEnv):
         return self._last
 
 
-register_agent(NAME, Noop)
-register_env(ENV, Tabletop)
+register_agent(NAME, VlagentsNoop)
+register_env(ENV, VlagentsTabletop)
 
 
 def serve(host: str, port: int) -> None:
     """As `vlagents start-server` does."""
-    service = AgentService(Noop(), NAME)
+    service = AgentService(VlagentsNoop(), NAME)
     with service:
         rpyc.ThreadedServer(
             service, port=port, hostname=host, protocol_config={"allow_pickle": True, "allow_public_attrs": True}
@@ -92,7 +92,7 @@ def serve(host: str, port: int) -> None:
 
 
 def drive(host: str, port: int, path: str, mode: str, out: TextIO) -> None:
-    """Its own client."""
+    """Drive the server with vlagents' own client."""
     arrays = peer.observation(path)
     cameras = {name: image for name, image in arrays.items() if name.startswith("camera_")}
 

@@ -4,8 +4,8 @@
         obs, _ = env.reset(seed=0, options={"init_state": 3})
         obs, reward, terminated, truncated, info = env.step(Act(action=np.zeros(7, np.float32)))
 
-The protocol is in `protocol.py`, in one place. The scenes' meshes and textures come with no package:
-`Libero.missing()` says how to get them.
+The protocol is in `benchmark_protocol.py`. The scenes' meshes and textures are in no package: `Libero.missing()` says
+how to download them.
 """
 
 from vlagents_ray.envs.libero.env import Libero

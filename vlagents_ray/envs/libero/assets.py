@@ -1,4 +1,4 @@
-"""Where LIBERO's meshes and textures are. Nothing here downloads them."""
+"""The location of LIBERO's meshes and textures, which nothing here downloads."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import hashlib
 import os
 from pathlib import Path
 
-from vlagents_ray.envs.libero import package
+from vlagents_ray.envs.libero import import_libero
 from vlagents_ray.errors import EnvFailed
 
 VARIABLE = "LIBERO_ASSETS"
@@ -21,12 +21,19 @@ CURE = (
 
 
 def find_assets(chosen: str | None = None) -> Path:
-    """The folder: `chosen`, else what `LIBERO_ASSETS` names, else where hf-libero itself looks.
+    """Find the folder of the assets: `chosen`, or the one that `LIBERO_ASSETS` names, or that of hf-libero itself.
 
-    Raises `EnvFailed`, with the command that gets them, if there is none or it lacks a part.
+    Args:
+        chosen: The folder in the env's options; None if it has none.
+
+    Returns:
+        The folder.
+
+    Raises:
+        EnvFailed: There is no such folder, or it lacks a part; the message has the command for the download.
     """
     named = chosen or os.environ.get(VARIABLE)
-    places = [Path(named)] if named else [package.root() / "assets", Path.home() / _CACHE]
+    places = [Path(named)] if named else [import_libero.root() / "assets", Path.home() / _CACHE]
     folder = next((place for place in places if place.is_dir()), None)
     if folder is None:
         looked = " and ".join(str(place) for place in places)
@@ -38,6 +45,6 @@ def find_assets(chosen: str | None = None) -> Path:
 
 
 def digest(folder: Path) -> str:
-    """A short name for what is in `folder`: equal for equal relative paths and sizes of all files."""
+    """Return a digest of a folder, which is equal if relative paths and sizes of all files are."""
     files = sorted((str(path.relative_to(folder)), path.stat().st_size) for path in folder.rglob("*") if path.is_file())
     return hashlib.sha256(repr(files).encode()).hexdigest()[:16]

@@ -14,11 +14,11 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import EvalEnv, one_row
 from vlagents_ray.envs.libero import assets as asset_files
 from vlagents_ray.envs.libero import robot
-from vlagents_ray.envs.libero.protocol import Protocol
-from vlagents_ray.envs.libero.tasks import find_task, read_states, task_names
-from vlagents_ray.envs.libero.world import Seen, World
-from vlagents_ray.envs.probe import egl_probe, failing
+from vlagents_ray.envs.libero.benchmark_protocol import LiberoProtocol
+from vlagents_ray.envs.libero.simulation import LiberoSimulation, SimulatorObs
+from vlagents_ray.envs.libero.tasks import find_task, read_states, require_suite, task_names
 from vlagents_ray.envs.recording import record_size_of
+from vlagents_ray.envs.rendering.render_probe import egl_probe, failing
 from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
 from vlagents_ray.interface import HIGH_RES, Act, Obs
 
@@ -27,7 +27,7 @@ class Libero(EvalEnv):
     """One environment of one LIBERO task, e.g. "libero_spatial/0".
 
     Observation: cameras "front" (LIBERO's agentview) and "wrist" (its eye in hand), turned as policies
-    expect it, see `Protocol`; in `state` what policies for LIBERO take: `xyz_axis_angle` (6,), the end
+    expect it, see `LiberoProtocol`; in `state` what policies for LIBERO take: `xyz_axis_angle` (6,), the end
     effector in the world's frame, whose axes are the robot base's, m and rad, the angle in [0, 2 pi] as
     robosuite's quaternion gives it; `gripper_qpos` (2,) m, of the fingers; and `joints` (7,) rad. In
     `info["sim_state"]`, for scripted experts only: `positions` of objects (3,) m in the world's frame, and
@@ -57,22 +57,28 @@ class Libero(EvalEnv):
         instruction: str | None = None,
         assets: str | None = None,
     ) -> None:
-        """Raises `UnknownEnv`, `ConfigError`, `MissingDependency`, or `EnvFailed` with its cure.
+        """Make the environment.
 
         Args:
             task: "SUITE/NUMBER", or "SUITE/NAME" with LIBERO's name.
-            width: of each image, pixels.
-            height: of each image, pixels.
-            record_size: (height, width) of further views of each camera, for the record alone.
+            width: Width of each image, pixels.
+            height: Height of each image, pixels.
+            record_size: (height, width) of further views of each camera, for recordings only.
             max_steps: None is the protocol's for the suite.
             settling_steps: None is the protocol's.
-            simulator_seed: of what an initial state leaves open; None is the protocol's.
-            stop_at_success: report `terminated` when the task is solved.
-            gripper_open: the action's last number that opens the gripper; None is LIBERO's -1. OpenVLA
+            simulator_seed: Seed of whatever an initial state leaves open; None is the protocol's.
+            stop_at_success: Report `terminated` when the task is solved.
+            gripper_open: The action's last number that opens the gripper; None is LIBERO's -1. OpenVLA
                 says 1, and 0 to close, which openvla's evaluation turns into LIBERO's as this does.
-            gripper_closed: the one that closes it; None is LIBERO's 1.
+            gripper_closed: The one that closes it; None is LIBERO's 1.
             instruction: None is the task's own.
-            assets: the folder with LIBERO's meshes and textures; None is what LIBERO_ASSETS names.
+            assets: The folder with LIBERO's meshes and textures; None is what LIBERO_ASSETS names.
+
+        Raises:
+            UnknownEnv: There is no such task.
+            ConfigError: An option has a wrong value.
+            MissingDependency: The simulator is not installed.
+            EnvFailed: The simulator or its assets cannot be loaded.
         """
         for name, value in (("width", width), ("height", height), ("max_steps", max_steps)):
             if value is not None and value < 1:
@@ -82,7 +88,7 @@ class Libero(EvalEnv):
             raise ConfigError(f"libero/{task}: settling_steps is {settling_steps}, want 0 or more")
         self._task = find_task(task)
         self._assets = asset_files.find_assets(assets)
-        self._protocol = Protocol.of(
+        self._protocol = LiberoProtocol.of(
             self._task.suite,
             image_size=(height, width),
             max_steps=max_steps,
@@ -97,12 +103,18 @@ class Libero(EvalEnv):
         self.max_steps = self._protocol.max_steps
         self._instruction = instruction or self._task.language
         self._steps: int | None = None
-        self._world: World | None = None
+        self._world: LiberoSimulation | None = None
         self._contract = robot.contract(self._protocol)
         with failing(self._name, "make"):
             self._states = read_states(self._task.states)
-            self._world = World(self._task, self._protocol, self._assets, record)
+            self._world = LiberoSimulation(self._task, self._protocol, self._assets, record)
         self.init_states = len(self._states)
+
+    @classmethod
+    def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
+        size = (arguments["height"], arguments["width"])
+        grippers = {name: arguments[name] for name in ("gripper_open", "gripper_closed")}
+        return robot.contract(LiberoProtocol.of(arguments["task"].partition("/")[0], image_size=size, **grippers))
 
     @property
     def contract(self) -> Contract:
@@ -113,7 +125,7 @@ class Libero(EvalEnv):
         return self._instruction
 
     def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
-        """Begin in the initial state `options["init_state"]`, or the one that the seed chooses."""
+        """Begin an episode in the initial state `options["init_state"]`, or in one chosen by the seed."""
         world, state = self._alive(), self._initial(seed, options or {})
         with failing(self._name, "reset"):
             seen = world.begin(self._states[state])
@@ -132,6 +144,10 @@ class Libero(EvalEnv):
         truncated = not ended and self._steps >= self.max_steps
         obs = self._observe(seen, look=self.looked_at)
         return obs, float(seen.success), ended, truncated, {"success": seen.success}
+
+    @classmethod
+    def require_task(cls, task: str | None) -> None:
+        require_suite(task or "")
 
     @classmethod
     def tasks(cls) -> list[str]:
@@ -181,7 +197,7 @@ class Libero(EvalEnv):
             raise ConfigError(f"{self._name}: init_state is {state!r}, want 0 to {count - 1}")
         return state
 
-    def _observe(self, seen: Seen, *, look: bool = True) -> Obs:
+    def _observe(self, seen: SimulatorObs, *, look: bool = True) -> Obs:
         world, cameras = self._alive(), self._protocol.cameras if look else {}
         info: dict[str, Any] = {"sim_state": {"positions": world.positions(), "goal": world.goal}}
         if seen.views and look:
@@ -194,7 +210,7 @@ class Libero(EvalEnv):
     def _name(self) -> str:
         return f"libero/{self._task.full_name}"
 
-    def _alive(self) -> World:
+    def _alive(self) -> LiberoSimulation:
         if self._world is None:
             raise EnvFailed(f"{self._name} is closed; make a new one")
         return self._world

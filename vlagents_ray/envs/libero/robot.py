@@ -1,4 +1,4 @@
-"""What LIBERO's robot feels, and what it takes: a Panda arm under robosuite's OSC_POSE."""
+"""The state and actions of LIBERO's robot, a Panda arm under robosuite's OSC_POSE."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
-from vlagents_ray.envs.libero.protocol import Protocol
+from vlagents_ray.envs.libero.benchmark_protocol import LiberoProtocol
 
 _OPEN_M = 0.04  # a finger's travel from closed to open
 
 
-def contract(protocol: Protocol) -> Contract:
-    """What an env under `protocol` gives and takes; names and units are those of policies for LIBERO."""
+def contract(protocol: LiberoProtocol) -> Contract:
+    """Return the contract of an env under a protocol; names and units are those of policies for LIBERO."""
     return Contract(
         cameras={name: CameraSpec(*protocol.image_size) for name in protocol.cameras},
         state={
@@ -41,7 +41,7 @@ def contract(protocol: Protocol) -> Contract:
 
 
 def read(raw: Mapping[str, Any]) -> tuple[dict[str, np.ndarray], float]:
-    """From robosuite's observation the state, each part (D,) float32, and the gripper in [0, 1], 1 = open."""
+    """Return the state in robosuite's observation, each part (D,) float32, and the gripper in [0, 1], 1 = open."""
     fingers = raw["robot0_gripper_qpos"]
     pose = np.concatenate([raw["robot0_eef_pos"], axis_angle(raw["robot0_eef_quat"])])
     state = {"xyz_axis_angle": pose, "gripper_qpos": fingers, "joints": raw["robot0_joint_pos"]}
@@ -49,7 +49,7 @@ def read(raw: Mapping[str, Any]) -> tuple[dict[str, np.ndarray], float]:
     return {name: part.astype(np.float32) for name, part in state.items()}, gripper
 
 
-def to_simulator(action: np.ndarray, protocol: Protocol) -> np.ndarray:
+def to_simulator(action: np.ndarray, protocol: LiberoProtocol) -> np.ndarray:
     """An action under `protocol`, (7,), as robosuite takes it: the gripper -1 to open, 1 to close, 0 to stay.
 
     Closer to `gripper_open` means open, as in openvla's evaluation, which binarises, and as robosuite's own

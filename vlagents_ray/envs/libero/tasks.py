@@ -9,15 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.envs.libero import package
-from vlagents_ray.envs.libero.protocol import SUITES
+from vlagents_ray.envs.libero import import_libero
+from vlagents_ray.envs.libero.benchmark_protocol import SUITES
 from vlagents_ray.errors import UnknownEnv
+from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import require
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
-    """One task of a suite."""
+class LiberoTask:
+    """A task of a suite of LIBERO."""
 
     suite: str
     number: int  # in the suite, as openpi and OpenVLA count
@@ -28,7 +29,7 @@ class Task:
 
     @property
     def full_name(self) -> str:
-        """As in `Libero.tasks()`, e.g. "libero_object/7"."""
+        """The task's name in `Libero.tasks()`, e.g. "libero_object/7"."""
         return f"{self.suite}/{self.number}"
 
 
@@ -37,12 +38,23 @@ def task_names() -> list[str]:
     return [f"{name}/{number}" for name, suite in SUITES.items() for number in range(suite.tasks)]
 
 
-def find_task(name: str) -> Task:
-    """The task `name`, "SUITE/NUMBER" or "SUITE/NAME"; imports LIBERO. Raises `UnknownEnv`."""
+def require_suite(name: str) -> tuple[str, str]:
+    """Suite and task of "SUITE/NUMBER" or "SUITE/NAME"; `UnknownEnv` for an unknown suite, or too large a number."""
     suite, _, which = name.partition("/")
     if suite not in SUITES:
-        raise UnknownEnv(f"libero has no suite {suite!r}: want one of {sorted(SUITES)}, as in 'libero_spatial/0'")
-    root = package.load()
+        raise UnknownEnv(
+            f"libero has no suite {suite!r}: want one of {sorted(SUITES)}, as in 'libero_spatial/0'"
+            f"{did_you_mean(suite, SUITES)}"
+        )
+    if not which or (which.isdecimal() and int(which) >= SUITES[suite].tasks):
+        raise UnknownEnv(f"libero: {suite} has no task {which!r}: want 0 to {SUITES[suite].tasks - 1}, or a name")
+    return suite, which
+
+
+def find_task(name: str) -> LiberoTask:
+    """The task `name`, "SUITE/NUMBER" or "SUITE/NAME"; imports LIBERO. Raises `UnknownEnv`."""
+    suite, which = require_suite(name)
+    root = import_libero.load()
     known = list(require("libero.libero.benchmark").task_maps[suite].values())
     names = [task.name for task in known]
     if which.isdecimal() and int(which) < len(known):
@@ -54,7 +66,7 @@ def find_task(name: str) -> Task:
             f"libero: {suite} has no task {which!r}: want 0 to {len(known) - 1}, or a name such as {names[0]!r}"
         )
     found = known[number]
-    return Task(
+    return LiberoTask(
         suite=suite,
         number=number,
         name=found.name,

@@ -10,9 +10,9 @@ import numpy as np
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import one_row
 from vlagents_ray.envs.batch import BatchEnv, Options, Steps, episodes_of
-from vlagents_ray.envs.graphics import Renderer
-from vlagents_ray.envs.maniskill import making, protocol
+from vlagents_ray.envs.maniskill import benchmark_protocol, factory
 from vlagents_ray.envs.maniskill.simulator import Simulator
+from vlagents_ray.envs.rendering.graphics import Renderer
 from vlagents_ray.errors import ConfigError, NotReset
 from vlagents_ray.interface import Act, Obs
 
@@ -43,19 +43,19 @@ class ManiSkillBatch(BatchEnv):
         reconfigure: bool = True,
         record_size: Sequence[int] | None = None,
     ) -> None:
-        """Raises as `ManiSkill`, whose options these are.
+        """Make the environments with the options of `ManiSkill`, whose errors this raises.
 
         `sim_backend` "physx_cpu" simulates a single environment, and `record_size` must be None.
         """
         if record_size is not None:
-            raise ConfigError(f"maniskill/{task}: record_size is for environments of their own; leave it out")
+            raise ConfigError(f"maniskill/{task}: record_size is for single environments; leave it out")
         if sim_backend not in ON_GPU and num_envs > 1:
             raise ConfigError(
                 f"maniskill/{task}: {sim_backend} simulates one environment, not {num_envs}; want physx_cuda"
             )
-        self._own_limit = making.registered_limit(task)
+        self._own_limit = factory.registered_limit(task)
         self.num_envs = num_envs
-        self.max_steps = making.step_limit(f"maniskill/{task}", max_steps, self._own_limit)
+        self.max_steps = factory.step_limit(f"maniskill/{task}", max_steps, self._own_limit)
         self._task = task
         self._instruction = instruction
         self._reconfigure = reconfigure
@@ -70,7 +70,7 @@ class ManiSkillBatch(BatchEnv):
             render_backend=render_backend,
             control_mode=control_mode,
             reward_mode=reward_mode,
-            sensors=making.sensor_settings(f"maniskill/{task}", width, height, shader),
+            sensors=factory.sensor_settings(f"maniskill/{task}", width, height, shader),
         )
         self._contract = self._simulator.contract(self._simulator.action)
 
@@ -111,7 +111,9 @@ class ManiSkillBatch(BatchEnv):
         return self._simulator.renderer()
 
     def describe(self) -> dict[str, Any]:
-        rules = protocol.described(reconfigure=self._reconfigure, max_steps=self.max_steps, own_limit=self._own_limit)
+        rules = benchmark_protocol.described(
+            reconfigure=self._reconfigure, max_steps=self.max_steps, own_limit=self._own_limit
+        )
         return {**self._simulator.describe(), "reconfigure": self._reconfigure, "protocol": rules}
 
     def close(self) -> None:

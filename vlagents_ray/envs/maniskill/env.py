@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.envs.base import EvalEnv, one_row
-from vlagents_ray.envs.batch import BatchEnv
-from vlagents_ray.envs.graphics import Renderer
-from vlagents_ray.envs.maniskill import making, protocol
+from vlagents_ray.envs.base import BatchEnv, EvalEnv, one_row
+from vlagents_ray.envs.maniskill import benchmark_protocol, factory
 from vlagents_ray.envs.maniskill.simulator import Simulator
 from vlagents_ray.envs.maniskill.tasks import INSTRUCTIONS
-from vlagents_ray.envs.probe import render_probe
 from vlagents_ray.envs.recording import record_size_of
+from vlagents_ray.envs.rendering.graphics import Renderer
+from vlagents_ray.envs.rendering.render_probe import render_probe
 from vlagents_ray.errors import NotReset
 from vlagents_ray.interface import Act, Obs
 
@@ -35,7 +34,7 @@ class ManiSkill(EvalEnv):
     gripper, 1 open, -1 closed. A robot without gripper takes (6,). The arm lags behind its commands:
     a constant 1.0 moves it some 0.03 m a step.
 
-    The env goes on after success, so that success once and success at the end can both be measured,
+    The env continues after success, so that success once and success at the end can both be measured,
     and never reports `terminated`.
     """
 
@@ -56,13 +55,13 @@ class ManiSkill(EvalEnv):
         reconfigure: bool = True,
         record_size: Sequence[int] | None = None,
     ) -> None:
-        """Raises `UnknownEnv`, `ConfigError`, `MissingDependency`, or `EnvFailed` with its cure.
+        """Make the environment.
 
         Args:
             task: ManiSkill's id.
-            width: of each image, pixels.
-            height: of each image, pixels.
-            cameras: which of the task's cameras to give; None is all.
+            width: Of each image, pixels.
+            height: Of each image, pixels.
+            cameras: Which of the task's cameras to give; None is all.
             control_mode: None is `pd_ee_delta_pose`, or the robot's own default if it lacks that.
             instruction: None is the task's, see `instruction_for`.
             max_steps: None is the task's own limit.
@@ -70,12 +69,18 @@ class ManiSkill(EvalEnv):
             render_backend: "cpu", "gpu", or "auto": the GPU if both SAPIEN and torch can use it.
             shader: ManiSkill's name, e.g. "minimal", "default"; None is the task's own.
             reward_mode: ManiSkill's name; None is the task's own.
-            reconfigure: rebuild the scene for each episode. Without it some tasks' dynamics
+            reconfigure: Rebuild the scene for each episode. Without it some tasks' dynamics
                 (PlugCharger, PushT) depend on the episode before; it saves about 15 ms a reset.
-            record_size: height and width of further views by the same cameras, for the record only.
+            record_size: Height and width of further views by the same cameras, for the record only.
+
+        Raises:
+            UnknownEnv: There is no such task.
+            ConfigError: An option has a wrong value.
+            MissingDependency: The simulator is not installed.
+            EnvFailed: The simulator or its assets cannot be loaded.
         """
-        self._own_limit = making.registered_limit(task)
-        self.max_steps = making.step_limit(f"maniskill/{task}", max_steps, self._own_limit)
+        self._own_limit = factory.registered_limit(task)
+        self.max_steps = factory.step_limit(f"maniskill/{task}", max_steps, self._own_limit)
         self._task = task
         self._instruction = instruction
         self._rebuild = {"reconfigure": True} if reconfigure else {}
@@ -90,7 +95,7 @@ class ManiSkill(EvalEnv):
             render_backend=render_backend,
             control_mode=control_mode,
             reward_mode=reward_mode,
-            sensors=making.sensor_settings(f"maniskill/{task}", width, height, shader),
+            sensors=factory.sensor_settings(f"maniskill/{task}", width, height, shader),
         )
         self._contract = self._simulator.contract(self._simulator.action)
 
@@ -132,7 +137,7 @@ class ManiSkill(EvalEnv):
 
     @classmethod
     def batched(cls, num_envs: int, **options: Any) -> BatchEnv | None:
-        """All in one simulator, if that is to run on a GPU."""
+        """Make all environments in one simulator, if it runs on a GPU."""
         from vlagents_ray.envs.maniskill.batch import ON_GPU, ManiSkillBatch
 
         if options.get("sim_backend") not in ON_GPU:
@@ -144,7 +149,9 @@ class ManiSkill(EvalEnv):
 
     def describe(self) -> dict[str, Any]:
         reconfigure = bool(self._rebuild)
-        rules = protocol.described(reconfigure=reconfigure, max_steps=self.max_steps, own_limit=self._own_limit)
+        rules = benchmark_protocol.described(
+            reconfigure=reconfigure, max_steps=self.max_steps, own_limit=self._own_limit
+        )
         return {**self._simulator.describe(), "reconfigure": reconfigure, "protocol": rules}
 
     def close(self) -> None:

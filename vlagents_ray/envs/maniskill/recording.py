@@ -13,7 +13,7 @@ from vlagents_ray.registry import require
 
 
 class RecordCameras:
-    """Stand where the task's cameras stand; made anew with each scene."""
+    """Cameras at the places of the task's cameras, created again with each scene."""
 
     def __init__(self, size: Size, names: Iterable[str]) -> None:
         self._height, self._width = size
@@ -22,7 +22,7 @@ class RecordCameras:
         self._cameras: dict[str, Any] = {}
 
     def views(self, env: Any) -> dict[str, np.ndarray]:
-        """What the cameras of `env`'s only environment see now, each (height, width, 3) uint8 RGB."""
+        """Return the current images of a single environment's cameras, (height, width, 3) uint8 RGB each."""
         if env.scene is not self._scene:
             self._cameras = {name: self._beside(env, name) for name in self._names}
             self._scene = env.scene
@@ -47,7 +47,7 @@ class RecordCameras:
         overlay = (getattr(env, "_rgb_overlay_images", None) or {}).get(name)
         seen = camera.get_obs(depth=False, position=False, segmentation=overlay is not None)
         rgb = seen["rgb"]
-        if overlay is not None:  # a digital twin: all but robot and objects is a photograph
+        if overlay is not None:  # a digital twin, whose background is a photograph
             pil = require("PIL.Image")
             photograph = pil.fromarray(overlay.cpu().numpy().astype(np.uint8)).resize((self._width, self._height))
             background = require("torch").tensor(np.array(photograph), device=rgb.device)

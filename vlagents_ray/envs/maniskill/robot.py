@@ -1,4 +1,4 @@
-"""What a ManiSkill robot feels, and what its control modes command."""
+"""The state of a ManiSkill robot, and the meaning of its control modes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ CONTROL_MODES: dict[str, dict[str, Any]] = {
 }
 
 
-class Robot:
+class ManiSkillRobot:
     """Reads proprioception from ManiSkill's `agent`, which is a new object after each reconfiguration."""
 
     def __init__(self, agent: Any) -> None:
@@ -63,7 +63,7 @@ class Robot:
         return self._finger_m is not None
 
     def read(self, agent: Any) -> list[tuple[dict[str, np.ndarray], float | None]]:
-        """For each environment the state, each part (D,) float32, and the gripper in [0, 1], 1 = open."""
+        """Return the state of each environment, each part (D,) float32, and the gripper in [0, 1], 1 = open."""
         rows = agent.robot.get_qpos().cpu().numpy()
         states = [{"joints": qpos[self._arm]} for qpos in rows]
         if self._has_tool:
@@ -100,6 +100,9 @@ def action_spec(control_mode: str, space: Any, *, has_gripper: bool) -> ActionSp
     )
 
 
+_LOCKED = 1e-4  # of the cosine of a pitch
+
+
 def tool_in_base(base: np.ndarray, tool: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Two (7,) world poses, metres and quaternion wxyz, as SAPIEN writes them, to the tool's pose in the base frame.
 
@@ -119,8 +122,12 @@ def tool_in_base(base: np.ndarray, tool: np.ndarray) -> tuple[np.ndarray, np.nda
     # the offset turned by conj(base): v + 2 u x (u x v - bw v) with u the base's vector part
     cx, cy, cz = by * pz - bz * py - bw * px, bz * px - bx * pz - bw * py, bx * py - by * px - bw * pz
     px, py, pz = px + 2 * (by * cz - bz * cy), py + 2 * (bz * cx - bx * cz), pz + 2 * (bx * cy - by * cx)
-    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    rolls = 2 * (w * x + y * z), 1 - 2 * (x * x + y * y)  # the sine and the cosine of it, times the pitch's cosine
     pitch = math.asin(min(max(2 * (w * y - z * x), -1.0), 1.0))
-    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    if math.hypot(*rolls) < _LOCKED:  # gimbal lock: only the sum or the difference of roll and yaw is determined
+        roll, yaw = 0.0, math.copysign(2.0, -pitch) * math.atan2(x, w)
+        yaw = math.remainder(yaw, 2 * math.pi)
+    else:
+        roll, yaw = math.atan2(*rolls), math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     tquat = np.array([px, py, pz, x, y, z, w], dtype=np.float32)
     return tquat, np.array([px, py, pz, roll, pitch, yaw], dtype=np.float32)

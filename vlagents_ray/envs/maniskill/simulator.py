@@ -1,4 +1,4 @@
-"""One ManiSkill simulator with one environment in it or several: what the envs made of it have in common."""
+"""A ManiSkill simulator with one environment or several."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract
-from vlagents_ray.envs.graphics import Renderer, vulkan_renderer
-from vlagents_ray.envs.maniskill import making
+from vlagents_ray.envs.maniskill import factory
 from vlagents_ray.envs.maniskill.recording import RecordCameras
-from vlagents_ray.envs.maniskill.robot import Robot, action_spec
+from vlagents_ray.envs.maniskill.robot import ManiSkillRobot, action_spec
 from vlagents_ray.envs.maniskill.tasks import instruction_for
-from vlagents_ray.envs.probe import vulkan_device
 from vlagents_ray.envs.recording import Size
+from vlagents_ray.envs.rendering.graphics import Renderer, vulkan_renderer
+from vlagents_ray.envs.rendering.render_probe import vulkan_device
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.interface import HIGH_RES, Obs
 from vlagents_ray.registry import require
@@ -25,7 +25,7 @@ from vlagents_ray.registry import require
 
 @dataclass(frozen=True, slots=True)
 class Moment:
-    """After a reset or step: one row an environment."""
+    """The result of a reset or step, with a row for each environment."""
 
     obs: list[Obs]
     success: list[bool]
@@ -33,7 +33,7 @@ class Moment:
 
 
 class Simulator:
-    """The task's `num_envs` environments, each of which goes on after success."""
+    """The `num_envs` environments of a task, each of which continues after success."""
 
     def __init__(
         self,
@@ -55,20 +55,20 @@ class Simulator:
         self._task = task
         self._asked_for = render_backend != "auto"
         self._record: RecordCameras | None = None
-        self.env: Any = making.make(
+        self.env: Any = factory.make(
             task,
             control_mode,
             num_envs=num_envs,
             obs_mode=obs_mode,
             reward_mode=reward_mode,
             sim_backend=sim_backend,
-            render_backend=making.render_backend(render_backend),
+            render_backend=factory.render_backend(render_backend),
             sensor_configs=dict(sensors),
         )
         try:
             self._check_usable()
             self.cameras = self._choose(cameras)
-            self._robot = Robot(self.env.agent)
+            self._robot = ManiSkillRobot(self.env.agent)
         except BaseException:
             self.close()
             raise
@@ -77,12 +77,12 @@ class Simulator:
 
     @property
     def action(self) -> ActionSpec:
-        """Of the control mode."""
+        """The specification of the control mode's actions."""
         env = self.alive()
         return action_spec(env.control_mode, env.single_action_space, has_gripper=self._robot.has_gripper)
 
     def contract(self, action: ActionSpec) -> Contract:
-        """Of each environment, which takes `action`."""
+        """Return the contract of each environment, with these actions."""
         return Contract(
             cameras=self.cameras,
             state=self._robot.gives,
@@ -103,20 +103,20 @@ class Simulator:
         env = self.alive()
         with self._failing("reset"):
             raw, info = env.reset(seed=[seed % 2**32 for seed in seeds], options=dict(options))
-            if env.num_envs == 1:  # rendering is most of a step: not for a camera that nobody asked for
+            if env.num_envs == 1:  # rendering is most of a step's time, so only the requested cameras are rendered
                 for name in set(env.scene.sensors) - set(self.cameras):
                     del env.scene.sensors[name]
             return self.moment(raw, info)
 
     def reset_each(self, seeds: Sequence[int], options: Sequence[Mapping[str, Any]]) -> Moment:
-        """Begin each environment's episode by itself, in the scenes that there are.
+        """Begin the episode of each environment separately, in the existing scenes.
 
-        ManiSkill seeds torch once for all that it resets together, from the first one's seed: what a
-        task draws by torch would depend on its neighbours.
+        ManiSkill seeds torch once for all environments that it resets together, by the first one's seed. What a task
+        draws by torch would then depend on the other environments.
         """
         env = self.alive()
         with self._failing("reset"):
-            mode, env._obs_mode = env._obs_mode, "none"  # nothing is rendered before all have begun
+            mode, env._obs_mode = env._obs_mode, "none"  # nothing is rendered before all episodes have begun
             try:
                 for i, (seed, option) in enumerate(zip(seeds, options, strict=True)):
                     only = require("torch").tensor([i], device=env.device)
@@ -130,12 +130,12 @@ class Simulator:
         """Execute one action in each environment, (N, D) float32."""
         env = self.alive()
         with self._failing("step"):
-            # a copy: torch shares the memory, and warns of a read-only array, such as Ray hands out
+            # a copy: torch shares the memory, and warns of read-only arrays, such as those of Ray
             raw, rewards, _, _, info = env.step(actions.copy())
             return replace(self.moment(raw, info), rewards=rewards.cpu().numpy().astype(float).tolist())
 
     def moment(self, raw: Mapping[str, Any], info: Mapping[str, Any]) -> Moment:
-        """What ManiSkill's own observation and info say. The images of a camera share one array, (N, H, W, 3)."""
+        """Convert ManiSkill's observation and info. The images of a camera share one array, (N, H, W, 3)."""
         env = self.alive()
         sensors = raw["sensor_data"]
         images = {name: np.ascontiguousarray(sensors[name]["rgb"].cpu().numpy()) for name in self.cameras}
@@ -186,7 +186,7 @@ class Simulator:
             env.close()
 
     def _check_usable(self) -> None:
-        if not hasattr(self.env.agent, "robot"):  # none at all, or several
+        if not hasattr(self.env.agent, "robot"):  # it has no robot, or several
             raise ConfigError(f"{self.name}: want a task with exactly one robot")
         if "success" not in self.env.get_info():
             raise ConfigError(f"{self.name} does not say what success is: there is nothing to evaluate")

@@ -1,4 +1,4 @@
-"""ManiSkill's tasks in words: it states no instructions of its own, except for the Bridge twins."""
+"""ManiSkill's tasks in words, which it states for the Bridge tasks only."""
 
 from __future__ import annotations
 

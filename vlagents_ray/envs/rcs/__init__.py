@@ -1,7 +1,7 @@
 """RCS, the Robot Control Stack, in MuJoCo, and DuoBench, the benchmark for two arms that is built on it.
 
 Both need packages that contradict the simulators of this package's extras, and RCS is AGPL-3: they
-live in a Python environment of their own, requirements/rcs.txt. See docs/benchmarks/rcs.md.
+need a separate Python environment, requirements/rcs.txt. See docs/benchmarks/rcs.md.
 """
 
 from vlagents_ray.envs.rcs.env import DuoBench, Rcs

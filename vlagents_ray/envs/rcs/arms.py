@@ -44,7 +44,7 @@ class Arms:
         self.has_gripper = self.single and bool(self._grippers)  # that `Obs.gripper` can tell
 
     def action_spec(self, *, delta: bool) -> ActionSpec:
-        """The contract of a row."""
+        """The contract of an action."""
         space, rotation = _COMMANDS[self._mode]
         return ActionSpec(
             dim=sum(self._sizes.values()) + len(self._grippers),

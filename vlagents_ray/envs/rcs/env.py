@@ -11,13 +11,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from vlagents_ray.contract import CameraSpec, Contract
-from vlagents_ray.envs.base import EvalEnv, one_row
+from vlagents_ray.envs.base import EvalEnv, one_row, require_known
 from vlagents_ray.envs.mapping import plain
-from vlagents_ray.envs.rcs import making
+from vlagents_ray.envs.rcs import factory
 from vlagents_ray.envs.rcs.arms import Arms
-from vlagents_ray.envs.rcs.tasks import DUOBENCH_TASKS, RCS_TASKS, ControlMode, Task
+from vlagents_ray.envs.rcs.tasks import DUOBENCH_TASKS, RCS_TASKS, ControlMode, RcsTask
 from vlagents_ray.envs.recording import record_size_of
-from vlagents_ray.errors import ConfigError, EnvFailed, NotReset, UnknownEnv
+from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
 from vlagents_ray.interface import HIGH_RES, Act, Obs
 from vlagents_ray.registry import require
 
@@ -36,7 +36,7 @@ class Rcs(EvalEnv):
     """
 
     suite: ClassVar[str] = "rcs"
-    known: ClassVar[Mapping[str, Task]] = RCS_TASKS
+    known: ClassVar[Mapping[str, RcsTask]] = RCS_TASKS
     packages: ClassVar[tuple[str, ...]] = ("rcs",)
 
     def __init__(
@@ -55,21 +55,27 @@ class Rcs(EvalEnv):
         instruction: str | None = None,
         max_steps: int | None = None,
     ) -> None:
-        """Raises `UnknownEnv`, `ConfigError`, `MissingDependency`, or `EnvFailed` with its cure.
+        """Make the environment.
 
         Args:
-            task: one of `tasks()`, or Gymnasium's id of a scene, "lab/shelf"; None is the first of `tasks()`.
-            module: imported first, because it registers the id; by default the id's namespace.
+            task: One of `tasks()`, or Gymnasium's id of a scene, "lab/shelf"; None is the first of `tasks()`.
+            module: Imported first, because it registers the id; by default the id's namespace.
             control_mode: "joints", "tquat" or "xyzrpy"; None is the protocol's.
-            delta: commands are relative to where the arm is.
-            control_hz: steps a second; None is the protocol's.
-            binary_gripper: it opens or closes; False: the command is its opening.
-            width: of each image, pixels.
-            height: of each image, pixels.
-            cameras: which of the scene's to give; None is all.
+            delta: Commands are relative to where the arm is.
+            control_hz: Steps a second; None is the protocol's.
+            binary_gripper: It opens or closes; False: the command is its opening.
+            width: Of each image, pixels.
+            height: Of each image, pixels.
+            cameras: Which of the scene's to give; None is all.
             record_size: (height, width) in pixels of a second view of each camera, for the record alone.
             instruction: None is the task's.
             max_steps: None is the protocol's limit.
+
+        Raises:
+            UnknownEnv: There is no such task.
+            ConfigError: An option has a wrong value.
+            MissingDependency: The simulator is not installed.
+            EnvFailed: The simulator or its assets cannot be loaded.
         """
         task = self.tasks()[0] if task is None else task
         self._name = f"{self.suite}/{task}"
@@ -91,10 +97,10 @@ class Rcs(EvalEnv):
         self._steps: int | None = None
         self._env: Any = None
         hz = control_hz or self._task.control_hz
-        maker = making.creator(self._task, self._name)
+        maker = factory.creator(self._task, self._name)
         config = maker.config()
         self._task.prepare(config)
-        making.configure(
+        factory.configure(
             config,
             control_mode=self._mode,
             delta=delta,
@@ -149,9 +155,14 @@ class Rcs(EvalEnv):
         if "success" not in info:
             raise ConfigError(f"{self._name} does not say what success is: want a scene with a task")
         self._steps += 1
-        said = {key: value for key, value in info.items() if key not in self._arms.names}  # the arms' own is not ours
-        outcome = {**plain(said), "success": bool(info["success"])}
+        task_info = {key: value for key, value in info.items() if key not in self._arms.names}  # without that of arms
+        outcome = {**plain(task_info), "success": bool(info["success"])}
         return self._observe(raw), float(reward), bool(terminated), self._steps >= self.max_steps, outcome
+
+    @classmethod
+    def require_task(cls, task: str | None) -> None:
+        if "/" not in (task or ""):
+            require_known(cls.suite, task, cls.tasks(), ", or an id, as in 'lab/shelf'")
 
     @classmethod
     def tasks(cls) -> list[str]:
@@ -159,7 +170,7 @@ class Rcs(EvalEnv):
 
     @classmethod
     def missing(cls) -> str | None:
-        return making.missing(*cls.packages)
+        return factory.missing(*cls.packages)
 
     def describe(self) -> dict[str, Any]:
         control = f"{self._mode}, delta" if self._contract.action.delta else self._mode
@@ -178,15 +189,12 @@ class Rcs(EvalEnv):
         if env is not None:
             env.close()
 
-    def _find(self, task: str, module: str | None) -> Task:
+    def _find(self, task: str, module: str | None) -> RcsTask:
         if task in self.known:
             found = self.known[task]
             return replace(found, module=module) if module is not None else found
-        if "/" not in task:
-            raise UnknownEnv(
-                f"{self.suite} has no task {task!r}: want one of {self.tasks()}, or an id, as in 'lab/shelf'"
-            )
-        return Task(id=task, module=module)
+        self.require_task(task)
+        return RcsTask(id=task, module=module)
 
     def _observe(self, raw: Mapping[str, Any]) -> Obs:
         state, gripper = self._arms.read(raw)
@@ -194,7 +202,7 @@ class Rcs(EvalEnv):
         info: dict[str, Any] = {"objects": {name: np.array(self._sim.data.joint(name).qpos) for name in self._loose}}
         if self._recording:
             info[HIGH_RES] = {
-                name.removeprefix(making.RECORD): np.ascontiguousarray(image)
+                name.removeprefix(factory.RECORD): np.ascontiguousarray(image)
                 for name, image in images.items()
                 if _for_the_record(name)
             }
@@ -230,7 +238,7 @@ class DuoBench(Rcs):
     """
 
     suite: ClassVar[str] = "duobench"
-    known: ClassVar[Mapping[str, Task]] = DUOBENCH_TASKS
+    known: ClassVar[Mapping[str, RcsTask]] = DUOBENCH_TASKS
     packages: ClassVar[tuple[str, ...]] = ("rcs", "duobench")
 
 
@@ -240,4 +248,4 @@ def _loose_joints(model: Any) -> list[str]:
 
 
 def _for_the_record(camera: str) -> bool:
-    return camera.startswith(making.RECORD)
+    return camera.startswith(factory.RECORD)

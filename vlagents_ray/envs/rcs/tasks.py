@@ -1,4 +1,4 @@
-"""The tasks of RCS and DuoBench, and the protocols that they are played by."""
+"""The tasks of RCS and DuoBench, and their protocols."""
 
 from __future__ import annotations
 
@@ -6,22 +6,22 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from vlagents_ray.envs.protocol import Protocol
+from vlagents_ray.envs.benchmark_protocol import BenchmarkProtocol
 from vlagents_ray.registry import require
 
 ControlMode = Literal["joints", "xyzrpy", "tquat"]
 
 
 @dataclass(frozen=True, slots=True)
-class Task:
-    """What makes a scene that RCS has registered with Gymnasium into a task."""
+class RcsTask:
+    """The settings that make a task of a scene which RCS has registered with Gymnasium."""
 
-    id: str  # of the scene, Gymnasium's
-    module: str | None  # registers it when it is imported; None: the user says which
-    protocol: Protocol | None = None  # None: the user sets `max_steps`
-    control_mode: ControlMode = "joints"  # an action's, absolute unless the user says otherwise
+    id: str  # Gymnasium's id of the scene
+    module: str | None  # module that registers it; None if the user names it
+    protocol: BenchmarkProtocol | None = None  # None: the user sets `max_steps`
+    control_mode: ControlMode = "joints"  # of an action, absolute by default
     control_hz: float = 30.0
-    instruction: str = ""  # where the simulator's info has none
+    instruction: str = ""  # used if the simulator's info has none
     prepare: Callable[[Any], None] = lambda _config: None  # puts the task into RCS's configuration of a scene without
 
 
@@ -30,10 +30,10 @@ def _pick(config: Any) -> None:
 
 
 RCS_TASKS = {
-    "pick": Task(
+    "pick": RcsTask(
         id="rcs/fr3",
         module="rcs.envs.configs",
-        protocol=Protocol(
+        protocol=BenchmarkProtocol(
             name="RCS pick",
             source="rcs-core 0.7.3, rcs/envs/tasks.py, for the task; it states neither rate nor step limit: ours",
             max_steps=300,
@@ -50,7 +50,7 @@ RCS_TASKS = {
     )
 }
 
-_DUOBENCH = Protocol(
+_DUOBENCH = BenchmarkProtocol(
     name="DuoBench",
     source="DuoBench 0.1.2, README, 'Evaluation Environment' (arXiv 2606.11901); it states no step limit: ours",
     max_steps=900,
@@ -74,5 +74,6 @@ _DUOBENCH_NAMES = (
     "transfer_reorient",
 )
 DUOBENCH_TASKS = {
-    name: Task(id=f"duobench/{name}", module=f"duobench.tasks.{name}", protocol=_DUOBENCH) for name in _DUOBENCH_NAMES
+    name: RcsTask(id=f"duobench/{name}", module=f"duobench.tasks.{name}", protocol=_DUOBENCH)
+    for name in _DUOBENCH_NAMES
 }

@@ -9,16 +9,16 @@ from typing import Any, get_args
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
-from vlagents_ray.envs.base import EvalEnv, one_row
+from vlagents_ray.envs.base import EvalEnv, one_row, require_known
 from vlagents_ray.envs.tabletop.goals import Goal, Task, draw_episode, goals
-from vlagents_ray.envs.tabletop.render import ELEVATION, VIEW, Renderer
-from vlagents_ray.envs.tabletop.world import STEP_LIMIT, World
-from vlagents_ray.errors import ConfigError, NotReset, UnknownEnv
+from vlagents_ray.envs.tabletop.render import ELEVATION, VIEW, TabletopRenderer
+from vlagents_ray.envs.tabletop.world import STEP_LIMIT, TabletopWorld
+from vlagents_ray.errors import ConfigError, NotReset
 from vlagents_ray.interface import Act, Obs
 
 MIXED = "mixed"
 _TASKS: tuple[Task, ...] = get_args(Task)
-_VERSION = 1  # of the scenes and the physics: results of different versions do not compare
+_VERSION = 1  # of the scenes and the physics; results of different versions are not comparable
 _CONTROL_HZ = 10.0
 _POINTING_DOWN = (math.pi, 0.0, 0.0)  # roll, pitch, yaw of the gripper in rad, always
 
@@ -41,15 +41,30 @@ class Tabletop(EvalEnv):
 
     def __init__(self, task: str | None = None, *, width: int = 224, height: int = 224, max_steps: int = 80) -> None:
         """`width` and `height` of the image in pixels, at least 32; `max_steps` until truncation."""
-        if task is not None and task not in self.tasks():
-            raise UnknownEnv(f"tabletop has no task {task!r}: want one of {self.tasks()}")
+        self.require_task(task)
         for name, value, least in (("width", width, 32), ("height", height, 32), ("max_steps", max_steps, 1)):
             if value < least:
                 raise ConfigError(f"tabletop: {name} is {value}, want at least {least}")
         self.max_steps = max_steps
         self._task = task or MIXED
-        self._contract = Contract(
-            cameras={"front": CameraSpec(height, width)},
+        self._contract = self.known_contract({"width": width, "height": height})
+        self._renderer = TabletopRenderer(width, height)
+        self._world: TabletopWorld | None = None
+        self._goal: Goal | None = None
+        self._steps = 0
+
+    @classmethod
+    def require_task(cls, task: str | None) -> None:
+        require_known("tabletop", task or MIXED, cls.tasks())
+
+    @classmethod
+    def tasks(cls) -> list[str]:
+        return [MIXED, *_TASKS]
+
+    @classmethod
+    def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
+        return Contract(
+            cameras={"front": CameraSpec(arguments["height"], arguments["width"])},
             state={"xyzrpy": StateSpec(6, "m+rad")},
             gripper=True,
             instruction=True,
@@ -66,14 +81,6 @@ class Tabletop(EvalEnv):
             ),
             control_hz=_CONTROL_HZ,
         )
-        self._renderer = Renderer(width, height)
-        self._world: World | None = None
-        self._goal: Goal | None = None
-        self._steps = 0
-
-    @classmethod
-    def tasks(cls) -> list[str]:
-        return [MIXED, *_TASKS]
 
     @property
     def contract(self) -> Contract:
@@ -96,9 +103,9 @@ class Tabletop(EvalEnv):
         }
 
     def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
-        """Begin the episode of `seed`. The one option, `instruction`, asks for something else in the same scene.
+        """Begin an episode. The only option, `instruction`, sets another goal in the same scene.
 
-        `info["instructions"]` lists what the episode's task could have asked for in this scene.
+        `info["instructions"]` lists the instructions of the episode's task that are possible in this scene.
         """
         unknown = sorted(set(options or {}) - {"instruction"})
         if unknown:
@@ -127,14 +134,14 @@ class Tabletop(EvalEnv):
     def close(self) -> None:
         self._world = self._goal = None
 
-    def _observe(self, world: World) -> Obs:
+    def _observe(self, world: TabletopWorld) -> Obs:
         state = np.array((world.x, world.y, world.z, *_POINTING_DOWN), np.float32)
         return Obs(cameras={"front": self._renderer.draw(world)}, gripper=world.opening, state={"xyzrpy": state})
 
     def _task_in_scene(self) -> Task:
         return next(task for task in _TASKS if task == self._task)
 
-    def _chosen(self, world: World, instruction: object) -> Goal:
+    def _chosen(self, world: TabletopWorld, instruction: object) -> Goal:
         tasks = _TASKS if self._task == MIXED else (self._task_in_scene(),)
         possible = {goal.instruction: goal for task in tasks for goal in goals(world, task)}
         if instruction not in possible:

@@ -1,4 +1,4 @@
-"""What an episode asks for, and the scenes it is asked in."""
+"""The goals of episodes, and their scenes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from vlagents_ray.envs.tabletop.world import PAD_HALF, PUCK_HEIGHT, PUCK_RADIUS, Pad, Puck, World
+from vlagents_ray.envs.tabletop.world import PAD_HALF, PUCK_HEIGHT, PUCK_RADIUS, Pad, Puck, TabletopWorld
 
 Task = Literal["pick_place", "slide", "stack", "lift"]
 TEMPLATES: dict[Task, str] = {
@@ -20,7 +20,7 @@ TEMPLATES: dict[Task, str] = {
 COLOURS = ("red", "green", "blue", "yellow", "purple")
 
 _PUCKS, _PADS = 4, 3
-_AREA = (0.22, 0.13)  # m, half extents of where things lie at first
+_AREA = (0.22, 0.13)  # m, half extents of the area in which objects are placed
 _CLEARANCE = 0.09  # m between centres: a puck's own radius, an open finger, and the neighbour
 _PAD_CLEARANCE = 0.125  # m between the centres of two pads
 _CORRIDOR = 0.065  # m on both sides of a slide that no other puck may be in
@@ -30,7 +30,7 @@ _LIFT_HEIGHT = 0.08  # m
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """One instruction; `target` is a pad's or, to be stacked on, a puck's colour."""
+    """The goal of an instruction; `target` is the colour of a pad, or of the puck to stack on."""
 
     task: Task
     puck: str
@@ -40,8 +40,8 @@ class Goal:
     def instruction(self) -> str:
         return TEMPLATES[self.task].format(puck=self.puck, target=self.target)
 
-    def reached(self, world: World) -> bool:
-        """Is the named puck where the instruction wants it, and let go?"""
+    def reached(self, world: TabletopWorld) -> bool:
+        """Whether the puck is at the instruction's target and released."""
         puck = world.puck(self.puck)
         if self.target is None:
             return puck is world.held and puck.z >= _LIFT_HEIGHT
@@ -56,8 +56,8 @@ class Goal:
         return at_pad and not (self.task == "slide" and puck.lifted)
 
 
-def goals(world: World, task: Task) -> list[Goal]:
-    """Everything that `task` could ask for in this scene, in a fixed order."""
+def goals(world: TabletopWorld, task: Task) -> list[Goal]:
+    """List the goals of a task that are possible in this scene, in a fixed order."""
     pucks, pads = [p.colour for p in world.pucks], [p.colour for p in world.pads]
     if task == "lift":
         return [Goal(task, puck) for puck in pucks]
@@ -65,8 +65,8 @@ def goals(world: World, task: Task) -> list[Goal]:
     return [Goal(task, a, b) for a in pucks for b in targets if task != "stack" or a != b]
 
 
-def draw_episode(task: Task, rng: np.random.Generator) -> tuple[World, Goal]:
-    """A scene and what to do in it. A slide is only asked for where nothing lies in its way."""
+def draw_episode(task: Task, rng: np.random.Generator) -> tuple[TabletopWorld, Goal]:
+    """Draw a scene and a goal; a slide is drawn only if no puck is in its way."""
     while True:
         world = _draw_scene(rng)
         wanted = [goal for goal in goals(world, task) if task != "slide" or _is_clear(world, goal)]
@@ -74,7 +74,7 @@ def draw_episode(task: Task, rng: np.random.Generator) -> tuple[World, Goal]:
             return world, wanted[rng.integers(len(wanted))]
 
 
-def _draw_scene(rng: np.random.Generator) -> World:
+def _draw_scene(rng: np.random.Generator) -> TabletopWorld:
     while True:
         places: list[tuple[float, float, float]] = []  # x, y, and the clearance from another of its kind
         for _ in range(200):
@@ -85,15 +85,15 @@ def _draw_scene(rng: np.random.Generator) -> World:
             if all(math.hypot(x - p[0], y - p[1]) >= min(clearance, p[2]) for p in places):
                 places.append((float(x), float(y), clearance))
         if len(places) < _PADS + _PUCKS:
-            continue  # a crowded draw: there is no room for the rest
+            continue  # no free place is left: draw again
         pad_colours = rng.permutation(COLOURS)[:_PADS]
         puck_colours = rng.permutation(COLOURS)[:_PUCKS]
         pads = [Pad(str(c), x, y) for c, (x, y, _) in zip(pad_colours, places[:_PADS], strict=True)]
         pucks = [Puck(str(c), x, y) for c, (x, y, _) in zip(puck_colours, places[_PADS:], strict=True)]
-        return World(pucks, pads)
+        return TabletopWorld(pucks, pads)
 
 
-def _is_clear(world: World, goal: Goal) -> bool:
+def _is_clear(world: TabletopWorld, goal: Goal) -> bool:
     start, end = world.puck(goal.puck), world.pad(goal.target or "")
     dx, dy = end.x - start.x, end.y - start.y
     length = math.hypot(dx, dy)

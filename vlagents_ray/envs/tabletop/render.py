@@ -1,7 +1,7 @@
 """Draws the table as the camera "front" sees it.
 
-What rests is drawn once and kept; a step copies that picture and adds the gripper, what it holds
-and their shadows. The camera's geometry is in the package's docstring.
+Objects at rest are drawn once; a step copies that image and adds the gripper, the object that it holds, and their
+shadows. The camera's geometry is in the package's docstring.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from vlagents_ray.envs.tabletop.world import (
     REACH,
     Pad,
     Puck,
-    World,
+    TabletopWorld,
 )
 
 VIEW = 0.66  # m, along the image's shorter side
@@ -41,8 +41,8 @@ _FINGER_LENGTH = 0.07  # m
 _SHADOW = (0.35, -0.22)  # m of offset along x and y per m of height
 
 
-class Renderer:
-    """Images of one size; holds the picture of what rests in the current episode."""
+class TabletopRenderer:
+    """A renderer for images of one size, which keeps the image of the objects at rest in the current episode."""
 
     def __init__(self, width: int, height: int) -> None:
         self._centre = (width / 2, height / 2)
@@ -59,14 +59,14 @@ class Renderer:
         self._still_key: tuple[tuple[float, float, float], ...] = ()
 
     def begin(self, pads: list[Pad]) -> None:
-        """Draw what stays for a whole episode."""
+        """Draw the pads, which do not move in an episode."""
         self._floor_picture = self._background.copy()
         for pad in pads:
             self._blend(self._floor_picture, self._pads[pad.colour], pad.x, pad.y, 0.0)
         self._still_key = ()
 
-    def draw(self, world: World) -> np.ndarray:
-        """The image, (H, W, 3) uint8 RGB; a new array each time."""
+    def draw(self, world: TabletopWorld) -> np.ndarray:
+        """Return the image, (H, W, 3) uint8 RGB, as a new array."""
         resting = [p for p in world.pucks if p is not world.held]
         key = tuple([(p.x, p.y, p.z) for p in resting])
         if key != self._still_key:

@@ -49,7 +49,7 @@ class Canvas:
         self._alpha = np.zeros((height, width, 1), np.float32)
 
     def paint(self, colour: Colour | np.ndarray, coverage: FloatArray) -> None:
-        """Lay `colour`, one or (h, w, 3), over what is there, with `coverage` in [0, 1]."""
+        """Paint a colour, one or (h, w, 3), over the canvas, with `coverage` in [0, 1]."""
         amount = np.clip(coverage, 0.0, 1.0)[..., None]
         self._rgb = self._rgb * (1 - amount) + np.asarray(colour, np.float32) * amount
         self._alpha = self._alpha * (1 - amount) + amount

@@ -1,4 +1,4 @@
-"""What moves on the table: pucks, and a gripper with two fingers that grasps and pushes them.
+"""The physics of the table: pucks, and a gripper with two fingers that grasps and pushes them.
 
 Quasi-static: a puck goes where it is carried or pushed and otherwise rests or falls. Plain floats
 rather than arrays: for a handful of bodies that is several times faster.
@@ -44,7 +44,7 @@ class Pad:
     y: float
 
 
-class World:
+class TabletopWorld:
     """The state of one episode."""
 
     def __init__(self, pucks: list[Puck], pads: list[Pad]) -> None:
@@ -56,7 +56,7 @@ class World:
 
     @property
     def opening(self) -> float:
-        """How far the gripper is open, in [0, 1]; about 0.58 while it holds a puck."""
+        """The gripper's opening in [0, 1]; about 0.58 while it holds a puck."""
         return self.gap / GAP_OPEN
 
     def puck(self, colour: str) -> Puck:
@@ -205,13 +205,13 @@ class World:
 
 
 def _overlap(puck: Puck, x: float, y: float, distance: float) -> tuple[float, float] | None:
-    """How far (dx, dy) `puck` must move straight away from (x, y) to be `distance` off; None if it is."""
+    """Return the shift (dx, dy) of a puck away from (x, y) to a distance; None if it is far enough."""
     dx, dy = puck.x - x, puck.y - y
     have = math.hypot(dx, dy)
     if have >= distance - _EPSILON:
         return None
     if have < _EPSILON:
-        return 0.0, -distance  # dead centre: any direction will do, as long as it is always the same
+        return 0.0, -distance  # at the centre any direction is right, if it is always the same
     return dx * (distance / have - 1), dy * (distance / have - 1)
 
 

@@ -1,9 +1,10 @@
-"""Results for other programs: tables with one row an episode, and datasets with one row a step."""
+"""Results for other programs: tables with one row for each episode, datasets with one row for each step."""
 
-from vlagents_ray.evaluate.exports.columns import COLUMNS, Column, rows
+from collections.abc import Callable
+
 from vlagents_ray.evaluate.exports.lerobot import to_lerobot
-from vlagents_ray.evaluate.exports.tables import to_csv, to_json, to_parquet
+from vlagents_ray.evaluate.exports.tables import COLUMNS, Column, rows, to_csv, to_json, to_parquet
 
-EXPORTS = {"json": to_json, "csv": to_csv, "parquet": to_parquet, "lerobot": to_lerobot}
+EXPORTS: dict[str, Callable[..., int]] = {"json": to_json, "csv": to_csv, "parquet": to_parquet, "lerobot": to_lerobot}
 
 __all__ = ["COLUMNS", "EXPORTS", "Column", "rows", "to_csv", "to_json", "to_lerobot", "to_parquet"]

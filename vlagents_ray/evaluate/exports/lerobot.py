@@ -1,17 +1,30 @@
-"""Recorded trajectories as a LeRobotDataset v3.0: to look at, and to train with."""
+"""Recorded trajectories as a LeRobotDataset v3.0, for viewing and for training."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vlagents_ray.contract import CameraSpec, Contract, StateSpec
+from vlagents_ray.dataset_contract import (
+    GRIPPER,
+    Centre,
+    DatasetContract,
+    angles_in,
+    centre_of,
+    rotation_centre_of,
+    rotation_vector_in,
+)
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate.files import link_or_copy
-from vlagents_ray.evaluate.results import CellResults, Results
-from vlagents_ray.evaluate.trajectory import Trajectory, video_of
-from vlagents_ray.evaluate.video import DEFAULT_FPS
+from vlagents_ray.evaluate.artifacts.storage import link_or_copy, require_there, whole_folder
+from vlagents_ray.evaluate.artifacts.trajectory import Trajectory, videos_of
+from vlagents_ray.evaluate.artifacts.video import DEFAULT_FPS
+from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results
+from vlagents_ray.naming import did_you_mean, distinct
 from vlagents_ray.registry import require
 from vlagents_ray.robot.dataset import UNFINISHED, Dataset
 from vlagents_ray.robot.episode import (
@@ -19,96 +32,266 @@ from vlagents_ray.robot.episode import (
     INDEX,
     STATE,
     Finished,
-    camera_key,
+    camera_keys,
     number_features,
+    parts_of,
     state_vector,
     vector_feature,
     video_feature,
+    without_slash,
 )
 from vlagents_ray.robot.statistics import ImageStatistics, Stats
 
-GRIPPER = "observation.gripper"
+GRIPPER_FEATURE = "observation.gripper"
 # LeRobot's own names for what an action led to; `success` is that of the state after it.
 OUTCOMES = {"next.reward": "float32", "next.success": "bool", "next.done": "bool"}
 
 
-def to_lerobot(results: Results, path: Path) -> int:
-    """Write the dataset into the new folder `path`; returns how many episodes it has. Needs the extra "record".
+def to_lerobot(
+    results: Results,
+    path: Path,
+    *,
+    cameras: Sequence[str] | None = None,
+    state: Sequence[str] | None = None,
+    successes: bool = False,
+    cut_idle: bool = False,
+) -> int:
+    """Write the recorded episodes as a LeRobotDataset v3.0 into the new folder `path`, or leave nothing there.
+
+    Needs the extra "record". One episode at a time is in memory.
 
     A frame is what the policy saw and the action that followed: the last observation of an episode, which none
-    followed, is left out. Raises `ConfigError` if no trajectory was recorded, or if they do not fit one dataset.
+    followed, is left out. Angles and rotation vectors of the state that jump by a full turn are written about another
+    centre. The dataset's contract (`vlagents_ray.dataset_contract`) names it, so that the policy's server does the
+    same.
+
+    Args:
+        cameras: The cameras of the dataset; by default all.
+        state: The parts of `observation.state` in this order, "gripper" for `Obs.gripper`; by default all, sorted, the
+            gripper last.
+        successes: Leave out episodes in which the task was never solved.
+        cut_idle: End each episode where, after the task was solved, neither state nor action changes any more.
+
+    Returns:
+        The number of episodes in the dataset.
+
+    Raises:
+        ConfigError: No such trajectory was recorded, a file is missing, a camera or part is unknown, or the episodes do
+            not fit one dataset.
     """
     recorded = [(cell, one) for cell in results.cells for one in cell.episodes if one.trajectory is not None]
     if not recorded:
-        raise ConfigError(f"{results.out}: has no trajectories; evaluate with `record: all`, or `failures`")
+        raise ConfigError(
+            f"{results.out}: has no trajectories; evaluate with --record all or failures (`record: all` in its file)"
+        )
+    if successes:
+        solved = [(cell, one) for cell, one in recorded if one.result.success_once]
+        if not solved:
+            raise ConfigError(f"{results.out}: in none of the {len(recorded)} recorded episodes was the task solved")
+        recorded = solved
     if path.exists() and any(path.iterdir()):
         raise ConfigError(f"{path}: is there, and not empty; export into a new folder")
     rates = {_fps(cell) for cell, _ in recorded}
     if len(rates) > 1:
         raise ConfigError(f"the envs run at {sorted(rates)} Hz, and a dataset has one rate; {_CURE}")
-    dataset = Dataset(path, rates.pop())
-    for cell, episode in recorded:
-        assert episode.trajectory is not None  # noqa: S101 - chosen by that
-        finished = _finished(cell, episode.result.instruction, results.out / episode.trajectory, path / UNFINISHED)
-        if not len(finished.rows[ACTION]):
-            continue  # the policy failed before it acted: a dataset knows no empty episode
-        if dataset.episodes and finished.features != dataset.info["features"]:
-            odd = sorted(k for k, v in finished.features.items() if dataset.info["features"].get(k) != v)
-            raise ConfigError(f"{cell.env}: has other features than the envs before it ({', '.join(odd)}); {_CURE}")
-        dataset.save(finished)
-    return dataset.episodes
+
+    def demonstrations() -> Iterator[_Demonstration]:
+        for cell, episode in recorded:
+            one = _demonstration(results, cell, episode, cameras, state, cut_idle)
+            if len(one.actions):  # a policy that failed before it acted leaves an empty episode, which no dataset has
+                yield one
+
+    angles = _angles(demonstrations())
+    with whole_folder(path) as root:
+        dataset = Dataset(root, rates.pop())
+        for one in demonstrations():
+            finished = _finished(one, angles, root / UNFINISHED)
+            if dataset.episodes and finished.features != dataset.info["features"]:
+                odd = sorted(k for k, v in finished.features.items() if dataset.info["features"].get(k) != v)
+                raise ConfigError(
+                    f"{one.cell.env}: has other features than the envs before it ({', '.join(odd)}); {_CURE}"
+                )
+            dataset.save(finished)
+        if not dataset.episodes:
+            raise ConfigError(f"{results.out}: in none of the {len(recorded)} recorded episodes did the policy act")
+        return dataset.episodes
 
 
 _CURE = "export env by env (--env)"
+# Rest is a change from one frame to the next below this share of the range of a part of the state, or of the action.
+_STILL = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class _Demonstration:
+    """The N frames of one episode that go into the dataset."""
+
+    cell: CellResults
+    episode: Episode
+    contract: Contract  # of the env
+    actions: np.ndarray  # (N, A)
+    rewards: np.ndarray  # (N,)
+    success: np.ndarray  # (N,)
+    parts: tuple[str, ...]
+    state: dict[str, np.ndarray]  # (N, D) each
+    gripper: np.ndarray | None  # (N,)
+    videos: dict[str, Path]  # by camera
 
 
 def _fps(cell: CellResults) -> float:
     return float(cell.contract.get("control_hz") or DEFAULT_FPS)
 
 
-def _finished(cell: CellResults, instruction: str, path: Path, folder: Path) -> Finished:
-    """The episode as the dataset takes it; its videos are put into `folder` first."""
-    trajectory = Trajectory.load(path)
-    rows, features = _numbers(trajectory, cell.contract)
+def _demonstration(
+    results: Results,
+    cell: CellResults,
+    episode: Episode,
+    cameras: Sequence[str] | None,
+    state: Sequence[str] | None,
+    cut_idle: bool,
+) -> _Demonstration:
+    path = str(episode.trajectory)
+    trajectory = Trajectory.load(results.file(path))
+    parts = parts_of(trajectory.state, trajectory.gripper is not None)
+    chosen = _chosen("state", state, parts, cell.env)
+    shown = _chosen("cameras", cameras, trajectory.cameras, cell.env)
+    videos = videos_of(Path(path), trajectory.cameras)
+    with_gripper = trajectory.gripper is not None and GRIPPER in chosen
+    named = set(chosen) - ({GRIPPER} if with_gripper else set())
+    kept = {part: values for part, values in trajectory.state.items() if part in named}
+    gripper = trajectory.gripper if with_gripper else None
+    frames = len(trajectory.actions)
+    if cut_idle:
+        moving = [trajectory.actions, *kept.values(), *([] if gripper is None else [gripper[:, np.newaxis]])]
+        frames = _frames_until_rest(trajectory.success, moving)
+    return _Demonstration(
+        cell,
+        episode,
+        Contract.from_json(cell.contract),
+        trajectory.actions[:frames],
+        trajectory.rewards[:frames],
+        trajectory.success[:frames],
+        tuple(chosen),
+        {part: values[:frames] for part, values in kept.items()},
+        None if gripper is None else gripper[:frames],
+        {camera: require_there(results.file(str(videos[camera]))) for camera in shown},
+    )
+
+
+def _chosen(option: str, wanted: Sequence[str] | None, known: Sequence[str], env: str) -> list[str]:
+    if wanted is None:
+        return list(known)
+    if unknown := [name for name in wanted if name not in known]:
+        raise ConfigError(
+            f"{option}: {env} has no {', '.join(map(repr, unknown))}, want some of {sorted(known)}"
+            f"{did_you_mean(unknown[0], known)}"
+        )
+    if len(set(wanted)) < len(wanted):
+        raise ConfigError(f"{option}: got {list(wanted)}, want each of them once")
+    return list(wanted)
+
+
+def _frames_until_rest(success: np.ndarray, moving: Sequence[np.ndarray]) -> int:
+    """The number of frames until nothing moves any more after the task was solved; all frames if it never was.
+
+    One frame at rest is kept, from which the policy learns to stop.
+    """
+    frames = len(success)
+    if not success.any():
+        return frames
+    last = int(success.argmax())  # the frame whose action solved it
+    for values in moving:
+        steps = np.abs(np.diff(values, axis=0)).max(axis=1, initial=0)
+        moved = np.flatnonzero(steps > _STILL * np.ptp(values, axis=0).max(initial=0))
+        last = max(last, int(moved.max(initial=0)))
+    return min(last + 2, frames)
+
+
+def _angles(demonstrations: Iterable[_Demonstration]) -> dict[int, Centre]:
+    """The places in `observation.state` of angles and rotation vectors that jump, with the centres of their values."""
+    angles: dict[int, list[np.ndarray]] = {}  # by place; each (N,)
+    vectors: dict[int, list[np.ndarray]] = {}  # by their first place; each (N, 3)
+    for one in demonstrations:
+        place = 0
+        for part in one.parts:
+            values = one.state.get(part)  # None: the gripper, which is one number
+            spec = (one.contract.state or {}).get(part)
+            if values is not None and spec is not None:
+                dim = values.shape[1]
+                for i in angles_in(part, spec.unit, dim):
+                    angles.setdefault(place + i, []).append(values[:, i])
+                if (first := rotation_vector_in(part, spec.unit, dim)) is not None:
+                    vectors.setdefault(place + first, []).append(values[:, first : first + 3])
+            place += 1 if values is None else values.shape[1]
+    centres: dict[int, Centre | None] = {place: centre_of(episodes) for place, episodes in angles.items()}
+    centres |= {place: rotation_centre_of(episodes) for place, episodes in vectors.items()}
+    return {place: centre for place, centre in centres.items() if centre is not None}
+
+
+def _finished(one: _Demonstration, angles: Mapping[int, Centre], folder: Path) -> Finished:
+    """The episode in the form that the dataset takes; its videos are put into `folder` first."""
+    keys = camera_keys(one.videos)
+    names = {key: camera for camera, key in keys.items()}
+    about = DatasetContract(_policy_contract(one), one.parts, names, angles)
+    rows, features = _numbers(one, about)
     images: dict[str, Stats] = {}
     videos: dict[str, Path] = {}
-    for camera in trajectory.cameras:
-        key = camera_key(camera)
-        images[key], size = _statistics(video_of(path, camera), len(trajectory.actions))
-        features[key] = video_feature(*size, _fps(cell))
+    for camera, video in one.videos.items():
+        key = keys[camera]
+        images[key], size = _statistics(video, len(one.actions))
+        features[key] = video_feature(*size, _fps(one.cell))
         videos[key] = folder / f"{key}.mp4"
-        link_or_copy(video_of(path, camera), videos[key])
-    return Finished(instruction, features, rows, images, videos)
+        link_or_copy(video, videos[key])
+    return Finished(one.episode.result.instruction, features, rows, images, videos, about)
 
 
-def _numbers(trajectory: Trajectory, contract: dict[str, Any]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Rows and features: the state in one vector and part by part, the action, and what came of it."""
-    frames, dim = trajectory.actions.shape
-    state = {part: values[:frames] for part, values in trajectory.state.items()}
-    gripper = None if trajectory.gripper is None else trajectory.gripper[:frames]
-    together, names = state_vector(state, gripper)
+def _policy_contract(one: _Demonstration) -> Contract:
+    """The contract of a policy that is trained on the dataset: its actions are the env's, without bounds."""
+    env = one.contract
+    specs = env.state or {}
+    return Contract(
+        cameras={camera: (env.cameras or {}).get(camera, CameraSpec()) for camera in one.videos},
+        state={part: replace(specs.get(part, StateSpec()), dim=values.shape[1]) for part, values in one.state.items()},
+        gripper=one.gripper is not None,
+        action=replace(env.action, dim=one.actions.shape[1], low=None, high=None),
+        control_hz=env.control_hz,
+    )
+
+
+def _numbers(one: _Demonstration, about: DatasetContract) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Rows and features: the state in one vector and part by part, the action, and its outcome."""
+    frames, dim = one.actions.shape
+    together, names = state_vector(one.state, one.gripper, one.parts)
+    together = about.wrapped(together)
     rows = {
-        ACTION: trajectory.actions,
-        "next.reward": trajectory.rewards.astype(np.float32),
-        "next.success": trajectory.success,
+        ACTION: one.actions,
+        "next.reward": one.rewards.astype(np.float32),
+        "next.success": one.success,
         "next.done": np.arange(frames) == frames - 1,
     }
     features = {ACTION: vector_feature([f"action_{i}" for i in range(dim)]), **number_features(OUTCOMES | INDEX)}
-    features[ACTION]["spec"] = contract.get("action")
+    features[ACTION]["spec"] = one.cell.contract.get("action")
     if names:
         rows[STATE], features[STATE] = together, vector_feature(names)
-    for part, values in state.items():
-        key = f"{STATE}.{part.replace('/', '_')}"
-        rows[key], features[key] = values, vector_feature([f"{part}_{i}" for i in range(values.shape[1])])
-        features[key]["unit"] = (contract.get("state") or {}).get(part, {}).get("unit")
-    if gripper is not None:
-        rows[GRIPPER] = gripper
-        features |= number_features({GRIPPER: "float32"})
+    keys = distinct(one.state, without_slash)
+    place = 0
+    for part in one.parts:
+        if part not in one.state:
+            rows[GRIPPER_FEATURE] = one.gripper
+            features |= number_features({GRIPPER_FEATURE: "float32"})
+            place += 1
+            continue
+        width = one.state[part].shape[1]
+        key = f"{STATE}.{keys[part]}"
+        rows[key] = together[:, place : place + width]
+        features[key] = vector_feature([f"{part}_{i}" for i in range(width)])
+        features[key]["unit"] = getattr((one.contract.state or {}).get(part), "unit", None)
+        place += width
     return rows, features
 
 
 def _statistics(video: Path, frames: int) -> tuple[Stats, tuple[int, int]]:
-    """Of the first `frames` pictures, and their height and width in pixels."""
+    """The statistics of the first `frames` images, and their (height, width) in pixels."""
     seen = ImageStatistics()
     with require("av").open(str(video)) as container:
         stream = container.streams.video[0]

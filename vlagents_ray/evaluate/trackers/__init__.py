@@ -1,5 +1,5 @@
 """Rates and videos of an evaluation where training is watched: wandb, trackio, TensorBoard."""
 
-from vlagents_ray.evaluate.trackers.tracking import Tracking
+from vlagents_ray.evaluate.trackers.tracking import TrackerFeed
 
-__all__ = ["Tracking"]
+__all__ = ["TrackerFeed"]

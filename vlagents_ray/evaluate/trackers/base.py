@@ -1,4 +1,4 @@
-"""What all trackers are told, and in which words."""
+"""The interface of all trackers."""
 
 from __future__ import annotations
 
@@ -11,32 +11,32 @@ from typing import Any
 
 @dataclass(frozen=True, slots=True)
 class About:
-    """A tracker's run: one policy of one folder of results, whichever of its checkpoints."""
+    """What a tracker's run is about: one policy of one folder of results, with all its checkpoints."""
 
     out: Path
     project: str
     group: str
     name: str  # of the policy
-    id: str  # the same whenever this folder is resumed
-    config: dict[str, Any]  # of the evaluation, and the code by what it is of
-    diffs: Sequence[Path]  # what differed from the commits
+    id: str  # stays the same when an evaluation resumes this folder
+    config: dict[str, Any]  # `evaluation`: its settings; `code`: the git state of policy, envs and driver
+    diffs: Sequence[Path]  # of the working trees from their commits
 
 
 class TrackerRun(ABC):
-    """One run in one tracker. What its methods raise is the caller's to bear."""
+    """One run in one tracker. Its methods may raise anything; the caller handles it."""
 
     @abstractmethod
     def __init__(self, about: About) -> None:
-        """Begin the run, or go on with it."""
+        """Begin the run, or resume it."""
 
     @abstractmethod
     def log(self, metrics: Mapping[str, float], step: int | None) -> None:
-        """Values at a training step; without one, as the run's only ones."""
+        """Log values at a training step; without a step they are the only values of the run."""
 
     @abstractmethod
     def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
-        """Videos of episodes behind the values that begin with `label`."""
+        """Upload videos of episodes of the suite and env that `label` names, as the names of its values do."""
 
     @abstractmethod
     def finish(self) -> None:
-        """Write what is left."""
+        """Send what is buffered, and end the run."""

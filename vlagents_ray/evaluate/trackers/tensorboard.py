@@ -8,15 +8,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vlagents_ray.evaluate.files import plain
 from vlagents_ray.evaluate.trackers.base import About, TrackerRun
+from vlagents_ray.naming import plain
 from vlagents_ray.registry import require
 
 FOLDER = "tensorboard"
 
 
 class TensorboardRun(TrackerRun):
-    """Scalars and texts; TensorBoard plays no MP4, so videos are named by their paths."""
+    """Scalars and texts. TensorBoard plays no MP4, so that the paths of videos are logged."""
 
     def __init__(self, about: About) -> None:
         self._event: Any = require("tensorboard.compat.proto.event_pb2").Event
@@ -29,16 +29,16 @@ class TensorboardRun(TrackerRun):
         self._text("config", json.dumps(about.config, indent=1, default=str), 0)
 
     def log(self, metrics: Mapping[str, float], step: int | None) -> None:
-        """A point of each curve; without a training step at 0."""
+        """Add a point to each curve; without a training step at 0."""
         values = [self._summary.Value(tag=name, simple_value=value) for name, value in metrics.items()]
         self._add(values, step or 0)
 
     def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
-        """Their paths in the folder of results, as a text."""
+        """Log the paths of the videos in the folder of results, as a text."""
         self._text(f"{label}/videos", "\n".join(str(path.relative_to(self._out)) for path in paths), step or 0)
 
     def finish(self) -> None:
-        """Write what is left."""
+        """Write what is buffered, and close the file."""
         self._writer.close()
 
     def _text(self, tag: str, text: str, step: int) -> None:

@@ -1,4 +1,4 @@
-"""Tells the trackers of each cell once, when it is complete; never in the way of the evaluation."""
+"""Logs each cell to the trackers once, when it is complete, without delaying the evaluation."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
-from vlagents_ray.evaluate.config import EvalConfig, Tracker, fingerprint
-from vlagents_ray.evaluate.files import PROVENANCE
-from vlagents_ray.evaluate.results import CellResults, Results
-from vlagents_ray.evaluate.schema import FILE
-from vlagents_ray.evaluate.summary import Group, summarize
+from vlagents_ray.evaluate.artifacts.storage import PROVENANCE
+from vlagents_ray.evaluate.plan.config import EvalConfig, Tracker, fingerprint
+from vlagents_ray.evaluate.results.database import FILE, WAIT_S
+from vlagents_ray.evaluate.results.reader import CellResults, Results
+from vlagents_ray.evaluate.results.summary import Group, summarize
 from vlagents_ray.evaluate.trackers.base import About, TrackerRun
 from vlagents_ray.registry import named_class, require
 
 log = logging.getLogger(__name__)
 
-CLOSE_S = 120.0  # for trackers to send what is left
+CLOSE_S = 120.0  # for trackers to send what is buffered
 _RUNS: dict[str, str] = {
     "wandb": "vlagents_ray.evaluate.trackers.wandb:WandbRun",
     "trackio": "vlagents_ray.evaluate.trackers.trackio:TrackioRun",
@@ -27,74 +27,74 @@ _RUNS: dict[str, str] = {
 }
 
 
-class Tracking:
-    """Has a thread, as a tracker may wait for a network. Use as a context manager around a run.
+class TrackerFeed:
+    """Logs to the trackers from a thread, as a tracker may wait for a network. Use as a context manager around a run.
 
-    A tracker that fails is not asked again in this run: that is a warning, and the results stay. What was told is
-    noted in the results, so that a run that resumes them tells only what is new.
+    A tracker that fails is not used again in this run: a warning is logged, and the results are unaffected. What was
+    logged is noted in the results, so that a run that resumes them logs only what is new.
     """
 
     def __init__(self, config: EvalConfig) -> None:
-        """`MissingDependency` for a tracker that is not installed."""
+        """Raise `MissingDependency` for a tracker that is not installed."""
         for name in config.track:
             require(name)
         self._config = config
-        self._left: list[Tracker] = list(config.track)  # that have not failed
+        self._working: list[Tracker] = list(config.track)  # those that have not failed
         self._runs: dict[tuple[str, str], TrackerRun] = {}  # by tracker and policy
-        self._news = threading.Event()
-        self._over = False
-        self._thread = threading.Thread(target=self._go, name="vlagents-ray-trackers", daemon=True)
+        self._updated = threading.Event()
+        self._closing = False
+        self._thread = threading.Thread(target=self._loop, name="vlagents-ray-trackers", daemon=True)
 
-    def look(self) -> None:
-        """A cell is complete. Several that are, while trackers are told of others, are one look."""
-        self._news.set()
+    def update(self) -> None:
+        """Look for complete cells soon. Calls while trackers are busy count as one."""
+        self._updated.set()
 
-    def __enter__(self) -> Tracking:
-        if self._left:
+    def __enter__(self) -> TrackerFeed:
+        if self._working:
             self._thread.start()
         return self
 
     def __exit__(self, *exc: object) -> None:
         if self._config.track:
-            self._over = True
-            self._news.set()
+            self._closing = True
+            self._updated.set()
             self._thread.join(CLOSE_S)
             if self._thread.is_alive():
-                log.warning("%s: still sending after %g s; given up", ", ".join(self._left), CLOSE_S)
+                log.warning("%s: still sending after %g s; given up", ", ".join(self._working), CLOSE_S)
 
-    def _go(self) -> None:
+    def _loop(self) -> None:
         over = False
         while not over:
-            self._news.wait()
-            self._news.clear()
-            over = self._over  # before looking: what is complete by then is told
-            self._tell()
+            self._updated.wait()
+            self._updated.clear()
+            over = self._closing  # read before the results are: whatever is complete by then is logged
+            self._log_to_all()
         for (name, _), run in self._runs.items():
             try:
                 run.finish()
             except Exception as error:  # noqa: BLE001 - whatever a tracker raises
                 log.warning("%s: %s: %s", name, type(error).__name__, error)
 
-    def _tell(self) -> None:
-        for name in list(self._left):
+    def _log_to_all(self) -> None:
+        for name in list(self._working):
             try:
-                self._tell_one(name, Results.load(self._config.out))
+                self._log_to(name, Results.load(self._config.out))
             except Exception as error:  # noqa: BLE001 - whatever a tracker raises
-                log.warning("%s: %s: %s; it is told no more", name, type(error).__name__, error)
-                self._left.remove(name)
+                log.warning("%s: %s: %s; nothing more is logged to it", name, type(error).__name__, error)
+                self._working.remove(name)
 
-    def _tell_one(self, name: Tracker, results: Results) -> None:
-        with closing(sqlite3.connect(self._config.out / FILE)) as db:
-            told = dict(db.execute("SELECT what, episodes FROM tracked WHERE tracker = ?", (name,)))
-            for what, cells, group in _parts(results):
-                if not all(map(_complete, cells)) or told.get(what) == group.episodes:
+    def _log_to(self, name: Tracker, results: Results) -> None:
+        with closing(sqlite3.connect(self._config.out / FILE, timeout=WAIT_S)) as db:
+            logged = dict(db.execute("SELECT what, episodes FROM tracked WHERE tracker = ?", (name,)))
+            for part, cells, group in _parts(results):
+                if not all(map(_complete, cells)) or logged.get(part) == group.episodes:
                     continue
                 run = self._run(name, results, cells[0].policy)
                 run.log(_metrics(group), cells[0].step)
-                if what == cells[0].cell and (videos := self._videos(cells[0])):
+                if part == cells[0].cell and (videos := self._videos(cells[0])):
                     run.videos(_label(group), videos, cells[0].step)
                 with db:
-                    db.execute("INSERT OR REPLACE INTO tracked VALUES (?, ?, ?)", (name, what, group.episodes))
+                    db.execute("INSERT OR REPLACE INTO tracked VALUES (?, ?, ?)", (name, part, group.episodes))
 
     def _run(self, name: Tracker, results: Results, policy: str) -> TrackerRun:
         if (name, policy) not in self._runs:
@@ -119,7 +119,7 @@ class Tracking:
 
 
 def _parts(results: Results) -> list[tuple[str, list[CellResults], Group]]:
-    """What is told as one: each cell, then each contender in all of its cells; first by what name it is noted."""
+    """What is logged together, as (the key under which that is noted, cells, aggregates): each cell, each policy id."""
     summary = summarize(results)
     alone = [(cell.cell, [cell], group) for cell, group in zip(results.cells, summary.cells, strict=True)]
     totals = zip(results.contenders, summary.totals, strict=True)

@@ -11,7 +11,7 @@ from vlagents_ray.registry import require
 
 
 class TrackioRun(TrackerRun):
-    """A run of the policy's name with the begin of its id: trackio knows runs by name. It has no summary."""
+    """A run named after the policy and the first digits of its id, as trackio identifies runs by name."""
 
     def __init__(self, about: About) -> None:
         self._trackio: Any = require("trackio")
@@ -21,14 +21,14 @@ class TrackioRun(TrackerRun):
         )  # fmt: skip
 
     def log(self, metrics: Mapping[str, float], step: int | None) -> None:
-        """A point of each curve; without a training step at 0."""
+        """Add a point to each curve; without a training step at 0, as trackio has no summary."""
         self._run.log(dict(metrics), step=step or 0)
 
     def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
-        """Videos beside the curves."""
+        """Show the videos beside the curves."""
         shown = {f"{label}/{path.stem}": self._trackio.Video(path) for path in paths}
         self._run.log(shown, step=step or 0)
 
     def finish(self) -> None:
-        """Write what is left."""
+        """Send what is buffered, and end the run."""
         self._run.finish()

@@ -6,15 +6,15 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from vlagents_ray.evaluate.files import plain
 from vlagents_ray.evaluate.trackers.base import About, TrackerRun
+from vlagents_ray.naming import plain
 from vlagents_ray.registry import require
 
 STEP = "training_step"
 
 
 class WandbRun(TrackerRun):
-    """A run whose curves are drawn against `training_step`; without one, values stand in its summary."""
+    """A run whose curves are drawn against `training_step`; values without a step are in its summary."""
 
     def __init__(self, about: About) -> None:
         self._wandb: Any = require("wandb")
@@ -31,19 +31,19 @@ class WandbRun(TrackerRun):
             self._artifact("code", "code", about.diffs)
 
     def log(self, metrics: Mapping[str, float], step: int | None) -> None:
-        """A point of each curve, or the summary."""
+        """Add a point to each curve; without a training step, write the summary."""
         if step is None:
             self._run.summary.update(dict(metrics))
         else:
             self._run.log({STEP: step, **metrics})
 
     def videos(self, label: str, paths: Sequence[Path], step: int | None) -> None:
-        """An artifact of type "videos"."""
+        """Upload the videos as an artifact of type "videos"."""
         at = "" if step is None else f"-{step}"
         self._artifact(f"videos-{plain(label.replace('/', '_'))}{at}", "videos", paths)
 
     def finish(self) -> None:
-        """Write what is left."""
+        """Send what is buffered, and end the run."""
         self._run.finish()
 
     def _artifact(self, name: str, kind: str, paths: Sequence[Path]) -> None:

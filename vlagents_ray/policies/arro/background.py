@@ -15,7 +15,7 @@ Colour = tuple[Channel, Channel, Channel]  # RGB, 0 to 255
 
 
 class BackgroundConfig(BaseModel, extra="forbid"):
-    """A colour, with a grid on it if wanted, or an image: what the policy was trained with."""
+    """A colour, optionally with a grid on it, or an image, as in the policy's training."""
 
     colour: Colour = (0, 0, 0)
     grid: Colour | None = Field(default=None, description="colour of the grid's lines, one pixel wide; unset: no grid")
@@ -33,18 +33,20 @@ class BackgroundConfig(BaseModel, extra="forbid"):
 
 
 class Background:
-    """Pastes segments on the background."""
+    """Pastes segments onto the background."""
 
     def __init__(self, config: BackgroundConfig) -> None:
         self._config = config
         self._drawn: dict[tuple[int, int], np.ndarray] = {}
 
     def load(self) -> None:
-        """Raise `ConfigError` unless the image, if there is to be one, can be read."""
+        """Raise `ConfigError` if an image is configured that cannot be read."""
         self._draw(1, 1)
 
     def behind(self, image: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """A new image: `image`, (H, W, 3) uint8, where `mask`, (H, W) bool, and the background elsewhere."""
+        """Return a new image: `image`, (H, W, 3) uint8, where `mask`, (H, W) bool, is True, and the background
+        elsewhere.
+        """
         height, width = mask.shape
         if (height, width) not in self._drawn:
             self._drawn[height, width] = self._draw(height, width)

@@ -12,7 +12,7 @@ Part = str | dict[str, dict[str, Any]]
 
 
 class ArroConfig(BaseModel, extra="forbid"):
-    """What is shown, which parts find it, and what happens when it is out of sight."""
+    """The cameras, the parts that find objects, and the treatment of missing ones."""
 
     cameras: list[str] | None = Field(
         default=None, description="the cameras that are changed; unset: those of the policy's contract, or all"

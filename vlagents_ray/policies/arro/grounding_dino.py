@@ -8,13 +8,12 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from vlagents_ray.policies.arro.parts import Found, Images
-from vlagents_ray.policies.arro.pretrained import PretrainedConfig, load_pretrained, writable
+from vlagents_ray.policies.arro.parts import Detection, Images, PretrainedConfig, load_pretrained, writable
 from vlagents_ray.registry import require
 
 
 class GroundingDinoConfig(PretrainedConfig):
-    """Which of its boxes count."""
+    """The weights, and which boxes count."""
 
     checkpoint: str = Field(default="IDEA-Research/grounding-dino-tiny", min_length=1)
     threshold: float = Field(default=0.35, ge=0, le=1, description="the least score of a box for a word of a phrase")
@@ -23,7 +22,10 @@ class GroundingDinoConfig(PretrainedConfig):
 
 
 class GroundingDinoDetector:
-    """Boxes for phrases, or for the things that a whole instruction names; all images of a size in one forward pass."""
+    """Detects boxes for phrases, or for the objects in a whole instruction.
+
+    One forward pass for each size of images.
+    """
 
     Config: ClassVar[type] = GroundingDinoConfig
 
@@ -33,36 +35,36 @@ class GroundingDinoDetector:
         self._processor: Any = None
 
     def load(self) -> None:
-        """Read the weights; `ConfigError` if they are not all there."""
+        """Read the weights; raises `ConfigError` if some are missing."""
         self._model, self._processor = load_pretrained(
             "GroundingDinoForObjectDetection", "GroundingDinoProcessor", self._config
         )
 
-    def detect(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Found]]:
-        """Boxes, the best first; a box goes by the phrase that has the best of its words."""
-        found: list[list[Found]] = [[] for _ in images]
-        for size in {image.shape for image in images}:  # padding, as a mixed batch needs it, would change what is seen
+    def detect(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Detection]]:
+        """Return boxes, the best first; a box belongs to the phrase with the best of its words."""
+        found: list[list[Detection]] = [[] for _ in images]
+        for size in {image.shape for image in images}:  # the padding of a mixed batch would change the result
             own = [i for i, image in enumerate(images) if image.shape == size]
             for i, things in zip(own, self._batch([images[i] for i in own], [phrases[i] for i in own]), strict=True):
                 found[i] = things
         return found
 
-    def _batch(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Found]]:
-        """Images of one size."""
+    def _batch(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Detection]]:
+        """Detect objects on images of one size."""
         torch = require("torch")
         texts = [_text(asked) for asked in phrases]
         inputs = self._processor(images=writable(images), text=texts, padding=True, return_tensors="pt")
         with torch.inference_mode():
             outputs = self._model(**inputs.to(self._model.device, self._model.dtype))
         words = outputs.logits.float().sigmoid().cpu().numpy()  # (B, queries, tokens)
-        boxes = outputs.pred_boxes.float().cpu().numpy()  # (B, queries, 4): centre and size, in images
+        boxes = outputs.pred_boxes.float().cpu().numpy()  # (B, queries, 4): centre and size, as shares of the image
         return [
-            self._found(one, asked, self._scores(scores, asked), own)
+            self._detections(one, asked, self._scores(scores, asked), own)
             for one, asked, scores, own in zip(images, phrases, words, boxes, strict=True)
         ]
 
     def _scores(self, words: np.ndarray, phrases: Sequence[str]) -> np.ndarray:
-        """(queries, phrases): the best score of a phrase's words."""
+        """Return (queries, phrases): the best score of a phrase's words."""
         offsets = self._processor.tokenizer(_text(phrases), return_offsets_mapping=True)["offset_mapping"]
         scores, start = [], 0
         for phrase in map(_clean, phrases):
@@ -72,12 +74,14 @@ class GroundingDinoDetector:
             start = end + len(_BETWEEN)
         return np.stack(scores, 1)
 
-    def _found(self, image: np.ndarray, phrases: Sequence[str], scores: np.ndarray, boxes: np.ndarray) -> list[Found]:
+    def _detections(
+        self, image: np.ndarray, phrases: Sequence[str], scores: np.ndarray, boxes: np.ndarray
+    ) -> list[Detection]:
         height, width = image.shape[:2]
         centre, half = boxes[:, :2], boxes[:, 2:] / 2
         corners = np.concatenate([centre - half, centre + half], 1).clip(0, 1) * np.array([width, height] * 2)
         named = scores.argmax(1)
-        found: list[Found] = []
+        found: list[Detection] = []
         for query in np.argsort(-scores.max(1), kind="stable"):
             score, phrase = float(scores[query].max()), phrases[named[query]]
             if score < self._config.threshold:
@@ -86,7 +90,7 @@ class GroundingDinoDetector:
             if len(same) < self._config.most and all(
                 _iou(one.box, corners[query]) < self._config.overlap for one in same
             ):
-                found.append(Found(phrase, corners[query].astype(np.float32), score))
+                found.append(Detection(phrase, corners[query].astype(np.float32), score))
         return found
 
 
@@ -98,7 +102,7 @@ def _clean(phrase: str) -> str:
 
 
 def _text(phrases: Sequence[str]) -> str:
-    """Phrases as Grounding DINO was trained to read them."""
+    """Join phrases in the form of Grounding DINO's training."""
     return _BETWEEN.join(map(_clean, phrases)) + "."
 
 

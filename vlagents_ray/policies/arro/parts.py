@@ -1,8 +1,8 @@
-"""What ARRO is made of. Each part is a class that takes an instance of its `Config` and, in `load`, its weights.
+"""The parts of ARRO. Each part is a class that takes an instance of its `Config`, and loads its weights in `load`.
 
-A part is shared by all sessions of a replica and keeps nothing of theirs; a tracker's memory of one
-session and camera is an object of its own, which can be pickled. All get the images of several
-sessions at once, and what they do with one must not depend on the others.
+A part is shared by all sessions of a replica and keeps no state of theirs; a tracker's memory of one session and camera
+is a separate object, which can be pickled. Each part gets the images of several sessions at once, and its result for
+one must not depend on the others.
 """
 
 from __future__ import annotations
@@ -12,96 +12,106 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+from pydantic import BaseModel, Field
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.registry import named_class
+from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
+from vlagents_ray.policies.base.checkpoint import find_checkpoint, from_pretrained
+from vlagents_ray.policies.base.config import DType
+from vlagents_ray.registry import named_class, require
 
 Images = Sequence[np.ndarray]  # (H, W, 3) uint8 RGB each, of any sizes
 
 PARTS: dict[str, dict[str, str]] = {
     "detector": {
-        "colour": "vlagents_ray.policies.arro.colour:ColourDetector",
+        "colour": "vlagents_ray.policies.arro.untrained:ColourDetector",
         "grounding_dino": "vlagents_ray.policies.arro.grounding_dino:GroundingDinoDetector",
     },
     "segmenter": {
-        "flat": "vlagents_ray.policies.arro.flat:FlatSegmenter",
+        "flat": "vlagents_ray.policies.arro.untrained:FlatSegmenter",
         "sam2": "vlagents_ray.policies.arro.sam2:Sam2Segmenter",
     },
-    "selector": {"circle": "vlagents_ray.policies.arro.flat:CircleSelector"},
+    "selector": {"circle": "vlagents_ray.policies.arro.untrained:CircleSelector"},
     "tracker": {
-        "iou": "vlagents_ray.policies.arro.iou:IouTracker",
+        "iou": "vlagents_ray.policies.arro.untrained:IouTracker",
         "sam2": "vlagents_ray.policies.arro.sam2:Sam2Tracker",
     },
 }
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
-    """A thing on an image."""
+class Detection:
+    """A detected object."""
 
-    phrase: str  # of those that were asked for, the one that it goes by
+    phrase: str  # the requested phrase that it was detected for
     box: np.ndarray  # (4,) float32, px: left, top, right, bottom
     score: float
-    mask: np.ndarray | None = None  # (H, W) bool, from a detector that knows the pixels; else they are segmented
+    mask: np.ndarray | None = None  # (H, W) bool, from a detector that provides masks; else the box is segmented
 
 
 class Detector(Protocol):
-    """Finds things by words."""
+    """Detects objects by phrases."""
 
     def load(self) -> None:
         """Read the weights."""
 
-    def detect(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Found]]:
-        """What there is of `phrases[i]` on `images[i]`, the best first."""
+    def detect(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Detection]]:
+        """Return the objects of `phrases[i]` on `images[i]`, the best first."""
         ...
 
 
 class Segmenter(Protocol):
-    """Cuts things out."""
+    """Computes masks of objects."""
 
     def load(self) -> None:
         """Read the weights."""
 
     def segment(self, images: Images, boxes: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """The thing in each box: (N, H, W) bool for boxes (N, 4) px; nowhere true where there is none."""
+        """Return the mask of the object in each box: (N, H, W) bool for boxes (N, 4) px.
+
+        All False where there is none.
+        """
         ...
 
     def propose(self, images: Images) -> list[np.ndarray]:
-        """All regions that may be things: (M, H, W) bool, which may overlap."""
+        """Return all regions that may be objects: (M, H, W) bool, which may overlap."""
         ...
 
 
 class Selector(Protocol):
-    """Chooses the gripper's fingers."""
+    """Selects the gripper's fingers."""
 
     def load(self) -> None:
         """Read the weights."""
 
     def select(self, images: Images, regions: Sequence[np.ndarray]) -> list[list[int]]:
-        """Which of the regions (M, H, W) of each image make up the gripper; none if it is not to be seen."""
+        """Return the indices of the regions (M, H, W) of each image that make up the gripper.
+
+        None if it is not visible.
+        """
         ...
 
 
 class Tracker(Protocol):
-    """Follows segments from frame to frame."""
+    """Tracks segments from frame to frame."""
 
     def load(self) -> None:
         """Read the weights."""
 
     def begin(self, images: Images, masks: Sequence[np.ndarray]) -> list[Any]:
-        """A memory of each image's segments, (N, H, W) bool with N >= 1, to follow them from here."""
+        """Return a memory of each image's segments, (N, H, W) bool with N >= 1, from which to track them."""
         ...
 
     def follow(self, images: Images, memories: Sequence[Any]) -> list[tuple[np.ndarray, np.ndarray]]:
-        """For each next image its segments (N, H, W) bool, and which of them are seen, (N,) bool.
+        """Return, for each next image, its segments (N, H, W) bool, and which of them are visible, (N,) bool.
 
-        Changes the memories. The mask of a segment that is not seen means nothing.
+        Updates the memories. The mask of a segment that is not visible is undefined.
         """
         ...
 
 
 def make_part(kind: str, entry: str | Mapping[str, Mapping[str, Any]]) -> Any:
-    """The part of that kind, from a registered name or "module:Class", or {name: settings}. Raises `ConfigError`."""
+    """Create the part of a kind from a registered name or "module:Class", or {name: settings}; raises `ConfigError`."""
     named = {entry: {}} if isinstance(entry, str) else dict(entry)
     if len(named) != 1:
         raise ConfigError(f"{kind}: got {sorted(named)}, want one name with its settings")
@@ -111,3 +121,29 @@ def make_part(kind: str, entry: str | Mapping[str, Mapping[str, Any]]) -> Any:
         return cls(cls.Config(**(settings or {})))
     except (TypeError, ValueError) as error:
         raise ConfigError(f"{kind} {name!r}: {error}") from error
+
+
+class PretrainedConfig(BaseModel, extra="forbid"):
+    """The weights, and their device."""
+
+    checkpoint: str = Field(min_length=1, description="a folder as transformers saves it, or a hub id")
+    device: str = Field(default="auto", description="'auto' (an accelerator if there is one), 'cpu', 'cuda', 'cuda:1'")
+    dtype: DType = Field(default="float32", description="of the weights")
+
+
+def load_pretrained(model: str, processor: str, config: PretrainedConfig) -> tuple[Any, Any]:
+    """Load a model and a processor by their class names in transformers.
+
+    Raises `ConfigError` if anything is missing.
+    """
+    ensure_torchvision()
+    transformers = require("transformers")
+    path = find_checkpoint(config.checkpoint, needs=("config.json", "*.safetensors", "*processor_config.json"))
+    device = torch_device(config.device)
+    loaded = from_pretrained(getattr(transformers, model), path, dtype=torch_dtype(config.dtype, device))
+    return loaded.to(device).eval(), getattr(transformers, processor).from_pretrained(path)
+
+
+def writable(images: Images) -> list[np.ndarray]:
+    """Return copies of the images: a server's are read-only, which torch warns about."""
+    return [image.copy() for image in images]

@@ -1,4 +1,4 @@
-"""Regions of an image in plain numpy: connected pixels, boxes, wider masks."""
+"""Regions of an image, in plain numpy: connected pixels, boxes, wider masks."""
 
 from __future__ import annotations
 
@@ -6,11 +6,11 @@ import numpy as np
 
 
 def connected(right: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """A number for each pixel, (H, W) int, the same where a chain of linked neighbours connects two.
+    """Label each pixel, (H, W) int; two pixels share a label if a chain of linked neighbours connects them.
 
     Args:
-        right: (H, W - 1) bool, is a pixel linked to the next one in its row?
-        down: (H - 1, W) bool, to the one below it?
+        right: (H, W - 1) bool, whether a pixel is linked to the next one in its row.
+        down: (H - 1, W) bool, whether a pixel is linked to the one below it.
     """
     height, width = right.shape[0], down.shape[1]
     index = np.arange(height * width).reshape(height, width)
@@ -28,19 +28,19 @@ def connected(right: np.ndarray, down: np.ndarray) -> np.ndarray:
 
 
 def split(mask: np.ndarray, smallest: int = 1) -> list[np.ndarray]:
-    """The connected regions of `mask`, (H, W) bool each, of at least `smallest` pixels; the largest first."""
+    """Return the connected regions of `mask`, (H, W) bool each, of at least `smallest` pixels; the largest first."""
     labels = connected(mask[:, :-1] & mask[:, 1:], mask[:-1] & mask[1:])
     return [labels == label for label in largest(labels[mask], smallest)]
 
 
 def flat(image: np.ndarray, tolerance: int) -> np.ndarray:
-    """A number for each pixel, (H, W) int; neighbours share it that differ by `tolerance` at most in all channels."""
+    """Label each pixel, (H, W) int; neighbours that differ by at most `tolerance` in all channels share a label."""
     signed = image.astype(np.int16)
     return connected(*(np.abs(np.diff(signed, axis=axis)).max(-1) <= tolerance for axis in (1, 0)))
 
 
 def largest(labels: np.ndarray, smallest: int) -> np.ndarray:
-    """The labels of at least `smallest` pixels, the commonest first."""
+    """Return the labels of at least `smallest` pixels, the most frequent first."""
     values, counts = np.unique(labels, return_counts=True)
     order = np.argsort(-counts, kind="stable")
     kept: np.ndarray = values[order[counts[order] >= smallest]]
@@ -48,19 +48,19 @@ def largest(labels: np.ndarray, smallest: int) -> np.ndarray:
 
 
 def box_of(mask: np.ndarray) -> np.ndarray:
-    """The smallest box around what is true: (4,) float32, px: left, top, right, bottom."""
+    """Return the smallest box around the true pixels: (4,) float32, px: left, top, right, bottom."""
     rows, columns = np.nonzero(mask.any(1))[0], np.nonzero(mask.any(0))[0]
     return np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], np.float32)
 
 
 def overlap(one: np.ndarray, other: np.ndarray) -> float:
-    """Intersection over union of two masks; 0 if both are empty."""
+    """Return the intersection over union of two masks; 0 if both are empty."""
     union = np.count_nonzero(one | other)
     return np.count_nonzero(one & other) / union if union else 0.0
 
 
 def grown(mask: np.ndarray, pixels: int) -> np.ndarray:
-    """The mask, widened by so many pixels to each side."""
+    """Widen the mask by `pixels` to each side."""
     for axis in (0, 1):
         padding = [(0, 0), (0, 0)]
         padding[axis] = (pixels, pixels)

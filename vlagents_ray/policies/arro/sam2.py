@@ -9,20 +9,19 @@ from typing import Any, ClassVar
 import numpy as np
 from pydantic import Field
 
-from vlagents_ray.policies.arro.parts import Images
-from vlagents_ray.policies.arro.pretrained import PretrainedConfig, load_pretrained, writable
+from vlagents_ray.policies.arro.parts import Images, PretrainedConfig, load_pretrained, writable
 from vlagents_ray.policies.arro.regions import overlap
 from vlagents_ray.registry import require
 
 
 class Sam2Config(PretrainedConfig):
-    """Which SAM 2: those of the video model serve for images, too."""
+    """The weights of SAM 2: those of the video model can be used for images, too."""
 
     checkpoint: str = Field(default="facebook/sam2.1-hiera-small", min_length=1)
 
 
 class Sam2SegmenterConfig(Sam2Config):
-    """How regions are proposed: a mask for each point of a grid, without the doubtful ones and repetitions."""
+    """The proposal of regions: a mask for each point of a grid, without uncertain and repeated ones."""
 
     points: int = Field(default=16, ge=1, description="of the grid, along each side")
     confidence: float = Field(default=0.8, ge=0, le=1, description="the least intersection over union it expects")
@@ -30,7 +29,7 @@ class Sam2SegmenterConfig(Sam2Config):
 
 
 class Sam2Segmenter:
-    """Masks for boxes and for a grid of points; all images in one forward pass of the image encoder."""
+    """Computes masks for boxes and for a grid of points; all images in one forward pass of the image encoder."""
 
     Config: ClassVar[type] = Sam2SegmenterConfig
 
@@ -40,11 +39,11 @@ class Sam2Segmenter:
         self._processor: Any = None
 
     def load(self) -> None:
-        """Read the weights; `ConfigError` if they are not all there."""
+        """Read the weights; raises `ConfigError` if some are missing."""
         self._model, self._processor = load_pretrained("Sam2Model", "Sam2ImageProcessor", self._config)
 
     def segment(self, images: Images, boxes: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """One mask a box."""
+        """Return one mask for each box."""
         torch = require("torch")
         made = []
         for image, embedded, own in zip(images, self._embedded(images), boxes, strict=True):
@@ -54,7 +53,7 @@ class Sam2Segmenter:
         return made
 
     def propose(self, images: Images) -> list[np.ndarray]:
-        """What lies under the points of the grid, the surest first."""
+        """Return the regions under the points of the grid, the most certain first."""
         torch = require("torch")
         along = (np.arange(self._config.points, dtype=np.float32) + 0.5) * (self._side / self._config.points)
         grid = torch.as_tensor(np.stack(np.meshgrid(along, along), -1).reshape(1, -1, 1, 2), dtype=self._model.dtype)
@@ -74,11 +73,11 @@ class Sam2Segmenter:
 
     @property
     def _side(self) -> int:
-        """Of the square that images are resized to, px."""
+        """The side of the square to which images are resized, px."""
         return int(self._processor.size["height"])
 
     def _embedded(self, images: Images) -> list[list[Any]]:
-        """The features of each image."""
+        """Compute the features of each image."""
         with require("torch").inference_mode():
             levels = self._model.get_image_embeddings(_pixels(self._processor, images, self._model))
         return [[level[i : i + 1] for level in levels] for i in range(len(images))]
@@ -90,10 +89,10 @@ class Sam2Segmenter:
 
 
 @dataclass(slots=True)
-class _Memory:
-    """What SAM 2 remembers of one camera of one session."""
+class _TrackMemory:
+    """SAM 2's memory of one camera of one session."""
 
-    session: Any  # transformers' own: features and pointers of the last frames, no more than the model looks at
+    session: Any  # transformers' session: features and pointers of the last frames, only those that the model uses
     frame: int = 0
 
 
@@ -111,14 +110,14 @@ class Sam2Tracker:
         self._processor: Any = None
 
     def load(self) -> None:
-        """Read the weights; `ConfigError` if they are not all there."""
+        """Read the weights; raises `ConfigError` if some are missing."""
         self._model, self._processor = load_pretrained("Sam2VideoModel", "Sam2VideoProcessor", self._config)
 
     def begin(self, images: Images, masks: Sequence[np.ndarray]) -> list[Any]:
-        """A memory of the masks."""
+        """Return a memory of the masks."""
         memories = []
         for own in masks:
-            memory = _Memory(
+            memory = _TrackMemory(
                 self._processor.init_video_session(inference_device=self._model.device, dtype=self._model.dtype)
             )
             self._processor.add_inputs_to_inference_session(
@@ -129,7 +128,7 @@ class Sam2Tracker:
         return memories
 
     def follow(self, images: Images, memories: Sequence[Any]) -> list[tuple[np.ndarray, np.ndarray]]:
-        """The masks on the next frame; one that the model thinks is out of sight is not seen."""
+        """Return the masks on the next frame; a segment that the model predicts to be out of sight is not visible."""
         followed = []
         for image, outputs in zip(images, self._advance(images, memories), strict=True):
             seen = (outputs.object_score_logits.flatten() > 0).cpu().numpy()
@@ -137,8 +136,8 @@ class Sam2Tracker:
             followed.append((masks, seen & masks.any((1, 2))))
         return followed
 
-    def _advance(self, images: Images, memories: Sequence[_Memory]) -> list[Any]:
-        """Run the model on the next frame of each."""
+    def _advance(self, images: Images, memories: Sequence[_TrackMemory]) -> list[Any]:
+        """Run the model on the next frame of each memory."""
         pixels = _pixels(self._processor.image_processor, images, self._model)
         with require("torch").inference_mode():
             features = self._model.get_image_features(pixels, return_dict=True)
@@ -153,8 +152,8 @@ class Sam2Tracker:
             self._forget(memory)
         return outputs
 
-    def _forget(self, memory: _Memory) -> None:
-        """Keep what the next frame needs: transformers' session would keep all frames with their masks."""
+    def _forget(self, memory: _TrackMemory) -> None:
+        """Keep only what the next frame needs: transformers' session would keep all frames with their masks."""
         session = memory.session
         session.cache.clear_all()
         session.processed_frames.clear()
@@ -163,7 +162,7 @@ class Sam2Tracker:
         for outputs in session.output_dict_per_obj.values():
             tracked = outputs["non_cond_frame_outputs"]
             for frame in list(tracked):
-                if frame <= following - config.num_maskmem:  # only its pointer to the object is still looked at
+                if frame <= following - config.num_maskmem:  # only its object pointer is still used
                     tracked[frame].pop("maskmem_features", None)
                     tracked[frame].pop("maskmem_pos_enc", None)
                 if frame <= following - max(config.num_maskmem, config.max_object_pointers_in_encoder):
@@ -177,17 +176,17 @@ class Sam2Tracker:
 
 
 def _pixels(processor: Any, images: Images, model: Any) -> Any:
-    """Images of any sizes as one (B, 3, side, side) tensor where the model is."""
+    """Return images of any sizes as one (B, 3, side, side) tensor on the model's device."""
     return processor(writable(images), return_tensors="pt")["pixel_values"].to(model.device, model.dtype)
 
 
 def _size(image: np.ndarray) -> np.ndarray:
-    """Width and height twice, as the corners of a box go."""
+    """Return width and height twice, in the order of a box's corners."""
     return np.array([image.shape[1], image.shape[0]] * 2, np.float32)
 
 
 def _upscaled(logits: Any, image: np.ndarray) -> np.ndarray:
-    """Masks (N, H, W) bool of the image's size, from (N, h, w) logits."""
+    """Return masks (N, H, W) bool of the image's size, from (N, h, w) logits."""
     if not len(logits):
         return np.zeros((0, *image.shape[:2]), bool)
     torch = require("torch")

@@ -1,4 +1,4 @@
-"""What is followed on the cameras: found on the first frame, tracked from then on, looked for again when lost."""
+"""The tracks of objects on the cameras: found on the first frame, then tracked, and searched again when lost."""
 
 from __future__ import annotations
 
@@ -9,39 +9,42 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.policies.arro.config import ArroConfig
-from vlagents_ray.policies.arro.parts import Detector, Found, Images, Segmenter, Selector, Tracker, make_part
+from vlagents_ray.policies.arro.parts import Detection, Detector, Images, Segmenter, Selector, Tracker, make_part
 from vlagents_ray.policies.arro.regions import grown, overlap
 
-GRIPPER = "(gripper)"  # the label of what the selector chose; no phrase that a detector is asked for
-Segment = tuple[str, np.ndarray]  # its label and mask, (H, W) bool
-_SAME = 0.5  # intersection over union from which on a thing that is found is one that is followed
+GRIPPER = "(gripper)"  # the label of the selector's regions; never a phrase for the detector
+Segment = tuple[str, np.ndarray]  # label and mask, (H, W) bool
+_SAME = 0.5  # intersection over union above which a detected object is one that is already tracked
 
 
 @dataclass(slots=True)
 class Track:
     """The segments of one session on one camera."""
 
-    wanted: tuple[str, ...]  # phrases, and GRIPPER
-    labels: list[str] = field(default_factory=list)  # what each segment was found as
-    masks: list[np.ndarray] = field(default_factory=list)  # (H, W) bool each, where it was seen last
-    lost: list[int] = field(default_factory=list)  # frames since then
-    memory: Any = None  # the tracker's
-    incomplete: int = 0  # frames for which something has been missing
-    searched: bool = True  # on this frame
+    wanted: tuple[str, ...]  # the phrases, and GRIPPER
+    labels: list[str] = field(default_factory=list)  # the label of each segment
+    masks: list[np.ndarray] = field(default_factory=list)  # (H, W) bool each, at its last visible position
+    lost: list[int] = field(default_factory=list)  # frames since then, for each segment
+    memory: Any = None  # the tracker's memory
+    incomplete: int = 0  # number of frames for which a segment has been missing
+    searched: bool = True  # whether this frame was searched
 
     @property
     def seen(self) -> list[str]:
-        """Labels of the segments that are in sight."""
+        """Labels of the visible segments."""
         return [label for label, lost in zip(self.labels, self.lost, strict=True) if not lost]
 
     @property
     def missing(self) -> list[str]:
-        """Labels of segments that are lost, and what was never found."""
+        """Labels of segments that are lost or were never found."""
         lost = [label for label, frames in zip(self.labels, self.lost, strict=True) if frames]
         return list(dict.fromkeys([*lost, *(one for one in self.wanted if one not in self.labels)]))
 
     def shown(self, shape: tuple[int, int], keep_lost: int, grow: int) -> np.ndarray:
-        """The segments together, (H, W) bool; one that is lost for `keep_lost` frames at most is where it was."""
+        """Return the union of the segments, (H, W) bool.
+
+        A segment lost for at most `keep_lost` frames is at its last position.
+        """
         together = np.zeros(shape, bool)
         for mask, lost in zip(self.masks, self.lost, strict=True):
             if lost <= keep_lost:
@@ -49,13 +52,13 @@ class Track:
         return grown(together, grow)
 
     def move(self, masks: Iterable[np.ndarray], seen: np.ndarray) -> None:
-        """Take over what the tracker says."""
+        """Take over the tracker's masks."""
         self.masks = [new if is_seen else old for new, old, is_seen in zip(masks, self.masks, seen, strict=True)]
         self.lost = [0 if is_seen else frames + 1 for frames, is_seen in zip(self.lost, seen, strict=True)]
 
 
 class Tracking:
-    """The four parts at work, for any number of sessions and cameras at once."""
+    """The four parts together, for any number of sessions and cameras at once."""
 
     def __init__(self, config: ArroConfig) -> None:
         self._detector: Detector = make_part("detector", config.detector)
@@ -71,14 +74,14 @@ class Tracking:
                 part.load()
 
     def begin(self, images: Images, phrases: Sequence[str]) -> list[Track]:
-        """Find what is wanted on each image; what is not there is among its track's `missing`."""
+        """Find the requested objects on each image; those not found are in its track's `missing`."""
         wanted = tuple(phrases) if self._selector is None else (*phrases, GRIPPER)
         tracks = [Track(wanted) for _ in images]
         self._search(images, tracks)
         return tracks
 
     def follow(self, images: Images, tracks: Sequence[Track]) -> None:
-        """Go on with each track on its next image."""
+        """Continue each track on its next image."""
         moving = [i for i, track in enumerate(tracks) if track.labels]
         moved = self._tracker.follow([images[i] for i in moving], [tracks[i].memory for i in moving])
         for i, (masks, seen) in zip(moving, moved, strict=True):
@@ -91,7 +94,7 @@ class Tracking:
             self._search([images[i] for i in due], [tracks[i] for i in due])
 
     def _search(self, images: Images, tracks: Sequence[Track]) -> None:
-        """Look for what is missing; a track that gains something begins anew with that and what is in sight."""
+        """Search missing objects; a track that gains some begins again with these and the visible ones."""
         cut = self._things(images, [[label for label in track.missing if label != GRIPPER] for track in tracks])
         grippers = self._grippers(images, [GRIPPER in track.missing for track in tracks])
         begun = []
@@ -109,8 +112,8 @@ class Tracking:
                 tracks[i].memory = memory
 
     def _things(self, images: Images, phrases: Sequence[Sequence[str]]) -> list[list[Segment]]:
-        """What the detector finds; the segmenter cuts it out where the detector does not itself."""
-        found: list[list[Found]] = [[] for _ in images]
+        """Return the detected objects; the segmenter computes their masks if the detector does not."""
+        found: list[list[Detection]] = [[] for _ in images]
         asked = [i for i, wanted in enumerate(phrases) if wanted]
         if asked:
             detected = self._detector.detect([images[i] for i in asked], [phrases[i] for i in asked])
@@ -127,13 +130,13 @@ class Tracking:
         return [[(label, mask) for label, mask in own if mask.any()] for own in segments]
 
     def _grippers(self, images: Images, wanted: Sequence[bool]) -> list[list[Segment]]:
-        """The gripper's regions, on the images where it is wanted and to be seen."""
+        """Return the gripper's regions, on the images where it is requested and visible."""
         grippers: list[list[Segment]] = [[] for _ in images]
         asked = [i for i, is_wanted in enumerate(wanted) if is_wanted]
         if self._selector is not None and asked:
             regions = self._segmenter.propose([images[i] for i in asked])
             chosen = self._selector.select([images[i] for i in asked], regions)
             for i, masks, numbers in zip(asked, regions, chosen, strict=True):
-                # copies: a view of one would keep all that were proposed
+                # copies: a view of one would keep all proposed masks in memory
                 grippers[i] = [(GRIPPER, masks[number].copy()) for number in numbers]
         return grippers

@@ -1,4 +1,4 @@
-"""The wrapper that shows segments on a virtual background."""
+"""The wrapper that shows the policy segments on a virtual background."""
 
 from __future__ import annotations
 
@@ -20,16 +20,22 @@ INFO = "arro"  # in Act.info and what `reset` returns: {camera: {"seen": labels,
 
 
 class Arro(Wrapper):
-    """Paints over all but the gripper and the things of the task, on the cameras of the config.
+    """Paints over all but the gripper and the objects of the task, on the cameras of the config.
 
-    Each session tracks its own; detector, segmenter and tracker get the images of all sessions of a batch together.
-    `Obs.info` is not changed, so that an image in it, such as a goal, shows its own background.
+    Each session tracks its own objects; detector, segmenter and tracker get the images of all sessions of a batch
+    together. `Obs.info` is not changed, so that an image in it, such as a goal, must already show its own background.
     """
 
     Config: ClassVar[type] = ArroConfig
     shared: ClassVar[tuple[str, ...]] = ("config", "tracking", "background")
 
     def __init__(self, agent: Agent, config: ArroConfig) -> None:
+        """Wrap a policy.
+
+        Args:
+            agent: The policy.
+            config: The cameras, the parts of their images to keep, and the models that find them.
+        """
         super().__init__(agent, config)
         self.tracking = Tracking(config)
         self.background = Background(config.background)
@@ -37,7 +43,7 @@ class Arro(Wrapper):
 
     @property
     def contract(self) -> Contract:
-        """The inner agent's, which also needs the cameras of the config, and an instruction to find things by."""
+        """The inner agent's contract, with the cameras of the config, and an instruction that names the objects."""
         inner = self.agent.contract or Contract()
         needed = {name: CameraSpec() for name in self.config.cameras or ()}
         return replace(
@@ -59,7 +65,7 @@ class Arro(Wrapper):
             )
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        """Begin an episode of both; raises `InvalidObservation` if something is missing that must not be."""
+        """Begin an episode of both; raises `InvalidObservation` if a required object is missing."""
         return {**super().reset(obs, instruction, **kwargs), INFO: self._report()}
 
     def begin(self, obs: Obs, instruction: str | None) -> Obs:
@@ -103,7 +109,7 @@ class Arro(Wrapper):
         ]
 
     def _names(self, obs: Obs) -> list[str]:
-        """The cameras that are changed."""
+        """Return the cameras that are changed."""
         stated = self.agent.contract.cameras if self.agent.contract is not None else None
         names = list(self.config.cameras or stated or obs.cameras)
         for name in names:
@@ -112,7 +118,7 @@ class Arro(Wrapper):
         return names
 
     def _views(self, obs: Obs) -> list[tuple[np.ndarray, Track]]:
-        """The images that are changed, with their tracks; raises before any of them is touched."""
+        """Return the images to change, with their tracks; raises before any of them is changed."""
         views = []
         for name, track in self._begun().items():
             if name not in obs.cameras:

@@ -1,38 +1,64 @@
-"""Where a checkpoint lies, and whether a model really holds what is in it."""
+"""Finds checkpoints, and checks that a model holds all tensors of its checkpoint."""
 
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import require
 
-STEP = "{step}"  # in a checkpoint's name
+log = logging.getLogger(__name__)
+
+STEP = "{step}"  # the placeholder in a checkpoint's name
 _INDEX = ".safetensors.index.json"
-_COMPARED = 64  # elements of each tensor: enough to tell trained weights from random ones
+_COMPARED = 64  # compared elements of each tensor: enough to tell trained weights from random ones
 _LISTED = 8
 
 
 def at_step(name: str, step: int | str | None) -> str:
-    """The name of a checkpoint with its step filled in, if it has a place for one."""
+    """Return the name of a checkpoint with its step filled in, if the name has a placeholder."""
     return name if step is None else name.replace(STEP, str(step))
 
 
-def find_checkpoint(name: str, step: int | None = None, needs: Iterable[str] = ()) -> Path:
-    """The folder or file of a checkpoint: a path on this machine, or a hub id, downloaded if it is not cached.
+_used: ContextVar[list[Path] | None] = ContextVar("_used", default=None)
 
-    `step` replaces `{step}` in `name`, with leading zeros to six digits where only that exists. `needs` are files (or
-    glob patterns) that a folder must hold.
-    Raises `ConfigError` when there is no such checkpoint, or a file is missing.
+
+@contextmanager
+def used_checkpoints() -> Iterator[list[Path]]:
+    """Yield a list that collects the paths found by `find_checkpoint` in this context.
+
+    A path within one replaces it.
+    """
+    found: list[Path] = []
+    token = _used.set(found)
+    try:
+        yield found
+    finally:
+        _used.reset(token)
+
+
+def find_checkpoint(name: str, step: int | None = None, needs: Iterable[str] = ()) -> Path:
+    """Return the folder or file of a checkpoint: a path on this machine, or a hub id, downloaded if it is not cached.
+
+    Args:
+        name: The path, or a hub id; a hub id takes a commit, a tag or a branch: `org/name@REVISION`.
+        step: Replaces `{step}` in `name`, with leading zeros to six digits where only that path exists.
+        needs: Files (or glob patterns) that a folder must hold.
+
+    Raises:
+        ConfigError: There is no such checkpoint, or a file is missing.
     """
     names = [at_step(name, digits) for digits in (step, f"{step or 0:06d}")]
     name = next((one for one in names if Path(one).expanduser().exists()), names[0])
     path = Path(name).expanduser()
     if not path.exists():
-        if name.startswith((".", "/", "~")) or name.count("/") != 1:
+        if name.startswith((".", "/", "~")) or name.partition("@")[0].count("/") != 1:
             raise ConfigError(f"checkpoint {name!r}: no such file or folder; have {_beside(path)}")
         path = _from_hub(name)
     if path.is_dir():
@@ -42,11 +68,13 @@ def find_checkpoint(name: str, step: int | None = None, needs: Iterable[str] = (
                 f"checkpoint {path}: misses {missing}, has {sorted(p.name for p in path.iterdir())[:20]}; "
                 f"is it a checkpoint of this family, and whole?"
             )
+    if (used := _used.get()) is not None and path not in used:
+        used[:] = [*(one for one in used if one not in path.parents), path]
     return path
 
 
 def _beside(path: Path) -> str:
-    """What lies where the checkpoint was expected, for a message."""
+    """List the files where the checkpoint was expected, for an error message."""
     parent = next((p for p in path.parents if p.is_dir()), Path("/"))
     names = sorted(p.name for p in parent.iterdir())
     shown = ", ".join(names[:_LISTED]) + (" …" if len(names) > _LISTED else "")
@@ -55,27 +83,31 @@ def _beside(path: Path) -> str:
 
 def _from_hub(name: str) -> Path:
     hub = require("huggingface_hub")
+    repository, _, revision = name.partition("@")
     try:
-        return Path(hub.snapshot_download(name))
-    except Exception as error:  # of a dozen kinds: no such id, no access, no network, offline mode
+        path = Path(hub.snapshot_download(repository, revision=revision or None))
+    except Exception as error:  # of many classes: no such id, no access, no network, offline mode
         raise ConfigError(
             f"checkpoint {name!r}: neither a path here nor to be had from the hub ({type(error).__name__}); "
-            f"download it to a folder and name that, or check the id, the network and your token"
+            f"download it to a folder and name that, or check the id (org/name or org/name@COMMIT), the network and "
+            f"your token"
         ) from error
+    log.info("checkpoint %s: commit %s", name, path.name)
+    return path
 
 
 class SavedTensors:
-    """The tensors of a checkpoint on disk by name, each read when it is asked for."""
+    """The tensors of a checkpoint on disk by name, each read when it is accessed."""
 
     def __init__(self, readers: Mapping[str, Callable[[], Any]]) -> None:
         self._readers = readers
 
     @classmethod
     def of(cls, path: Path) -> SavedTensors:
-        """Those of a .safetensors file, or of a folder with one, or with several and their index."""
+        """Open a .safetensors file, or a folder with one, or with several and their index."""
         files = [path] if path.is_file() else _safetensors(path)
         opened = [require("safetensors").safe_open(str(file), framework="pt") for file in files]
-        return cls({key: _Reader(file, key) for file in opened for key in file.keys()})  # noqa: SIM118 - no mapping
+        return cls({key: _PickleReader(file, key) for file in opened for key in file.keys()})  # noqa: SIM118 - no mapping
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._readers)
@@ -84,12 +116,12 @@ class SavedTensors:
         return self._readers[name]()
 
     def renamed(self, rename: Callable[[str], str | None]) -> SavedTensors:
-        """The same under other names; those for which there is None are left out."""
+        """Return the tensors under other names; those that `rename` maps to None are left out."""
         named = {rename(key): reader for key, reader in self._readers.items()}
         return SavedTensors({key: reader for key, reader in named.items() if key is not None})
 
 
-class _Reader:
+class _PickleReader:
     def __init__(self, file: Any, key: str) -> None:
         self._file, self._key = file, key
 
@@ -111,11 +143,11 @@ def _safetensors(folder: Path) -> list[Path]:
 
 
 def require_loaded(model: Any, saved: SavedTensors | Mapping[str, Any]) -> None:
-    """Raise `ConfigError` unless every parameter and saved buffer of `model` is what the checkpoint holds.
+    """Raise `ConfigError` unless every parameter and saved buffer of `model` has the checkpoint's value.
 
-    Names and shapes are compared, and 64 elements of each tensor, up to the model's dtype. A parameter that is
-    tied to another one need not be there itself. Some libraries go on with random weights where they could not
-    load theirs: what such a policy does looks like a bad policy, and costs its user a week.
+    Names and shapes are compared, and 64 elements of each tensor, up to the model's dtype. A parameter that is tied to
+    another one may be missing itself. Some libraries continue with random weights if they could not load the
+    checkpoint's: the result looks like a bad policy, and is hard to diagnose.
     """
     torch = require("torch")
     names = set(saved)
@@ -138,10 +170,28 @@ def require_loaded(model: Any, saved: SavedTensors | Mapping[str, Any]) -> None:
         )
 
 
-def require_filled(params: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
-    """Raise `ConfigError` unless the nested `params` are arrays of just the names and shapes that are `wanted`.
+def from_pretrained(cls: Any, path: Path, **options: Any) -> Any:
+    """Return `cls.from_pretrained(path, **options)`; raises `ConfigError` if a parameter is not in the checkpoint.
 
-    For JAX, whose loaders hand out what they read: what is an array there came from the checkpoint.
+    From version 5 on transformers renames parameters as it reads them, so that `require_loaded`, which compares names,
+    cannot check its models; but it reports the parameters for which it found no values.
+    """
+    try:
+        model, said = cls.from_pretrained(path, output_loading_info=True, **options)
+    except (OSError, RuntimeError, ValueError) as error:  # raised for files of another format, and for incomplete ones
+        raise ConfigError(f"checkpoint {path}: {cls.__name__} does not load: {str(error).strip()[:500]}") from error
+    lacks = {key: sorted(map(str, said[key]))[:_LISTED] for key in ("missing_keys", "mismatched_keys") if said[key]}
+    if lacks:
+        raise ConfigError(
+            f"checkpoint {path}: it does not fill {cls.__name__}: {lacks}; is it a checkpoint of this model?"
+        )
+    return model
+
+
+def require_filled(params: Mapping[str, Any], wanted: Mapping[str, Any]) -> None:
+    """Raise `ConfigError` unless the nested `params` are arrays with exactly the names and shapes in `wanted`.
+
+    For JAX, whose loaders return what they read: an array in `params` comes from the checkpoint.
     """
     have, want = dict(_leaves(params)), dict(_leaves(wanted))
     absent = sorted(name for name in want if not hasattr(have.get(name), "__array__"))

@@ -1,4 +1,4 @@
-"""Settings that every model family has; each family's own model adds its own and narrows these."""
+"""The settings of all model families; each family adds its own and narrows these."""
 
 from __future__ import annotations
 
@@ -13,9 +13,12 @@ DType = Literal["auto", "float32", "bfloat16", "float16"]
 
 
 class ModelConfig(BaseModel, extra="forbid"):
-    """A checkpoint, where it runs, what it sees, and how its chunks become actions."""
+    """The settings of a model: its checkpoint, its device, its inputs, and how its chunks become actions."""
 
-    checkpoint: str = Field(min_length=1, description="folder or file, or hub id; `{step}` stands for checkpoint_step")
+    checkpoint: str = Field(
+        min_length=1,
+        description="folder or file, or hub id: org/name, org/name@COMMIT; `{step}` stands for checkpoint_step",
+    )
     checkpoint_step: int | None = Field(default=None, ge=0, description="the training step that replaces `{step}`")
     device: str = Field(default="auto", description="'auto' (an accelerator if there is one), 'cpu', 'cuda', 'cuda:1'")
     dtype: DType = Field(default="auto", description="of the weights; 'auto': the family's own choice")
@@ -67,5 +70,5 @@ class ModelConfig(BaseModel, extra="forbid"):
 
     @property
     def rows(self) -> int:
-        """The most rows of one forward pass."""
+        """The largest number of rows of one forward pass."""
         return self.batch_sizes[-1] if self.batch_sizes else self.max_rows

@@ -1,44 +1,78 @@
-"""A policy that is a model: sessions, history, chunks and samples around one forward pass."""
+"""The base of policies that are models: sessions, history, chunks and samples around one forward pass."""
 
 from __future__ import annotations
 
 import abc
 import copy
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, ClassVar
 
 import numpy as np
 
-from vlagents_ray.client.plan import ENSEMBLE, Chunk, Plan
-from vlagents_ray.contract import Contract, check_action
+from vlagents_ray.chunking.buffer import ENSEMBLE, Chunk, ChunkBuffer
+from vlagents_ray.contract import Contract
 from vlagents_ray.errors import InvalidAction, InvalidObservation, NotReset, PolicyFailed
 from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER, Act, Agent, Obs
 from vlagents_ray.policies.base.config import ModelConfig
-from vlagents_ray.policies.base.observing import count_in, leftover_plan, wanted_samples
-from vlagents_ray.policies.base.row import Prediction, Row
+from vlagents_ray.policies.base.model_inputs import count_in, leftover_plan, wanted_samples
+from vlagents_ray.validation import check_action
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One chunk to compute: a session's own, or a sample of its distribution."""
+
+    frames: tuple[Any, ...]  # the results of `ModelPolicy.perceive` for the last observations, oldest first
+    instruction: str
+    rng: np.random.Generator  # the session's own, so that other rows do not matter
+    leftover: np.ndarray | None = None  # (H', D) float32, real-time chunking: see LEFTOVER in the interface
+    delay: int = 0  # DELAY: the first rows of the chunk, so many, are the leftover's
+    info: Mapping[str, Any] = field(default_factory=dict)  # the observation's info
+    # the session's memory, for families that keep more than frames
+    memory: dict[str, Any] = field(default_factory=dict)
+    sample: bool = False  # drawn from the distribution, even if the session's own chunk is the likeliest one
+
+    def noise(self, *shape: int) -> np.ndarray:
+        """Draw standard normal numbers, float32, the same on every device."""
+        return self.rng.standard_normal(shape, dtype=np.float32)
+
+    def history(self, length: int) -> tuple[Any, ...]:
+        """Return the last `length` frames.
+
+        At the beginning of an episode its first frame stands for the missing ones.
+        """
+        return (self.frames[0],) * (length - len(self.frames)) + self.frames[-length:]
+
+
+@dataclass(frozen=True, slots=True)
+class Prediction:
+    """A chunk, with the model's uncertainty where the model states one."""
+
+    actions: np.ndarray  # (H, D) float32, in the units of the contract's action
+    mean: np.ndarray | None = None  # (H, D), of the model's distribution
+    std: np.ndarray | None = None  # (H, D)
+    info: dict[str, Any] = field(default_factory=dict)  # for `Act.info`
 
 
 @dataclass(slots=True)
-class Episode:
-    """What a session has of its own."""
+class PolicyEpisode:
+    """The state of a session's episode."""
 
     instruction: str
-    frames: deque[Any]  # of `perceive`, oldest first
+    frames: deque[Any]  # results of `perceive`, oldest first
     rng: np.random.Generator
-    draws: np.random.Generator  # of samples, so that asking for them changes no action
-    plan: Plan  # chunks by tick, where they are averaged
-    rows: deque[np.ndarray] = field(default_factory=deque)  # (D,) each, still to be returned
-    tick: int = 0
+    draws: np.random.Generator  # generator of samples, so that requesting them changes no action
+    plan: ChunkBuffer  # the actions still to be returned, where single ones are
     memory: dict[str, Any] = field(default_factory=dict)
 
 
 class ModelPolicy(Agent, abc.ABC):
-    """Base of the model families. A family defines `load`, `perceive` and `predict`, and its contract.
+    """The base class of the model families. A family defines `load`, `perceive`, `predict` and its contract.
 
-    The model is asked for one row an observation, all sessions of a batch in one forward pass of at most
-    `config.rows`; a session's noise comes from its own generator, seeded by the config's seed and the episode's.
+    The model computes one row for each observation, all sessions of a batch in one forward pass of at most
+    `config.rows` rows. A session's noise comes from its own generator, seeded by the config's seed and the episode's.
     """
 
     shared: ClassVar[tuple[str, ...]] = ("config", "model")
@@ -46,36 +80,37 @@ class ModelPolicy(Agent, abc.ABC):
     def __init__(self, config: Any) -> None:
         self.config: ModelConfig = config
         self.model: Any = None
-        self.episode: Episode | None = None
+        self.episode: PolicyEpisode | None = None
 
     @property
     def history(self) -> int:
-        """Observations that `predict` gets of each session, at most."""
+        """The largest number of observations of each session that `predict` uses."""
         return 1
 
     @property
     def state_dim(self) -> int | None:
-        """Numbers of the model's state vector, once loaded; to warm up where its parts may be of any length."""
+        """The length of the model's state vector, once loaded; for the warm-up where its parts may have any length."""
         return None
 
     def chunk(self, horizon: int) -> int:
-        """For the contract: how many of the model's `horizon` rows an `act` returns."""
+        """Return, for the contract, how many of the model's `horizon` rows an `act` returns."""
         return min(self.config.execute or horizon, horizon) if self.config.actions == "chunk" else 1
 
     @abc.abstractmethod
     def load(self) -> Any:
-        """Read the checkpoint; what is returned becomes `self.model`, shared by all sessions."""
+        """Read the checkpoint; the result becomes `self.model`, which all sessions share."""
 
     @abc.abstractmethod
     def perceive(self, obs: Obs) -> Any:
-        """What is kept of an observation: converted and resized, and no view of its memory, which is given back.
+        """Convert and resize an observation for the history.
 
-        An error that it raises fails the request of that session alone.
+        The result must not be a view of the observation, whose memory is freed. An error fails the request of that
+        session only.
         """
 
     @abc.abstractmethod
     def predict(self, rows: Sequence[Row]) -> Sequence[Prediction | Exception]:
-        """One chunk a row, all in one forward pass. A row's result must not depend on the others."""
+        """Compute one chunk for each row, all in one forward pass. A row's result must not depend on the others."""
 
     def initialize(self) -> None:
         """Load the checkpoint; with `batch_sizes`, run each of them once."""
@@ -86,24 +121,24 @@ class ModelPolicy(Agent, abc.ABC):
                     raise prediction
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        """Begin the episode of `kwargs["seed"]` (an int, 0 if not given)."""
+        """Begin the episode with the seed `kwargs["seed"]` (an int, 0 if not given)."""
         contract = self.contract
         if contract is not None and contract.instruction and not instruction:
             raise InvalidObservation("instruction: got none, want what the robot is to do, in words")
-        # numpy takes no negative seed; each int64 has its own number modulo 2**64
+        # numpy accepts no negative seed; each int64 maps to its own number modulo 2**64
         seed = [self.config.seed, int(kwargs.get("seed") or 0) % 2**64]
-        self.episode = Episode(
+        self.episode = PolicyEpisode(
             instruction or "",
             deque(maxlen=self.history),
             np.random.default_rng(seed),
             np.random.default_rng([*seed, 1]),
-            Plan(ENSEMBLE, self.config.ensemble_m),
+            ChunkBuffer(ENSEMBLE, self.config.ensemble_m),
         )
         self.notice(obs)
         return {}
 
     def notice(self, obs: Obs) -> None:
-        """Take into the session's memory what has to be known of every observation, also where no chunk is wanted."""
+        """Update the session's memory from an observation; called for each one, also if no chunk is requested."""
 
     def observe(self, obs: Obs) -> None:
         """Add an observation to the history."""
@@ -111,9 +146,9 @@ class ModelPolicy(Agent, abc.ABC):
         self._begun().frames.append(self.perceive(obs))
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
-        """A chunk (H, D), or one action (D,), as `config.actions` says, for each session.
+        """Return a chunk (H, D), or one action (D,), by `config.actions`, for each session.
 
-        One forward pass serves all that need the model at this tick.
+        One forward pass serves all sessions that need the model at this tick.
         """
         results: list[Act | Exception | None] = [None] * len(obs)
         rows: list[Row] = []
@@ -135,23 +170,24 @@ class ModelPolicy(Agent, abc.ABC):
         ]
 
     def close(self) -> None:
-        """Let go of the weights."""
+        """Free the weights."""
         self.model = None
 
-    def _begun(self) -> Episode:
+    def _begun(self) -> PolicyEpisode:
         if self.episode is None:
             raise NotReset(f"{type(self).__name__}: act before reset; call reset(obs, instruction) first")
         return self.episode
 
     def _rows(self, obs: Obs, session: ModelPolicy) -> list[Row]:
-        """What the model is asked for this session: nothing while rows are left, else its chunk, then its samples."""
+        """Return the rows to compute for a session: none while actions are left, else its chunk, then its samples."""
         episode = session._begun()
         samples = wanted_samples(obs, self.config)
         session.notice(obs)
-        if episode.rows and self.history == 1:
+        rows_left = self.config.actions == "queue" and episode.plan.next is not None
+        if rows_left and self.history == 1:
             return []
         episode.frames.append(self.perceive(obs))
-        if episode.rows:
+        if rows_left:
             return []
         own = Row(
             frames=tuple(episode.frames),
@@ -169,7 +205,7 @@ class ModelPolicy(Agent, abc.ABC):
     def _act(self, session: ModelPolicy, found: list[Prediction | Exception]) -> Act | Exception:
         episode = session._begun()
         if not found:
-            return self._next(episode, {})
+            return Act(episode.plan.take().action)
         if (error := next((p for p in found if isinstance(p, Exception)), None)) is not None:
             return error
         own, *samples = found
@@ -178,28 +214,16 @@ class ModelPolicy(Agent, abc.ABC):
         if samples:
             info[DISTRIBUTION] = self._distribution(own, samples)  # type: ignore[arg-type]
         if self.config.actions == "chunk":
-            episode.tick += 1
             return Act(chunk, info=info)
-        try:  # before it is kept for later ticks
+        try:  # before the chunk is kept for later ticks
             check_action(chunk, self.contract)
         except InvalidAction as broken:
             return broken
-        if self.config.actions == "queue":
-            episode.rows.extend(chunk)
-            return self._next(episode, info)
-        episode.plan.add(Chunk(episode.tick, episode.tick, chunk, done=False, info={}), episode.tick)
-        step = episode.plan.at(episode.tick)
-        if step is None:
-            return PolicyFailed("ensemble: no chunk covers this tick")
-        episode.tick += 1
-        return Act(step.action, info=info)
-
-    def _next(self, episode: Episode, info: dict[str, Any]) -> Act:
-        episode.tick += 1
-        return Act(episode.rows.popleft(), info=info)
+        episode.plan.add(Chunk(0, episode.plan.executed, chunk))
+        return Act(episode.plan.take().action, info=info)
 
     def _used(self, actions: np.ndarray) -> np.ndarray:
-        """The rows of a chunk that are used, (execute, D)."""
+        """Return the rows of a chunk that are used, (execute, D)."""
         return np.ascontiguousarray(actions[: self.config.execute], dtype=np.float32)
 
     def _distribution(self, own: Prediction, samples: list[Prediction]) -> dict[str, np.ndarray]:
@@ -209,7 +233,7 @@ class ModelPolicy(Agent, abc.ABC):
         return {"mean": mean, "std": std, "samples": drawn}
 
     def _forward(self, rows: list[Row]) -> list[Prediction | Exception]:
-        """All rows, in forward passes of the sizes that the config allows."""
+        """Compute all rows, in forward passes of the sizes that the config allows."""
         found: list[Prediction | Exception] = []
         most = self.config.rows
         for start in range(0, len(rows), most):
@@ -223,7 +247,7 @@ class ModelPolicy(Agent, abc.ABC):
         return found
 
     def _example(self) -> Row:
-        """A row to warm up with: black images and zeros, as the contract wants them."""
+        """Return a row for the warm-up: black images and zeros that fit the contract."""
         contract = self.contract or Contract()
         lengths = {name: part.dim or 1 for name, part in (contract.state or {}).items()}
         unstated = [name for name, part in (contract.state or {}).items() if part.dim is None]
@@ -241,5 +265,5 @@ class ModelPolicy(Agent, abc.ABC):
 
 
 def _sample(row: Row, draws: np.random.Generator) -> Row:
-    """The same row, with noise and memory that are not the session's."""
+    """Return the row with noise and memory that are separate from the session's."""
     return replace(row, rng=draws, memory=copy.deepcopy(row.memory), sample=True)

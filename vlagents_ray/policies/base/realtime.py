@@ -1,9 +1,9 @@
-"""Real-time chunking of flow-matching policies: a chunk that goes on from what the robot is doing meanwhile.
+"""Real-time chunking of flow-matching policies: a new chunk continues the motion that the robot is executing.
 
 After Black, Galliker & Levine 2025 (https://arxiv.org/abs/2506.07339), with two differences. Rows that will have been
 executed when the answer comes are not guided but moved straight from the noise to the plan, so that they come out as
-they were planned. And the later rows' correction takes the model's Jacobian for the identity, as LeRobot 0.4.4 does: it
-costs no backward pass.
+planned. And the correction of the later rows takes the model's Jacobian as the identity, as LeRobot 0.4.4 does: it
+needs no backward pass.
 
 Flow time is openpi's: 1 is noise, 0 is the actions, and the velocity is noise minus actions.
 """
@@ -16,20 +16,20 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.policies.base.row import Row
+from vlagents_ray.policies.base.policy import Row
 
 
 @dataclass(frozen=True, slots=True)
 class Guide:
-    """What each row of a batch of chunks is to follow, as arrays of whichever library the model is written in."""
+    """The plan that each row of a batch of chunks follows, as arrays of the library in which the model is written."""
 
-    plan: Any  # (B, H, D) as the model sees actions, i.e. normalised; zeros where there is none
+    plan: Any  # (B, H, D) in the model's units, i.e. normalised; zeros where there is no plan
     frozen: Any  # (B, H, 1): 1.0 where a row will have been executed, else 0.0
-    weight: Any  # (B, H, 1) in [0, 1]: how closely a later row is to follow
+    weight: Any  # (B, H, 1) in [0, 1]: how closely a later row follows
 
     @classmethod
     def of(cls, rows: Sequence[Row], horizon: int, dim: int) -> Guide | None:
-        """That of the rows' `delay` and `leftover`, made what the model sees already; None if no row has any."""
+        """Return the guide of the rows' `delay` and `leftover`, in the model's units; None if no row has any."""
         if all(row.leftover is None for row in rows):
             return None
         plan = np.zeros((len(rows), horizon, dim), np.float32)
@@ -45,7 +45,7 @@ class Guide:
         return cls(plan, frozen, weight)
 
     def to(self, convert: Callable[[np.ndarray], Any]) -> Guide:
-        """The same in another library, or on another device."""
+        """Convert the arrays to another library, or move them to another device."""
         return Guide(convert(self.plan), convert(self.frozen), convert(self.weight))
 
     def steer(
@@ -59,10 +59,11 @@ class Guide:
         limit: float,
         lower: Callable[[Any, float], Any] = min,
     ) -> Any:
-        """The velocity (B, H, D) at the noisy actions of that flow time, as the plan changes it.
+        """Return the velocity (B, H, D), corrected by the plan, at the noisy actions of this flow time.
 
-        A later row is pulled with a gain of at most `limit`, and of the number of steps at most: with that, one step
-        goes all the way. `lower` is the smaller of two numbers, for libraries whose `time` is no plain number.
+        The gain of the correction of a later row is at most `limit`, and at most the number of steps: with that, one
+        step goes all the way. `lower` returns the smaller of two numbers, for libraries whose `time` is not a plain
+        number.
         """
         spread = (1.0 - time) ** 2 + time**2
         gain = lower(spread / (time * (1.0 - time) + 1e-6), min(limit, float(steps)))
@@ -71,7 +72,7 @@ class Guide:
 
 
 def _weights(delay: int, length: int, horizon: int) -> np.ndarray:
-    """(horizon,): the paper's soft mask, from about 1 after the frozen rows down to 0 where the plan ends."""
+    """Return (horizon,): the paper's soft mask, from about 1 after the frozen rows down to 0 where the plan ends."""
     behind = np.arange(horizon, dtype=np.float32)
     share = np.clip((length - behind) / (length - delay + 1), 0.0, 1.0)
     return np.asarray(share * np.expm1(share) / np.expm1(1.0), np.float32)

@@ -10,20 +10,20 @@ from vlagents_ray.policies.base import ModelConfig
 
 
 class DiffusionPolicyConfig(ModelConfig):
-    """Beside what all models have: that the file may run code, and how the noise is removed."""
+    """Settings of Diffusion Policy, beside those of all models."""
 
     checkpoint: str = Field(min_length=1, description="a .ckpt file; `{step}` stands for checkpoint_step")
     trust_checkpoint: bool = Field(
         default=False,
-        description="these checkpoints are pickles, and loading one runs whatever code its author put in: true says "
-        "that you know where it comes from",
+        description="these checkpoints are pickles, and loading one runs the code that its author put in: set true if "
+        "you trust its origin",
     )
     source_dir: str | None = Field(
         default=None,
         description="a checkout of Diffusion Policy; unset: the installed one, or that of DIFFUSION_POLICY_SRC",
     )
     dtype: Literal["auto", "float32"] = Field(default="auto", description="float32, as its authors compute")
-    compile: Literal[False] = Field(default=False, description="not done for this family")
+    compile: Literal[False] = Field(default=False, description="not supported for this family")
     actions: Literal["chunk", "queue", "ensemble"] = Field(
         default="queue",
         description="as in all models; 'queue' because the model sees the last frames, those within a chunk too, "
@@ -34,4 +34,4 @@ class DiffusionPolicyConfig(ModelConfig):
         description="parts that follow each other as the checkpoint's low_dim keys do; unset: parts of their names, "
         "'state' for a checkpoint without cameras",
     )
-    steps: int | None = Field(default=None, ge=1, description="of denoising; unset: as many as in the checkpoint")
+    steps: int | None = Field(default=None, ge=1, description="denoising steps; unset: those of the checkpoint")

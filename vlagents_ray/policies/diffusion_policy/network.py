@@ -1,4 +1,4 @@
-"""A checkpoint of Diffusion Policy's training workspaces, made the policy that it was."""
+"""The policy module of a checkpoint of Diffusion Policy's training workspaces."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, require_loaded
-from vlagents_ray.policies.base.source import use_source
+from vlagents_ray.policies.base.model_code import use_source
 from vlagents_ray.policies.diffusion_policy.config import DiffusionPolicyConfig
 from vlagents_ray.registry import require
 
@@ -19,22 +19,22 @@ _WEIGHTS = "policy.obs_encoder.rgb_model.weights"
 
 
 @dataclass(frozen=True)
-class Network:
-    """The policy's module, and what it reads."""
+class DiffusionNetwork:
+    """The policy's module and its inputs."""
 
     module: Any
     device: Any
     images: dict[str, tuple[int, int]]  # height and width, by the checkpoint's name
     vectors: dict[str, int]  # length, by the checkpoint's name, in its order
-    absolute: bool  # poses with rotations in six numbers, as its robomimic tasks with `abs_action`
+    absolute: bool  # poses with rotations in six numbers, as in the robomimic tasks with `abs_action`
 
     @classmethod
-    def load(cls, config: DiffusionPolicyConfig) -> Network:
-        """Read the checkpoint; `ConfigError` if it is not trusted, not whole, or not of this family."""
+    def load(cls, config: DiffusionPolicyConfig) -> DiffusionNetwork:
+        """Read the checkpoint; raises `ConfigError` if it is not trusted, incomplete, or of another family."""
         if not config.trust_checkpoint:
             raise ConfigError(
                 f"checkpoint {config.checkpoint!r}: this family's checkpoints are pickles, and loading one runs "
-                f"whatever code its author put in; set trust_checkpoint: true if you know where it comes from"
+                f"whatever code its author put in; set trust_checkpoint: true if you trust its origin"
             )
         path = _file(config)
         ensure_torchvision()
@@ -50,7 +50,7 @@ class Network:
         absent = sorted({"action", *images, *vectors} - set(module.normalizer.params_dict.keys()))
         if absent:
             raise ConfigError(
-                f"checkpoint {path}: its normalizer has nothing for {absent}, so its numbers mean nothing; save it "
+                f"checkpoint {path}: its normalizer has nothing for {absent}, so its numbers have no units; save it "
                 f"after the workspace has called set_normalizer"
             )
         if config.steps is not None:
@@ -69,12 +69,12 @@ def _file(config: DiffusionPolicyConfig) -> Path:
 
 
 def _read(path: Path) -> tuple[Any, Mapping[str, Any]]:
-    """The settings that it was trained with, and the weights: averaged ones, if the training made them."""
+    """Return the settings of the training and the weights, averaged ones if the training computed them."""
     torch, dill = require("torch"), require("dill")
     try:
         payload = torch.load(path, map_location="cpu", pickle_module=dill, weights_only=False)
         settings, states = payload["cfg"], payload["state_dicts"]
-    except Exception as error:  # unpickling raises whatever the file makes it raise
+    except Exception as error:  # unpickling can raise any exception
         raise ConfigError(
             f"checkpoint {path}: got no payload of a Diffusion Policy workspace ({type(error).__name__}: {error}); "
             f"want a .ckpt that its save_checkpoint wrote"
@@ -88,7 +88,7 @@ def _read(path: Path) -> tuple[Any, Mapping[str, Any]]:
 def _made(path: Path, settings: Any) -> Any:
     omegaconf = require("omegaconf").OmegaConf
     if omegaconf.select(settings, _WEIGHTS) not in (None, "r3m", "R3M"):
-        # Weights that the training began with would be downloaded, to be replaced at once.
+        # The initial weights of the training would be downloaded, only to be replaced.
         omegaconf.update(settings, _WEIGHTS, None)
     module = require("hydra.utils").instantiate(settings.policy)
     if not hasattr(module, "noise_scheduler"):

@@ -1,4 +1,4 @@
-"""The noise of a batch, each row's from its own session."""
+"""The noise of a batch, drawn for each row from its session's generator."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from vlagents_ray.registry import require
 
 
 def noise_of(rows: Sequence[Row]) -> Any:
-    """A context in which `torch.randn` draws row by row: the first axis of what it is asked for are the rows.
+    """Return a context in which `torch.randn` draws each row, along the first axis, from its session's generator.
 
-    The policies draw their first trajectory so, and the scheduler what it adds at each step; neither takes one
-    generator a row. Other draws would come from the process's own generator, and are refused.
+    The policies draw their first trajectory with it, and the scheduler the noise of each step; neither accepts one
+    generator for each row. Other draws would come from the process's generator, and are refused.
     """
     torch = require("torch")
     uniform = (torch.rand, torch.randint, torch.rand_like, torch.randn_like)

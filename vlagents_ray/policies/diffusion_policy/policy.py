@@ -1,4 +1,4 @@
-"""Diffusion Policy as a policy: real frames of the past, noise of each session, rows one by one."""
+"""Diffusion Policy, with the sessions' real past frames and their own noise."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelPolicy, Prediction, Row
-from vlagents_ray.policies.base.observing import (
+from vlagents_ray.policies.base.model_inputs import (
     camera_images,
     camera_specs,
     choose_cameras,
@@ -20,11 +20,11 @@ from vlagents_ray.policies.base.observing import (
     state_vector,
 )
 from vlagents_ray.policies.diffusion_policy.config import DiffusionPolicyConfig
-from vlagents_ray.policies.diffusion_policy.network import OBS, Network
+from vlagents_ray.policies.diffusion_policy.network import OBS, DiffusionNetwork
 from vlagents_ray.policies.diffusion_policy.noise import noise_of
 from vlagents_ray.registry import require
 
-USUAL_CAMERAS = {  # of the authors' tasks
+USUAL_CAMERAS = {  # those of the authors' tasks
     "image": "front",
     "agentview_image": "front",
     "robot0_eye_in_hand_image": "wrist",
@@ -33,7 +33,7 @@ _POSE_NUMBERS = 10  # position, rotation in six numbers, gripper
 
 
 class DiffusionPolicy(ModelPolicy):
-    """Asks the module's own `predict_action` for a whole batch."""
+    """The policy of a Diffusion Policy checkpoint, which calls the module's `predict_action` for a whole batch."""
 
     Config: ClassVar[type] = DiffusionPolicyConfig
 
@@ -47,8 +47,8 @@ class DiffusionPolicy(ModelPolicy):
 
     @property
     def contract(self) -> Contract:
-        """All but the absence of an instruction is known once the checkpoint is loaded."""
-        network: Network | None = self.model
+        """The contract; before the checkpoint is loaded it states only that there is no instruction."""
+        network: DiffusionNetwork | None = self.model
         if network is None:
             return Contract(instruction=False)
         parts, sizes = self._parts(network), network.vectors.values()
@@ -65,18 +65,18 @@ class DiffusionPolicy(ModelPolicy):
 
     @property
     def state_dim(self) -> int | None:
-        """Numbers in all the checkpoint's vectors, once it is loaded."""
+        """The total length of the checkpoint's vectors; None before it is loaded."""
         return None if self.model is None else sum(self.model.vectors.values())
 
-    def load(self) -> Network:
-        """Read the checkpoint, and refuse names of cameras that it does not have."""
-        network = Network.load(self.config)
+    def load(self) -> DiffusionNetwork:
+        """Read the checkpoint; raises `ConfigError` for cameras that it does not have."""
+        network = DiffusionNetwork.load(self.config)
         self._cameras(network)
         return network
 
     def perceive(self, obs: Obs) -> dict[str, np.ndarray]:
-        """Images (H, W, 3) uint8 and vectors (D,) float32 by the checkpoint's names."""
-        network: Network = self.model
+        """Return images (H, W, 3) uint8 and vectors (D,) float32 by the checkpoint's names."""
+        network: DiffusionNetwork = self.model
         seen = {
             name: _resized(image, *network.images[name])
             for name, image in camera_images(obs, self._cameras(network)).items()
@@ -86,8 +86,8 @@ class DiffusionPolicy(ModelPolicy):
         return seen | {name: vector[a:b] for name, (a, b) in zip(network.vectors, pairwise(ends), strict=True)}
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
-        """One batch through the module, whose noise is the rows' own."""
-        network: Network = self.model
+        """Compute the chunks of a batch, with the noise of each row's session."""
+        network: DiffusionNetwork = self.model
         torch = require("torch")
         histories = [row.history(self.history) for row in rows]
         inputs = {}
@@ -100,17 +100,17 @@ class DiffusionPolicy(ModelPolicy):
             actions = network.module.predict_action(inputs)["action"]
         return [Prediction(chunk) for chunk in actions.float().cpu().numpy()]
 
-    def _parts(self, network: Network) -> list[str]:
+    def _parts(self, network: DiffusionNetwork) -> list[str]:
         usual = ["state" if name == OBS else name for name in network.vectors]
         return usual if self.config.state is None else self.config.state
 
-    def _cameras(self, network: Network) -> dict[str, str]:
+    def _cameras(self, network: DiffusionNetwork) -> dict[str, str]:
         usual = {name: ours for name, ours in USUAL_CAMERAS.items() if name in network.images}
         return choose_cameras(self.config.cameras, usual, list(network.images))
 
 
 def _resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
-    """As the authors' get_real_obs_dict does it: scaled, and cropped in the middle to the model's aspect."""
+    """Scale an image, and crop its centre to the model's aspect ratio, as the authors' get_real_obs_dict does."""
     if image.shape[:2] == (height, width):
         return image.copy()
     transform = require("diffusion_policy.common.cv2_util").get_image_transform
@@ -118,7 +118,7 @@ def _resized(image: np.ndarray, height: int, width: int) -> np.ndarray:
 
 
 def _action(dim: int, *, absolute: bool) -> ActionSpec:
-    """Where a task has `abs_action`, one or two poses in the base's frame, whose rotations the model writes in six."""
+    """Describe the actions; those of `abs_action` are one or two poses in the base frame, with 6D rotations."""
     if not absolute or dim % _POSE_NUMBERS:
         return ActionSpec(dim=dim)
     return ActionSpec(dim=dim, space="ee_pose", delta=False, rotation="rot6d", frame="base")

@@ -1,7 +1,7 @@
 """Scripted experts: for each simulator a small class that solves its tasks without learning.
 
 `EXPERTS` maps an env's full name, or the suite alone, to "module:Class"; the full name wins. A
-module is imported when the first of its experts is asked for.
+module is imported when the first of its experts is used.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ EXPERTS: dict[str, str] = {
     "maniskill/PushCube-v1": "vlagents_ray.policies.experts.maniskill:PushCube",
     "maniskill/PickCube-v1": "vlagents_ray.policies.experts.maniskill:PickCube",
     "metaworld": "vlagents_ray.policies.experts.metaworld:MetaWorldExpert",
-    "rcs/pick": "vlagents_ray.policies.experts.rcs:Pick",
+    "rcs/pick": "vlagents_ray.policies.experts.rcs:RcsPick",
     "gymnasium/FetchReach-v4": "vlagents_ray.policies.experts.fetch:FetchReach",
     "gymnasium/FetchReachDense-v4": "vlagents_ray.policies.experts.fetch:FetchReach",
     "libero": "vlagents_ray.policies.experts.libero:LiberoExpert",
@@ -27,24 +27,21 @@ EXPERTS: dict[str, str] = {
 
 
 class Expert(Protocol):
-    """One session's expert, made anew for every episode."""
+    """The expert of a session, created for each episode."""
 
     def __init__(self, env_name: str) -> None: ...
 
     def reset(self, obs: Obs, instruction: str) -> None:
-        """Begin an episode; raises `InvalidObservation` if the task cannot be made out."""
+        """Begin an episode; raises `InvalidObservation` if the task cannot be determined."""
         ...
 
     def act(self, obs: Obs) -> Act:
-        """One action, (D,) float32, in the units of the env's contract."""
+        """Compute an action, (D,) float32, in the units of the env's contract."""
         ...
 
 
 def expert_for(env_name: str) -> Expert:
-    """A fresh expert for the env `env_name`, e.g. "tabletop/slide" or "maniskill/PushCube-v1".
-
-    Raises `ContractMismatch` if there is none for it.
-    """
+    """Make an expert for an env, e.g. "tabletop/slide"; raises `ContractMismatch` if there is none."""
     target = EXPERTS.get(env_name) or EXPERTS.get(env_suite(env_name))
     if target is None:
         raise ContractMismatch(

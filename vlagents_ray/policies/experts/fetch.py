@@ -8,11 +8,11 @@ from vlagents_ray.errors import MissingState
 from vlagents_ray.interface import Act, Obs
 
 _METRES_PER_UNIT = 0.05  # Gymnasium-Robotics, MujocoFetchEnv._set_action
-_GAIN = 0.5  # of the way to go, in each step: the arm comes to rest instead of swinging past
+_GAIN = 0.5  # share of the remaining distance in each step, so that the arm does not overshoot
 
 
 class FetchReach:
-    """Moves the gripper straight to the target and holds it there; (4,) in [-1, 1], the gripper left alone."""
+    """Moves the hand straight to the target and holds it there; actions are (4,) in [-1, 1]."""
 
     def __init__(self, env_name: str) -> None:
         self._name = env_name
@@ -22,13 +22,13 @@ class FetchReach:
         self._way(obs)
 
     def act(self, obs: Obs) -> Act:
-        """The next action, (4,) float32."""
+        """Compute the next action, (4,) float32."""
         action = np.zeros(4, dtype=np.float32)
         action[:3] = np.clip(_GAIN * self._way(obs) / _METRES_PER_UNIT, -1.0, 1.0)
         return Act(action=action)
 
     def _way(self, obs: Obs) -> np.ndarray:
-        """From the gripper to the target, (3,) m."""
+        """Return the vector from the gripper to the target, (3,) m."""
         for name in ("desired_goal", "achieved_goal"):
             if name not in obs.state:
                 raise MissingState(name, have=obs.state)

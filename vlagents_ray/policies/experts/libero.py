@@ -1,8 +1,8 @@
-"""An expert for LIBERO's two suites of picking one thing up and placing it, from the simulator's state.
+"""An expert for LIBERO's two suites of picking and placing one object, from the simulator's state.
 
-It answers (7,) for OSC_POSE: 0.05 m and 0.5 rad a unit, gripper -1 open, 1 closed. The hand keeps the
-orientation that it began with, in which the fingers close along y. Bowls in or on the cabinet
-(libero_spatial/4 and /9) are out of its reach so: it acts there, and fails.
+Its actions are (7,) for OSC_POSE: 0.05 m and 0.5 rad a unit, gripper -1 open, 1 closed. The hand keeps its
+initial orientation, in which the fingers close along y. Bowls in or on the cabinet (libero_spatial/4 and
+/9) are then out of reach: it acts there, and fails.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from vlagents_ray.registry import env_task
 
 _SUITES = ("libero_spatial", "libero_object")
 _OPEN, _CLOSED = -1.0, 1.0
-_PER_M, _PER_RAD = 10.0, 2.0  # units of the action: half of the way that is left, and all of the turn
+_PER_M, _PER_RAD = 10.0, 2.0  # units of the action: half of the remaining distance, and all of the rotation
 _MOST_TURN = 0.3
 _ARRIVED_M = 0.008
-_OVER_M = 0.12  # height over the grasp, on the way to it
+_OVER_M = 0.12  # height above the grasp when approaching it
 _LIFT_M = 0.2
 _LEAVE_M = 0.15
 
 
 @dataclass(frozen=True, slots=True)
 class Grip:
-    """How a kind of thing is held and let go."""
+    """The grasp and release of a kind of object."""
 
-    offset: tuple[float, float, float]  # of the hand from the thing's origin when it closes, m
-    release_m: float  # height of the thing over its place when the hand opens
+    offset: tuple[float, float, float]  # from the object's origin to the hand when it closes, m
+    release_m: float  # height of the object above its target when the hand opens
 
 
 _RIM = Grip((0.0, 0.048, 0.035), 0.02)  # bowls are wider than the hand: a finger goes inside
@@ -41,29 +41,29 @@ _MIDDLE = Grip((0.0, 0.0, 0.0), 0.1)
 
 
 @dataclass(frozen=True, slots=True)
-class Phase:
-    """A stretch of the way, over when the hand has arrived, or after `steps`."""
+class PickPhase:
+    """A phase of the motion, which ends when the hand arrives, or after `steps`."""
 
     name: str
     gripper: float
     steps: int
-    waits: bool = False  # for the fingers: as long as `steps`, wherever the hand is
+    waits: bool = False  # waits `steps` for the fingers, independent of the hand
 
 
 _PHASES = (
-    Phase("over", _OPEN, 80),
-    Phase("down", _OPEN, 60),
-    Phase("grasp", _CLOSED, 15, waits=True),
-    Phase("lift", _CLOSED, 60),
-    Phase("carry", _CLOSED, 120),
-    Phase("lower", _CLOSED, 60),
-    Phase("release", _OPEN, 12, waits=True),
-    Phase("leave", _OPEN, 25),
+    PickPhase("over", _OPEN, 80),
+    PickPhase("down", _OPEN, 60),
+    PickPhase("grasp", _CLOSED, 15, waits=True),
+    PickPhase("lift", _CLOSED, 60),
+    PickPhase("carry", _CLOSED, 120),
+    PickPhase("lower", _CLOSED, 60),
+    PickPhase("release", _OPEN, 12, waits=True),
+    PickPhase("leave", _OPEN, 25),
 )
 
 
 class LiberoExpert:
-    """Takes the thing that the goal names from above, and puts it where the goal says."""
+    """Grasps the object of the goal from above, and places it at the goal's target."""
 
     def __init__(self, env_name: str) -> None:
         suite = (env_task(env_name) or _SUITES[0]).partition("/")[0]
@@ -73,10 +73,15 @@ class LiberoExpert:
         self._upright: np.ndarray | None = None  # (3, 3), the hand's first orientation
         self._thing, self._place = "", ""
         self._phase, self._spent = 0, 0
-        self._target = np.zeros(3)  # m, of the hand in this phase
+        self._target = np.zeros(3)  # of the hand in this phase, m
 
     def reset(self, obs: Obs, instruction: str) -> None:
-        """Raises `InvalidObservation` without LIBERO's simulator state, `ContractMismatch` for another goal."""
+        """Begin an episode.
+
+        Raises:
+            InvalidObservation: The observation has no simulator state of LIBERO.
+            ContractMismatch: The goal is not of picking and placing an object.
+        """
         goal, positions = self._sim_state(obs)
         if len(goal) != 1 or len(goal[0]) != 3 or goal[0][0] not in ("on", "in"):
             raise ContractMismatch(f"{self._name}: the expert brings one thing to one place, the goal is {goal}")
@@ -88,7 +93,7 @@ class LiberoExpert:
         self._target = self._aim(hand, positions)
 
     def act(self, obs: Obs) -> Act:
-        """The next action, (7,) float32."""
+        """Compute the next action, (7,) float32."""
         if self._upright is None:
             raise NotReset(f"{self._name}: act before reset; call reset(obs, instruction) first")
         _, positions = self._sim_state(obs)
@@ -106,11 +111,11 @@ class LiberoExpert:
         return Act(np.concatenate([move, back, [phase.gripper]]).astype(np.float32))
 
     def _aim(self, hand: np.ndarray, positions: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Where the hand goes in the phase that begins, (3,) m."""
+        """Return the target of the hand in the phase that begins, (3,) m."""
         grip = _RIM if "bowl" in self._thing else _MIDDLE
         thing, up = positions[self._thing], np.array([0.0, 0.0, 1.0])
         grasp = thing + np.array(grip.offset)
-        above = positions[self._place] + hand - thing  # where the thing would be over its place
+        above = positions[self._place] + hand - thing  # of the hand, with the object above its target
         targets: dict[str, np.ndarray] = {
             "over": grasp + _OVER_M * up,
             "down": grasp,
@@ -119,10 +124,10 @@ class LiberoExpert:
             "lower": above + grip.release_m * up,
             "leave": hand + _LEAVE_M * up,
         }
-        return targets.get(_PHASES[self._phase].name, self._target)  # else the fingers move, and the hand stays
+        return targets.get(_PHASES[self._phase].name, self._target)  # in other phases only the fingers move
 
     def _sim_state(self, obs: Obs) -> tuple[list[list[str]], dict[str, np.ndarray]]:
-        """The goal's predicates, and where things are, (3,) m."""
+        """Return the goal's predicates and the positions of objects, (3,) m."""
         state = obs.info.get("sim_state")
         if not isinstance(state, dict) or not {"goal", "positions"} <= set(state):
             got: Any = sorted(state) if isinstance(state, dict) else type(state).__name__
@@ -134,7 +139,7 @@ class LiberoExpert:
 
 
 def _hand(obs: Obs) -> tuple[np.ndarray, np.ndarray]:
-    """Position (3,) m and orientation (3, 3) of the hand in the world."""
+    """Return the position (3,) m and orientation (3, 3) of the hand in the world's frame."""
     pose = obs.state.get("xyz_axis_angle")
     if pose is None or pose.shape != (6,):
         raise InvalidObservation("state 'xyz_axis_angle': want (6,), m and rad, as LIBERO's env gives it")
@@ -142,7 +147,7 @@ def _hand(obs: Obs) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _matrix(rotation_vector: np.ndarray) -> np.ndarray:
-    """(3,) rad to (3, 3), by Rodrigues' formula."""
+    """Convert a rotation vector (3,) rad to a matrix (3, 3) by Rodrigues' formula."""
     angle = float(np.linalg.norm(rotation_vector))
     if angle == 0.0:
         return np.eye(3)
@@ -153,5 +158,5 @@ def _matrix(rotation_vector: np.ndarray) -> np.ndarray:
 
 
 def _rotation_vector(matrix: np.ndarray) -> np.ndarray:
-    """(3, 3) to (3,) rad, for the small turns that the hand is off by: the sines stand for the angles."""
+    """Convert a matrix (3, 3) to a rotation vector (3,) rad, with sines for the small angles."""
     return np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]) / 2

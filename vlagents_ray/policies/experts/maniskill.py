@@ -1,6 +1,6 @@
 """Experts for ManiSkill's PushCube and PickCube, from the simulator's state.
 
-They answer in the control mode `pd_ee_delta_pose`, (7,): 0.1 m a unit, no rotation, gripper 1 open,
+Their actions are those of the control mode `pd_ee_delta_pose`, (7,): 0.1 m a unit, no rotation, gripper 1 open,
 -1 closed. The arm moves only about a third of a commanded step, so commanding the whole distance to
 the target again in every step is a stable controller. For some poses ManiSkill's inverse kinematics
 finds no solution to a long step, and the arm stays where it is: then the steps become shorter.
@@ -13,18 +13,18 @@ import numpy as np
 from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.interface import Act, Obs
 
-_UNIT_M = 0.1  # commanded by an action of 1.0
+_UNIT_M = 0.1  # motion commanded by an action of 1.0
 _OPEN, _CLOSED = 1.0, -1.0
 
 
 class PushCube:
     """Goes around and behind the cube, down to the table, and pushes it along x onto the target."""
 
-    _BEHIND_M = 0.12  # of the tool behind the cube before the push
+    _BEHIND_M = 0.12  # distance of the tool behind the cube before the push
     _OVER_M = 0.15  # height of the tool on its way there, clear of the cube
     _LOW_M = 0.02  # height of the tool while pushing: the cube's middle
-    _FAR_M = 0.28  # of the target from the middle of the table, along x
-    _PLACED_M = 0.03  # of the cube from the target's middle; success wants 0.1
+    _FAR_M = 0.28  # distance of the target from the centre of the table, along x
+    _PLACED_M = 0.03  # distance of the cube from the target's centre; success needs 0.1
 
     def __init__(self, env_name: str) -> None:
         self._name = env_name
@@ -53,7 +53,7 @@ class PushCube:
         if self._phase == "down":
             return self._hand.move(tool, low, _CLOSED)
         if self._phase == "push":
-            # near the end of its reach the arm stops following: there the cube has to slide the last centimetres
+            # near the end of its reach the arm does not follow, so the cube has to slide the last centimetres
             speed = 0.8 if goal[0] > self._FAR_M else 0.5
             return self._hand.move(tool, np.array([goal[0], goal[1], self._LOW_M]), _CLOSED, limit=speed)
         return self._hand.move(tool, tool, _CLOSED)
@@ -63,8 +63,8 @@ class PickCube:
     """Goes over the cube, down, grasps it, moves it to the goal and holds it there."""
 
     _OVER_M = 0.08  # height of the tool over the cube before it goes down
-    _GRASP_STEPS = 3  # the fingers' way until the grasp is firm
-    _GIVE_UP_STEPS = 8  # without contact on both fingers: try again from above
+    _GRASP_STEPS = 3  # until the fingers hold the cube
+    _GIVE_UP_STEPS = 8  # without contact on both fingers; then it tries again from above
 
     def __init__(self, env_name: str) -> None:
         self._name = env_name
@@ -98,22 +98,22 @@ class PickCube:
             return self._hand.move(tool, cube, _OPEN, limit=0.5)
         if self._phase == "grasp":
             return self._hand.move(tool, tool, _CLOSED)
-        # the cube, not the tool, has to arrive; a little softer, so that the arm comes to rest
+        # the cube, not the tool, has to arrive; shorter steps let the arm come to rest
         return self._hand.move(tool, tool + 0.8 * (goal - cube), _CLOSED, limit=0.6)
 
 
 class _Hand:
-    """Turns distances to go into actions, with shorter steps while the arm does not follow."""
+    """Converts remaining distances to actions, with shorter steps while the arm does not follow."""
 
     _STUCK_M = 0.001  # the arm moved less than this, though a longer step was commanded
 
     def __init__(self) -> None:
-        self._at: np.ndarray | None = None  # (3,) m, where the last step began
+        self._at: np.ndarray | None = None  # (3,) m, position at the last step
         self._commanded_m = 0.0
         self._scale = 1.0
 
     def move(self, tool: np.ndarray, target: np.ndarray, gripper: float, limit: float = 1.0) -> Act:
-        """An action that commands the way from `tool` to `target`, (3,) m, at most `limit` units along each axis."""
+        """Return an action from `tool` towards `target`, (3,) m, of at most `limit` units along each axis."""
         moved_m = np.inf if self._at is None else float(np.linalg.norm(tool - self._at))
         stuck = moved_m < self._STUCK_M and self._commanded_m > 10 * self._STUCK_M
         self._scale = max(self._scale / 2, 0.1) if stuck else min(self._scale * 2, 1.0)

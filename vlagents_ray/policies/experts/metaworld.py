@@ -14,7 +14,7 @@ _SIZE = 39  # hand 3, gripper 1, objects 14, the same of the step before, goal 3
 
 
 class MetaWorldExpert:
-    """Hands the simulator's observation, in `info["sim_state"]`, to the task's oracle."""
+    """Passes the simulator's observation, in `info["sim_state"]`, to the task's oracle."""
 
     def __init__(self, env_name: str) -> None:
         oracles: dict[str, Any] = require("metaworld.policies").ENV_POLICY_MAP
@@ -29,7 +29,7 @@ class MetaWorldExpert:
         self._sim_state(obs)
 
     def act(self, obs: Obs) -> Act:
-        """The next action, (4,) float32 in [-1, 1]."""
+        """Compute the next action, (4,) float32 in [-1, 1]."""
         action = np.asarray(self._oracle.get_action(self._sim_state(obs)), dtype=np.float32)
         return Act(action=np.clip(action, -1.0, 1.0))
 

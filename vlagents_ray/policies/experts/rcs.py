@@ -1,4 +1,4 @@
-"""An expert for RCS's pick task, from where the simulator says the cuboid is."""
+"""An expert for RCS's pick task, from the simulator's pose of the cuboid."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ _CUBOID = "PickTask_box_joint"
 _OPEN, _CLOSED = 1.0, 0.0
 
 
-class Pick:
-    """Goes over the cuboid, turns with it, goes down, closes the gripper, and lifts.
+class RcsPick:
+    """Moves above the cuboid, aligns with it, moves down, closes the gripper, and lifts.
 
-    It answers in the control mode `tquat`, absolute, (8,): metres and quaternion xyzw in the robot's
+    Its actions are those of the control mode `tquat`, absolute, (8,): metres and quaternion xyzw in the robot's
     base frame, then the gripper, 1 open, 0 closed. The hand points down, and its fingers close along
     the cuboid's shorter side, 32 mm.
     """
 
-    _STEP_M = 0.02  # of the commanded pose, in each step
+    _STEP_M = 0.02  # largest change of the commanded position in a step
     _OVER_M = 0.12  # height of the tool above the cuboid's middle before it goes down
     _ARRIVED_M = 0.006
     _GRASP_STEPS = 12  # until the fingers have closed
-    _LIFT_M = 0.2  # above where the cuboid lay; success wants some 5 cm
+    _LIFT_M = 0.2  # above the cuboid's first position; success needs about 5 cm
 
     def __init__(self, env_name: str) -> None:
         self._name = env_name
@@ -41,7 +41,7 @@ class Pick:
         self._lay = self._cuboid(obs)[:3]
 
     def act(self, obs: Obs) -> Act:
-        """The next action, (8,) float32."""
+        """Compute the next action, (8,) float32."""
         tool, cuboid = _tool(obs), self._cuboid(obs)
         over = cuboid[:3] + np.array([0.0, 0.0, self._OVER_M])
         if self._phase == "over" and np.linalg.norm(tool - over) < self._ARRIVED_M:
@@ -80,13 +80,13 @@ def _tool(obs: Obs) -> np.ndarray:
 
 
 def _turn(wxyz: np.ndarray) -> float:
-    """How far a lying cuboid is turned about the vertical, in [-pi/2, pi/2]: half a turn more looks the same."""
+    """Return a lying cuboid's rotation about the vertical in [-pi/2, pi/2], as half a turn makes no difference."""
     turn = 2 * math.atan2(wxyz[3], wxyz[0])
     return math.remainder(turn, math.pi)
 
 
 def _down(turn: float) -> list[float]:
-    """The quaternion xyzw of a hand that points down, turned about the vertical."""
+    """Return the quaternion xyzw of a hand that points down, rotated about the vertical."""
     return [math.cos(turn / 2), math.sin(turn / 2), 0.0, 0.0]
 
 

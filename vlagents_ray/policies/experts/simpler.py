@@ -10,19 +10,19 @@ from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.interface import Act, Obs
 
 _OPEN, _CLOSED = 1.0, 0.0
-_STEP_M = 0.04  # commanded along an axis, at most
-_STEP_RAD = 0.2  # commanded about the vertical, at most
-_OVER_M = 0.08  # of the gripper over the object before it goes down, and over the target after it let go
+_STEP_M = 0.04  # largest command along an axis
+_STEP_RAD = 0.2  # largest command about the vertical
+_OVER_M = 0.08  # height of the gripper above the object before the grasp, and above the target after the release
 _LIFT_M = 0.10
-_LOWEST_M = 0.0135  # of the gripper, over the robot's foot: lower, the fingers press on the table and do not close
-_DROP_M = 0.04  # of the object's middle over the target's, when it is let go
+_LOWEST_M = 0.0135  # height of the gripper above the robot's foot; lower, the fingers press on the table
+_DROP_M = 0.04  # height of the object's centre above the target's at the release
 
 
 class _Stage(NamedTuple):
     name: str
     gripper: float
-    steps: int  # after so many the next begins
-    near_m: float  # or when the gripper is so near to the goal
+    steps: int  # after which the next stage begins
+    near_m: float  # distance to the goal at which the next stage begins
 
 
 _STAGES = (
@@ -43,17 +43,17 @@ class SimplerExpert:
     def __init__(self, env_name: str) -> None:
         self._name = env_name
         self._stage = self._steps = 0
-        self._goal = np.zeros(3)  # of the gripper in this stage, m in the base's frame
-        self._turn = 0.0  # still to be commanded, rad
+        self._goal = np.zeros(3)  # of the gripper in this stage, m in the base frame
+        self._turn = 0.0  # remaining rotation, rad
 
     def reset(self, obs: Obs, instruction: str) -> None:
         """Begin an episode; raises `InvalidObservation` without the simulator's state."""
         places, yaw = self._state(obs)
         self._begin(0, places)
-        self._turn = (yaw + np.pi / 2) % np.pi - np.pi / 2  # the fingers open across the object, either way round
+        self._turn = (yaw + np.pi / 2) % np.pi - np.pi / 2  # the fingers open across the object, in either direction
 
     def act(self, obs: Obs) -> Act:
-        """The next action, (7,) float32."""
+        """Compute the next action, (7,) float32."""
         places, _ = self._state(obs)
         _, _, gripper, commanded = places
         stage = _STAGES[self._stage]
@@ -73,7 +73,7 @@ class SimplerExpert:
         self._stage, self._steps = stage, 0
         thing, target, gripper, _ = places
         up = np.array([0.0, 0.0, 1.0])
-        held = gripper - thing  # from the object to the gripper, once it is grasped
+        held = gripper - thing  # from the object to the gripper, when grasped
         name = _STAGES[stage].name
         if name == "over":
             self._goal = np.maximum(thing, [-np.inf, -np.inf, _LOWEST_M]) + _OVER_M * up
@@ -89,7 +89,7 @@ class SimplerExpert:
             self._goal = self._goal + _OVER_M * up
 
     def _state(self, obs: Obs) -> tuple[np.ndarray, float]:
-        """Where object, target and gripper are and the gripper is commanded to, (4, 3) m; and the object's yaw, rad."""
+        """Return the positions of object, target, gripper and its command, (4, 3) m, and the object's yaw, rad."""
         state = obs.info.get("sim_state")
         if not isinstance(state, np.ndarray) or state.shape != (13,):
             got = f"shape {state.shape}" if isinstance(state, np.ndarray) else type(state).__name__

@@ -1,7 +1,7 @@
-"""Solves the tabletop from the camera image and the instruction alone.
+"""An expert for the tabletop from the camera image and the instruction alone.
 
-It knows what a calibrated robot cell knows: where the camera stands (see `vlagents_ray.envs.tabletop`),
-how high a puck is, and the gripper's own proprioception. Where things are it has to see.
+Its knowledge is that of a calibrated robot cell: the pose of the camera (see `vlagents_ray.envs.tabletop`), the
+height of a puck, and the gripper's proprioception. It locates objects in the image.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ _HUES = {"red": 1.0, "yellow": 46.0, "green": 133.0, "blue": 216.0, "purple": 27
 _HUE_TOLERANCE = 20.0  # degrees
 _PASTEL, _FULL = (0.15, 0.5), (0.55, 1.0)  # saturation of pads and of pucks
 _PUCK_HEIGHT = 0.03  # m
-_PUCK_REACH, _PAD_REACH = 0.034, 0.06  # m, how far from its middle a puck's or a pad's pixels can be
+_PUCK_REACH, _PAD_REACH = 0.034, 0.06  # m, largest distance of a puck's or a pad's pixels from its centre
 
 _TRAVEL_Z, _GRASP_Z = 0.10, 0.006  # m, of the fingertips
-_AWAY = (0.0, 0.20, 0.16)  # m, where the gripper hides nothing
+_AWAY = (0.0, 0.20, 0.16)  # m, where the gripper does not occlude objects
 _ARRIVED = 0.003  # m
-_HOLDING = 0.4  # fingers that close on nothing open less than this
+_HOLDING = 0.4  # the opening of fingers that hold a puck is larger
 _OPEN, _CLOSED = 1.0, -1.0
 
 _INSTRUCTIONS = {
@@ -47,11 +47,11 @@ class Waypoint:
     grip: float
     wait: int = 0
     grasps: bool = False  # a puck must be held when this one is left
-    looks: bool = False  # when it is reached, look and plan anew
+    looks: bool = False  # at this waypoint it takes a new image and plans again
 
 
 class TabletopExpert:
-    """Looks once, then follows waypoints; looks again when a grasp has failed."""
+    """Plans waypoints from one image and follows them; plans again after a failed grasp."""
 
     def __init__(self, env_name: str) -> None:
         self._env_name = env_name
@@ -60,7 +60,11 @@ class TabletopExpert:
         self._waited = 0
 
     def reset(self, obs: Obs, instruction: str) -> None:
-        """Raises `InvalidObservation` for an instruction of another kind, or if a thing it names is not in sight."""
+        """Begin an episode.
+
+        Raises:
+            InvalidObservation: The instruction is of another kind, or names an object that is not visible.
+        """
         self._plan = plan(_image(obs), instruction)
         self._instruction = instruction
         self._waited = 0
@@ -78,11 +82,11 @@ class TabletopExpert:
         if self._has_arrived(position):
             self._waited += 1
         offset = (np.array(self._plan[0].xyz) - position) / _METRES_PER_UNIT
-        offset /= max(1.0, float(np.abs(offset).max()))  # slower rather than off the straight line
+        offset /= max(1.0, float(np.abs(offset).max()))  # slower, to stay on the straight line
         return Act(np.append(offset, self._plan[0].grip).astype(np.float32), done=done)
 
     def _after(self, plan_so_far: list[Waypoint], obs: Obs, position: np.ndarray, opening: float) -> list[Waypoint]:
-        """The plan from here on, its first waypoint being reached."""
+        """Return the remaining plan after its first waypoint has been reached."""
         if plan_so_far[0].looks:
             return plan(_image(obs), self._instruction)
         if plan_so_far[0].grasps and opening < _HOLDING:
@@ -95,9 +99,9 @@ class TabletopExpert:
 
 
 def plan(image: np.ndarray, instruction: str) -> list[Waypoint]:
-    """The way to fulfil `instruction` in the scene on `image`, (H, W, 3) uint8."""
+    """Plan waypoints that fulfil an instruction in the scene of an image, (H, W, 3) uint8."""
     kind, puck, target = _parse(instruction)
-    seen = _Seen(image)
+    seen = _SeenObject(image)
     x, y = seen.puck(puck)
     grasp = [
         Waypoint((x, y, _TRAVEL_Z), _OPEN),
@@ -129,8 +133,8 @@ def _parse(instruction: str) -> tuple[str, str, str]:
     )
 
 
-class _Seen:
-    """The coloured things on one image, in metres on the table."""
+class _SeenObject:
+    """The coloured objects in an image, in metres on the table."""
 
     def __init__(self, image: np.ndarray) -> None:
         height, width = image.shape[:2]
@@ -153,7 +157,7 @@ class _Seen:
         self._hue = sextant * 60  # degrees, from -60
 
     def puck(self, colour: str) -> tuple[float, float]:
-        """Where the middle of the puck stands: (x, y) m."""
+        """Return the centre of a puck, (x, y) m."""
         return self._find(colour, "puck", _FULL, _PUCK_REACH, _PUCK_HEIGHT / 2)
 
     def pad(self, colour: str) -> tuple[float, float]:
@@ -181,7 +185,7 @@ def _image(obs: Obs) -> np.ndarray:
 
 
 def _proprioception(obs: Obs) -> tuple[np.ndarray, float]:
-    """The fingertips' position, (3,) m, and the gripper's opening in [0, 1]."""
+    """Return the fingertips' position, (3,) m, and the gripper's opening in [0, 1]."""
     if "xyzrpy" not in obs.state:
         raise MissingState("xyzrpy", have=obs.state)
     if obs.gripper is None:

@@ -1,4 +1,4 @@
-"""A LeRobot checkpoint, read strictly: what is missing, unknown or random in it is an error before serving."""
+"""Strict loading of LeRobot checkpoints: missing, unknown or random parts are errors before serving."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.accelerator import ensure_torchvision
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
-from vlagents_ray.policies.lerobot.kinds import KINDS, REFUSED, Flow
-from vlagents_ray.policies.lerobot.processors import PIPELINES
+from vlagents_ray.policies.lerobot.policy_types import KINDS, REFUSED, Flow
+from vlagents_ray.policies.lerobot.processors import PIPELINES, require_known_steps
 from vlagents_ray.registry import require
 
 WEIGHTS = "model.safetensors"
-TRAINED = "pretrained_model"  # where LeRobot's training puts the checkpoint inside its step's folder
-_PATCHED = {"pi0", "pi05", "pi0_fast"}  # run with openpi's changes to transformers only
-_CHECK = "transformers.models.siglip.check"  # which these add
+TRAINED = "pretrained_model"  # LeRobot's folder of the checkpoint within that of a training step
+_PATCHED = {"pi0", "pi05", "pi0_fast"}  # they need openpi's changes to transformers
+_CHECK = "transformers.models.siglip.check"  # a module that these changes add
 
 
 def find(config: LeRobotConfig) -> Path:
-    """The folder with config, weights and processors. Raises `ConfigError`."""
+    """Find the folder with config, weights and processors; raises `ConfigError` if there is none."""
     folder = find_checkpoint(config.checkpoint, config.checkpoint_step)
     if (folder / TRAINED).is_dir():
         folder /= TRAINED
@@ -32,15 +32,18 @@ def find(config: LeRobotConfig) -> Path:
     missing = [name for name in PIPELINES if not (folder / name).is_file()]
     if missing:
         raise ConfigError(
-            f"checkpoint {folder}: misses {missing}, with the normalisation; one that was made before LeRobot had "
-            f"processors is converted by: python -m lerobot.processor.migrate_policy_normalization "
+            f"checkpoint {folder}: misses {missing}, with the normalisation; convert a checkpoint from before LeRobot "
+            f"had processors by: python -m lerobot.processor.migrate_policy_normalization "
             f"--pretrained-path {folder}"
         )
+    if not config.trust_remote_code:
+        for name in PIPELINES:
+            require_known_steps(folder / name)
     return folder
 
 
 def load(folder: Path, config: LeRobotConfig, device: Any) -> Any:
-    """LeRobot's policy on the device, in evaluation mode, every parameter of it from the checkpoint."""
+    """Load LeRobot's policy to the device, in evaluation mode, with every parameter from the checkpoint."""
     ensure_torchvision()
     factory = require("lerobot.policies.factory")
     settings = _settings(folder, config)
@@ -54,8 +57,8 @@ def load(folder: Path, config: LeRobotConfig, device: Any) -> Any:
     except Exception as error:
         raise ConfigError(
             f"checkpoint {folder}: LeRobot cannot load it as {settings.type!r} ({type(error).__name__}: {error}); is "
-            f"it whole, and of this version of LeRobot? What it names on the hub has to be in the cache where there is "
-            f"no network, or to be replaced by `overrides`"
+            f"it complete, and of this version of LeRobot? Without a network, what it names on the hub has to be in "
+            f"the cache, or to be replaced by `overrides`"
         ) from error
     require_loaded(policy, saved.renamed(lambda name: _as_loaded(policy, name)))
     if config.dtype == "float32":
@@ -67,7 +70,7 @@ def load(folder: Path, config: LeRobotConfig, device: Any) -> Any:
 
 
 def _settings(folder: Path, config: LeRobotConfig) -> Any:
-    """The checkpoint's config.json as LeRobot's object, `overrides` laid over it."""
+    """Read the checkpoint's config.json, with `overrides`, as LeRobot's object."""
     base = require("lerobot.configs.policies").PreTrainedConfig
     require("lerobot.utils.import_utils").register_third_party_plugins()
     try:
@@ -103,14 +106,14 @@ def _require_known(name: str, folder: Path) -> None:
 
 
 def _prepare(settings: Any, config: LeRobotConfig, device: Any) -> bool:
-    """Where and how the policy runs. True if its parameters are to be of the types that they were saved in."""
+    """Set the device and types of the policy; returns whether its parameters keep their saved types."""
     if settings.use_peft:
         raise ConfigError(
             "checkpoint: is a PEFT adapter, want whole weights; merge it (merge_and_unload) and save that"
         )
     settings.device = str(device)
     if hasattr(settings, "pretrained_backbone_weights"):
-        settings.pretrained_backbone_weights = None  # else downloaded, only to be replaced by the checkpoint's
+        settings.pretrained_backbone_weights = None  # they would be downloaded, only to be replaced
     if config.compile and not hasattr(settings, "compile_model"):
         raise ConfigError(f"compile: LeRobot's {settings.type!r} has no compile_model; leave it out")
     if config.compile:
@@ -125,12 +128,12 @@ def _prepare(settings: Any, config: LeRobotConfig, device: Any) -> bool:
         settings.dtype = config.dtype
     as_saved = bool(getattr(settings, "load_vlm_weights", False))
     if as_saved:
-        settings.load_vlm_weights = False  # else downloaded in bfloat16, only to be replaced by the checkpoint's
+        settings.load_vlm_weights = False  # they would be downloaded in bfloat16, only to be replaced
     return as_saved
 
 
 def _as_loaded(policy: Any, name: str) -> str | None:
-    """What LeRobot calls a saved tensor when it has read it: checkpoints that openpi wrote have older names."""
+    """Return LeRobot's name of a saved tensor, as checkpoints of openpi have older names."""
     fix = getattr(policy, "_fix_pytorch_state_dict_keys", None)
     if fix is not None:
         name = next(iter(fix({name: None}, policy.config)), "")

@@ -1,19 +1,24 @@
-"""LeRobot's policies, many sessions in one forward pass, with their own processors around them."""
+"""LeRobot's policies with their processors, with one forward pass for many sessions."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import logging
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.dataset_contract import DatasetContract, angles_in, centre_between, usual_unit
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import torch_device
-from vlagents_ray.policies.base.observing import (
+from vlagents_ray.policies.base.model_code import remote_code
+from vlagents_ray.policies.base.model_inputs import (
+    GRIPPER,
     camera_images,
     choose_cameras,
     needs_gripper,
@@ -22,36 +27,46 @@ from vlagents_ray.policies.base.observing import (
 )
 from vlagents_ray.policies.lerobot import checkpoint
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
-from vlagents_ray.policies.lerobot.kinds import KINDS, MASKING, RESIZING, Kind
+from vlagents_ray.policies.lerobot.policy_types import (
+    KINDS,
+    MASKING,
+    RESIZING,
+    Kind,
+)
 from vlagents_ray.policies.lerobot.processors import Processors
 from vlagents_ray.registry import require
 
+log = logging.getLogger(__name__)
+
 STATE, ENVIRONMENT = "observation.state", "observation.environment_state"
-JOINTS, ENVIRONMENT_STATE = "joints", "environment_state"  # parts of `Obs.state` that make these, unless said otherwise
-_EMPTY = "empty_camera_"  # of a policy that was trained with cameras that are always masked
+JOINTS, ENVIRONMENT_STATE = "joints", "environment_state"  # parts of `Obs.state` that make these, by default
+_MATCHED = ("min", "max", "mean")  # statistics by which the parts of a state are found in it
+_EMPTY = "empty_camera_"  # prefix of cameras that were always masked in training
 
 
 @dataclass(frozen=True, slots=True)
-class Loaded:
-    """A checkpoint, ready: what all sessions share."""
+class LoadedLeRobot:
+    """A loaded checkpoint, which all sessions share."""
 
     kind: Kind
     processors: Processors
     cameras: dict[str, str]  # the policy's observation key -> our name
-    state: list[str]  # parts of the proprioception; none if the policy takes no state
-    environment: int  # numbers of the environment's state; 0 if the policy takes none
+    state: list[str]  # parts of the proprioception; empty if the policy has no state
+    environment: int  # length of the environment's state; 0 if the policy has none
     contract: Contract
+    trained: DatasetContract  # of the dataset; empty if it stated none
 
 
 class LeRobot(ModelPolicy):
-    """Any policy that LeRobot 0.4.4 loads, by the `type` in its checkpoint."""
+    """A policy that LeRobot 0.4.4 loads, by the `type` in its checkpoint."""
 
     Config: ClassVar[type] = LeRobotConfig
+    trainable: ClassVar[str | None] = "model.kind.policy"
     config: LeRobotConfig
 
     @property
     def contract(self) -> Contract | None:
-        """The checkpoint's; None before it is loaded."""
+        """The contract of the checkpoint; None before it is loaded."""
         return None if self.model is None else self.model.contract
 
     @property
@@ -63,42 +78,49 @@ class LeRobot(ModelPolicy):
         feature = None if self.model is None else self.model.kind.config.robot_state_feature
         return None if feature is None else int(feature.shape[0])
 
-    def load(self) -> Loaded:
-        """Read the checkpoint. Raises `ConfigError` where anything of it is missing, unknown or random."""
-        folder = checkpoint.find(self.config)
+    def load(self) -> LoadedLeRobot:
+        """Read the checkpoint; raises `ConfigError` if a part of it is missing, unknown or random."""
+        with remote_code(allowed=self.config.trust_remote_code):
+            return self._loaded(checkpoint.find(self.config))
+
+    def _loaded(self, folder: Path) -> LoadedLeRobot:
         policy = checkpoint.load(folder, self.config, torch_device(self.config.device))
         settings = policy.config
         kind = KINDS.get(settings.type, Kind)(policy)
         self.config = _with_defaults(self.config, kind)
         processors = Processors(folder, settings, self.config)
-        cameras = _cameras(settings, self.config, processors.rename_map)
-        parts = list(self.config.state or [JOINTS]) if settings.robot_state_feature else []
+        trained = _trained(settings, processors)
+        cameras = _cameras(settings, self.config, processors.rename_map, trained.cameras)
+        parts = list(self.config.state or trained.state or [JOINTS]) if settings.robot_state_feature else []
         inputs = [*cameras, *(key for key in (STATE, ENVIRONMENT) if key in settings.input_features)]
         processors.require_statistics(settings, inputs)
         environment = settings.env_state_feature.shape[0] if settings.env_state_feature else 0
+        width = processors.width(settings.action_feature.shape[0])
+        action = trained.contract.action
         contract = Contract(
             cameras={ours: _camera(settings, key) for key, ours in cameras.items()},
-            state=_states(parts, settings.robot_state_feature, environment),
+            state=_states(parts, settings.robot_state_feature, environment, trained),
             gripper=needs_gripper(parts),
             instruction=processors.instructed or None,
-            action=ActionSpec(dim=processors.width(settings.action_feature.shape[0])),
+            action=action if action.dim == width else ActionSpec(dim=width),
+            control_hz=trained.contract.control_hz,
             chunk=self.chunk(kind.horizon),
             history=kind.steps,
         )
-        return Loaded(kind, processors, cameras, parts, environment, contract)
+        return LoadedLeRobot(kind, processors, cameras, parts, environment, contract, trained)
 
     def perceive(self, obs: Obs) -> dict[str, np.ndarray]:
-        """Images by the policy's keys, (H, W, 3) uint8, and its state vectors, float32."""
-        model: Loaded = self.model
+        """Return images by the policy's keys, (H, W, 3) uint8, and its state vectors, float32."""
+        model: LoadedLeRobot = self.model
         frame = {key: image.copy() for key, image in camera_images(obs, model.cameras).items()}
         if model.state:
-            frame[STATE] = state_vector(obs, model.state, self.state_dim)
+            frame[STATE] = model.trained.wrapped(state_vector(obs, model.state, self.state_dim))
         if model.environment:
             frame[ENVIRONMENT] = state_vector(obs, [ENVIRONMENT_STATE], model.environment)
         return frame
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
-        """One forward pass for all rows whose images are of one size; types that cannot batch run row by row."""
+        """Compute the chunks, in one pass for all rows with images of one size unless the type cannot batch."""
         chunks: dict[int, np.ndarray] = {}
         for members in self._groups(rows):
             chunks |= zip(members, self._draw([rows[i] for i in members]), strict=True)
@@ -113,7 +135,7 @@ class LeRobot(ModelPolicy):
         return list(groups.values())
 
     def _draw(self, rows: list[Row]) -> np.ndarray:
-        """The rows' chunks, (B, horizon, D) float32."""
+        """Compute the chunks of rows, (B, horizon, D) float32."""
         torch, model = require("torch"), self.model
         settings = model.kind.config
         leftovers = [None if row.leftover is None else model.processors.leftover(row.leftover) for row in rows]
@@ -124,12 +146,12 @@ class LeRobot(ModelPolicy):
 
 
 def _with_defaults(config: LeRobotConfig, kind: Kind) -> LeRobotConfig:
-    """The settings, where they are silent as the checkpoint was made to be run."""
+    """Return the settings, with the checkpoint's values as defaults."""
     coefficient = getattr(kind.config, "temporal_ensemble_coeff", None)
     defaults: dict[str, Any] = {} if config.actions == "ensemble" else {"execute": kind.usual}
-    if kind.steps > 1:  # trained on consecutive frames, so that it has to see those within a chunk, too
+    if kind.steps > 1:  # trained on consecutive frames, so it needs those within a chunk as well
         defaults["actions"] = "queue"
-    if coefficient is not None:  # its n_action_steps is 1, since LeRobot then asks at every tick
+    if coefficient is not None:  # its n_action_steps is 1, as LeRobot then runs it at every tick
         defaults = {"actions": "ensemble", "ensemble_m": coefficient, "execute": None}
     if (config.execute or 0) > kind.horizon:
         raise ConfigError(
@@ -139,8 +161,61 @@ def _with_defaults(config: LeRobotConfig, kind: Kind) -> LeRobotConfig:
     return config.model_copy(update={k: v for k, v in defaults.items() if k not in config.model_fields_set})
 
 
-def _cameras(settings: Any, config: LeRobotConfig, renames: dict[str, str]) -> dict[str, str]:
-    """The policy's observation key of each camera -> our name."""
+def _trained(settings: Any, processors: Processors) -> DatasetContract:
+    """Return the contract of the checkpoint's dataset, or one inferred from the features of an older dataset."""
+    state, dataset = settings.robot_state_feature, processors.dataset()
+    if dataset is None:
+        return DatasetContract(Contract()) if state is None else _of_features(settings.input_features, processors)
+    if state is None or dataset.width == state.shape[0]:
+        return dataset
+    log.warning(
+        "the contract of the checkpoint's dataset has %d numbers of state, the policy takes %d: it is not used; "
+        "set `state` to the parts that the policy was trained with",
+        dataset.width,
+        state.shape[0],
+    )
+    return DatasetContract(Contract())
+
+
+def _of_features(features: Iterable[str], processors: Processors) -> DatasetContract:
+    """Infer the parts of the state, and its angles, from features and their statistics.
+
+    Our older datasets have no contract, nor do copies by LeRobot's tools without some episodes. The parts are features
+    beside `observation.state`; a comparison of their statistics with its own gives their order.
+    """
+    keys = {key.removeprefix(f"{STATE}."): key for key in features if key.startswith(f"{STATE}.")}
+    if f"observation.{GRIPPER}" in features:
+        keys[GRIPPER] = f"observation.{GRIPPER}"
+    whole = processors.statistics(STATE)
+    parts = {part: processors.statistics(key) for part, key in keys.items()}
+    listed = [part for key in features for part, own in keys.items() if own == key]
+    for order in (listed, sorted(keys, key=lambda part: (part == GRIPPER, part))):
+        if order and all(
+            _alike([parts[part].get(name, []) for part in order], whole.get(name, [])) for name in _MATCHED
+        ):
+            break
+    else:
+        return DatasetContract(Contract())
+    angles, place = {}, 0
+    for part in order:
+        width = len(parts[part]["mean"])
+        for i in angles_in(part, usual_unit(part), width):
+            centre = centre_between(whole["min"][place + i], whole["max"][place + i])
+            if centre is not None:
+                angles[place + i] = centre
+        place += width
+    return DatasetContract(Contract(), tuple(order), angles=angles)
+
+
+def _alike(parts: Sequence[Sequence[float]], whole: Sequence[float]) -> bool:
+    values = np.concatenate(parts)
+    return len(values) == len(whole) and np.allclose(values, whole, rtol=1e-5, atol=1e-6)
+
+
+def _cameras(
+    settings: Any, config: LeRobotConfig, renames: dict[str, str], trained: Mapping[str, str]
+) -> dict[str, str]:
+    """Map the policy's observation key of each camera to our name."""
     names = {key: _short(key) for key in settings.image_features if _EMPTY not in key}
     if unknown := sorted(set(config.masked_cameras) - set(names.values())):
         raise ConfigError(f"masked_cameras: got {unknown}, want some of {sorted(names.values())}")
@@ -151,7 +226,8 @@ def _cameras(settings: Any, config: LeRobotConfig, renames: dict[str, str]) -> d
         )
     seen = {key: name for key, name in names.items() if name not in config.masked_cameras}
     sources = {renamed: source for source, renamed in renames.items()}
-    usual = {name: _short(sources.get(key, key)) for key, name in seen.items()}
+    features = {name: sources.get(key, key) for key, name in seen.items()}  # the dataset's names
+    usual = {name: trained.get(feature, _short(feature)) for name, feature in features.items()}
     chosen = choose_cameras(config.cameras, usual, list(seen.values()))
     return {key: chosen[name] for key, name in seen.items()}
 
@@ -161,13 +237,15 @@ def _short(key: str) -> str:
 
 
 def _camera(settings: Any, key: str) -> CameraSpec:
-    """Any size where the policy resizes; elsewhere that of its training, as another one would change what it sees."""
+    """Specify a camera: any size if the policy resizes, else that of its training."""
     if settings.type in RESIZING or getattr(settings, "resize_imgs_with_padding", None) is not None:
         return CameraSpec()
     _, height, width = settings.input_features[key].shape
     return CameraSpec(height, width)
 
 
-def _states(parts: Sequence[str], feature: Any, environment: int) -> dict[str, StateSpec]:
+def _states(parts: Sequence[str], feature: Any, environment: int, trained: DatasetContract) -> dict[str, StateSpec]:
     specs = state_specs(parts, feature.shape[0]) if parts else {}
+    if tuple(parts) == trained.state:
+        specs |= trained.contract.state or {}
     return {**specs, ENVIRONMENT_STATE: StateSpec(environment)} if environment else specs

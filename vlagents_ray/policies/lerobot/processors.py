@@ -1,7 +1,8 @@
-"""The checkpoint's own pipelines around its policy: observations in, actions out, leftovers back."""
+"""The checkpoint's processors of observations, actions and leftover actions."""
 
 from __future__ import annotations
 
+import inspect
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,8 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.errors import ConfigError
+from vlagents_ray.dataset_contract import BYTES, STATISTICS, DatasetContract
+from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.policies.base import Row
+from vlagents_ray.policies.base.model_code import CURE
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
 from vlagents_ray.registry import require
 
@@ -26,10 +29,10 @@ _STATISTICS = {
 
 
 class Processors:
-    """Both pipelines, on the policy's device. Raises `ConfigError` if they are not whole."""
+    """The pre- and post-processor, on the policy's device; raises `ConfigError` if they are incomplete."""
 
     def __init__(self, folder: Path, settings: Any, config: LeRobotConfig) -> None:
-        """`settings` is the policy's own config."""
+        """Load the processors; `settings` is the policy's own config."""
         self._device = settings.device
         saved = [_saved_steps(folder / name) for name in PIPELINES]
         unknown = sorted(set(config.processors) - set().union(*saved))
@@ -54,10 +57,22 @@ class Processors:
             ) from error
         self._back = self._inverse()
 
+    def statistics(self, key: str) -> dict[str, list[float]]:
+        """Return the statistics of a feature of the dataset; empty if there are none."""
+        for step in self._before.steps:
+            if found := getattr(step, "_tensor_stats", {}).get(key):
+                return {name: value.flatten().tolist() for name, value in found.items()}
+        return {}
+
+    def dataset(self) -> DatasetContract | None:
+        """Return the contract of the dataset of the training; None if it has none."""
+        numbers = self.statistics(STATISTICS).get(BYTES)
+        return None if numbers is None else DatasetContract.from_statistics(numbers)
+
     def require_statistics(self, settings: Any, inputs: Sequence[str]) -> None:
         """Raise `ConfigError` unless all `inputs`, and the actions, are normalised as the policy was trained.
 
-        LeRobot passes on unchanged what it has no statistics for.
+        LeRobot passes features without statistics on unchanged.
         """
         features = {**settings.input_features, **settings.output_features}
         for pipeline, keys, file in ((self._before, inputs, PIPELINES[0]), (self._after, [ACTION], PIPELINES[1])):
@@ -69,12 +84,12 @@ class Processors:
                 missing = [name for name in wanted if name not in have or not have[name].isfinite().all()]
                 if missing:
                     raise ConfigError(
-                        f"checkpoint: {file} has no usable {missing} of {key!r}, has {sorted(have)}; without them the "
-                        f"policy sees and does nonsense: save its processors with the statistics of its dataset"
+                        f"checkpoint: {file} has no usable {missing} of {key!r}, has {sorted(have)}; without them "
+                        f"its inputs and actions are wrong: save its processors with the statistics of its dataset"
                     )
 
     def observe(self, rows: Sequence[Row], steps: int) -> dict[str, Any]:
-        """What the policy takes, (rows * steps, …) on its device: the last `steps` frames of each row."""
+        """Return the policy's inputs, (rows * steps, …) on its device: the last `steps` frames of each row."""
         torch = require("torch")
         frames = [frame for row in rows for frame in row.history(steps)]
         batch: dict[str, Any] = {}
@@ -85,20 +100,20 @@ class Processors:
         return {key: value for key, value in self._before(batch).items() if value is not None}
 
     def actions(self, chunks: Any) -> np.ndarray:
-        """(B, T, D) of the policy as (B, T, D') float32, in the units that the robot takes."""
-        flat = self._after(chunks.float().flatten(0, 1))  # rows, as LeRobot's own loop hands them over
+        """Convert the policy's actions (B, T, D) to (B, T, D') float32, in the robot's units."""
+        flat = self._after(chunks.float().flatten(0, 1))  # rows, as in LeRobot's own loop
         return np.asarray(flat.unflatten(0, chunks.shape[:2]).float().cpu())
 
     def leftover(self, rows: np.ndarray) -> Any:
-        """(H, D') that `actions` gave, in the policy's units again; None if they cannot be turned back."""
+        """Convert actions (H, D') back to the policy's units; None if that is not possible."""
         return None if self._back is None else self._back(require("torch").from_numpy(rows))
 
     def width(self, dim: int) -> int:
-        """D' of the actions of a policy with `dim` of its own."""
+        """Return D', the number of values of the robot's actions, for a policy with `dim` of its own."""
         return int(self._after(require("torch").zeros(1, dim)).shape[-1])
 
     def _inverse(self) -> Any:
-        """A pipeline that undoes the post-processor, if that only unnormalises."""
+        """Make the inverse of the post-processor, if it only unnormalises."""
         processor, converters = require("lerobot.processor"), require("lerobot.processor.converters")
         steps: list[Any] = []
         for step in self._after.steps:
@@ -117,7 +132,32 @@ class Processors:
         )
 
 
+def require_known_steps(file: Path) -> None:
+    """Raise `ConfigError` if a pipeline names a step that is neither LeRobot's nor an installed plugin's.
+
+    LeRobot imports and calls the "class" of a step without a "registry_name", also `subprocess.Popen`.
+    """
+    steps = json.loads(file.read_text(encoding="utf-8")).get("steps", [])
+    for name in [step.get("class") for step in steps if "registry_name" not in step]:
+        if not _is_lerobots(name):
+            raise ConfigError(
+                f"{file}: got a step of the class {name!r}, want one with a registry_name, or a processor step in "
+                f"lerobot.*: loading the checkpoint would run that, whatever it is; {CURE}"
+            )
+
+
+def _is_lerobots(name: object) -> bool:
+    module, _, cls = str(name).rpartition(".")
+    if not module.startswith("lerobot."):
+        return False
+    try:
+        found = getattr(require(module), cls, None)
+    except (ImportError, MissingDependency):
+        return False
+    return inspect.isclass(found) and issubclass(found, require("lerobot.processor").ProcessorStep)
+
+
 def _saved_steps(file: Path) -> dict[str, Mapping[str, Any]]:
-    """The registered name of each step of a pipeline -> its settings."""
+    """Map the registered name of each step of a pipeline to its settings."""
     steps = json.loads(file.read_text(encoding="utf-8")).get("steps", [])
     return {step.get("registry_name", step.get("class", "")): step.get("config", {}) for step in steps}

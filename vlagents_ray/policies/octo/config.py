@@ -10,7 +10,7 @@ from vlagents_ray.policies.base import ModelConfig
 
 
 class OctoConfig(ModelConfig):
-    """Beside what all models have: which data the actions are scaled for, and what is a task."""
+    """Settings of Octo, beside those of all models."""
 
     checkpoint: str = Field(
         min_length=1, description="folder of `save_pretrained` (its newest step, or `folder/{step}`), or hub id"
@@ -24,16 +24,21 @@ class OctoConfig(ModelConfig):
     source_dir: str | None = Field(
         default=None, description="a checkout of Octo; unset: the installed one, or the one that OCTO_SRC names"
     )
+    trust_remote_code: bool = Field(
+        default=False,
+        description="load a checkpoint that names other code than Octo's components, which then runs with all rights "
+        "of this process, or that has transformers run code from the hub",
+    )
 
     dataset: str | None = Field(
         default=None,
-        description="whose statistics scale the actions, such as bridge_dataset; unset: the checkpoint's only ones",
+        description="dataset whose statistics scale the actions, e.g. bridge_dataset; unset: the checkpoint's only one",
     )
     normalization: Literal["normal", "bounds"] = Field(
         default="normal", description="how training scaled actions: by mean and std, or from [p01, p99] to [-1, 1]"
     )
     window: int | None = Field(
-        default=None, ge=1, description="observations that the model sees, at most; unset: as many as in training"
+        default=None, ge=1, description="largest number of observations that the model gets; unset: as in training"
     )
     crop: bool = Field(
         default=True,
@@ -42,5 +47,5 @@ class OctoConfig(ModelConfig):
     )
     goal: Literal["either", "language", "image"] = Field(
         default="either",
-        description="what makes a task: an instruction, an image in `info['goal_image']` at reset, or whichever comes",
+        description="what makes a task: an instruction, an image in `info['goal_image']` at reset, or either",
     )

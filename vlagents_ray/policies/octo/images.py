@@ -1,4 +1,4 @@
-"""Images as Octo's ResizeImageWrapper makes them."""
+"""Images in the form of Octo's ResizeImageWrapper."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import numpy as np
 
 from vlagents_ray.registry import require
 
-_CROPPED = np.sqrt(np.float32(0.9))  # of each side: the average area of the training's random crops
+_CROPPED = np.sqrt(np.float32(0.9))  # share of each side, by the average area of the training's random crops
 
 
 def resized(image: np.ndarray, height: int, width: int, *, crop: bool) -> np.ndarray:
-    """A (H, W, 3) uint8 image as (height, width, 3), of its own memory: Lanczos, then the middle of it if `crop`."""
+    """Resize an (H, W, 3) uint8 image to (height, width, 3) by Lanczos, with a crop of its centre if `crop`; a copy."""
     if not crop and image.shape[:2] == (height, width):
-        return image.copy()  # what the filter would give
+        return image.copy()  # the filter would change nothing
     tf = require("tensorflow")
     found = tf.image.resize(image, (height, width), method="lanczos3", antialias=True)
     if crop:

@@ -1,4 +1,4 @@
-"""Octo as a policy: windows of real frames, tasks in words or as images, and each session's own noise."""
+"""Octo, with windows of real frames, tasks in words or as images, and the noise of each session."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import GOAL_IMAGE, Obs
 from vlagents_ray.policies.base import ModelPolicy, Prediction, Row
-from vlagents_ray.policies.base.observing import (
+from vlagents_ray.policies.base.model_inputs import (
     camera_images,
     camera_specs,
     choose_cameras,
@@ -21,14 +21,14 @@ from vlagents_ray.policies.base.observing import (
 )
 from vlagents_ray.policies.octo.config import OctoConfig
 from vlagents_ray.policies.octo.images import resized
-from vlagents_ray.policies.octo.network import PROPRIO, Network, normalised_state, real_actions
+from vlagents_ray.policies.octo.network import PROPRIO, OctoNetwork, normalised_state, real_actions
 
-PRIMARY = "image_primary"  # the camera that training crops, and that goal images are of
+PRIMARY = "image_primary"  # the camera of goal images, which training crops
 USUAL_CAMERAS = {PRIMARY: "front", "image_wrist": "wrist"}
 
 
 class Octo(ModelPolicy):
-    """One row a session: its window of frames through the transformer, its noise through the action head."""
+    """The policy of an Octo checkpoint: a row for each session, with its window of frames and its noise."""
 
     Config: ClassVar[type] = OctoConfig
 
@@ -38,14 +38,14 @@ class Octo(ModelPolicy):
 
     @property
     def history(self) -> int:
-        network: Network | None = self.model
+        network: OctoNetwork | None = self.model
         return self.config.window or (1 if network is None else network.window)
 
     @property
     def contract(self) -> Contract:
-        """Cameras, state and size of the action are known once the checkpoint is loaded."""
+        """The contract; cameras, state and the action's size are stated once the checkpoint is loaded."""
         instruction = {"language": True, "image": False}.get(self.config.goal)
-        network: Network | None = self.model
+        network: OctoNetwork | None = self.model
         if network is None:
             return Contract(instruction=instruction, history=self.config.window)
         dim = len(network.statistics(self.config.dataset, "action")["mean"])
@@ -61,13 +61,13 @@ class Octo(ModelPolicy):
 
     @property
     def state_dim(self) -> int | None:
-        """Numbers in the state vector, if the checkpoint reads one, once it is loaded."""
+        """The length of the state vector; None if the checkpoint reads none, or is not loaded."""
         return None if self.model is None else self.model.proprio_dim
 
-    def load(self) -> Network:
-        """Read the checkpoint, and refuse settings that it cannot serve."""
+    def load(self) -> OctoNetwork:
+        """Read the checkpoint; raises `ConfigError` for settings that do not fit it."""
         config = self.config
-        network = Network.load(config.checkpoint, config.checkpoint_step, config.device, config.source_dir)
+        network = OctoNetwork.load(config)
         self._cameras(network)
         wanted = ("mean", "std") if config.normalization == "normal" else ("mean", "p01", "p99")
         statistics = network.statistics(config.dataset, "action")
@@ -88,7 +88,7 @@ class Octo(ModelPolicy):
         return network
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        """Begin an episode, whose task is `obs.info["goal_image"]` if it brings one, else the instruction."""
+        """Begin an episode, whose task is `obs.info["goal_image"]` if there is one, else the instruction."""
         goal = self._goal(obs, instruction)
         info = super().reset(obs, instruction, **kwargs)
         if goal is not None:
@@ -96,8 +96,8 @@ class Octo(ModelPolicy):
         return info
 
     def perceive(self, obs: Obs) -> dict[str, np.ndarray]:
-        """The images and the state by Octo's names, in the sizes of its training."""
-        network: Network = self.model
+        """Return the images and the state by Octo's names, in the sizes of its training."""
+        network: OctoNetwork = self.model
         seen = {name: self._image(name, image) for name, image in camera_images(obs, self._cameras(network)).items()}
         if network.proprio_dim is not None:
             vector = state_vector(obs, self.config.state or (), network.proprio_dim)
@@ -105,9 +105,9 @@ class Octo(ModelPolicy):
         return seen
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
-        """One pass of the transformer for each window, one of the action head for each row."""
-        network: Network = self.model
-        windows = {id(row.frames): row for row in rows}  # a sample sees what its session sees
+        """Compute the chunks, with one pass of the transformer for each window and of the action head for each row."""
+        network: OctoNetwork = self.model
+        windows = {id(row.frames): row for row in rows}  # the samples of a session share its window
         place = {window: i for i, window in enumerate(windows)}
         asked = list(windows.values())
         size = next((size for size in self.config.batch_sizes or () if size >= len(asked)), len(asked))
@@ -121,7 +121,7 @@ class Octo(ModelPolicy):
         return [Prediction(real_actions(chunk, statistics, self.config.normalization)) for chunk in actions]
 
     def _observations(self, rows: Sequence[Row]) -> dict[str, np.ndarray]:
-        """Windows (B, W, ...), where the first frame stands for those that were not, which are masked."""
+        """Return windows (B, W, ...), padded by the first frame, which is masked there."""
         length = self.history
         histories = [row.history(length) for row in rows]
         observations = {
@@ -133,7 +133,7 @@ class Octo(ModelPolicy):
         return observations
 
     def _tasks(self, rows: Sequence[Row]) -> dict[str, Any]:
-        """The tasks of a batch: in words, with blank goal images, or as goal images, with blank words; masked so."""
+        """Return the tasks of a batch: words with blank goal images, or goal images with blank words, with masks."""
         goals = [row.memory.get(GOAL_IMAGE) for row in rows]
         words = [row.instruction if goal is None else "" for row, goal in zip(rows, goals, strict=True)]
         tasks: dict[str, Any] = self.model.model.create_tasks(texts=words)
@@ -161,15 +161,15 @@ class Octo(ModelPolicy):
     def _image(self, name: str, image: np.ndarray) -> np.ndarray:
         return resized(image, *self.model.cameras[name], crop=self.config.crop and name == PRIMARY)
 
-    def _cameras(self, network: Network) -> dict[str, str]:
+    def _cameras(self, network: OctoNetwork) -> dict[str, str]:
         chosen, known = self.config.cameras, list(network.cameras)
         if chosen and set(chosen) <= set(known):
-            return chosen  # Octo was trained with cameras missing: it has no tokens of those left out
+            return chosen  # Octo was trained with missing cameras, for which it has no tokens
         return choose_cameras(chosen, {name: ours for name, ours in USUAL_CAMERAS.items() if name in known}, known)
 
 
 def _action(dim: int, dataset: str | None) -> ActionSpec:
-    """Of a dataset of the pretraining: its standard form. What a fine-tuned checkpoint commands is not written in it.
+    """Describe the actions of a pretraining dataset, in its standard form; fine-tuned checkpoints do not state them.
 
     octo/data/oxe: change of the end effector's position and of its roll, pitch and yaw, then the gripper, 1 = open.
     """

@@ -1,4 +1,4 @@
-"""Physical Intelligence's own code: π0, π0-FAST and π0.5 as openpi trains and saves them, JAX or PyTorch."""
+"""π0, π0-FAST and π0.5 with Physical Intelligence's own code, openpi, in JAX or PyTorch."""
 
 from vlagents_ray.policies.openpi.policy import OpenPi
 

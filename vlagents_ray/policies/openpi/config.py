@@ -9,13 +9,13 @@ from vlagents_ray.policies.openpi.robots import Layout
 
 
 class OpenPiConfig(ModelConfig):
-    """Which of openpi's training configs, where its code is, and how observations become its keys."""
+    """Settings of openpi's policies, beside those of all models."""
 
     config: str = Field(
         min_length=1, description="the training config: one of openpi's names, such as pi05_libero, or 'module:NAME'"
     )
     checkpoint: str = Field(
-        min_length=1, description="what openpi saved at a step: params/ or model.safetensors, and assets/; or gs://…"
+        min_length=1, description="openpi's folder of a step, with params/ or model.safetensors, and assets/; or gs://…"
     )
     source_dir: str | None = Field(
         default=None, description="a checkout of openpi; unset: the variable OPENPI_SRC, or what is installed"
@@ -30,10 +30,10 @@ class OpenPiConfig(ModelConfig):
         description="openpi's keys of the state -> the parts of ours that make up each, and how many numbers each has; "
         "'gripper' stands for `Obs.gripper`, 'gripper_closed' for 1 minus that; unset: those of the config's robot",
     )
-    layout: Layout | None = Field(default=None, description="of the images that the transforms take: hwc or chw")
-    steps: int | None = Field(default=None, ge=1, description="of the flow (pi0, pi0.5); unset: openpi's, 10")
-    max_decoding_steps: int = Field(default=256, ge=1, description="tokens of a chunk (pi0-FAST), at most")
-    guidance: float = Field(default=5.0, gt=0, description="real-time chunking: the most that the old plan pulls")
+    layout: Layout | None = Field(default=None, description="layout of the images for the transforms: hwc or chw")
+    steps: int | None = Field(default=None, ge=1, description="steps of the flow (pi0, pi0.5); unset: openpi's, 10")
+    max_decoding_steps: int = Field(default=256, ge=1, description="largest number of tokens of a chunk (pi0-FAST)")
+    guidance: float = Field(default=5.0, gt=0, description="real-time chunking: largest weight of the old plan")
     batch_sizes: list[int] | None = Field(
         default=None, description="the only numbers of rows to run; unset: [1, 2, 4, 8, 16] for JAX, any for PyTorch"
     )

@@ -1,4 +1,4 @@
-"""openpi's models, loaded whole and asked for many rows at once: JAX, with or without a flow, and PyTorch."""
+"""openpi's models for batches of rows: in JAX, with or without a flow, and in PyTorch."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ _END = 1  # PaliGemma's end of sequence
 _LISTED = 5
 
 
-class Model(abc.ABC):
-    """What the policy asks."""
+class OpenPiModel(abc.ABC):
+    """The interface of a model for the policy."""
 
-    noise_shape: tuple[int, int] | None = None  # (H, action_dim) of a row's noise; None for a model that takes none
+    noise_shape: tuple[int, int] | None = None  # (H, action_dim) of a row's noise; None for a model without noise
 
     @abc.abstractmethod
     def sample(self, batch: dict[str, Any], noise: np.ndarray, guide: Guide | None) -> np.ndarray:
-        """What the model says for a batch of inputs: (B, H, action_dim), or (B, T) tokens."""
+        """Compute actions (B, H, action_dim), or tokens (B, T), for a batch of inputs."""
 
 
-class JaxFlow(Model):
-    """π0 and π0.5. Compiled once for each number of rows."""
+class JaxFlow(OpenPiModel):
+    """π0 and π0.5 in JAX, compiled once for each number of rows."""
 
     def __init__(self, network: Any, device: Any, config: OpenPiConfig) -> None:
         jax, nnx = require("jax"), require("flax.nnx")
@@ -52,7 +52,7 @@ class JaxFlow(Model):
         self.noise_shape = (network.action_horizon, network.action_dim)
 
     def sample(self, batch: dict[str, Any], noise: np.ndarray, guide: Guide | None) -> np.ndarray:
-        """(B, H, action_dim) float32. A batch without plans runs the same program, with nothing to follow."""
+        """Compute actions (B, H, action_dim) float32; a batch without plans runs the same program without guidance."""
         jax = require("jax")
         if guide is None:
             none = np.zeros((*noise.shape[:2], 1), np.float32)
@@ -61,8 +61,8 @@ class JaxFlow(Model):
         return np.asarray(self._sample(self._state, *arrays), np.float32)  # waits for the device
 
 
-class JaxTokens(Model):
-    """π0-FAST: greedy decoding, so that no noise is involved."""
+class JaxTokens(OpenPiModel):
+    """π0-FAST in JAX, with greedy decoding and without noise."""
 
     def __init__(self, network: Any, device: Any, config: OpenPiConfig) -> None:
         jax, nnx = require("jax"), require("flax.nnx")
@@ -77,21 +77,21 @@ class JaxTokens(Model):
         self._sample = jax.jit(sample)
 
     def sample(self, batch: dict[str, Any], noise: np.ndarray, guide: Guide | None) -> np.ndarray:
-        """(B, T) int32."""
+        """Decode tokens, (B, T) int32."""
         jax = require("jax")
         return self.ended(np.asarray(self._sample(self._state, jax.device_put(batch, self._device)), np.int32))
 
     @staticmethod
     def ended(tokens: np.ndarray) -> np.ndarray:
-        """The tokens (B, T) with zeros after the end of each row, as it would be alone.
+        """Replace the tokens (B, T) after the end of each row by zeros, as in a batch of one.
 
-        openpi decodes until all rows end in the same step: a row of a batch goes on after its own end.
+        openpi decodes until all rows have ended, and so continues rows of a batch after their end.
         """
         ends = tokens == _END
         return np.where(np.cumsum(ends, axis=1) - ends > 0, 0, tokens)
 
 
-class TorchFlow(Model):
+class TorchFlow(OpenPiModel):
     """openpi's PyTorch port of π0 and π0.5."""
 
     def __init__(self, network: Any, device: Any, config: OpenPiConfig) -> None:
@@ -100,7 +100,7 @@ class TorchFlow(Model):
         self.noise_shape = (network.config.action_horizon, network.config.action_dim)
 
     def sample(self, batch: dict[str, Any], noise: np.ndarray, guide: Guide | None) -> np.ndarray:
-        """(B, H, action_dim) float32."""
+        """Compute actions (B, H, action_dim) float32."""
         jax, torch = require("jax"), require("torch")
 
         def convert(array: np.ndarray) -> Any:
@@ -126,8 +126,8 @@ class TorchFlow(Model):
         return step
 
 
-def load_jax(config: Any, folder: Path, settings: OpenPiConfig) -> Model:
-    """`ConfigError` unless every parameter of the model, and of its fine-tuning, is in the checkpoint."""
+def load_jax(config: Any, folder: Path, settings: OpenPiConfig) -> OpenPiModel:
+    """Load a JAX model; raises `ConfigError` if a parameter of the model or of its fine-tuning is missing."""
     jax, models = require("jax"), require("openpi.models.model")
     device = jax_device({"cuda": "gpu"}.get(settings.device, settings.device))
     dtype = ("float32" if device.platform == "cpu" else "bfloat16") if settings.dtype == "auto" else settings.dtype
@@ -150,8 +150,8 @@ def load_jax(config: Any, folder: Path, settings: OpenPiConfig) -> Model:
     return kind(network, device, settings)
 
 
-def load_torch(config: Any, folder: Path, settings: OpenPiConfig) -> Model:
-    """`ConfigError` where transformers is not patched as openpi wants it, or the weights do not fill the model."""
+def load_torch(config: Any, folder: Path, settings: OpenPiConfig) -> OpenPiModel:
+    """Load a PyTorch model; raises `ConfigError` if transformers lacks openpi's patch, or a parameter is missing."""
     device = torch_device(settings.device)
     file = folder / "model.safetensors"
     chosen = settings.dtype if settings.dtype != "auto" else ("float32" if device.type == "cpu" else "bfloat16")
@@ -173,9 +173,9 @@ def _observation(batch: dict[str, Any]) -> Any:
 
 
 def _steer_jax(model: Any, noise: Any, guide: Guide, steps: int, limit: float) -> None:
-    """Change this copy of π0 so that its velocity follows the guide.
+    """Change a copy of π0 so that its velocity follows the guide.
 
-    openpi's sampling loop is one function, but takes each step's actions and time through `embed_suffix`, and its
+    openpi's sampling loop is a single function, but each step's actions and time pass through `embed_suffix`, and the
     velocity through `action_out_proj`.
     """
     minimum = require("jax.numpy").minimum
@@ -193,13 +193,13 @@ def _steer_jax(model: Any, noise: Any, guide: Guide, steps: int, limit: float) -
 
 
 def _require_used(params: Any, network: Any, folder: Path, name: str) -> None:
-    """openpi drops what its model has no place for. Some base checkpoints have such; LoRA's must not be lost."""
+    """Raise `ConfigError` if the model drops tensors of LoRA; other unused tensors of base checkpoints are logged."""
     flatten = require("flax.traverse_util").flatten_dict
     own = set(flatten(require("flax.nnx").state(network).to_pure_dict(), sep="/"))
     extra = sorted(set(flatten(params, sep="/")) - own)
     if any("lora" in key for key in extra):
         raise ConfigError(
-            f"checkpoint {folder}: was fine-tuned by LoRA, of which config {name!r} knows nothing: {extra[:_LISTED]}; "
+            f"checkpoint {folder}: was fine-tuned by LoRA, which config {name!r} does not have: {extra[:_LISTED]}; "
             f"choose the config that it was trained with, such as pi0_libero_low_mem_finetune"
         )
     if extra:

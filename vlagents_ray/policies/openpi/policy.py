@@ -1,4 +1,4 @@
-"""The policy around openpi's models and transforms."""
+"""The policy that runs openpi's models and transforms."""
 
 from __future__ import annotations
 
@@ -14,12 +14,17 @@ from vlagents_ray.errors import ConfigError, PolicyFailed
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.checkpoint import STEP, find_checkpoint
-from vlagents_ray.policies.base.observing import CLOSED, GRIPPER, camera_specs, needs_gripper
+from vlagents_ray.policies.base.model_code import use_source
+from vlagents_ray.policies.base.model_inputs import (
+    CLOSED,
+    GRIPPER,
+    camera_specs,
+    needs_gripper,
+)
 from vlagents_ray.policies.base.realtime import Guide
-from vlagents_ray.policies.base.source import use_source
 from vlagents_ray.policies.openpi.config import OpenPiConfig
-from vlagents_ray.policies.openpi.models import Model, load_jax, load_torch
-from vlagents_ray.policies.openpi.robots import Robot, choose_robot
+from vlagents_ray.policies.openpi.models import OpenPiModel, load_jax, load_torch
+from vlagents_ray.policies.openpi.robots import RobotConvention, choose_robot
 from vlagents_ray.policies.openpi.training import FOLDERS, SOURCE, train_config
 from vlagents_ray.policies.openpi.transforms import Transforms
 from vlagents_ray.registry import require
@@ -29,34 +34,34 @@ _REMOTE = "://"
 
 
 @dataclass(frozen=True)
-class Loaded:
-    """The model, and what is around it."""
+class LoadedOpenPi:
+    """A model with its transforms and the robot's convention."""
 
-    model: Model
+    model: OpenPiModel
     transforms: Transforms
-    robot: Robot
+    robot: RobotConvention
     horizon: int
 
 
 @dataclass(frozen=True)
-class Ready:
-    """A row as the model takes it."""
+class TransformedRow:
+    """A row in the form of the model's inputs."""
 
     inputs: dict[str, Any]
-    row: Row  # its leftover actions as the model sees them
+    row: Row  # with its leftover actions in the model's units
     noise: np.ndarray
 
 
 class OpenPi(ModelPolicy):
-    """openpi's policies, many sessions in one call of the model."""
+    """The policies of openpi, with one call of the model for many sessions."""
 
     Config: ClassVar[type] = OpenPiConfig
     config: OpenPiConfig
-    model: Loaded | None
+    model: LoadedOpenPi | None
 
     @property
     def contract(self) -> Contract:
-        """Known once the checkpoint is loaded: its config says whose robot it is for."""
+        """The contract of the robot that the checkpoint's config names; empty before the checkpoint is loaded."""
         if self.model is None:
             return Contract()
         robot = self.model.robot
@@ -71,8 +76,8 @@ class OpenPi(ModelPolicy):
             history=1,
         )
 
-    def load(self) -> Loaded:
-        """The checkpoint, by the config that it was trained with."""
+    def load(self) -> LoadedOpenPi:
+        """Load the checkpoint by the config with which it was trained."""
         use_source("openpi", SOURCE, self.config.source_dir, within=FOLDERS)
         config = train_config(self.config.config)
         folder = self._folder()
@@ -92,39 +97,39 @@ class OpenPi(ModelPolicy):
                 f"checkpoint {folder}: has {sorted(p.name for p in folder.iterdir())}, want params/ or "
                 f"model.safetensors; name the folder of one step, not that of the run"
             )
-        return Loaded(model, transforms, robot, config.model.action_horizon)
+        return LoadedOpenPi(model, transforms, robot, config.model.action_horizon)
 
     def perceive(self, obs: Obs) -> dict[str, Any]:
-        """openpi's observation, but for the prompt."""
+        """Return the observation in openpi's form, without the prompt."""
         return self._loaded().robot.read(obs)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
-        """One call of the model for all rows that openpi's transforms take."""
+        """Compute the chunks of all rows that openpi's transforms accept, in one call of the model."""
         read = [self._read(row) for row in rows]
         spare = next((one for one in read if not isinstance(one, Exception)), None)
         if spare is None:
             return read  # type: ignore[return-value]  # errors all
-        # The number of rows stays one that is compiled: in the place of a bad one goes a good one.
-        said = self._sample([spare if isinstance(one, Exception) else one for one in read])
+        # A valid row stands in for an invalid one, so that the number of rows remains a compiled one.
+        flows = self._sample([spare if isinstance(one, Exception) else one for one in read])
         actions = self._loaded().transforms.actions
         return [
             one if isinstance(one, Exception) else Prediction(actions(one.inputs["state"], flow))
-            for one, flow in zip(read, said, strict=True)
+            for one, flow in zip(read, flows, strict=True)
         ]
 
-    def _read(self, row: Row) -> Ready | Exception:
-        """A row as the model takes it, or what is wrong with it, which its own session is told."""
+    def _read(self, row: Row) -> TransformedRow | Exception:
+        """Convert a row to the model's inputs; returns an exception for its session if that fails."""
         loaded, observation = self._loaded(), row.frames[-1]
         shape = loaded.model.noise_shape
         try:
             inputs = loaded.transforms.read(observation, row.instruction)
             if row.leftover is not None:
                 row = replace(row, leftover=loaded.transforms.plan(observation, row.instruction, row.leftover))
-        except Exception as error:  # noqa: BLE001 - handed to the session whose observation it is
+        except Exception as error:  # noqa: BLE001 - returned to the session of the observation
             return error
-        return Ready(inputs, row, row.noise(*shape or ()))
+        return TransformedRow(inputs, row, row.noise(*shape or ()))
 
-    def _sample(self, ready: Sequence[Ready]) -> np.ndarray:
+    def _sample(self, ready: Sequence[TransformedRow]) -> np.ndarray:
         model = self._loaded().model
         batch = require("jax").tree.map(lambda *leaves: np.stack(leaves), *(one.inputs for one in ready))
         shape = model.noise_shape
@@ -135,9 +140,9 @@ class OpenPi(ModelPolicy):
         name, step = self.config.checkpoint, self.config.checkpoint_step
         if _REMOTE not in name:
             return find_checkpoint(name, step, needs=["assets"])
-        return Path(require("openpi.shared.download").maybe_download(name.replace(STEP, str(step))))
+        return find_checkpoint(str(require("openpi.shared.download").maybe_download(name.replace(STEP, str(step)))))
 
-    def _loaded(self) -> Loaded:
+    def _loaded(self) -> LoadedOpenPi:
         if self.model is None:
             raise PolicyFailed("openpi: act before initialize; the checkpoint is not loaded")
         return self.model

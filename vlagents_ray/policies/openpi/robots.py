@@ -1,4 +1,4 @@
-"""The robots that openpi has transforms for: their keys, in the names that our clients' mappings give."""
+"""The robots for which openpi has transforms: openpi's keys and our names of their cameras and states."""
 
 from __future__ import annotations
 
@@ -11,23 +11,23 @@ import numpy as np
 from vlagents_ray.contract import ActionSpec
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.base.observing import camera_images, choose_cameras, state_vector
+from vlagents_ray.policies.base.model_inputs import camera_images, choose_cameras, state_vector
 
 Layout = Literal["hwc", "chw"]
 
 
 @dataclass(frozen=True, slots=True)
-class Robot:
-    """From an `Obs` to what openpi's transforms take."""
+class RobotConvention:
+    """The mapping of an `Obs` to the inputs of openpi's transforms for a robot."""
 
     cameras: Mapping[str, str]  # openpi's key -> our camera
-    state: Mapping[str, Mapping[str, int]]  # openpi's key -> parts of our state, and how many numbers each has
+    state: Mapping[str, Mapping[str, int]]  # openpi's key -> parts of our state and their lengths
     layout: Layout = "hwc"
     action: ActionSpec = field(default_factory=ActionSpec)
-    optional: tuple[str, ...] = ()  # cameras that openpi masks where there are none
+    optional: tuple[str, ...] = ()  # cameras that openpi masks if they are missing
 
     def read(self, obs: Obs) -> dict[str, Any]:
-        """openpi's observation but for the prompt: images uint8, states float32, all of their own memory."""
+        """Return openpi's observation without the prompt: copies of the images, uint8, and states, float32."""
         data: dict[str, Any] = {}
         for key, image in camera_images(obs, self.cameras).items():
             _put(data, key, np.array(image if self.layout == "hwc" else image.transpose(2, 0, 1)))
@@ -43,7 +43,7 @@ def _put(data: dict[str, Any], key: str, value: np.ndarray) -> None:
     data[last] = value
 
 
-_ALOHA = Robot(
+_ALOHA = RobotConvention(
     {"images.cam_high": "front", "images.cam_left_wrist": "left_wrist", "images.cam_right_wrist": "right_wrist"},
     {"state": {"left/joints": 6, "left/gripper": 1, "right/joints": 6, "right/gripper": 1}},
     "chw",
@@ -53,13 +53,13 @@ _ALOHA = Robot(
 
 # As in openpi's examples/{libero,droid,aloha_real,aloha_sim}. In LIBERO's actions a gripper closes at 1, in DROID's too
 # (and its reading is 0 when open); ALOHA's two are in [0, 1], at 6 and 13, 1 = open, and pass as they are.
-ROBOTS: Mapping[str, Robot] = {  # by the class of openpi's transform of observations
-    "LiberoInputs": Robot(
+ROBOTS: Mapping[str, RobotConvention] = {  # by the class of openpi's transform of observations
+    "LiberoInputs": RobotConvention(
         {"observation/image": "front", "observation/wrist_image": "wrist"},
         {"observation/state": {"xyz_axis_angle": 6, "gripper_qpos": 2}},
         action=ActionSpec(dim=7, delta=True, gripper_open=-1.0, gripper_closed=1.0),
     ),
-    "DroidInputs": Robot(
+    "DroidInputs": RobotConvention(
         {"observation/exterior_image_1_left": "front", "observation/wrist_image_left": "wrist"},
         {"observation/joint_position": {"joints": 7}, "observation/gripper_position": {"gripper_closed": 1}},
         action=ActionSpec(dim=8, gripper_open=0.0, gripper_closed=1.0),
@@ -75,10 +75,11 @@ def choose_robot(
     cameras: Mapping[str, str] | None,
     state: Mapping[str, Mapping[str, int]] | None,
     layout: Layout | None,
-) -> Robot:
-    """The robot that openpi's config of that name is for, by the class of its transform, with what is set otherwise.
+) -> RobotConvention:
+    """Return the convention of the robot of one of openpi's configs, with the settings that override it.
 
-    Raises `ConfigError` for a transform that is not one of openpi's own, unless `cameras` and `state` are given.
+    Raises:
+        ConfigError: The config's transform is not one of openpi's own, and `cameras` and `state` are not both set.
     """
     usual = ROBOTS.get(transform)
     if usual is None:
@@ -87,7 +88,7 @@ def choose_robot(
                 f"config {config!r}: its observations go through {transform or 'no transform'}, want one of "
                 f"{sorted(ROBOTS)}, or its keys, as in cameras: {{KEY: front}}, state: {{KEY: {{joints: 7}}}}"
             )
-        usual = Robot(cameras, {})
+        usual = RobotConvention(cameras, {})
     if cameras is None and config == "pi0_aloha_sim":
         cameras = _ALOHA_SIM
     known = [key for key in usual.cameras if key not in usual.optional or cameras is None or key in cameras]

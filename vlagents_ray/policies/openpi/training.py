@@ -1,4 +1,4 @@
-"""openpi's training configs, which say what a checkpoint is of."""
+"""openpi's training configs, which describe the models and data of checkpoints."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FOLDERS = ("src", "packages/openpi-client/src")
 
 
 def train_config(name: str) -> Any:
-    """openpi's `TrainConfig` of that name, or the one at "module:NAME"."""
+    """Return openpi's `TrainConfig` of a name, or the one at "module:NAME"."""
     configs = require("openpi.training.config")
     module, colon, attribute = name.partition(":")
     if not colon:

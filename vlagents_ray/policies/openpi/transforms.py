@@ -1,4 +1,4 @@
-"""openpi's own transforms around its models: from a robot's keys to a model's inputs, and back to its actions."""
+"""openpi's transforms from a robot's keys to a model's inputs, and from its outputs to the robot's actions."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from vlagents_ray.registry import require
 
 @dataclass(frozen=True)
 class Transforms:
-    """Those of one checkpoint, with its statistics, in the order of openpi's `create_trained_policy`."""
+    """The transforms of a checkpoint with its statistics, in the order of openpi's `create_trained_policy`."""
 
     inputs: Any  # a dict of unbatched arrays -> such a dict
     outputs: Any
-    forward: Any  # what `inputs` does to actions before the model's own transforms
+    forward: Any  # the part of `inputs` for actions, before the model's own transforms
     robot: str  # the class of its first transform of observations, e.g. "LiberoInputs"
-    prompt: bool  # is one needed, or has the config its own?
+    prompt: bool  # whether one is needed; otherwise the config has its own
 
     @classmethod
     def of(cls, config: Any, folder: Path) -> Transforms:
-        """`ConfigError` where the checkpoint has no statistics of the config's asset, or too few."""
+        """Read the transforms; raises `ConfigError` if the checkpoint lacks statistics of the config's asset."""
         openpi = require("openpi.transforms")
         data = _data_config(config, folder)
         statistics = _statistics(folder, data.asset_id)
@@ -47,7 +47,7 @@ class Transforms:
         )
 
     def read(self, observation: dict[str, Any], instruction: str) -> dict[str, Any]:
-        """The model's inputs for one row."""
+        """Return the model's inputs for one row."""
         inputs: dict[str, Any] = self.inputs(_with(observation, instruction))
         mask = np.asarray(inputs["tokenized_prompt_mask"])
         if mask.all():
@@ -56,24 +56,24 @@ class Transforms:
             )
         return inputs
 
-    def actions(self, state: np.ndarray, said: np.ndarray) -> np.ndarray:
-        """What the model said for one row -> (H, D) float32, in the robot's units."""
-        return np.asarray(self.outputs({"state": state, "actions": said})["actions"], np.float32)
+    def actions(self, state: np.ndarray, output: np.ndarray) -> np.ndarray:
+        """Convert the model's output for one row to actions (H, D) float32, in the robot's units."""
+        return np.asarray(self.outputs({"state": state, "actions": output})["actions"], np.float32)
 
     def plan(self, observation: dict[str, Any], instruction: str, actions: np.ndarray) -> np.ndarray:
-        """A robot's actions (H, D) as the model sees them, relative to that observation where it is trained so."""
+        """Convert a robot's actions (H, D) to the model's units, relative to the observation if it is trained so."""
         data = _with(observation, instruction) | {"actions": np.array(actions)}
         return np.asarray(self.forward(data)["actions"], np.float32)
 
 
 def _with(observation: dict[str, Any], instruction: str) -> dict[str, Any]:
-    """A copy, as deep as openpi's transforms change theirs."""
+    """Copy an observation as deeply as openpi's transforms change it."""
     data: dict[str, Any] = require("jax").tree.map(np.array, observation)
     return data | {"prompt": instruction} if instruction else data
 
 
 def _data_config(config: Any, folder: Path) -> Any:
-    """The config's, with the checkpoint's own statistics: openpi would look for others first, on the network too."""
+    """Return the config's data config with the checkpoint's statistics; openpi would first look for others online."""
     factory = config.data
     here = dataclasses.replace(factory.assets, assets_dir=str(folder / "assets"))
     return dataclasses.replace(factory, assets=here).create(config.assets_dirs, config.model)
@@ -87,8 +87,8 @@ def _statistics(folder: Path, asset: str | None) -> Any:
     except FileNotFoundError as error:
         have = sorted(str(p.parent.relative_to(folder / "assets")) for p in folder.glob("assets/**/norm_stats.json"))
         raise ConfigError(
-            f"checkpoint {folder}: no assets/{asset}/norm_stats.json, has those of {have}; without its statistics a "
-            f"policy's actions mean nothing: copy them there, or choose the config that it was trained with"
+            f"checkpoint {folder}: no assets/{asset}/norm_stats.json, has those of {have}; without statistics a "
+            f"policy's actions have no units: copy them there, or choose the config of its training"
         ) from error
     absent = sorted({"state", "actions"} - set(found))
     if absent:

@@ -1,7 +1,7 @@
-"""What OFT's fine-tuning adds to OpenVLA, each part in a file of its own: heads, projectors, FiLM.
+"""The components that OFT's fine-tuning adds to OpenVLA, each in its own file: heads, projectors, FiLM.
 
-They are small, so that their tensors are applied as they are, by the formulas of upstream's prismatic/models; all
-sizes are the tensors' own.
+They are small, so their tensors are used directly, by the formulas of upstream's prismatic/models; all sizes are the
+tensors' own.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from vlagents_ray.registry import require
 Weights = Mapping[str, Any]  # tensors by name
 
 _MLP = ("layer_norm1", "fc1", *(f"mlp_resnet_blocks.{i}.ffn.{j}" for i in (0, 1) for j in (0, 1)), "layer_norm2", "fc2")
-_WRAPPED = "module."  # before all names where training was distributed
+_WRAPPED = "module."  # prefix of all names after distributed training
 _LORA_ALPHA = 16  # upstream's scale is min(rank, 16) / rank
 
 
 def read_component(folder: Path, name: str) -> dict[str, Any]:
-    """The tensors in the only file `name--*_checkpoint.pt`; one that is missing or not alone is a `ConfigError`."""
+    """Return the tensors of the only file `name--*_checkpoint.pt`; raises `ConfigError` if there is none or several."""
     files = sorted(path.name for path in folder.glob(f"{name}--*checkpoint.pt"))
     if len(files) != 1:
         have = sorted(path.name for path in folder.glob("*.pt"))
@@ -34,7 +34,7 @@ def read_component(folder: Path, name: str) -> dict[str, Any]:
 
 
 def require_unused(folder: Path, names: Iterable[str]) -> None:
-    """Raise `ConfigError` for a component that is there and that the settings leave out."""
+    """Raise `ConfigError` if a component exists that the settings leave out."""
     for name in names:
         if any(folder.glob(f"{name}--*")):
             raise ConfigError(
@@ -53,7 +53,7 @@ def _exactly(found: Weights, layers: Iterable[str], what: str) -> Weights:
 
 
 class Mlp:
-    """A head: MLP with residual blocks over the hidden states of one row's action tokens."""
+    """A head: an MLP with residual blocks over the hidden states of one row's action tokens."""
 
     def __init__(self, saved: Weights, prefix: str) -> None:
         own = _exactly(saved, [f"{prefix}.{layer}" for layer in _MLP], "action_head")
@@ -61,16 +61,16 @@ class Mlp:
 
     @property
     def dim(self) -> int:
-        """Numbers of one row of actions."""
+        """The length of an action."""
         return len(self._weights["fc2.bias"])
 
     def to(self, **place: Any) -> Mlp:
-        """Moved to a device and dtype."""
+        """Move the tensors to a device and dtype."""
         self._weights = {key: tensor.to(**place) for key, tensor in self._weights.items()}
         return self
 
     def __call__(self, x: Any) -> Any:
-        """(…, in) to (…, dim)."""
+        """Map (…, in) to (…, dim)."""
         relu = require("torch").relu
         x = relu(_linear(self._weights, "fc1", _norm(self._weights, "layer_norm1", x)))
         for i in (0, 1):
@@ -80,23 +80,23 @@ class Mlp:
 
 
 class Projector:
-    """Numbers as embeddings of the language model: two layers with GELU between."""
+    """Maps numbers to embeddings of the language model: two layers with GELU between them."""
 
     def __init__(self, saved: Weights, what: str) -> None:
         self._weights = _exactly(saved, ("fc1", "fc2"), what)
 
     @property
     def dim(self) -> int:
-        """Numbers that go in."""
+        """The length of the input."""
         return int(self._weights["fc1.weight"].shape[1])
 
     def to(self, **place: Any) -> Projector:
-        """Moved to a device and dtype."""
+        """Move the tensors to a device and dtype."""
         self._weights = {key: tensor.to(**place) for key, tensor in self._weights.items()}
         return self
 
     def __call__(self, x: Any) -> Any:
-        """(…, dim) to (…, D)."""
+        """Map (…, dim) to (…, D)."""
         gelu = require("torch").nn.functional.gelu
         return _linear(self._weights, "fc2", gelu(_linear(self._weights, "fc1", x)))
 
@@ -105,7 +105,7 @@ class Film:
     """Vision backbones whose blocks are scaled and shifted by the instruction (arXiv 1709.07871)."""
 
     def __init__(self, saved: Weights, backbone: Any) -> None:
-        """Takes its own tensors out of `saved`, and loads the others into the backbone that it goes with."""
+        """Take FiLM's tensors from `saved`, and load the others into the backbone."""
         plain, self._film = {}, {}
         for key, tensor in _merged(saved).items():
             name = key.removeprefix("vision_backbone.")
@@ -125,18 +125,18 @@ class Film:
         self._vits = vits
 
     def to(self, **place: Any) -> Film:
-        """Moved to a device and dtype; the backbone goes with the model that it is part of."""
+        """Move the tensors to a device and dtype; the backbone moves with its model."""
         self._film = {key: tensor.to(**place) for key, tensor in self._film.items()}
         return self
 
     def __call__(self, pixels: Any, language: Any) -> Any:
-        """Patches (B, P, V) of pixels (B, C, S, S) for instructions (B, D), each the mean of its embeddings."""
+        """Return patches (B, P, V) of pixels (B, C, S, S) for instructions (B, D), each the mean of its embeddings."""
         torch = require("torch")
         parts = pixels.split(3, dim=1)
         return torch.cat([self._see(name, part, language) for name, part in zip(self._vits, parts, strict=True)], dim=2)
 
     def _see(self, name: str, pixels: Any, language: Any) -> Any:
-        """What the last block but one gives, as OpenVLA takes it."""
+        """Return the output of the second to last block, which OpenVLA uses."""
         vit = self._vits[name]
         x = vit.norm_pre(vit.patch_drop(vit._pos_embed(vit.patch_embed(pixels))))
         for i, block in enumerate(vit.blocks[:-1]):
@@ -149,7 +149,7 @@ class Film:
 
 
 def _merged(saved: Weights) -> dict[str, Any]:
-    """With the low-rank adapters added to the layers that they adapt, convolutions too: OFT+ saves them apart."""
+    """Add the low-rank adapters to their layers, also to convolutions: OFT+ saves them separately."""
     merged = {key.replace(".base_layer.", "."): tensor for key, tensor in saved.items() if ".lora_" not in key}
     for key, down in saved.items():
         if ".lora_A." in key:

@@ -1,4 +1,4 @@
-"""OpenVLA-OFT: pictures, proprioception and an instruction in, a chunk of actions out in one forward pass."""
+"""OpenVLA-OFT: computes a chunk of actions from images, proprioception and an instruction in one forward pass."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import Row
-from vlagents_ray.policies.base.observing import (
+from vlagents_ray.policies.base.model_inputs import (
     camera_images,
     camera_specs,
     choose_cameras,
@@ -21,21 +21,21 @@ from vlagents_ray.policies.base.observing import (
     state_specs,
     state_vector,
 )
-from vlagents_ray.policies.openvla import pictures
+from vlagents_ray.policies.openvla import preprocessing
+from vlagents_ray.policies.openvla.base import DecodedChunk, PreparedRow, PrismaticPolicy
 from vlagents_ray.policies.openvla.components import Film, Mlp, Projector, read_component, require_unused
-from vlagents_ray.policies.openvla.family import Answer, Asked, PrismaticConfig, PrismaticPolicy
-from vlagents_ray.policies.openvla.parallel import Parallel, Question
-from vlagents_ray.policies.openvla.prismatic import Prismatic, load_prismatic
+from vlagents_ray.policies.openvla.parallel import ModelInput, Parallel
+from vlagents_ray.policies.openvla.prismatic import Prismatic, PrismaticConfig, load_prismatic
 from vlagents_ray.policies.openvla.statistics import Bounds, Statistics
 
 _PRIMARY = "full_image"
-_CAMERAS = (_PRIMARY, "wrist_image", "left_wrist_image", "right_wrist_image")  # in the order of training
-_USUAL = {_PRIMARY: "front", "wrist_image": "wrist"}  # LIBERO's
-_STATE = ("xyz_axis_angle", "gripper_qpos")  # LIBERO's, 6 and 2 numbers
+_CAMERAS = (_PRIMARY, "wrist_image", "left_wrist_image", "right_wrist_image")  # in their order in training
+_USUAL = {_PRIMARY: "front", "wrist_image": "wrist"}  # of LIBERO
+_STATE = ("xyz_axis_angle", "gripper_qpos")  # of LIBERO, 6 and 2 numbers
 
 
 class OpenVLAOFTConfig(PrismaticConfig):
-    """Settings of OpenVLA-OFT; what a checkpoint was trained with must be said, as its files do not."""
+    """Settings of OpenVLA-OFT; they must state how a checkpoint was trained, as its files do not."""
 
     attention: Literal["sdpa", "eager"] = Field(default="sdpa", description="of the language model; has no causal mask")
     center_crop: bool = Field(default=True, description="trained with random crops (upstream's `image_aug`)")
@@ -58,7 +58,7 @@ class OpenVLAOFTConfig(PrismaticConfig):
 
 
 class OpenVLAOFT(PrismaticPolicy):
-    """A chunk an `act`."""
+    """The policy, which returns a chunk for each `act`."""
 
     Config = OpenVLAOFTConfig
     config: OpenVLAOFTConfig
@@ -74,7 +74,9 @@ class OpenVLAOFT(PrismaticPolicy):
 
     @property
     def contract(self) -> Contract:
-        """The cameras and states of training, and an instruction; a chunk of the checkpoint's datasets' actions."""
+        """The cameras and states of training, an instruction, and chunks of the actions of the checkpoint's
+        datasets.
+        """
         return Contract(
             cameras=camera_specs(self._cameras),
             state=state_specs(self._state, self.state_dim),
@@ -87,11 +89,11 @@ class OpenVLAOFT(PrismaticPolicy):
 
     @property
     def state_dim(self) -> int | None:
-        """Numbers in the state vector, if any: the projector's, once it is loaded."""
+        """The length of the state vector, which is the projector's; None if there is none, or before it is loaded."""
         return None if self.model is None or self.model.proprio is None else self.model.proprio.dim
 
     def load(self) -> Parallel:
-        """Read the checkpoint and its components; what is missing, or there and not used, is a `ConfigError`."""
+        """Read the checkpoint and its components; raises `ConfigError` for a missing one, and for an unused one."""
         config = self.config
         base = load_prismatic(config, config.bounds)
         place = {"device": base.device, "dtype": base.dtype}
@@ -121,10 +123,10 @@ class OpenVLAOFT(PrismaticPolicy):
         )
 
     def perceive(self, obs: Obs) -> tuple[tuple[Any, ...], np.ndarray | None]:
-        """The pictures as the backbones want them, (C, S, S) float32 each, and the state vector (P,)."""
-        seen = [pictures.resized(image) for image in camera_images(obs, self._cameras).values()]
+        """Return the images as inputs of the backbones, (C, S, S) float32 each, and the state vector (P,)."""
+        seen = [preprocessing.resized(image) for image in camera_images(obs, self._cameras).values()]
         if self.config.center_crop:
-            seen = [pictures.middle(image) for image in seen]
+            seen = [preprocessing.middle(image) for image in seen]
         projector = self.model.proprio
         state = None if projector is None else state_vector(obs, self._state, projector.dim)
         return tuple(self.model.base.pixels(image) for image in seen), state
@@ -133,7 +135,7 @@ class OpenVLAOFT(PrismaticPolicy):
     def _checkpoint(self) -> Prismatic | None:
         return None if self.model is None else self.model.base
 
-    def _question(self, row: Row, key: str) -> Question:
+    def _model_input(self, row: Row, key: str) -> ModelInput:
         seen, state = row.frames[-1]
         base = self.model.base
         if (dim := base.statistics.scale(key).dim) != self.model.dim:
@@ -141,23 +143,25 @@ class OpenVLAOFT(PrismaticPolicy):
                 f"unnorm_key: got {key!r} of {dim} numbers, want one of {self.model.dim}, the head's"
             )
         proprio = None if state is None else base.statistics.scale(key, "proprio").normalise(state)
-        return Question(seen, base.tokens(row.instruction), proprio)
+        return ModelInput(seen, base.tokens(row.instruction), proprio)
 
-    def _answer(self, asked: Sequence[Asked]) -> list[Answer]:
-        """One forward pass, or, of diffusion, one a step. Regression has one answer, which all samples are."""
-        questions = [ask.question for ask in asked]
+    def _compute(self, prepared: Sequence[PreparedRow]) -> list[DecodedChunk]:
+        """Run one forward pass, or one for each diffusion step. Regression has one answer, also for all samples."""
+        inputs = [entry.model_input for entry in prepared]
         shape = (self.model.horizon, self.model.dim)
         if self.config.head == "l1":
-            return [Answer(chunk) for chunk in self.model.regress(questions)]
+            return [DecodedChunk(chunk) for chunk in self.model.regress(inputs)]
         if self.config.head == "diffusion":
-            noise = np.stack([ask.row.noise(*shape) for ask in asked])
-            return [Answer(chunk) for chunk in self.model.denoise(questions, noise)]
-        draws = np.stack([ask.row.rng.random(shape) if ask.row.sample else np.full(shape, np.nan) for ask in asked])
-        return [Answer(*parts) for parts in zip(*self.model.choose(questions, draws), strict=True)]
+            noise = np.stack([entry.row.noise(*shape) for entry in prepared])
+            return [DecodedChunk(chunk) for chunk in self.model.denoise(inputs, noise)]
+        draws = np.stack(
+            [entry.row.rng.random(shape) if entry.row.sample else np.full(shape, np.nan) for entry in prepared]
+        )
+        return [DecodedChunk(*parts) for parts in zip(*self.model.choose(inputs, draws), strict=True)]
 
 
 def _action_dim(statistics: Statistics, unnorm_key: str | None, head: Mlp | None) -> int:
-    """Numbers of one row of actions: the same in the head and in all datasets that an episode may ask for."""
+    """Return the length of an action, which the head and all datasets that an episode may name must share."""
     dims = statistics.action_dims(unnorm_key)
     if head is not None:
         dims.add(head.dim)

@@ -1,28 +1,28 @@
-"""OFT's parallel decode: all actions of a chunk in one forward pass, each token seeing all the others.
+"""OFT's parallel decoding: all actions of a chunk in one forward pass, each token attending to all others.
 
-Upstream runs a fork of transformers whose Llama attention, with SDPA, has no causal mask. The plain one does the same
-when it is handed a mask of four dimensions, (B, 1, L, L), which says whom each token sees.
+Upstream runs a fork of transformers whose Llama attention, with SDPA, has no causal mask. The original does the same
+with a mask of four dimensions, (B, 1, L, L), that states to which tokens each one attends.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from vlagents_ray.policies.openvla.components import Film, Mlp, Projector
-from vlagents_ray.policies.openvla.denoising import denoise, time_embedding
 from vlagents_ray.policies.openvla.prismatic import Prismatic
 from vlagents_ray.registry import require
 
-_STOP = 2  # Llama's end of text, which stands behind the actions in training
+_STOP = 2  # Llama's end of text, which follows the actions in training
 
 
 @dataclass(frozen=True)
-class Question:
-    """What one chunk is asked for."""
+class ModelInput:
+    """The inputs for one chunk."""
 
     pictures: tuple[Any, ...]  # (C, S, S) float32 each, in the order of training
     tokens: list[int]
@@ -31,38 +31,38 @@ class Question:
 
 @dataclass(frozen=True)
 class Parallel:
-    """A checkpoint of OFT: OpenVLA's, and its components; those that it was trained without are None."""
+    """A checkpoint of OFT: OpenVLA's, and its components; components that it was trained without are None."""
 
     base: Prismatic
-    horizon: int  # H, rows of a chunk
-    dim: int  # D, numbers of a row
+    horizon: int  # H, the number of rows of a chunk
+    dim: int  # D, the length of a row
     head: Mlp | None  # None: action tokens
     proprio: Projector | None
-    noisy: Projector | None  # of noisy actions: the head is a diffusion's
+    noisy: Projector | None  # embeds noisy actions: the head is a diffusion head
     film: Film | None
-    steps: tuple[int, int]  # of diffusion: in training, here
+    steps: tuple[int, int]  # diffusion steps: in training, at inference
 
-    def regress(self, questions: Sequence[Question]) -> np.ndarray:
-        """Chunks (B, H, D) in [-1, 1] of the regression head."""
+    def regress(self, inputs: Sequence[ModelInput]) -> np.ndarray:
+        """Return chunks (B, H, D) in [-1, 1] of the regression head."""
         with require("torch").inference_mode():
-            return _numpy(self._heads(self._hidden(self._sequences(questions))))
+            return _numpy(self._heads(self._hidden(self._sequences(inputs))))
 
-    def denoise(self, questions: Sequence[Question], noise: np.ndarray) -> np.ndarray:
-        """Chunks (B, H, D) in [-1, 1] of the diffusion head, from noise of that shape."""
+    def denoise(self, inputs: Sequence[ModelInput], noise: np.ndarray) -> np.ndarray:
+        """Return chunks (B, H, D) in [-1, 1] of the diffusion head, from noise of that shape."""
         torch = require("torch")
         with torch.inference_mode():
-            seen = self._sequences(questions)
+            seen = self._sequences(inputs)
             start = self.base.to_device(torch.from_numpy(noise))
             return _numpy(denoise(start, lambda time, noisy: self._noise(seen, time, noisy), *self.steps))
 
-    def choose(self, questions: Sequence[Question], draws: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Chunks (B, H, D) in [-1, 1] by action tokens, and mean and deviation of the bins they were chosen from.
+    def choose(self, inputs: Sequence[ModelInput], draws: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return chunks (B, H, D) in [-1, 1] by action tokens, and mean and deviation of the bins of each token.
 
-        `draws` (B, H, D) are as `ActionBins.choose` takes them.
+        `draws` (B, H, D) are those of `ActionBins.choose`.
         """
         torch = require("torch")
         with torch.inference_mode():
-            hidden = self._hidden(self._sequences(questions)).unflatten(1, (self.horizon, self.dim))
+            hidden = self._hidden(self._sequences(inputs)).unflatten(1, (self.horizon, self.dim))
             logits = self.base.network.language_model.lm_head(hidden).float()
             tokens = self.base.bins.choose(logits, torch.tensor(draws, device=self.base.device))
             return self.base.bins.values(tokens), *self.base.bins.moments(logits)
@@ -75,25 +75,28 @@ class Parallel:
         noisy = self.noisy(actions.flatten(1)[..., None])  # type: ignore[misc]
         return self._heads(self._hidden([(require("torch").cat([s, now]), w) for s, w in seen], noisy))
 
-    def _sequences(self, questions: Sequence[Question]) -> list[tuple[Any, Any]]:
-        """Embeddings of what is seen (P, D), and of the words (L, D), of each question."""
+    def _sequences(self, inputs: Sequence[ModelInput]) -> list[tuple[Any, Any]]:
+        """Return, for each input, the embeddings of images and state (P, D), and of the words (L, D)."""
         torch = require("torch")
-        words = [self.base.embed([*question.tokens, _STOP]) for question in questions]
-        views = len(questions[0].pictures)
-        pixels = self.base.to_device([picture for question in questions for picture in question.pictures])
+        words = [self.base.embed([*model_input.tokens, _STOP]) for model_input in inputs]
+        views = len(inputs[0].pictures)
+        pixels = self.base.to_device([picture for model_input in inputs for picture in model_input.pictures])
         if self.film is None:
             patches = self.base.network.vision_backbone(pixels)
         else:
             language = torch.stack([one.mean(0) for one in words])
             patches = self.film(pixels, language.repeat_interleave(views, 0))
-        seen = self.base.network.projector(patches).unflatten(0, (len(questions), views)).flatten(1, 2)
+        seen = self.base.network.projector(patches).unflatten(0, (len(inputs), views)).flatten(1, 2)
         if self.proprio is not None:
-            states = self.base.to_device([torch.from_numpy(question.proprio) for question in questions])
+            states = self.base.to_device([torch.from_numpy(model_input.proprio) for model_input in inputs])
             seen = torch.cat([seen, self.proprio(states)[:, None]], 1)
         return list(zip(seen, words, strict=True))
 
     def _hidden(self, sequences: Sequence[tuple[Any, Any]], actions: Any = None) -> Any:
-        """Hidden states (B, H * D, …) of the action tokens, which are `actions` or zeros; padded on the right."""
+        """Return hidden states (B, H * D, …) of the action tokens, which are `actions` or zeros.
+
+        Padded on the right.
+        """
         torch = require("torch")
         count = self.horizon * self.dim
         if actions is None:
@@ -108,7 +111,7 @@ class Parallel:
         visible = torch.arange(length, device=self.base.device) < lengths[:, None]
         mask = visible[:, None, None].expand(-1, 1, length, -1).to(embeddings.dtype)
         hidden = self.base.network.language_model.model(inputs_embeds=embeddings, attention_mask=mask, use_cache=False)
-        starts = lengths - count - 2  # the token before the first action answers for it, as in training
+        starts = lengths - count - 2  # the token before an action predicts it, as in training
         places = starts[:, None] + torch.arange(count, device=self.base.device)
         return hidden.last_hidden_state[torch.arange(len(rows))[:, None], places]
 
@@ -116,3 +119,42 @@ class Parallel:
 def _numpy(tensor: Any) -> np.ndarray:
     array: np.ndarray = tensor.float().cpu().numpy()
     return array
+
+
+def denoise(noise: Any, predict: Callable[[int, Any], Any], trained: int, steps: int) -> Any:
+    """Return actions (B, H, D) in [-1, 1] from noise.
+
+    `predict` returns the noise in them at a time of training's scale.
+    """
+    kept = _kept(trained)
+    for time, before in _times(trained, steps):
+        guessed = predict(time, noise)
+        clean = (noise - (1 - kept[time]) ** 0.5 * guessed) / kept[time] ** 0.5
+        left = kept[before] if before >= 0 else 1.0
+        noise = left**0.5 * clean.clamp(-1, 1) + (1 - left) ** 0.5 * guessed
+    return noise
+
+
+def time_embedding(time: int, dim: int, device: Any) -> Any:
+    """Return (dim,) float32, sines and then cosines."""
+    torch = require("torch")
+    half = dim // 2
+    rates = torch.exp(torch.arange(half, device=device) * -math.log(10000) / (half - 1))
+    return torch.cat([(time * rates).sin(), (time * rates).cos()])
+
+
+def _times(trained: int, steps: int) -> Iterator[tuple[int, int]]:
+    stride = trained // steps
+    for i in reversed(range(steps)):
+        yield i * stride, (i - 1) * stride
+
+
+def _kept(trained: int) -> list[float]:
+    """Return the share of the signal that remains at each time of training."""
+
+    def alpha(x: float) -> float:
+        return math.cos((x + 0.008) / 1.008 * math.pi / 2) ** 2
+
+    betas = [min(1 - alpha((i + 1) / trained) / alpha(i / trained), 0.999) for i in range(trained)]
+    kept: list[float] = np.cumprod(1 - np.array(betas, np.float32)).tolist()
+    return kept

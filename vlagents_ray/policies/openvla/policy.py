@@ -1,4 +1,8 @@
-"""OpenVLA: a picture and an instruction in, the next action out, token by token."""
+"""OpenVLA: decodes the next action from an image and an instruction, token by token.
+
+Upstream's `predict_action` takes one prompt and calls `generate`. Here prompts of different lengths are padded on the
+left, with masks and positions that give each the same result as alone, and share every forward pass.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +15,11 @@ from pydantic import Field
 from vlagents_ray.contract import Contract
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import Row
-from vlagents_ray.policies.base.observing import camera_images, camera_specs, choose_cameras
-from vlagents_ray.policies.openvla import pictures
-from vlagents_ray.policies.openvla.decoding import decode
-from vlagents_ray.policies.openvla.family import Answer, Asked, PrismaticConfig, PrismaticPolicy
-from vlagents_ray.policies.openvla.prismatic import Prismatic, load_prismatic
+from vlagents_ray.policies.base.model_inputs import camera_images, camera_specs, choose_cameras
+from vlagents_ray.policies.openvla import preprocessing
+from vlagents_ray.policies.openvla.base import DecodedChunk, PreparedRow, PrismaticPolicy
+from vlagents_ray.policies.openvla.prismatic import Prismatic, PrismaticConfig, load_prismatic
+from vlagents_ray.registry import require
 
 _IMAGE = "image"  # the model's only camera
 
@@ -31,7 +35,7 @@ class OpenVLAConfig(PrismaticConfig):
 
 
 class OpenVLA(PrismaticPolicy):
-    """One action an `act`."""
+    """The policy, which returns one action for each `act`."""
 
     Config = OpenVLAConfig
     config: OpenVLAConfig
@@ -43,7 +47,7 @@ class OpenVLA(PrismaticPolicy):
 
     @property
     def contract(self) -> Contract:
-        """One camera and an instruction; the action of the checkpoint's datasets."""
+        """One camera and an instruction; the actions of the checkpoint's datasets."""
         return Contract(
             cameras=camera_specs(self._cameras),
             state={},
@@ -58,34 +62,90 @@ class OpenVLA(PrismaticPolicy):
         return load_prismatic(self.config)
 
     def perceive(self, obs: Obs) -> Any:
-        """The picture as the backbones want it, (C, S, S) float32."""
+        """Return the image as the input of the backbones, (C, S, S) float32."""
         image = camera_images(obs, self._cameras)[_IMAGE]
         if self.config.center_crop:
-            image = pictures.middle(pictures.resized(image))
+            image = preprocessing.middle(preprocessing.resized(image))
         return self.model.pixels(image)
 
     @property
     def _checkpoint(self) -> Prismatic | None:
         return self.model
 
-    def _question(self, row: Row, key: str) -> tuple[Any, list[int]]:
+    def _model_input(self, row: Row, key: str) -> tuple[Any, list[int]]:
         return row.frames[-1], self.model.tokens(row.instruction)
 
-    def _answer(self, asked: Sequence[Asked]) -> list[Answer]:
-        """One decode; a session's own answer is greedy, samples are drawn at temperature 1 and share its prompt."""
-        prompts = {_prompt(ask): ask.question for ask in asked}
+    def _compute(self, prepared: Sequence[PreparedRow]) -> list[DecodedChunk]:
+        """Decode all answers: a session's own greedily, samples at temperature 1 with the same prompt."""
+        prompts = {_prompt(entry): entry.model_input for entry in prepared}
         places = {prompt: place for place, prompt in enumerate(prompts)}
-        draws = np.full((len(asked), max(ask.scale.dim for ask in asked)), np.nan)
-        for numbers, ask in zip(draws, asked, strict=True):
-            if ask.row.sample:
-                numbers[: ask.scale.dim] = ask.row.rng.random(ask.scale.dim)
-        answers = decode(self.model, list(prompts.values()), [places[_prompt(ask)] for ask in asked], draws)
+        draws = np.full((len(prepared), max(entry.scale.dim for entry in prepared)), np.nan)
+        for numbers, entry in zip(draws, prepared, strict=True):
+            if entry.row.sample:
+                numbers[: entry.scale.dim] = entry.row.rng.random(entry.scale.dim)
+        answers = decode(self.model, list(prompts.values()), [places[_prompt(entry)] for entry in prepared], draws)
         return [
-            Answer(*(part[None, : ask.scale.dim] for part in parts))
-            for ask, *parts in zip(asked, *answers, strict=True)
+            DecodedChunk(*(part[None, : entry.scale.dim] for part in parts))
+            for entry, *parts in zip(prepared, *answers, strict=True)
         ]
 
 
-def _prompt(ask: Asked) -> tuple[int, str]:
-    """The same for a session's own row and its samples."""
-    return id(ask.row.frames), ask.row.instruction
+def _prompt(entry: PreparedRow) -> tuple[int, str]:
+    """Return a key that a session's own row and its samples share."""
+    return id(entry.row.frames), entry.row.instruction
+
+
+def decode(
+    model: Prismatic, prompts: Sequence[tuple[Any, list[int]]], owners: Sequence[int], draws: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return R answers to P prompts, (R, S) in [-1, 1], and mean and deviation of the bins of each token.
+
+    Args:
+        model: The checkpoint.
+        prompts: The pixels (C, S, S) and tokens of each prompt.
+        owners: (R,), the prompt of each answer; a prompt with several answers is read once.
+        draws: (R, S), for `ActionBins.choose`.
+    """
+    torch = require("torch")
+    with torch.inference_mode():
+        uniform = torch.tensor(draws, device=model.device)
+        embeddings, mask = _left_padded(model, prompts)
+        language = model.network.language_model
+        positions = (mask.cumsum(-1) - 1).clamp(min=0)
+        read = language.model(inputs_embeds=embeddings, attention_mask=mask, position_ids=positions, use_cache=True)
+        index = torch.tensor(owners, device=model.device)
+        hidden, mask, position = read.last_hidden_state[index, -1], mask[index], positions[index, -1:]
+        cache = tuple((keys[index], values[index]) for keys, values in read.past_key_values)
+        chosen: list[Any] = []
+        logits: list[Any] = []
+        for step in range(draws.shape[1]):
+            if step:
+                mask = torch.cat([mask, mask.new_ones(len(mask), 1)], 1)
+                read = language.model(
+                    input_ids=chosen[-1][:, None],
+                    attention_mask=mask,
+                    position_ids=position + step,
+                    past_key_values=cache,
+                    use_cache=True,
+                )
+                hidden, cache = read.last_hidden_state[:, -1], read.past_key_values
+            logits.append(language.lm_head(hidden).float())
+            chosen.append(model.bins.choose(logits[-1], uniform[:, step]))
+        return model.bins.values(torch.stack(chosen, 1)), *model.bins.moments(torch.stack(logits, 1))
+
+
+def _left_padded(model: Prismatic, prompts: Sequence[tuple[Any, list[int]]]) -> tuple[Any, Any]:
+    """Return embeddings (P, L, D) and their mask (P, L), with the patches after the first token, as in training."""
+    torch = require("torch")
+    patches = model.network.projector(model.network.vision_backbone(model.to_device([pixels for pixels, _ in prompts])))
+    rows = []
+    for seen, (_, tokens) in zip(patches, prompts, strict=True):
+        words = model.embed(tokens)
+        rows.append(torch.cat([words[:1], seen, words[1:]]))
+    length = max(map(len, rows))
+    embeddings = patches.new_zeros(len(rows), length, patches.shape[-1])
+    mask = torch.zeros(len(rows), length, dtype=torch.long, device=model.device)
+    for i, row in enumerate(rows):
+        embeddings[i, -len(row) :] = row
+        mask[i, -len(row) :] = 1
+    return embeddings, mask

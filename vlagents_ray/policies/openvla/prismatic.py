@@ -1,29 +1,28 @@
-"""The model behind both policies: a checkpoint in OpenVLA's format for transformers, with all it needs."""
+"""The model of both policies: a checkpoint in OpenVLA's format for transformers, and all its parts."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
 import numpy as np
+from pydantic import Field, model_validator
+from typing_extensions import Self
 
 from vlagents_ray.errors import InvalidObservation
+from vlagents_ray.policies.base import ModelConfig
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
-from vlagents_ray.policies.openvla.bins import ActionBins
 from vlagents_ray.policies.openvla.sources import model_classes
 from vlagents_ray.policies.openvla.statistics import Bounds, Statistics
 from vlagents_ray.registry import require
 
-if TYPE_CHECKING:
-    from vlagents_ray.policies.openvla.family import PrismaticConfig
-
 _NEEDS = ("config.json", "preprocessor_config.json", "tokenizer_config.json", "*.safetensors")
-_SPACE = 29871  # Llama's token of an empty word, which stood between "Out:" and the action in training
+_SPACE = 29871  # Llama's token of an empty word, which is between "Out:" and the action in training
 _PROMPT = "In: What action should the robot take to {}?\nOut:"
-_PROMPT_V01 = (  # OpenVLA v0.1 was tuned from Vicuna; upstream, too, tells it by the checkpoint's name
+_PROMPT_V01 = (  # OpenVLA v0.1 was fine-tuned from Vicuna; upstream, too, recognises it by the checkpoint's name
     "A chat between a curious user and an artificial intelligence assistant. The assistant gives helpful, detailed, "
     "and polite answers to the user's questions. USER: What action should the robot take to {}? ASSISTANT:"
 )
@@ -34,7 +33,7 @@ class Prismatic:
     """A loaded checkpoint."""
 
     path: Path
-    network: Any  # OpenVLAForActionPrediction; used are its vision_backbone, projector and language_model
+    network: Any  # OpenVLAForActionPrediction, of which vision_backbone, projector and language_model are used
     tokenizer: Any
     processor: Any  # PrismaticImageProcessor
     bins: ActionBins
@@ -44,11 +43,14 @@ class Prismatic:
     dtype: Any
 
     def pixels(self, image: np.ndarray) -> Any:
-        """An (H, W, 3) uint8 picture as the checkpoint's backbones want it, (C, S, S) float32 on the CPU."""
+        """Convert an (H, W, 3) uint8 image to an input of the checkpoint's backbones, (C, S, S) float32 on the CPU."""
         return self.processor.apply_transform(require("PIL.Image").fromarray(image))
 
     def tokens(self, instruction: str) -> list[int]:
-        """The prompt for an instruction. Raises `InvalidObservation` if it is longer than the model was trained for."""
+        """Return the prompt for an instruction.
+
+        Raises `InvalidObservation` if it is longer than in the model's training.
+        """
         ids: list[int] = self.tokenizer(self.prompt.format(instruction.lower())).input_ids
         if ids[-1] != _SPACE:
             ids.append(_SPACE)
@@ -58,7 +60,7 @@ class Prismatic:
         return ids
 
     def to_device(self, arrays: Sequence[Any]) -> Any:
-        """Tensors of one shape as a batch in the model's dtype; a GPU copies it while the CPU goes on."""
+        """Stack tensors of one shape to a batch in the model's dtype; the copy to a GPU is asynchronous."""
         torch = require("torch")
         batch = torch.stack(list(arrays))
         if self.device.type == "cuda":
@@ -66,13 +68,13 @@ class Prismatic:
         return batch.to(self.device, self.dtype, non_blocking=True)
 
     def embed(self, tokens: Sequence[int]) -> Any:
-        """(L, D)."""
+        """Return the embeddings of tokens, (L, D)."""
         torch = require("torch")
         return self.network.get_input_embeddings()(torch.tensor(tokens, device=self.device))
 
 
 def load_prismatic(config: PrismaticConfig, bounds: Bounds = "q99") -> Prismatic:
-    """Read a checkpoint and verify it. Raises `ConfigError`."""
+    """Read and verify a checkpoint; raises `ConfigError`."""
     path = find_checkpoint(config.checkpoint, config.checkpoint_step, _NEEDS)
     statistics = Statistics.of(path, bounds)
     statistics.require(config.unnorm_key)
@@ -96,3 +98,72 @@ def load_prismatic(config: PrismaticConfig, bounds: Bounds = "q99") -> Prismatic
         device=device,
         dtype=dtype,
     )
+
+
+class PrismaticConfig(ModelConfig):
+    """Settings of both policies."""
+
+    compile: Literal[False] = Field(default=False, description="not for this family: prompts' lengths vary too much")
+    unnorm_key: str | None = Field(
+        default=None,
+        description="dataset whose statistics turn answers into physical units, with or without `_no_noops`; unset: "
+        "the checkpoint's only one, or the one that `reset` or an observation names",
+    )
+    source_dir: str | None = Field(
+        default=None,
+        description="a clone of openvla or openvla-oft, for the model's classes; unset: $OPENVLA_SRC, "
+        "$OPENVLA_OFT_SRC, or an installed `prismatic`",
+    )
+    trust_remote_code: bool = Field(
+        default=False,
+        description="run the Python code that lies in the checkpoint's folder instead: whoever can write there, or in "
+        "the hub's repository, can do on this machine whatever this process can",
+    )
+    attention: Literal["sdpa", "eager", "flash_attention_2"] = Field(
+        default="sdpa", description="of the language model; flash_attention_2 needs the package flash-attn and a GPU"
+    )
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if self.trust_remote_code and self.source_dir:
+            raise ValueError("source_dir and trust_remote_code: got both, want the model's classes from one of them")
+        return self
+
+
+class ActionBins:
+    """The bins of [-1, 1], which are the last tokens of the vocabulary; the very last one is the lowest bin."""
+
+    def __init__(self, config: Any, device: Any) -> None:
+        torch = require("torch")
+        edges = np.linspace(-1, 1, config.n_action_bins)
+        middles = (edges[:-1] + edges[1:]) / 2
+        self._first = config.text_config.vocab_size - config.pad_to_multiple_of - 1
+        # there is one token more than bins
+        self._middles = torch.tensor(np.append(middles, middles[-1]), device=device)
+        self._tokens = self._first - torch.arange(config.n_action_bins, device=device)
+
+    def choose(self, logits: Any, draws: Any) -> Any:
+        """Return tokens (…) for logits (…, V): those of bins at given quantiles, or the likeliest tokens.
+
+        A number of `draws` (…), in [0, 1), is the quantile of the distribution over bins; where it is NaN, the
+        likeliest of all tokens is taken.
+        """
+        torch = require("torch")
+        upto = self._over_bins(logits).cumsum(-1)
+        drawn = (upto > (draws * upto[..., -1])[..., None]).int().argmax(-1)
+        return torch.where(draws.isnan(), logits.argmax(-1), self._tokens[drawn])
+
+    def values(self, tokens: Any) -> np.ndarray:
+        """Return the values in [-1, 1]; a token that is not a bin counts as the nearest bin, as upstream."""
+        bins = (self._first - tokens).clamp(0, len(self._middles) - 1)
+        return np.asarray(self._middles[bins].cpu())
+
+    def moments(self, logits: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return the mean and standard deviation (…) of the distribution over bins."""
+        over = self._over_bins(logits)
+        mean = over @ self._middles
+        spread = (over * (self._middles - mean[..., None]) ** 2).sum(-1).sqrt()
+        return np.asarray(mean.cpu()), np.asarray(spread.cpu())
+
+    def _over_bins(self, logits: Any) -> Any:
+        return logits[..., self._tokens].double().softmax(-1)

@@ -1,4 +1,4 @@
-"""OpenVLA's model classes: out of a source tree, or, where that is allowed, out of the checkpoint itself."""
+"""OpenVLA's model classes, from a source tree or, where that is allowed, from the checkpoint itself."""
 
 from __future__ import annotations
 
@@ -19,16 +19,19 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import require
 
 MODEL, PROCESSOR = "OpenVLAForActionPrediction", "PrismaticImageProcessor"
-VARIABLES = ("OPENVLA_SRC", "OPENVLA_OFT_SRC")  # either will do for both: what is used of them is the same
+VARIABLES = ("OPENVLA_SRC", "OPENVLA_OFT_SRC")  # either serves both policies: the used code is the same
 _PACKAGES = ("prismatic", "prismatic.extern", "prismatic.extern.hf", "prismatic.training", "prismatic.vla")
 
 
 def model_classes(checkpoint: Path, source_dir: str | None, trust_remote_code: bool) -> tuple[Any, Any]:
-    """The classes of the model and of its image processor.
+    """Return the classes of the model and of its image processor.
 
-    With `trust_remote_code`, those that the checkpoint's files name: Python code that runs with all rights of this
-    process. Else those of the source tree: `source_dir`, $OPENVLA_SRC, $OPENVLA_OFT_SRC, or an installed `prismatic`.
-    Raises `ConfigError` where there are none.
+    With `trust_remote_code`, they are the classes that the checkpoint's files name: Python code that runs with all
+    rights of this process. Otherwise they come from the source tree: `source_dir`, $OPENVLA_SRC, $OPENVLA_OFT_SRC, or
+    an installed `prismatic`.
+
+    Raises:
+        ConfigError: There are no such classes.
     """
     if trust_remote_code:
         return (
@@ -49,7 +52,7 @@ def _remote(checkpoint: Path, file: str, auto: str) -> Any:
 
 
 def _source(source_dir: str | None) -> Path:
-    """The folder that holds the package `prismatic`."""
+    """Return the folder that holds the package `prismatic`."""
     asked = [source_dir] if source_dir else [os.environ[name] for name in VARIABLES if os.environ.get(name)]
     if not asked:
         spec = importlib.util.find_spec("prismatic")  # finds without importing
@@ -67,7 +70,8 @@ def _source(source_dir: str | None) -> Path:
 
 @lru_cache(maxsize=4)
 def _from_source(root: Path) -> tuple[Any, Any]:
-    with _bare_packages(root), contextlib.redirect_stdout(io.StringIO()):  # OFT's prints settings that are not ours
+    # OFT's code prints settings that do not apply here
+    with _bare_packages(root), contextlib.redirect_stdout(io.StringIO()):
         modeling = importlib.import_module("prismatic.extern.hf.modeling_prismatic")
         processing = importlib.import_module("prismatic.extern.hf.processing_prismatic")
     return getattr(modeling, MODEL), getattr(processing, PROCESSOR)
@@ -75,7 +79,9 @@ def _from_source(root: Path) -> tuple[Any, Any]:
 
 @contextlib.contextmanager
 def _bare_packages(root: Path) -> Iterator[None]:
-    """Import from `root` without the packages' own `__init__`, which want all that training needs, TensorFlow too."""
+    """Import from `root` without the packages' own `__init__`, which import all of training's packages, TensorFlow
+    too.
+    """
     before = _take_out()
     for name in _PACKAGES:
         package = types.ModuleType(name)

@@ -9,7 +9,7 @@ from vlagents_ray.policies.base.config import ModelConfig
 
 
 class VJepa2AcConfig(ModelConfig):
-    """Upstream's .pt file with encoder and predictor, and how plans are searched for."""
+    """Settings of V-JEPA 2-AC, beside those of all models: its checkpoint, and the search for plans."""
 
     encoder: str | None = Field(
         default=None, description="folder or hub id of a `VJEPA2Model` instead of the encoder in the checkpoint"
@@ -25,18 +25,18 @@ class VJepa2AcConfig(ModelConfig):
     image_size: int = Field(default=256, ge=16, description="pixels of a side, as the model was trained")
     normalize: bool = Field(default=True, description="normalise features, as the model was trained")
 
-    execute: int | None = Field(default=1, ge=1, description="steps of a plan that are used; the paper's: the first")
+    execute: int | None = Field(default=1, ge=1, description="steps of a plan that are executed; in the paper one")
     rollout: int = Field(default=2, ge=1, description="steps of a plan")
-    samples: int = Field(default=400, ge=2, description="plans that are tried in an iteration")
-    topk: int = Field(default=10, ge=2, description="of which so many, the nearest to the goal, say where to try next")
+    samples: int = Field(default=400, ge=2, description="plans sampled in an iteration")
+    topk: int = Field(default=10, ge=2, description="number of best plans that determine the next distribution")
     iterations: int = Field(default=10, ge=1)
     momentum_mean: float = Field(default=0.15, ge=0, lt=1, description="share of the last iteration's mean position")
     momentum_std: float = Field(default=0.15, ge=0, lt=1)
     momentum_mean_gripper: float = Field(default=0.15, ge=0, lt=1)
     momentum_std_gripper: float = Field(default=0.15, ge=0, lt=1)
-    maxnorm: float = Field(default=0.05, gt=0, description="the longest step along each axis, m")
-    close_gripper: int | None = Field(default=None, ge=0, description="steps of a plan from this one on close it")
-    pass_size: int = Field(default=400, ge=1, description="plans in one forward pass of the predictor, at most")
+    maxnorm: float = Field(default=0.05, gt=0, description="largest step along each axis, m")
+    close_gripper: int | None = Field(default=None, ge=0, description="step of a plan from which on the gripper closes")
+    pass_size: int = Field(default=400, ge=1, description="largest number of plans in a forward pass of the predictor")
 
     @model_validator(mode="after")
     def _chosen_from_more(self) -> Self:

@@ -1,4 +1,4 @@
-"""Images to features: V-JEPA 2's encoder as transformers has it, from its format or from upstream's."""
+"""V-JEPA 2's image encoder in transformers, loaded from its own format or from upstream's."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import numpy as np
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.accelerator import ensure_torchvision
-from vlagents_ray.policies.base.checkpoint import find_checkpoint, require_loaded
-from vlagents_ray.policies.base.pretrained import from_pretrained
+from vlagents_ray.policies.base.checkpoint import find_checkpoint, from_pretrained, require_loaded
 from vlagents_ray.policies.vjepa2_ac.config import VJepa2AcConfig
 from vlagents_ray.registry import require
 
@@ -21,7 +20,7 @@ _PATCHES = "encoder.embeddings.patch_embeddings.proj.weight"
 
 
 def to_pixels(image: np.ndarray, side: int) -> np.ndarray:
-    """(3, side, side) float32 from (H, W, 3) uint8: the square in the middle, resized and normalised as upstream."""
+    """Crop, resize and normalise an (H, W, 3) uint8 image as upstream, to (3, side, side) float32."""
     torch = require("torch")
     height, width = image.shape[:2]
     edge = min(height, width)
@@ -33,14 +32,14 @@ def to_pixels(image: np.ndarray, side: int) -> np.ndarray:
 
 
 class Encoder:
-    """Features of still images, each shown for the two frames that make up one step of the encoder."""
+    """Computes features of still images, which are repeated for the two frames of one step of the encoder."""
 
     def __init__(self, model: Any, normalize: bool) -> None:
         self._model = model
         self._normalize = normalize
 
     def __call__(self, pixels: np.ndarray) -> Any:
-        """(B, N, F) from (B, 3, side, side)."""
+        """Compute features (B, N, F) of images (B, 3, side, side)."""
         torch = require("torch")
         device = self._model.device
         clip = torch.as_tensor(pixels).to(device, self._model.dtype, non_blocking=True)[:, None].repeat(1, 2, 1, 1, 1)
@@ -49,7 +48,7 @@ class Encoder:
 
 
 def load_encoder(config: VJepa2AcConfig, saved: Mapping[str, Any] | None) -> Any:
-    """The `VJEPA2Model` of `config.encoder`, or with the weights of upstream's encoder, `saved`."""
+    """Load the `VJEPA2Model` of `config.encoder`, or make one with upstream's weights `saved`."""
     ensure_torchvision()
     transformers = require("transformers")
     if config.encoder is not None:
@@ -70,7 +69,7 @@ def load_encoder(config: VJepa2AcConfig, saved: Mapping[str, Any] | None) -> Any
 
 
 def from_upstream(saved: Mapping[str, Any], config: VJepa2AcConfig) -> Any:
-    """A `VJEPA2Model` with the weights of upstream's vision transformer; `ConfigError` unless they fill it."""
+    """Make a `VJEPA2Model` with upstream's weights; raises `ConfigError` if some are missing."""
     transformers = require("transformers")
     tensors = _renamed(saved)
     width, _, tubelet, patch, _ = tensors[_PATCHES].shape
@@ -85,7 +84,7 @@ def from_upstream(saved: Mapping[str, Any], config: VJepa2AcConfig) -> Any:
         num_attention_heads=heads,
         num_hidden_layers=len({name.split(".")[2] for name in tensors if name.startswith("encoder.layer.")}),
         mlp_ratio=tensors["encoder.layer.0.mlp.fc1.weight"].shape[0] / width,
-        pred_num_hidden_layers=1,  # of V-JEPA 2's own predictor, of masked patches, which is not used
+        pred_num_hidden_layers=1,  # V-JEPA 2's own predictor of masked patches is not used
     )
     model = transformers.VJEPA2Model(settings)
     model.predictor = require("torch").nn.Identity()
@@ -97,7 +96,7 @@ def from_upstream(saved: Mapping[str, Any], config: VJepa2AcConfig) -> Any:
 
 
 def _renamed(saved: Mapping[str, Any]) -> dict[str, Any]:
-    """Upstream's tensors by transformers' names; query, key and value are one matrix there."""
+    """Rename upstream's tensors to transformers' names; query, key and value are one matrix upstream."""
     tensors: dict[str, Any] = {}
     for name, tensor in saved.items():
         new = (

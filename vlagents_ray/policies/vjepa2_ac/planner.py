@@ -1,7 +1,7 @@
 """The cross-entropy method over a world model, for many sessions at once.
 
-Follows upstream's `cem` step by step, except that all sessions and samples are computed together
-and that the standard normal draws are handed in. An action is a change of pose, (7,): metres along
+It follows upstream's `cem` step by step, except that all sessions and samples are computed together
+and that the standard normal draws are arguments. An action is a change of pose, (7,): metres along
 x, y, z, three rotations that are always zero, and the change of the gripper's closedness.
 """
 
@@ -16,24 +16,24 @@ from vlagents_ray.registry import require
 
 Tensor = Any  # torch's
 World = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""Features (M, T, N, F), actions (M, T, 7) and poses (M, T, 7) to the features of the next frame, (M, N, F)."""
+"""A function of features (M, T, N, F), actions (M, T, 7) and poses (M, T, 7): the next frame's features, (M, N, F)."""
 
-DRAWN = 4  # numbers of an action that are searched for: x, y, z and the gripper
-_GRIPPER_RANGE = 0.75  # of its change in a step
-_GRIPPER_REST = 0.25  # smaller changes are none
+DRAWN = 4  # numbers of an action that are sampled: x, y, z and the gripper
+_GRIPPER_RANGE = 0.75  # largest change of the gripper in a step
+_GRIPPER_REST = 0.25  # smaller changes become zero
 
 
 @dataclass(frozen=True, slots=True)
 class Plans:
-    """What was found for each session."""
+    """The plans of all sessions."""
 
     actions: Tensor  # (B, H, 7)
     std: Tensor  # (B, H, 7), of the last distribution
-    energy: Tensor  # (B,): how far from the goal the best plan of the last iteration ends
+    energy: Tensor  # (B,), distance of the last iteration's best plan from the goal
 
 
 def plan(world: World, features: Tensor, poses: Tensor, goals: Tensor, noise: Tensor, config: VJepa2AcConfig) -> Plans:
-    """Plans from `features` (B, N, F) and `poses` (B, 7) to `goals` (B, N, F), with `noise` (B, I, H, S, 4)."""
+    """Search plans from `features` (B, N, F) and `poses` (B, 7) to `goals` (B, N, F), with `noise` (B, I, H, S, 4)."""
     torch = require("torch")
     mean = torch.zeros(len(poses), config.rollout, DRAWN, device=poses.device)
     std = torch.ones_like(mean)
@@ -58,7 +58,7 @@ def _momentum(like: Tensor, position: float, gripper: float) -> Tensor:
 
 
 def _bounded(tried: Tensor, config: VJepa2AcConfig) -> Tensor:
-    """(B, H, S, 4): what a robot may be asked for in one step."""
+    """Limit sampled actions, (B, H, S, 4), to the largest change in one step."""
     torch = require("torch")
     position = tried[..., :3].clip(-config.maxnorm, config.maxnorm)
     gripper = tried[..., 3:].clip(-_GRIPPER_RANGE, _GRIPPER_RANGE)
@@ -68,13 +68,13 @@ def _bounded(tried: Tensor, config: VJepa2AcConfig) -> Tensor:
 
 
 def _actions(drawn: Tensor) -> Tensor:
-    """(..., 4) to (..., 7), without rotation."""
+    """Expand sampled actions (..., 4) to (..., 7), without rotation."""
     torch = require("torch")
     return torch.cat([drawn[..., :3], torch.zeros_like(drawn[..., :3]), drawn[..., 3:]], -1)
 
 
 def _energies(world: World, features: Tensor, poses: Tensor, goals: Tensor, actions: Tensor, most: int) -> Tensor:
-    """(B, S): the mean absolute difference between the goal and where each of the actions (B, S, H, 7) leads."""
+    """Compute the mean absolute difference (B, S) between the goal and the prediction for actions (B, S, H, 7)."""
     torch = require("torch")
     sessions, samples, horizon = actions.shape[:3]
     flat = actions.flatten(0, 1)
@@ -91,7 +91,7 @@ def _energies(world: World, features: Tensor, poses: Tensor, goals: Tensor, acti
 
 
 def moved(poses: Tensor, actions: Tensor) -> Tensor:
-    """The poses (M, 7) that the actions (M, 7) lead to: x, y, z, Euler angles about fixed x, y, z, closedness."""
+    """Apply actions (M, 7) to poses (M, 7): x, y, z, Euler angles about fixed x, y, z, closedness."""
     torch = require("torch")
     rotation = _matrices(actions[:, 3:6].double()) @ _matrices(poses[:, 3:6].double())
     angles = _angles(rotation).to(poses.dtype)
@@ -100,7 +100,7 @@ def moved(poses: Tensor, actions: Tensor) -> Tensor:
 
 
 def _matrices(angles: Tensor) -> Tensor:
-    """Euler angles (M, 3) about fixed x, y, z to (M, 3, 3)."""
+    """Convert Euler angles (M, 3) about fixed x, y, z to matrices (M, 3, 3)."""
     torch = require("torch")
     (sx, sy, sz), (cx, cy, cz) = angles.sin().unbind(-1), angles.cos().unbind(-1)
     rows = (
@@ -112,7 +112,7 @@ def _matrices(angles: Tensor) -> Tensor:
 
 
 def _angles(matrices: Tensor) -> Tensor:
-    """The inverse, with the second angle in [-pi/2, pi/2]; where that is its bound, the third one is zero."""
+    """Convert matrices to Euler angles, the second in [-pi/2, pi/2]; at these bounds the third is zero."""
     torch = require("torch")
     level = torch.hypot(matrices[:, 0, 0], matrices[:, 1, 0])
     second = torch.atan2(-matrices[:, 2, 0], level)

@@ -1,4 +1,4 @@
-"""V-JEPA 2-AC as a policy."""
+"""The policy of V-JEPA 2-AC, which plans to a goal image."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.interface import GOAL_IMAGE, Obs
 from vlagents_ray.policies.base import ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import torch_device, torch_dtype
-from vlagents_ray.policies.base.observing import (
+from vlagents_ray.policies.base.model_inputs import (
     GRIPPER,
     camera_images,
     camera_specs,
@@ -29,19 +29,19 @@ from vlagents_ray.registry import require
 
 CAMERA = "front"  # the model has one camera, without a name
 _STATE = ["xyzrpy"]
-_GOAL, _GOAL_FEATURES = "goal", "goal_features"  # in a session's memory: pixels, and what the encoder made of them
+_GOAL, _GOAL_FEATURES = "goal", "goal_features"  # keys in a session's memory: pixels, and their features
 
 
 @dataclass(frozen=True, slots=True)
 class Frame:
-    """What is kept of an observation."""
+    """The parts of an observation that the session keeps."""
 
     pixels: np.ndarray  # (3, side, side) float32
     pose: np.ndarray  # (7,) float32: x, y, z m, roll, pitch, yaw rad, closedness
 
 
 class WorldModel:
-    """Encoder and predictor: weights and features are float32, what is between may be computed in another type."""
+    """The encoder and the predictor; weights and features are float32, computations may be in another type."""
 
     def __init__(self, encoder: Any, predictor: Any, config: VJepa2AcConfig, dtype: Any) -> None:
         self.encode = Encoder(encoder, config.normalize)
@@ -50,12 +50,12 @@ class WorldModel:
         self._device, self._dtype = encoder.device.type, dtype
 
     def autocast(self) -> Any:
-        """Within it the type is `dtype`, as upstream trains; its attention takes no weights of another one."""
+        """Return a context that computes in `dtype`, as upstream trains; its attention needs weights of one type."""
         torch = require("torch")
         return torch.autocast(self._device, self._dtype, enabled=self._dtype != torch.float32)
 
     def __call__(self, features: Tensor, actions: Tensor, poses: Tensor) -> Tensor:
-        """The next frame's features: see `planner.World`."""
+        """Predict the next frame's features (see `planner.World`)."""
         torch = require("torch")
         tokens = features.shape[2]
         following = self._predictor(features.flatten(1, 2), actions, poses)[:, -tokens:].float()
@@ -63,9 +63,9 @@ class WorldModel:
 
 
 class VJepa2Ac(ModelPolicy):
-    """Moves the gripper so that the camera sees what `info["goal_image"]` shows.
+    """Moves the gripper so that the camera's image becomes `info["goal_image"]`.
 
-    The goal comes with the `reset` or with any later observation, and stays until there is another one.
+    The goal image is in the `reset`'s observation or any later one, and holds until there is another one.
     """
 
     Config: ClassVar[type] = VJepa2AcConfig
@@ -95,16 +95,16 @@ class VJepa2Ac(ModelPolicy):
         )
 
     def load(self) -> WorldModel:
-        """Encoder and predictor, every parameter of which is the checkpoint's."""
+        """Load encoder and predictor, with every parameter from the checkpoint."""
         saved = read_checkpoint(self.config)
         device = torch_device(self.config.device)
-        dtype = torch_dtype(self.config.dtype, device, preferred="float32")  # in which upstream plans
+        dtype = torch_dtype(self.config.dtype, device, preferred="float32")  # upstream plans in float32
         encoder = load_encoder(self.config, saved.get("encoder"))
         predictor = load_predictor(self.config, saved["predictor"], encoder.config.hidden_size)
         return WorldModel(encoder.to(device).eval(), predictor.to(device).eval(), self.config, dtype)
 
     def notice(self, obs: Obs) -> None:
-        """Take over the goal in `obs`, if there is one; features of the same image are kept."""
+        """Set the goal to that of an observation, if it has one; features of the same image are kept."""
         image = obs.info.get(GOAL_IMAGE)
         if image is None:
             return
@@ -126,7 +126,7 @@ class VJepa2Ac(ModelPolicy):
         ready = [row for row in rows if _GOAL in row.memory]
         found = iter(self._plans(ready) if ready else [])
         no_goal = InvalidObservation(
-            f"info[{GOAL_IMAGE!r}]: got none since the reset, want an image of what is to be reached, (H, W, 3) uint8"
+            f"info[{GOAL_IMAGE!r}]: got none since the reset, want an image of the goal, (H, W, 3) uint8"
         )
         return [next(found) if _GOAL in row.memory else no_goal for row in rows]
 
@@ -159,7 +159,7 @@ class VJepa2Ac(ModelPolicy):
 
 
 def _openings(actions: np.ndarray, closedness: float) -> np.ndarray:
-    """Plans (H, 7) whose last column is how far the gripper shall be open after each step, instead of a change."""
+    """Replace the last column of plans (H, 7), the change of the gripper, by its opening after each step."""
     opened = actions.copy()
     for row in opened:
         closedness = float(np.clip(closedness + row[6], 0, 1))

@@ -1,4 +1,4 @@
-"""The action-conditioned predictor, whose code is upstream's."""
+"""The action-conditioned predictor, with upstream's code."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from typing import Any
 
 from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, require_loaded
-from vlagents_ray.policies.base.source import use_source
+from vlagents_ray.policies.base.model_code import use_source
 from vlagents_ray.policies.vjepa2_ac.config import VJepa2AcConfig
 from vlagents_ray.registry import require
 
-_PREFIXES = ("module.", "backbone.")  # of distributed training, and of upstream's wrapper
+_PREFIXES = ("module.", "backbone.")  # added by distributed training and upstream's wrapper
 
 
 def read_checkpoint(config: VJepa2AcConfig) -> dict[str, dict[str, Any]]:
-    """The parts of upstream's file by name ("encoder", "predictor"), each with its tensors. Nothing is unpickled."""
+    """Read the tensors of the parts of upstream's file, "encoder" and "predictor"; nothing is unpickled."""
     torch = require("torch")
     path = find_checkpoint(config.checkpoint, config.checkpoint_step, needs=("*.pt",))
     file = path if path.is_file() else _only(path)
     try:
         parts = torch.load(file, map_location="cpu", weights_only=True)
-    except Exception as error:  # of many kinds: no zip file, a pickle of something else
+    except Exception as error:  # it may not be a zip file, or a pickle of other types
         raise ConfigError(
             f"checkpoint {file}: not a file of tensors ({type(error).__name__}); want upstream's .pt"
         ) from error
@@ -36,7 +36,7 @@ def read_checkpoint(config: VJepa2AcConfig) -> dict[str, dict[str, Any]]:
 
 
 def load_predictor(config: VJepa2AcConfig, saved: Mapping[str, Any], width: int) -> Any:
-    """The predictor, filled; `ConfigError` where its code or a weight is missing, or it is not for that encoder."""
+    """Load the predictor; raises `ConfigError` if its code or a weight is missing, or the encoder does not fit."""
     use_source("src", "VJEPA2_SRC", config.source_dir)
     try:
         module = importlib.import_module("src.models.ac_predictor")
@@ -54,7 +54,7 @@ def load_predictor(config: VJepa2AcConfig, saved: Mapping[str, Any], width: int)
         )
     model = module.vit_ac_predictor(
         img_size=(config.image_size, config.image_size),
-        num_frames=2 * config.rollout,  # of tubelets of two; it sizes the mask, which is the same for any
+        num_frames=2 * config.rollout,  # tubelets have two frames; this sets the mask's size only
         tubelet_size=2,
         embed_dim=width,
         predictor_embed_dim=embedding.shape[0],
@@ -79,7 +79,7 @@ def _only(folder: Path) -> Path:
 
 
 def _clean(part: Mapping[str, Any]) -> dict[str, Any]:
-    """Tensors by the names that the model itself gives them."""
+    """Rename tensors to the names of the model itself."""
     cleaned = {}
     for name, tensor in part.items():
         for prefix in _PREFIXES:

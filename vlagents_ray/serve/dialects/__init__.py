@@ -1,5 +1,5 @@
-"""Other systems' protocols on the server's own port, so that their clients run against it as they are.
+"""Protocols of other systems, so that their clients can use the server without changes.
 
-One file a dialect: it turns what its client sends into an `Obs` by a key mapping, puts that into the same batch queue
-as everybody's, and answers as its client expects. What its bytes mean is in `vlagents_ray.wire`.
+Each dialect has a folder. Its codec converts bytes to values; its handler converts values to an `Obs` with a key
+mapping, puts that into the same batch queue as all other requests, and replies as the client expects.
 """

@@ -1,0 +1,7 @@
+"""Measurements that developers repeat, in a checkout: `python -m benchmarks.NAME --help`.
+
+`overhead` compares an evaluation with bare environments, `evaluation` with the peers' own; `soak` lets one run for
+long; `scaling` has more and more workers play on a Ray cluster over several `hosts`, which are made on one machine;
+`autoscaling` watches replicas while `robots` and rollouts come and go; `hop` measures a child process behind a replica.
+What users repeat is `vlagents-ray bench`.
+"""

@@ -1,0 +1,318 @@
+"""Replicas that come with the load and go with it: a timeline of one run on this machine.
+
+An application that may have no replica at all meets, one after the other: a single robot, a burst of robots, rollout
+workers, and a single robot again, with quiet in between until the last replica is gone. All the while it is noted how
+many replicas there are and are wanted, and how many sessions they hold; each act is timed where it was asked for.
+The policy and the environment sleep, so that four replicas run on few cores.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import typer
+
+from benchmarks.environments import ACTION_DIM, SLEEPING_ENV
+from benchmarks.robots import RobotBurst
+from vlagents_ray.bench.figures import OURS, THEIRS, check_plot_file
+from vlagents_ray.bench.line_process import LineProcess, ProcessFailed, our_environment
+from vlagents_ray.cli.bench import Json, Plot
+from vlagents_ray.cli.console import errors, out, progress, save, table
+from vlagents_ray.client.transports.serve_handle import call_replica
+from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Results, SuiteConfig, evaluate
+from vlagents_ray.registry import require
+from vlagents_ray.serve.config.deployment import POLICY
+from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.server import running_server
+from vlagents_ray.serve.scaling.sibling_replicas import SiblingApi
+
+_SESSIONS = "#e0a030"  # a colour
+_APP = "noop"
+_EVERY_S = 0.5  # between two looks at the replicas
+_ANSWER_S = 0.3  # that a replica may take to say how many sessions it holds
+_LATE_S = 180.0  # that a burst may take longer than planned: replicas start
+_QUIET_S = 180.0
+_FROM_NONE = {"min_replicas": 0, "max_replicas": 4, "look_back_s": 4, "upscale_delay_s": 2, "downscale_delay_s": 6}
+
+
+@dataclass(frozen=True, slots=True)
+class AutoscalingPlan:
+    """The robots and workers that come, and the application that serves them."""
+
+    robots: int = 12
+    hz: float = 10.0
+    workers: int = 8
+    seconds: float = 25.0  # of a burst
+    alone_s: float = 5.0  # of a single robot
+    policy_ms: float = 40.0  # of a batch
+    batch: int = 2  # so that one replica gives 50 actions a second
+    step_ms: float = 20.0
+    steps: int = 50
+    autoscaling: Mapping[str, float] = field(default_factory=_FROM_NONE.copy)
+
+
+class ScaleSample(NamedTuple):
+    """The state of the application at one moment."""
+
+    at: float  # s of `time.time()`
+    wanted: int  # replicas
+    running: int
+    sessions: int
+
+
+class LoadPhase(NamedTuple):
+    """A phase in which robots or workers were connected."""
+
+    name: str
+    begun: float  # s of `time.time()`
+    ended: float
+    acts: Sequence[tuple[float, float]]  # s, ms; of rollouts an episode's median
+    first_reset_s: float | None  # of the robot that waited longest; rollouts connect before
+    resumed: int
+    failed: Sequence[str]
+
+
+def measure_autoscaling(plan: AutoscalingPlan, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+    """Run all phases; returns plain JSON values, times in s since the first robot came."""
+    served = deployment(
+        "noop",
+        config={"action_dim": ACTION_DIM, "base_ms": plan.policy_ms},
+        batch={"max_size": plan.batch},
+        autoscaling=dict(plan.autoscaling),
+    )
+    with contextlib.ExitStack() as stack:
+        server = stack.enter_context(running_server(served, num_cpus=plan.workers + 1))
+        top = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        command = [sys.executable, "-m", "benchmarks.robots", server.url]
+        robots = stack.enter_context(LineProcess("robots", command, our_environment()))
+        robots.read(_LATE_S)
+        watcher = stack.enter_context(ScaleWatcher())
+        phases = []
+        for number, (name, come) in enumerate(_bursts(plan, robots).items()):
+            watcher.wait_for_quiet(int(plan.autoscaling.get("min_replicas", 1)))
+            progress(f"{name} …")
+            phases.append(come(name, top / str(number)))
+        watcher.wait_for_quiet(int(plan.autoscaling.get("min_replicas", 1)))
+    return report(plan, watcher.samples, phases)
+
+
+def _bursts(plan: AutoscalingPlan, robots: LineProcess) -> dict[str, Callable[[str, Path], LoadPhase]]:
+    def of(number: int, seconds: float) -> Callable[[str, Path], LoadPhase]:
+        def come(name: str, _: Path) -> LoadPhase:
+            begun = time.time()
+            said = robots.request(json.dumps({"robots": number, "hz": plan.hz, "seconds": seconds}), seconds + _LATE_S)
+            return _met(name, begun, [RobotBurst(*one) for one in said])
+
+        return come
+
+    return {
+        "first robot": of(1, plan.alone_s),
+        f"{plan.robots} robots": of(plan.robots, plan.seconds),
+        f"{plan.workers} rollout workers": lambda name, out: _rollouts(plan, name, out),
+        "first robot again": of(1, plan.alone_s),
+    }
+
+
+def _met(name: str, begun: float, robots: Sequence[RobotBurst]) -> LoadPhase:
+    return LoadPhase(
+        name,
+        begun,
+        time.time(),
+        sorted((at, ms) for robot in robots for at, ms in robot.acts),
+        max(robot.reset_s for robot in robots),
+        sum(robot.resumed for robot in robots),
+        [why for robot in robots for why in robot.failed],
+    )
+
+
+def _rollouts(plan: AutoscalingPlan, name: str, out: Path) -> LoadPhase:
+    """Run an evaluation of about so many seconds."""
+    begun = time.time()
+    episodes = max(1, round(plan.seconds * 1e3 / (plan.steps * (plan.step_ms + plan.policy_ms))))
+    config = EvalConfig(
+        policies=[PolicyConfig(name="noop", url=f"serve://{_APP}")],
+        suites=[
+            SuiteConfig(
+                envs=[SLEEPING_ENV],
+                env_options={"step_ms": plan.step_ms, "max_steps": plan.steps, "size": 64},
+                episodes=plan.workers * episodes,
+            )
+        ],
+        workers=plan.workers,
+        video="none",
+        out=out,
+    )
+    evaluate(config)
+    [cell] = Results.load(out).cells
+    acts = [(one.finished, one.result.policy_ms) for one in cell.episodes if one.result.policy_ms is not None]
+    failed = [attempt.error for attempt in cell.attempts]
+    failed += [f"{one.result.key}: {one.result.error}" for one in cell.episodes if one.result.status != "done"]
+    return LoadPhase(name, begun, time.time(), sorted(acts), None, 0, failed)
+
+
+class ScaleWatcher:
+    """Samples the application within a context."""
+
+    def __init__(self) -> None:
+        self.samples: list[ScaleSample] = []
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="autoscaling", daemon=True)
+
+    def __enter__(self) -> ScaleWatcher:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def wait_for_quiet(self, replicas: int) -> None:
+        """Wait until no session and only so many replicas are left. Raises `ProcessFailed` after minutes."""
+        deadline = time.monotonic() + _QUIET_S
+        asked = time.time()
+        while not any(one.running <= replicas and one.sessions == 0 and one.at > asked for one in self.samples[-1:]):
+            if time.monotonic() > deadline:
+                raise ProcessFailed(
+                    f"replicas: {self.samples[-1:]} after {_QUIET_S:g} s without anybody, want {replicas}"
+                )
+            time.sleep(_EVERY_S)
+
+    def _watch(self) -> None:
+        while not self._stop.wait(_EVERY_S):
+            self.samples.append(look())
+
+
+def look() -> ScaleSample:
+    """Sample the application. Replicas that stop count as running as long as they live."""
+    from ray.serve.context import _get_global_client
+
+    client = _get_global_client()
+    details = client.get_serve_details()["applications"][_APP]["deployments"][POLICY]
+    names = {one["actor_name"]: one["state"] for one in details["replicas"]}
+    running = sum(state in ("RUNNING", "STOPPING") for state in names.values())
+    sessions = sum(_sessions([name for name, state in names.items() if state == "RUNNING"]))
+    return ScaleSample(time.time(), int(details["target_num_replicas"]), running, sessions)
+
+
+def _sessions(replicas: Sequence[str]) -> Iterator[int]:
+    """Yield the sessions of each replica that answers at once."""
+    import ray
+
+    asked = []
+    for name in replicas:
+        with contextlib.suppress(ValueError):  # it ended meanwhile
+            asked.append(call_replica(ray.get_actor(name, namespace="serve"), SiblingApi.load))
+    ready, _ = ray.wait(asked, num_returns=len(asked), timeout=_ANSWER_S) if asked else ([], [])
+    for reference in ready:
+        with contextlib.suppress(ray.exceptions.RayError):
+            yield ray.get(reference).sessions
+
+
+def report(plan: AutoscalingPlan, samples: Sequence[ScaleSample], phases: Sequence[LoadPhase]) -> dict[str, Any]:
+    """Return all figures as plain JSON values."""
+    begun = phases[0].begun
+    return {
+        "plan": asdict(plan),
+        "samples": [one._replace(at=one.at - begun)._asdict() for one in samples],
+        "phases": [
+            one._asdict()
+            | {"begun": one.begun - begun, "ended": one.ended - begun, "failed": list(one.failed)}
+            | {"acts": len(one.acts), "most_replicas": _most(samples, one), "seconds": by_second(one.acts, begun)}
+            | dict(zip(("median_ms", "p95_ms", "longest_ms"), _quantiles([ms for _, ms in one.acts]), strict=True))
+            for one in phases
+        ],
+    }
+
+
+def by_second(acts: Sequence[tuple[float, float]], begun: float) -> list[dict[str, float]]:
+    """Return median and 95 % quantile of the acts of each second, by its middle."""
+    found: dict[int, list[float]] = {}
+    for at, ms in acts:
+        found.setdefault(int((at - begun) // 1), []).append(ms)
+    quantiles = {second: _quantiles(each) for second, each in sorted(found.items())}
+    return [{"at": second + 0.5, "median_ms": one[0], "p95_ms": one[1]} for second, one in quantiles.items()]
+
+
+def _quantiles(values: Sequence[float]) -> list[float]:
+    return [float(one) for one in np.quantile(values, (0.5, 0.95, 1.0))] if values else [float("nan")] * 3
+
+
+def _most(samples: Sequence[ScaleSample], phase: LoadPhase) -> int:
+    return max((one.running for one in samples if phase.begun <= one.at <= phase.ended), default=0)
+
+
+def plot_autoscaling(found: Mapping[str, Any], file: Path) -> None:
+    """Draw replicas and sessions over time, and below how long acts took. Raises as `check_plot_file` does."""
+    check_plot_file(file)
+    figure = require("matplotlib.figure").Figure(figsize=(9, 5), layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True)
+    times = [one["at"] for one in found["samples"]]
+    for name, colour, style in (("wanted", THEIRS, "--"), ("running", OURS, "-")):
+        numbers = [one[name] for one in found["samples"]]
+        above.step(times, numbers, style, where="post", color=colour, label=f"replicas {name}")
+    above.set_ylabel("replicas")
+    sessions = above.twinx()
+    sessions.fill_between(
+        times, [one["sessions"] for one in found["samples"]], step="post", color=_SESSIONS, alpha=0.25, lw=0
+    )
+    sessions.set_ylabel("sessions (shaded)")
+    above.legend(loc="upper left", fontsize=8, frameon=False)
+    for phase in found["phases"]:
+        at = [one["at"] for one in phase["seconds"]]
+        below.plot(at, [one["median_ms"] for one in phase["seconds"]], ".-", color=OURS, markersize=3)
+        below.plot(at, [one["p95_ms"] for one in phase["seconds"]], ".", color=THEIRS, markersize=3)
+        waited = "" if phase["first_reset_s"] is None else f"\nfirst reset {phase['first_reset_s']:.1f} s"
+        text = f"{phase['name']}\n{len(phase['failed'])} failed{waited}"
+        below.annotate(text, (phase["begun"], 1.0), xycoords=("data", "axes fraction"), va="top", fontsize=7)
+        for axes in (above, below):
+            axes.axvspan(phase["begun"], phase["ended"], color="#000000", alpha=0.04, lw=0)
+    below.set_ylim(0, 1.6 * max(one["p95_ms"] for phase in found["phases"] for one in phase["seconds"]))
+    below.set_ylabel("an act, ms (grey: 95 %)")
+    below.set_xlabel("s since the first robot came")
+    for axes in (above, below, sessions):
+        axes.spines[["top"]].set_visible(False)
+    figure.savefig(file, dpi=100)
+
+
+def show_autoscaling(found: Mapping[str, Any]) -> None:
+    """Print a row for each phase."""
+    rows = table("", "first reset s", "replicas", "acts", "failed", "begun again", "median ms", "p95 ms", "longest")
+    for one in found["phases"]:
+        waited = "" if one["first_reset_s"] is None else f"{one['first_reset_s']:.1f}"
+        rows.add_row(
+            one["name"], waited, str(one["most_replicas"]), str(one["acts"]), str(len(one["failed"])),
+            str(one["resumed"]), *(f"{one[key]:.1f}" for key in ("median_ms", "p95_ms", "longest_ms")),
+        )  # fmt: skip
+    out.print(rows)
+
+
+def main(
+    robots: Annotated[int, typer.Option(min=1, help="That come at once.")] = 12,
+    workers: Annotated[int, typer.Option(min=1, help="Of the evaluation that comes after them.")] = 8,
+    seconds: Annotated[float, typer.Option(min=1, help="That each of the two stays, about.")] = 25.0,
+    json_file: Json = None,
+    plot: Plot = None,
+) -> None:
+    """Replicas over time while robots and rollouts come and go, from no replica and back to none."""
+    with errors():
+        check_plot_file(plot)
+        found = measure_autoscaling(AutoscalingPlan(robots=robots, workers=workers, seconds=seconds), progress)
+        show_autoscaling(found)
+        save(found, json_file)
+        if plot is not None:
+            plot_autoscaling(found, plot)
+            out.print(f"wrote {plot}")
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,102 @@
+"""Environments of the measurements: a tabletop that records its times, and one that takes time and no CPU.
+
+Standard library, numpy and this package's light part only: the peers' Python imports it too.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract
+from vlagents_ray.envs.base import EvalEnv, one_row
+from vlagents_ray.envs.tabletop import Tabletop
+from vlagents_ray.interface import Act, Obs
+
+TIMED_TABLETOP = "benchmarks.environments:TimedTabletop"  # its name for `make_env`
+SLEEPING_ENV = "benchmarks.environments:SleepingEnv"
+ACTION_DIM = 4  # of the latter
+
+
+class EpisodeTimes(NamedTuple):
+    """When an episode that was played to its end began and ended."""
+
+    begun: float  # s of time.time(), before its reset
+    ended: float  # after its last step
+    steps: int
+    seed: int
+
+
+class TimedTabletop(Tabletop):
+    """The tabletop, which writes when each episode began and ended to a file for each process.
+
+    `notes` is the folder; `step_ms` is CPU time that each step takes more, for a simulator's physics.
+    """
+
+    def __init__(self, *, notes: str, size: int = 224, max_steps: int = 80, step_ms: float = 0.0) -> None:
+        super().__init__(width=size, height=size, max_steps=max_steps)
+        self._notes = Path(notes)
+        self._step_s = step_ms / 1e3
+        self._begun = 0.0
+        self._seed = 0
+
+    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+        self._begun, self._seed = time.time(), seed
+        return super().reset(seed=seed, options=options)
+
+    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        until = time.thread_time() + self._step_s  # CPU time: the clock would run on while others have the core
+        found = super().step(act)
+        while self._step_s and time.thread_time() < until:
+            pass
+        if found[3]:  # truncated: nothing else ends it
+            with (self._notes / f"{os.getpid()}.txt").open("a") as file:
+                file.write(f"{self._begun!r} {time.time()!r} {self._steps} {self._seed}\n")
+        return found
+
+
+def read_episode_times(folder: Path) -> dict[int, list[EpisodeTimes]]:
+    """Read what each process, by its id, has played, in order. A line that is being written is left out."""
+    found = {}
+    for file in folder.glob("*.txt"):
+        lines = [line.split() for line in file.read_text().splitlines(keepends=True) if line.endswith("\n")]
+        found[int(file.stem)] = [EpisodeTimes(float(a), float(b), int(steps), int(seed)) for a, b, steps, seed in lines]
+    return found
+
+
+class SleepingEnv(EvalEnv):
+    """Each step sleeps `step_ms`, so that many of them run on few cores; an episode is `max_steps` of them."""
+
+    def __init__(self, *, step_ms: float = 20.0, max_steps: int = 50, size: int = 224) -> None:
+        """Take `size`, the pixels a side of the one camera."""
+        self.max_steps = max_steps
+        self._step_s = step_ms / 1e3
+        self._contract = Contract(cameras={"front": CameraSpec(size, size)}, action=ActionSpec(dim=ACTION_DIM))
+        self._obs = Obs(cameras={"front": np.zeros((size, size, 3), np.uint8)})
+        self._steps = 0
+
+    @property
+    def contract(self) -> Contract:
+        return self._contract
+
+    @property
+    def instruction(self) -> str:
+        return "let time pass"
+
+    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+        self._steps = 0
+        return self._obs, {"success": False}
+
+    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        one_row(act, self._contract)
+        time.sleep(self._step_s)
+        self._steps += 1
+        return self._obs, 0.0, False, self._steps >= self.max_steps, {"success": False}
+
+    def close(self) -> None:
+        """Do nothing: no resource is held."""

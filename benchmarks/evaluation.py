@@ -1,0 +1,242 @@
+"""Episodes a minute of whole evaluations, ours and the peers' own, in alternating rounds on one machine.
+
+Each plays the same episodes of one environment (`environments.TimedTabletop`: same code, image size, step limit and
+seeds) with a policy that does nothing behind its own server, by its own command, and keeps its results. A round runs
+each once:
+
+- ours: `vlagents-ray eval`, which serves the policy for the length of the run;
+- vlagents: `run-eval`, over shared memory. It plays one configuration in one process, which is its first way here;
+  the second splits the episodes into one configuration for each worker, each with a process and a server of its own;
+- vla-eval: one model server, and as many shards as ours has workers, without Docker.
+
+The rate is that from the first reset to the last step, so that nobody's start-up or shutdown counts: that of `run-eval`
+contains a fixed sleep of 30 s. The wall time of the whole command is the second figure, with all of that.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import typer
+
+import vlagents_ray
+from benchmarks.environments import TIMED_TABLETOP, read_episode_times
+from vlagents_ray.bench.line_process import LineProcess, ProcessFailed, our_environment
+from vlagents_ray.bench.peers import SCRIPTS, peer_clients
+from vlagents_ray.bench.report import evaluation_outcomes
+from vlagents_ray.cli.bench import DEFAULT_PEERS_PYTHON, Json, PeersPython, show_outcomes, show_skipped
+from vlagents_ray.cli.console import errors, out, progress, save, table
+from vlagents_ray.cli.options import parse_list
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate.workers.cluster import THREAD_VARIABLES
+from vlagents_ray.serve.ports import LOOPBACK, free_block
+
+OURS = "vlagents-ray"
+SPLIT = "vlagents, split"  # into a configuration for each worker
+PEERS = ("vlagents", "vla-eval")
+_MOST_S = 3600.0  # for one command
+
+
+@dataclass(frozen=True, slots=True)
+class EvaluationPlan:
+    """What all systems play."""
+
+    episodes: int = 200  # in all
+    workers: int = 2
+    rounds: int = 3
+    size: int = 224  # pixels a side
+    max_steps: int = 80  # nothing else ends an episode
+    step_ms: float = 0.0  # CPU time that each env step takes more than the tabletop's own
+
+    def __post_init__(self) -> None:
+        if self.episodes % self.workers:
+            raise ConfigError(f"episodes: got {self.episodes}, want a multiple of the {self.workers} workers")
+
+    def env(self, notes: Path) -> dict[str, Any]:
+        """Return the options of the environment."""
+        return {"notes": str(notes), "size": self.size, "max_steps": self.max_steps, "step_ms": self.step_ms}
+
+
+class Played(NamedTuple):
+    """The figures of one command."""
+
+    episodes_per_minute: float  # from the first reset to the last step
+    wall_s: float  # of the whole command
+
+
+Run = Callable[[Path, Path], None]  # given its own folder and that of the notes
+
+
+def measure_evaluation(
+    plan: EvaluationPlan,
+    *,
+    peers: Sequence[str] = (),
+    peers_python: Path,
+    progress: Callable[[str], None] = lambda _: None,
+) -> dict[str, Any]:
+    """Measure all systems; returns plain JSON values. Peers that cannot run here are in `skipped`, with the reason."""
+    wanted = PEERS if "all" in peers else peers
+    if unknown := set(wanted) - set(PEERS):
+        raise ConfigError(f"peers: got {sorted(unknown)}, want some of {list(PEERS)}, or 'all'")
+    found, skipped, versions = peer_clients(wanted, peers_python)
+    scripts = {way.peer: SCRIPTS / way.script for way in found}
+    rounds: dict[str, list[Played]] = {}
+    with tempfile.TemporaryDirectory() as top:
+        runs = {OURS: _ours(plan)} | their_runs(plan, scripts, peers_python, alone(Path(top)))
+        for number in range(plan.rounds):
+            for name, run in runs.items():
+                folder = Path(top) / f"{name} {number}"
+                rounds.setdefault(name, []).append(played := play(plan, run, folder))
+                progress(
+                    f"round {number + 1}/{plan.rounds}: {name} {played.episodes_per_minute:.0f} episodes/min, "
+                    f"whole command {played.wall_s:.1f} s"
+                )
+    return {
+        "plan": asdict(plan),
+        "cores": os.cpu_count(),
+        "versions": {OURS: version(OURS)} | {peer: versions[peer] for peer in scripts},
+        "skipped": skipped,
+        "rounds": {name: [one._asdict() for one in each] for name, each in rounds.items()},
+        "medians": {name: _median(each)._asdict() for name, each in rounds.items()},
+        "ratios": {name: ratios(rounds[OURS], each) for name, each in rounds.items() if name != OURS},
+    }
+
+
+def play(plan: EvaluationPlan, run: Run, folder: Path) -> Played:
+    """Have one system play the plan. Raises `ProcessFailed` if it did not play just that."""
+    notes = folder / "notes"
+    notes.mkdir(parents=True)
+    begun = time.monotonic()
+    run(folder, notes)
+    wall_s = time.monotonic() - begun
+    episodes = [note for each in read_episode_times(notes).values() for note in each]
+    seeds, steps = sorted(note.seed for note in episodes), {note.steps for note in episodes}
+    if seeds != list(range(plan.episodes)) or steps != {plan.max_steps}:
+        raise ProcessFailed(
+            f"{folder.name}: played {len(episodes)} episodes with {len(set(seeds))} seeds and {sorted(steps)} steps, "
+            f"want each of {plan.episodes} once with {plan.max_steps}; its results stand for something else"
+        )
+    playing_s = max(note.ended for note in episodes) - min(note.begun for note in episodes)
+    return Played(60 * plan.episodes / playing_s, wall_s)
+
+
+def ratios(ours: Sequence[Played], theirs: Sequence[Played]) -> dict[str, Any]:
+    """Return our rate over theirs and their wall time over ours: both are above 1 where we are faster."""
+    pairs = list(zip(ours, theirs, strict=True))
+    rates = [mine.episodes_per_minute / other.episodes_per_minute for mine, other in pairs]
+    walls = [other.wall_s / mine.wall_s for mine, other in pairs]
+    return {
+        "rounds": rates,
+        "median": statistics.median(rates),
+        "wall_rounds": walls,
+        "wall_median": statistics.median(walls),
+    }
+
+
+def alone(folder: Path) -> dict[str, str]:
+    """Return variables with which another Python imports our two packages, and nothing else of this Python's."""
+    place = folder / "path"
+    place.mkdir()
+    for package in (Path(vlagents_ray.__file__).parent, Path(__file__).parent):
+        (place / package.name).symlink_to(package)
+    return {"PYTHONPATH": f"{place}{os.pathsep}{SCRIPTS}"} | dict.fromkeys(THREAD_VARIABLES, "1")
+
+
+def _ours(plan: EvaluationPlan) -> Run:
+    def run(folder: Path, notes: Path) -> None:
+        settings = [f"--env-set={name}={value}" for name, value in plan.env(notes).items()]
+        command = [
+            sys.executable, "-c", "from vlagents_ray.cli import main; main()",
+            "eval", TIMED_TABLETOP, "--policy=noop", "--set=action_dim=4",
+            f"--episodes={plan.episodes}", f"--workers={plan.workers}", "--video=none", f"--out={folder / 'results'}",
+            *settings,
+        ]  # fmt: skip
+        environment = os.environ | our_environment()
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, timeout=_MOST_S)
+        if done.returncode:
+            raise ProcessFailed(f"{OURS}: ended with exit status {done.returncode}\n{done.stderr[-2000:]}")
+
+    return run
+
+
+def their_runs(
+    plan: EvaluationPlan, scripts: Mapping[str, Path], python: Path, environment: Mapping[str, str]
+) -> dict[str, Run]:
+    """Return how each peer in `scripts` plays the plan; there are two ways for vlagents."""
+
+    def way(name: str, peer: str, workers: int) -> Run:
+        def run(folder: Path, notes: Path) -> None:
+            words = {"folder": str(folder), "episodes": plan.episodes, "workers": workers, "seed": 0}
+            given = json.dumps(words | {"env": plan.env(notes)})
+            port = str(free_block(workers))
+            with LineProcess(
+                name, [str(python), str(scripts[peer]), "evaluate", LOOPBACK, port, given], environment
+            ) as child:
+                child.read(_MOST_S)
+
+        return run
+
+    found = {peer: way(peer, peer, 1 if peer == "vlagents" else plan.workers) for peer in scripts}
+    if "vlagents" in scripts and plan.workers > 1:
+        found[SPLIT] = way(SPLIT, "vlagents", plan.workers)
+    return found
+
+
+def _median(rounds: Sequence[Played]) -> Played:
+    return Played(*(statistics.median(values) for values in zip(*rounds, strict=True)))
+
+
+def show_evaluation(found: Mapping[str, Any]) -> None:
+    """Print a row for each system, and the targets."""
+    plan = found["plan"]
+    rows = table("", "episodes/min", "whole command s", "ours / theirs", "wall: theirs / ours")
+    rows.title = (
+        f"{plan['episodes']} episodes of {plan['max_steps']} steps, {plan['size']}x{plan['size']}, "
+        f"{plan['workers']} workers on {found['cores']} cores, medians of {plan['rounds']} rounds"
+    )
+    for name, row in found["medians"].items():
+        ratio = found["ratios"].get(name)
+        cells = [f"{ratio['median']:.2f}", f"{ratio['wall_median']:.2f}"] if ratio else ["", ""]
+        rows.add_row(name, f"{row['episodes_per_minute']:.0f}", f"{row['wall_s']:.1f}", *cells)
+    out.print(rows)
+    show_outcomes(evaluation_outcomes(found))
+    show_skipped(found)
+
+
+def main(
+    episodes: Annotated[int, typer.Option(min=1, help="Of each system and round.")] = 200,
+    workers: Annotated[int, typer.Option(min=1)] = 2,
+    peers: Annotated[str, typer.Option(help="vlagents, vla-eval, with a comma between them, or 'all'.")] = "",
+    rounds: Annotated[int, typer.Option(min=1)] = 3,
+    size: Annotated[int, typer.Option(min=32, help="Pixels a side of the image.")] = 224,
+    max_steps: Annotated[int, typer.Option(min=1, help="Steps of an episode.")] = 80,
+    env_ms: Annotated[float, typer.Option(min=0, help="CPU time that each env step takes more.")] = 0.0,
+    peers_python: PeersPython = DEFAULT_PEERS_PYTHON,
+    json_file: Json = None,
+    report: Annotated[
+        Path | None, typer.Option(help="Add the figures to this file of `vlagents-ray bench report --json`.")
+    ] = None,
+) -> None:
+    """Episodes a minute of whole evaluations: `vlagents-ray eval`, and the peers' own commands, in turns."""
+    with errors():
+        plan = EvaluationPlan(episodes, workers, rounds, size, max_steps, env_ms)
+        found = measure_evaluation(plan, peers=parse_list(peers), peers_python=peers_python, progress=progress)
+    show_evaluation(found)
+    save(found, json_file)
+    if report is not None:
+        save({**json.loads(report.read_text()), "evaluation": found}, report)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,308 @@
+"""What an evaluation costs over the bare environments: steps a second, in alternating rounds.
+
+A bare round steps the environments in as many processes as the evaluation has workers, with zeros
+as actions and no policy, server or Ray. An evaluated round plays the same episodes through a served
+`noop` policy. Both count the steps made while all workers were playing: making environments, and
+waiting for the last worker to start or to finish, are left out; the gaps between episodes are not.
+CPU time is that of the same span: of all bare processes, or of everything that an evaluation runs (its own
+process, workers, replica, HAProxy and Ray's daemons).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import sqlite3
+import statistics
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from multiprocessing.synchronize import Barrier
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import typer
+
+from vlagents_ray.cli.bench import Json
+from vlagents_ray.cli.console import errors, out, progress, save, table
+from vlagents_ray.cli.options import parse_settings
+from vlagents_ray.envs import make_env
+from vlagents_ray.errors import EnvFailed
+from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, evaluate
+from vlagents_ray.evaluate.workers.cluster import THREAD_VARIABLES
+from vlagents_ray.interface import Act
+from vlagents_ray.ray_tools.reaper import MARK, marked
+from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.server import running_server
+
+_START_S = 600.0
+_TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
+_EVERY_S = 0.2
+_LOOK_EVERY = 5  # samples, before the processes are looked for anew
+
+
+class Span(NamedTuple):
+    """One episode: when it began and ended, s, and its steps."""
+
+    begun: float
+    ended: float
+    steps: int
+
+
+class CallRate(NamedTuple):
+    """The figures of one round."""
+
+    steps_per_s: float
+    cpu_ms_per_step: float
+
+
+class Steady(NamedTuple):
+    """The span in which all workers play: s of `time.time()`, and the steps of all in it."""
+
+    first: float
+    last: float
+    steps: float
+
+    @property
+    def rate(self) -> float:
+        """The steps a second."""
+        return self.steps / (self.last - self.first)
+
+
+@dataclass(frozen=True, slots=True)
+class Overhead:
+    """Each round, in the order measured; round i of both ran one after the other."""
+
+    env: str
+    workers: int
+    bare: tuple[CallRate, ...]
+    evaluated: tuple[CallRate, ...]
+
+    @property
+    def ratios(self) -> tuple[float, ...]:
+        """The ratios of evaluated to bare, by round."""
+        return tuple(e.steps_per_s / b.steps_per_s for e, b in zip(self.evaluated, self.bare, strict=True))
+
+    @property
+    def ratio(self) -> float:
+        """The median of the ratios."""
+        return statistics.median(self.ratios)
+
+    @property
+    def added_cpu_ms(self) -> tuple[float, ...]:
+        """The CPU time that the evaluation adds to a step, ms, by round."""
+        return tuple(e.cpu_ms_per_step - b.cpu_ms_per_step for e, b in zip(self.evaluated, self.bare, strict=True))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return plain JSON values."""
+        return {
+            "env": self.env,
+            "workers": self.workers,
+            "bare_steps_per_second": [r.steps_per_s for r in self.bare],
+            "evaluated_steps_per_second": [r.steps_per_s for r in self.evaluated],
+            "ratios": list(self.ratios),
+            "median_ratio": self.ratio,
+            "bare_cpu_ms_per_step": [r.cpu_ms_per_step for r in self.bare],
+            "evaluated_cpu_ms_per_step": [r.cpu_ms_per_step for r in self.evaluated],
+            "median_added_cpu_ms_per_step": statistics.median(self.added_cpu_ms),
+        }
+
+
+def measure_overhead(
+    env: str,
+    *,
+    workers: int = 2,
+    episodes: int = 8,
+    rounds: int = 3,
+    env_options: Mapping[str, Any] | None = None,
+    progress: Callable[[str], None] = lambda _: None,
+) -> Overhead:
+    """Alternate bare and evaluated rounds of `episodes` episodes for each worker."""
+    options = dict(env_options or {})
+    with make_env(env, **options) as one:
+        action_dim = one.contract.action.dim or 1
+    cpus = max(os.cpu_count() or 1, workers)
+    bare: list[CallRate] = []
+    evaluated: list[CallRate] = []
+    policy = deployment("noop", config={"action_dim": action_dim})
+    with running_server(policy, num_cpus=cpus), tempfile.TemporaryDirectory() as folder:
+        for number in range(rounds):
+            bare.append(bare_rate(env, options, action_dim, workers, episodes))
+            progress(f"round {number + 1}/{rounds}: bare {bare[-1].steps_per_s:.1f} steps/s")
+            config = EvalConfig(
+                policies=[PolicyConfig(name="noop", url="serve://noop")],
+                suites=[SuiteConfig(envs=[env], env_options=options, episodes=episodes * workers)],
+                workers=workers,
+                video="none",
+                out=Path(folder) / str(number),
+            )
+            with CpuSampler(lambda: marked(os.environ[MARK])) as cpu:  # the cluster's own mark
+                evaluate(config)
+            playing = steady(recorded(config.out), workers)
+            evaluated.append(CallRate(playing.rate, cpu.between(playing.first, playing.last) * 1e3 / playing.steps))
+            progress(f"round {number + 1}/{rounds}: evaluated {evaluated[-1].steps_per_s:.1f} steps/s")
+    return Overhead(env, workers, tuple(bare), tuple(evaluated))
+
+
+def steady(episodes: Sequence[Span], workers: int) -> Steady:
+    """Find the span from when all `workers` play for the first time until they do for the last.
+
+    Each episode's steps are taken as spread evenly over it. Raises `EnvFailed` if they never all play.
+    """
+    edges = sorted([(e.begun, 1) for e in episodes] + [(e.ended, -1) for e in episodes])
+    playing = 0
+    full: list[float] = []  # moments at which the number of playing workers becomes, or ceases to be, full
+    for moment, change in edges:
+        if workers in (playing, playing + change):
+            full.append(moment)
+        playing += change
+    if len(full) < 2:
+        raise EnvFailed(f"{workers} workers were never all playing; measure more episodes")
+    first, last = full[0], full[-1]
+    inside = sum(e.steps * max(0.0, min(e.ended, last) - max(e.begun, first)) / (e.ended - e.begun) for e in episodes)
+    return Steady(first, last, inside)
+
+
+def bare_rate(env: str, options: Mapping[str, Any], action_dim: int, workers: int, episodes: int) -> CallRate:
+    """Let `workers` processes play `episodes` episodes of zeros each."""
+    context = multiprocessing.get_context("spawn")
+    start = context.Barrier(workers)
+    results = context.Queue()
+    before = {name: os.environ.get(name) for name in THREAD_VARIABLES}
+    os.environ.update(dict.fromkeys(THREAD_VARIABLES, "1"))  # as the evaluation's workers have it
+    try:
+        processes = [
+            context.Process(
+                target=_play, args=(env, dict(options), action_dim, worker * episodes, episodes, start, results)
+            )
+            for worker in range(workers)
+        ]
+        for process in processes:
+            process.start()
+    finally:
+        for name, value in before.items():
+            os.environ.pop(name) if value is None else os.environ.update({name: value})
+    played: list[tuple[list[Span], float]] = [results.get(timeout=_START_S) for _ in processes]
+    for process in processes:
+        process.join(60)
+        if process.exitcode != 0:
+            raise EnvFailed(f"{env}: a bare process ended with exit code {process.exitcode}")
+    spans = [span for one, _ in played for span in one]
+    steps = sum(span.steps for span in spans)
+    return CallRate(steady(spans, workers).rate, sum(cpu for _, cpu in played) * 1e3 / steps)
+
+
+def _play(
+    name: str, options: dict[str, Any], action_dim: int, seed: int, episodes: int, start: Barrier, results: Any
+) -> None:
+    spans: list[Span] = []
+    act = Act(np.zeros(action_dim, np.float32))
+    with make_env(name, **options) as env:
+        start.wait(_START_S)
+        used = time.process_time()
+        for episode in range(episodes):
+            begun, steps, done = time.time(), 0, False
+            env.reset(seed=seed + episode)
+            while not done:
+                _, _, terminated, truncated, _ = env.step(act)
+                steps += 1
+                done = terminated or truncated
+            spans.append(Span(begun, time.time(), steps))
+        results.put((spans, time.process_time() - used))
+
+
+def recorded(out: Path) -> list[Span]:
+    """Read every episode of these results."""
+    with contextlib.closing(sqlite3.connect(out / "results.db")) as db:
+        rows = db.execute("SELECT finished - seconds, finished, steps FROM episodes").fetchall()
+    return [Span(*row) for row in rows]
+
+
+def cpu_seconds(pid: int) -> float:
+    """Return the user and system CPU time of a process so far, all its threads, s. `OSError` if it has ended."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) * _TICK_S  # utime and stime of proc_pid_stat(5)
+
+
+class CpuSampler:
+    """Samples the CPU time of this process and of those that `processes` returns, in a context.
+
+    A process that has ended keeps what it was last seen with. Its own sampling is not counted.
+    """
+
+    def __init__(self, processes: Callable[[], Iterable[int]]) -> None:
+        self._processes = processes
+        self._seen: dict[int, float] = {}
+        self._moments: list[tuple[float, float]] = []  # s of time.time(), CPU s
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._sample, name="cpu", daemon=True)
+
+    def __enter__(self) -> CpuSampler:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def between(self, first: float, last: float) -> float:
+        """Interpolate the CPU time used between two moments, s of `time.time()`."""
+        moments, totals = zip(*self._moments, strict=True)
+        return float(np.interp(last, moments, totals) - np.interp(first, moments, totals))
+
+    def _sample(self) -> None:
+        pids: set[int] = set()
+        number = 0
+        while True:
+            if number % _LOOK_EVERY == 0:
+                pids = {*self._processes(), os.getpid()}
+            number += 1
+            for pid in pids:
+                try:
+                    self._seen[pid] = cpu_seconds(pid)
+                except OSError:
+                    continue
+            self._moments.append((time.time(), sum(self._seen.values()) - time.thread_time()))
+            if self._stop.is_set():
+                return
+            self._stop.wait(_EVERY_S)
+
+
+def show_overhead(found: Overhead) -> None:
+    """Print a row for each round."""
+    rows = table("round", "bare steps/s", "evaluated steps/s", "ratio", "bare CPU ms/step", "evaluated CPU ms/step")
+    rows.title = f"{found.env}, {found.workers} workers"
+    for number, (bare, ours, ratio) in enumerate(zip(found.bare, found.evaluated, found.ratios, strict=True), 1):
+        rows.add_row(
+            str(number), f"{bare.steps_per_s:.1f}", f"{ours.steps_per_s:.1f}", f"{ratio:.3f}",
+            f"{bare.cpu_ms_per_step:.3f}", f"{ours.cpu_ms_per_step:.3f}",
+        )  # fmt: skip
+    out.print(rows)
+
+
+def main(
+    env: Annotated[str, typer.Argument(help="The environment to step.")] = "tabletop",
+    workers: Annotated[int, typer.Option(min=1)] = 2,
+    episodes: Annotated[int, typer.Option(min=1, help="For each worker and round.")] = 8,
+    rounds: Annotated[int, typer.Option(min=1)] = 3,
+    json_file: Json = None,
+    env_set: Annotated[list[str], typer.Option("--env-set", metavar="KEY=VALUE")] = [],  # noqa: B006
+) -> None:
+    """Steps a second, and CPU time a step, of an evaluation against those of the bare environments."""
+    with errors():
+        options = parse_settings(env_set, "--env-set")
+        found = measure_overhead(
+            env, workers=workers, episodes=episodes, rounds=rounds, env_options=options, progress=progress
+        )
+    show_overhead(found)
+    data = found.to_json()
+    out.print(f"median ratio {found.ratio:.3f}, CPU time added to a step {data['median_added_cpu_ms_per_step']:.3f} ms")
+    save(data, json_file)
+
+
+if __name__ == "__main__":
+    typer.run(main)

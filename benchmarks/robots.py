@@ -1,0 +1,71 @@
+"""Robots that act at their rate and do nothing else: `python -m benchmarks.robots URL`.
+
+Each line that the process reads is a burst, {"robots": 12, "hz": 10, "seconds": 20}. It is answered, when it is over,
+with what each robot measured.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from typing import NamedTuple
+
+from vlagents_ray.bench.clients import observation
+from vlagents_ray.bench.peers.peer import die_with_parent, own_stdout
+from vlagents_ray.client.agent import RemoteAgent
+from vlagents_ray.errors import VLAgentsError
+
+_CONNECT_S = 120.0
+
+
+class RobotBurst(NamedTuple):
+    """What one robot measured in a burst."""
+
+    reset_s: float  # how long its first reset took, connecting and all
+    acts: list[tuple[float, float]]  # s of `time.time()` when it was answered, ms that it took
+    resumed: int  # acts before which the session had to begin again
+    failed: list[str]  # acts, or the reset, without an action: why
+
+
+def burst(url: str, robots: int, hz: float, seconds: float) -> list[RobotBurst]:
+    """Let all robots act at once, each for so long after its reset."""
+    with ThreadPoolExecutor(robots) as pool:
+        return list(pool.map(lambda _: play(url, hz, seconds), range(robots)))
+
+
+def play(url: str, hz: float, seconds: float) -> RobotBurst:
+    """Let one robot act. A tick that an act takes up is not made up for."""
+    obs, acts, resumed, failed = observation(64, 1), [], 0, []
+    with RemoteAgent(url, connect_timeout_s=_CONNECT_S, rank="robot") as agent:
+        begun = time.time()
+        try:
+            agent.reset(obs, "let time pass")
+        except VLAgentsError as error:
+            return RobotBurst(time.time() - begun, [], 0, [f"reset: {error}"])
+        reset_s, tick = time.time() - begun, time.time()
+        until = tick + seconds
+        while tick < until:
+            asked = time.time()
+            try:
+                resumed += bool(agent.act(obs).info.get("resumed"))
+                acts.append((time.time(), 1e3 * (time.time() - asked)))
+            except VLAgentsError as error:
+                failed.append(f"{type(error).__name__}: {error}")
+            tick = max(tick + 1 / hz, time.time())
+            time.sleep(max(0.0, tick - time.time()))
+    return RobotBurst(reset_s, acts, resumed, failed)
+
+
+def main() -> None:
+    """Run the process."""
+    die_with_parent()
+    out = own_stdout()
+    print(json.dumps("ready"), file=out, flush=True)
+    for line in sys.stdin:
+        print(json.dumps(burst(sys.argv[1], **json.loads(line))), file=out, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,165 @@
+"""The driver of `bench scaling`, a process at the cluster's head: `python -m benchmarks.scaling_driver JSON`.
+
+It serves policies that sleep, says so in a line of JSON, and then plays each `ScalingRound` that it reads, a line of
+JSON, answering with a `PlayedEpisodes`. It is what `vlagents-ray eval` is: Serve's client and the evaluation's driver
+in one process, so that the CPU time that it uses, in all its threads, is a driver's.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import json
+import sys
+import tempfile
+import time
+from array import array
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from benchmarks.environments import ACTION_DIM, SLEEPING_ENV
+from benchmarks.overhead import cpu_seconds, recorded, steady
+from vlagents_ray.bench.peers.peer import die_with_parent, own_stdout
+from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SilentProgress, SuiteConfig, WorkerConfig, evaluate
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.cases import EvalCase
+from vlagents_ray.policies.noop import Noop, NoopConfig
+from vlagents_ray.serve.launch.deployment_file import deployment, together
+from vlagents_ray.serve.launch.server import running_server
+
+DAEMONS = ("gcs_server", "raylet", "ServeController")  # of this node, by what their command line begins with or names
+
+
+@dataclass(frozen=True, slots=True)
+class Fleet:
+    """One application: replicas of a policy that sleeps."""
+
+    replicas: int
+    chunk: int = 1
+    pinned: bool = False  # each takes one of a resource with the application's name
+
+    def args(self, app: str, policy_ms: float) -> dict[str, Any]:
+        """Return the arguments of its deployment."""
+        return {
+            "config": {"action_dim": ACTION_DIM, "chunk": self.chunk, "base_ms": policy_ms},
+            "replicas": self.replicas,
+            "resources": {"custom": {app: 1.0}} if self.pinned else {},
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class ScalingRound:
+    """An evaluation to play."""
+
+    workers: int
+    episodes: int  # of each worker
+    steps: int
+    step_ms: float
+    app: str | None = None  # None: a policy in each worker's own process, which takes no time
+    size: int = 224
+
+
+class PlayedEpisodes(NamedTuple):
+    """The figures of a `ScalingRound`."""
+
+    episodes_per_minute: float | None  # while all workers were playing; None with a policy in their own processes
+    wall_s: float  # of the whole evaluation, workers' start and all
+    transports: list[str]
+    failures: int  # attempts
+    # From the first recorded episode to the last:
+    episodes: int
+    span_s: float
+    busy_s: float  # that workers were playing, added up
+    driver_s: float  # CPU time of this process
+    daemons_s: dict[str, float]  # and of Ray's on this node
+
+    @property
+    def rate(self) -> float:
+        """The episodes a minute of a round with an application."""
+        assert self.episodes_per_minute is not None, "a round without one has no rate"  # noqa: S101
+        return self.episodes_per_minute
+
+
+class ScalingLedger(SilentProgress):
+    """When each episode was recorded, and what the driver and the daemons had used by then."""
+
+    def __init__(self) -> None:
+        self.at_s, self.cpu_s = array("d"), array("d")
+        self.failures = 0
+        self.first: dict[str, float] = {}
+
+    def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
+        """Record the time."""
+        self.first = self.first or daemons_s()
+        self.at_s.append(time.monotonic())
+        self.cpu_s.append(time.process_time())
+
+    def retry(self, *_: object) -> None:
+        """Count a retry."""
+        self.failures += 1
+
+
+def play(one: ScalingRound, out: Path) -> PlayedEpisodes:
+    """Play a round; `out` is a new folder. Raises `EnvFailed` if its workers were never all playing."""
+    policy = PolicyConfig(name="noop", url=None if one.app is None else f"serve://{one.app}")
+    options: dict[str, Any] = {"step_ms": one.step_ms, "max_steps": one.steps, "size": one.size}
+    config = EvalConfig(
+        policies=[policy],
+        suites=[SuiteConfig(envs=[SLEEPING_ENV], env_options=options, episodes=one.workers * one.episodes)],
+        workers=one.workers,
+        worker=WorkerConfig(cpus=1.0),  # as many on a node as it has
+        video="none",
+        out=out,
+    )
+    local = functools.partial(Noop, NoopConfig(action_dim=ACTION_DIM)) if one.app is None else None
+    ledger, begun = ScalingLedger(), time.monotonic()
+    summary = evaluate(config, agent_factory=local, progress=ledger)
+    wall_s, last = time.monotonic() - begun, daemons_s()
+    played = recorded(out)
+    first = min(each.ended for each in played)
+    return PlayedEpisodes(
+        None if one.app is None else 60 * steady(played, one.workers).rate / one.steps,
+        wall_s,
+        summary.transports,
+        ledger.failures,
+        len(ledger.at_s) - 1,
+        ledger.at_s[-1] - ledger.at_s[0],
+        sum(each.ended - max(first, each.begun) for each in played),
+        ledger.cpu_s[-1] - ledger.cpu_s[0],
+        {name: used - ledger.first.get(name, 0.0) for name, used in last.items()},
+    )
+
+
+def daemons_s() -> dict[str, float]:
+    """Return the CPU time that Ray's own processes of this node have used so far, s."""
+    found = dict.fromkeys(DAEMONS, 0.0)
+    for entry in Path("/proc").iterdir():
+        if not entry.name.isdigit():
+            continue
+        with contextlib.suppress(OSError):  # it has ended
+            program = (entry / "cmdline").read_bytes().partition(b"\0")[0].decode(errors="replace")
+            for name in DAEMONS:
+                if Path(program).name.removeprefix("ray::").startswith(name):
+                    found[name] += cpu_seconds(int(entry.name))
+    return found
+
+
+def main() -> None:
+    """Run the process."""
+    import ray
+
+    die_with_parent()
+    out = own_stdout()
+    settings = json.loads(sys.argv[1])
+    fleets = {app: Fleet(**fleet) for app, fleet in settings["fleets"].items()}
+    parts = {app: deployment("noop", **fleet.args(app, settings["policy_ms"])) for app, fleet in fleets.items()}
+    with running_server(together(parts), address=settings["address"]), tempfile.TemporaryDirectory() as top:
+        print(json.dumps({"nodes": sum(node["Alive"] for node in ray.nodes())}), file=out, flush=True)
+        for number, line in enumerate(sys.stdin):
+            played = play(ScalingRound(**json.loads(line)), Path(top) / str(number))
+            print(json.dumps(played._asdict()), file=out, flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,300 @@
+"""Many episodes in one evaluation, with workers killed while it runs: does anything grow, slow down or get lost?
+
+Small images and few steps, so that what is measured is what an evaluation does around an episode. The gap is the time
+between an episode's last step and the next one's reset in the same worker: result, its way to the driver, the database,
+the next job and its way back. Every so often the youngest worker is killed; the eldest lives from the first episode to
+the last, and its memory is what is watched, beside the driver's.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import signal
+import tempfile
+import threading
+import time
+from array import array
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import typer
+
+from benchmarks.environments import TIMED_TABLETOP, EpisodeTimes, read_episode_times
+from vlagents_ray.bench.report import Outcome, unmeasured
+from vlagents_ray.cli.bench import Json, show_outcomes
+from vlagents_ray.cli.console import errors, out, progress, save
+from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Results, SilentProgress, SuiteConfig, evaluate
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.cases import EvalCase, cells
+from vlagents_ray.evaluate.plan.jobs import plan as planned
+from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.server import running_server
+
+LIMIT_GAP_MS = 5.0
+LIMIT_SLOWDOWN = 1.25  # of the last thousand episodes against the first, noise included
+LIMIT_GROWTH_MIB = 0.5  # of a process in a thousand episodes
+_EVERY_S = 0.5  # between two looks at the memory
+_PAGE = os.sysconf("SC_PAGE_SIZE")
+_MIB = 2**20
+_SETTLING = 0.2  # of the episodes, in which pools and caches fill
+
+
+@dataclass(frozen=True, slots=True)
+class SoakPlan:
+    """What `measure_soak` plays, and for how long."""
+
+    episodes: int = 10_000
+    workers: int = 2
+    kill_every_s: float = 30.0  # 0: never
+    max_steps: int = 20
+    size: int = 32  # pixels a side
+
+    @property
+    def window(self) -> int:
+        """The number of episodes at the beginning, and at the end, that are compared: at most a quarter of all."""
+        return min(1000, self.episodes // 4)
+
+
+class ResourceSample(NamedTuple):
+    """Memory at one moment."""
+
+    episodes: int  # recorded so far
+    driver: int  # resident bytes
+    eldest: int | None  # of the first worker; None once it has ended
+
+
+def measure_soak(soak: SoakPlan, progress: Callable[[str], None] = lambda _: None) -> dict[str, Any]:
+    """Play the evaluation and watch it; returns plain JSON values."""
+    ledger = SoakLedger(progress)
+    cpus = max(os.cpu_count() or 1, soak.workers)
+    with (
+        running_server(deployment("noop", config={"action_dim": 4}), num_cpus=cpus),
+        tempfile.TemporaryDirectory() as top,
+    ):
+        notes = Path(top) / "notes"
+        notes.mkdir()
+        config = EvalConfig(
+            policies=[PolicyConfig(name="noop", url="serve://noop")],
+            suites=[
+                SuiteConfig(
+                    envs=[TIMED_TABLETOP],
+                    env_options={"notes": str(notes), "size": soak.size, "max_steps": soak.max_steps},
+                    episodes=soak.episodes,
+                )
+            ],
+            workers=soak.workers,
+            video="none",
+            out=Path(top) / "results",
+        )
+        with SoakWatcher(notes, ledger, soak) as watcher:
+            evaluate(config, progress=ledger)
+        found = Results.load(config.out)
+        wanted = sorted(str(job.key) for job in planned(cells(config)))
+        return report(soak, ledger, watcher, read_episode_times(notes), found, wanted)
+
+
+class SoakLedger(SilentProgress):
+    """When each episode was recorded, and the CPU time that the driver had used by then."""
+
+    def __init__(self, progress: Callable[[str], None]) -> None:
+        self.at_s, self.cpu_s = array("d"), array("d")  # of time.time(); small beside what they are to find
+        self._progress = progress
+
+    def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
+        """Record the time."""
+        self.at_s.append(time.time())
+        self.cpu_s.append(time.process_time())
+        if len(self.at_s) % 1000 == 0:
+            self._progress(f"{len(self.at_s)} of {cell.planned} episodes")
+
+
+class SoakWatcher:
+    """Samples memory, and kills the youngest worker every so often. Use as a context manager."""
+
+    def __init__(self, notes: Path, ledger: SoakLedger, soak: SoakPlan) -> None:
+        self.samples: list[ResourceSample] = []
+        self.killed: list[int] = []
+        self._notes = notes
+        self._ledger = ledger
+        self._soak = soak
+        self._seen: list[int] = []  # workers that have finished an episode, the eldest first
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="soak", daemon=True)
+
+    def __enter__(self) -> SoakWatcher:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._stop.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        since: float | None = None  # the first episode, or the last kill
+        while not self._stop.wait(_EVERY_S):
+            self._seen += [pid for file in self._notes.glob("*.txt") if (pid := int(file.stem)) not in self._seen]
+            if not self._seen:
+                continue
+            self.samples.append(
+                ResourceSample(len(self._ledger.at_s), resident(os.getpid()) or 0, resident(self._seen[0]))
+            )
+            since = since or time.monotonic()
+            if self._soak.kill_every_s and time.monotonic() - since >= self._soak.kill_every_s and self._kill():
+                since = time.monotonic()
+
+    def _kill(self) -> bool:
+        """Kill the youngest, once all are playing."""
+        playing = [pid for pid in self._seen if is_worker(pid)]
+        if len(playing) < self._soak.workers:
+            return False
+        with suppress(ProcessLookupError):
+            os.kill(playing[-1], signal.SIGKILL)
+        self.killed.append(playing[-1])
+        return True
+
+
+def is_worker(pid: int) -> bool:
+    """Return whether that process is one of Ray's, and not another that has got its number since."""
+    try:
+        return b"ray::" in Path(f"/proc/{pid}/cmdline").read_bytes()
+    except OSError:
+        return False
+
+
+def resident(pid: int) -> int | None:
+    """Return the resident memory of a process, bytes; None if it has ended."""
+    try:
+        return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * _PAGE
+    except (OSError, IndexError):
+        return None
+
+
+def report(
+    soak: SoakPlan,
+    ledger: SoakLedger,
+    watcher: SoakWatcher,
+    notes: Mapping[int, Sequence[EpisodeTimes]],
+    results: Results,
+    wanted: Sequence[str],
+) -> dict[str, Any]:
+    """Return all figures as plain JSON values."""
+    episodes = [one for cell in results.cells for one in cell.episodes]
+    attempts = [one for cell in results.cells for one in cell.attempts]
+    at, cpu, window = ledger.at_s, ledger.cpu_s, soak.window
+    between = gaps(notes.values())
+    return {
+        "plan": asdict(soak),
+        "episodes_per_minute": 60 * (len(at) - 1) / (at[-1] - at[0]),
+        "keys_once": sorted(str(one.result.key) for one in episodes) == list(wanted),
+        "done": sum(one.result.status == "done" for one in episodes),
+        "killed": len(watcher.killed),
+        "retries": sum(one.retried for one in attempts),
+        "played_again": sum(map(len, notes.values())) - len(episodes),
+        "gap_ms": {"first": _spread(between[:window]), "last": _spread(between[-window:])},
+        "driver_cpu_ms": {
+            "first": 1e3 * (cpu[window - 1] - cpu[0]) / (window - 1),
+            "last": 1e3 * (cpu[-1] - cpu[-window]) / (window - 1),
+        },
+        "memory": {
+            "driver": growth([(one.episodes, one.driver) for one in watcher.samples], soak.episodes),
+            "worker": growth(
+                [(one.episodes, one.eldest) for one in watcher.samples if one.eldest is not None], soak.episodes
+            ),
+        },
+    }
+
+
+def gaps(workers: Iterable[Sequence[EpisodeTimes]]) -> list[float]:
+    """Return the times between two episodes of a worker, s, in the order in which the later ones began."""
+    pairs = [pair for notes in workers for pair in itertools.pairwise(notes)]
+    return [after.begun - before.ended for before, after in sorted(pairs, key=lambda pair: pair[1].begun)]
+
+
+def growth(samples: Sequence[tuple[int, int]], episodes: int) -> dict[str, float] | None:
+    """Fit the growth of resident memory in a thousand episodes, MiB, by least squares.
+
+    `samples` are (episodes, bytes). The first fifth is left out, in which pools and caches fill, and what comes after
+    the last episode, when all results are read. None of too few.
+    """
+    settled = [(done, size) for done, size in samples if _SETTLING * episodes <= done < episodes]
+    if len({done for done, _ in settled}) < 2:
+        return None
+    done, size = zip(*settled, strict=True)
+    slope = np.polyfit(np.array(done) / 1000, np.array(size) / _MIB, 1)[0]
+    return {"begin_mib": settled[0][1] / _MIB, "end_mib": settled[-1][1] / _MIB, "mib_per_1000": float(slope)}
+
+
+def _spread(gaps_s: Sequence[float]) -> dict[str, float]:
+    median, p95 = np.quantile(gaps_s, (0.5, 0.95)) * 1e3
+    return {"median": float(median), "p95": float(p95)}
+
+
+def soak_outcomes(found: Mapping[str, Any]) -> list[Outcome]:
+    """Return the targets of `measure_soak`, and whether they are met."""
+    episodes, gap, cpu = found["plan"]["episodes"], found["gap_ms"], found["driver_cpu_ms"]
+    first, last = gap["first"]["median"], gap["last"]["median"]
+    slowdown = cpu["last"] / cpu["first"]
+    once = f"{found['done']} done, {'each key once' if found['keys_once'] else 'not each key once'}"
+    return [
+        Outcome(
+            "every episode", f"{episodes} done, each key once", once, found["keys_once"] and found["done"] == episodes
+        ),
+        Outcome(
+            "between two episodes of a worker, at first",
+            f"< {LIMIT_GAP_MS:g} ms",
+            f"{first:.2f} ms",
+            first < LIMIT_GAP_MS,
+        ),
+        Outcome(
+            "between two episodes of a worker, at last", f"< {LIMIT_GAP_MS:g} ms", f"{last:.2f} ms", last < LIMIT_GAP_MS
+        ),
+        Outcome(
+            "the same, last over first", f"≤ {LIMIT_SLOWDOWN}", f"{last / first:.2f}", last <= LIMIT_SLOWDOWN * first
+        ),
+        Outcome(
+            "the driver's CPU time for an episode, last over first",
+            f"≤ {LIMIT_SLOWDOWN}",
+            f"{slowdown:.2f} ({cpu['first']:.2f} ms at first)",
+            slowdown <= LIMIT_SLOWDOWN,
+        ),
+        *(_growth(f"memory of the {name}", row) for name, row in found["memory"].items()),
+    ]
+
+
+def _growth(what: str, row: Mapping[str, Any] | None) -> Outcome:
+    wanted = f"≤ {LIMIT_GROWTH_MIB:g} MiB in 1,000 episodes"
+    if row is None:
+        return unmeasured(what, wanted)
+    seen = f"{row['mib_per_1000']:+.3f} MiB, {row['begin_mib']:.0f} to {row['end_mib']:.0f}"
+    return Outcome(what, wanted, seen, row["mib_per_1000"] <= LIMIT_GROWTH_MIB)
+
+
+def show_soak(found: Mapping[str, Any]) -> None:
+    """Print what was counted, and the targets."""
+    out.print(
+        f"{found['plan']['episodes']} episodes, {found['episodes_per_minute']:.0f} a minute; workers killed: "
+        f"{found['killed']}, retries: {found['retries']}, played again: {found['played_again']}",
+    )
+    show_outcomes(soak_outcomes(found))
+
+
+def main(
+    episodes: Annotated[int, typer.Option(min=100)] = 10_000,
+    workers: Annotated[int, typer.Option(min=1)] = 2,
+    kill_every: Annotated[float, typer.Option(min=0, help="Seconds between two kills of a worker; 0: none.")] = 30.0,
+    json_file: Json = None,
+) -> None:
+    """Many short episodes, with workers killed meanwhile: memory, what an episode costs around it, each once."""
+    with errors():
+        found = measure_soak(SoakPlan(episodes, workers, kill_every), progress)
+    show_soak(found)
+    save(found, json_file)
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,31 @@
+"""Mistakes on the command line of `python -m benchmarks.NAME` are reported before anything starts."""
+
+from __future__ import annotations
+
+from types import ModuleType
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from benchmarks import autoscaling, evaluation, hop, scaling
+
+
+@pytest.mark.parametrize(
+    ("module", "words", "text"),
+    [
+        (autoscaling, ["--plot", "a.gif"], ".png"),
+        (evaluation, ["--episodes", "5"], "multiple of the 2 workers"),
+        (evaluation, ["--peers", "nobody"], "nobody"),
+        (hop, ["--python", "nowhere"], "nowhere"),
+        (scaling, ["--workers", "2,4"], "from 1 on"),
+        (scaling, ["--nodes", "none"], "--nodes"),
+    ],
+)
+def test_mistakes_are_reported_in_a_line(module: ModuleType, words: list[str], text: str) -> None:
+    app = typer.Typer()
+    app.command()(module.main)
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 2, done.output
+    assert text in done.stderr
+    assert "Traceback" not in done.output

@@ -1,0 +1,40 @@
+"""The benchmark of an evaluation's overhead counts what it says it counts."""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks.overhead import Span, measure_overhead, steady
+from vlagents_ray.errors import EnvFailed
+
+
+def test_two_workers_side_by_side() -> None:
+    assert steady([Span(0, 10, 100), Span(0, 10, 100)], 2).rate == pytest.approx(20)
+
+
+def test_a_late_start_and_an_early_end_are_left_out() -> None:
+    spans = [Span(0, 10, 100), Span(5, 15, 100)]
+    assert steady(spans, 2).rate == pytest.approx(20)
+
+
+def test_a_gap_between_episodes_counts() -> None:
+    spans = [Span(0, 4, 40), Span(6, 10, 40), Span(0, 10, 100)]
+    assert steady(spans, 2).rate == pytest.approx(18)
+
+
+def test_workers_that_never_play_together_are_an_error() -> None:
+    with pytest.raises(EnvFailed):
+        steady([Span(0, 1, 5), Span(2, 3, 5)], 2)
+
+
+@pytest.mark.slow
+@pytest.mark.ray
+@pytest.mark.alone
+def test_it_measures_the_tabletop() -> None:
+    found = measure_overhead("tabletop", workers=2, episodes=10, rounds=1)
+    assert len(found.ratios) == 1
+    assert 0 < found.ratio < 1
+    data = found.to_json()
+    assert data["median_ratio"] == found.ratio
+    assert data["median_added_cpu_ms_per_step"] > 0
+    assert data["bare_cpu_ms_per_step"][0] > 0

@@ -1,0 +1,136 @@
+"""Chunks that overlap, and what is done next."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from vlagents_ray import ConfigError, PolicyFailed
+from vlagents_ray.chunking.buffer import Chunk, ChunkBuffer
+
+
+def chunk(number: int, step: int, values: list[float], *, done: bool = False) -> Chunk:
+    return Chunk(number, step, np.array(values, np.float32)[:, np.newaxis], done)
+
+
+def values(plan: ChunkBuffer, steps: int) -> list[float | None]:
+    """What is done at so many steps from now on; the plan advances by them."""
+    done: list[float | None] = []
+    for _ in range(steps):
+        done.append(None if plan.next is None else round(float(plan.next.action[0]), 6))
+        plan.advance()
+    return done
+
+
+def advanced(steps: int) -> ChunkBuffer:
+    plan = ChunkBuffer()
+    for _ in range(steps):
+        plan.advance()
+    return plan
+
+
+def test_rows_that_others_were_executed_in_place_of_are_left_out() -> None:
+    plan = advanced(12)
+    assert plan.add(chunk(0, 10, [0, 1, 2, 3]))
+    assert values(plan, 4) == [2, 3, None, None]
+
+
+def test_while_the_robot_holds_no_row_is_left_out_however_long_that_takes() -> None:
+    plan = ChunkBuffer()
+    plan.add(chunk(0, 0, [0, 1, 2]))
+    assert values(plan, 2) == [0, 1]
+    for _ in range(1000):
+        assert plan.next is not None  # and nobody advances it
+    assert plan.add(chunk(1, 1, [10, 20, 30]))  # of an observation before the second row
+    assert values(plan, 3) == [20, 30, None]
+
+
+def test_an_answer_that_came_too_late_altogether_changes_nothing() -> None:
+    plan = advanced(30)
+    assert not plan.add(chunk(0, 0, [0, 1, 2]))
+    assert plan.next is None
+
+
+def test_an_answer_one_step_too_late_is_good_for_its_last_row_if_there_is_no_other() -> None:
+    plan = advanced(1)
+    assert plan.add(chunk(0, 0, [7]))
+    assert values(plan, 2) == [7, None]
+    plan = advanced(1)
+    plan.add(chunk(0, 0, [0, 1]))
+    assert not plan.add(chunk(1, 0, [7]))
+    assert values(plan, 2) == [1, None]
+
+
+@pytest.mark.parametrize(
+    ("merge", "expected"),
+    [
+        ("newest", [1, 20, 30]),
+        ("average", [1, 11, 30]),
+        ("weighted_average", [1, 0.3 * 2 + 0.7 * 20, 30]),
+        ("conservative", [1, 0.7 * 2 + 0.3 * 20, 30]),
+        (np.maximum, [1, 20, 30]),
+    ],
+)
+def test_a_tick_that_two_chunks_have_a_row_for_is_merged_as_chosen(merge: object, expected: list[float]) -> None:
+    plan = ChunkBuffer(merge)
+    plan.add(chunk(0, 0, [1, 2]))
+    plan.add(chunk(1, 1, [20, 30]))
+    assert values(plan, 3) == pytest.approx(expected)
+
+
+def test_the_ensemble_weighs_as_act_does_oldest_first() -> None:
+    plan = ChunkBuffer("ensemble", ensemble_m=0.5)
+    for step in range(3):
+        plan.add(chunk(step, step, [float(step)] * 5))
+    weights = np.exp(-0.5 * np.arange(3))
+    assert values(plan, 3)[2:] == pytest.approx([weights @ [0, 1, 2] / weights.sum()])
+
+
+def test_what_is_left_of_the_plan_is_what_would_be_done() -> None:
+    plan = ChunkBuffer("average")
+    plan.add(chunk(0, 0, [0, 2, 4]))
+    plan.add(chunk(1, 1, [4, 6, 8]))
+    plan.advance()
+    left = plan.leftover()
+    assert left is not None
+    assert left[:, 0].tolist() == [3, 5, 8]
+    plan.drop()
+    assert plan.leftover() is None
+
+
+def test_a_policy_that_chunks_in_real_time_is_told_of_no_more_rows_than_are_left() -> None:
+    plan = ChunkBuffer()
+    assert plan.continuation([3]) == {}
+    plan.add(chunk(0, 0, [0, 1, 2]))
+    for delays, told in (([], 0), ([1, 2], 2), ([1, 150], 3)):  # of a stall, the whole rest will be executed
+        assert plan.continuation(delays)["delay_ticks"] == told
+
+
+def test_what_was_planned_from_an_old_observation_is_forgotten() -> None:
+    plan = ChunkBuffer()
+    for seen_at in (1.0, 2.0):
+        plan.add(Chunk(0, 0, np.full((2, 1), seen_at, np.float32), seen_at=seen_at))
+    assert not plan.drop(before=1.0)
+    assert plan.drop(before=1.5)
+    assert values(plan, 1) == [2]
+    assert plan.drop()
+    assert plan.next is None
+
+
+def test_an_unknown_merge_is_refused_with_what_there_is() -> None:
+    with pytest.raises(ConfigError, match="want one of"):
+        ChunkBuffer("median")
+
+
+def test_rows_are_handed_out_one_by_one_and_replaced_at_once() -> None:
+    plan = ChunkBuffer()
+    plan.replace(np.array([[1.0], [2.0], [3.0]], np.float32))
+    assert [plan.take().action[0] for _ in range(2)] == [1, 2]
+    plan.replace(np.array([[4.0], [5.0]], np.float32))
+    assert [plan.take().action[0] for _ in range(2)] == [4, 5]
+    assert plan.executed == 4
+    with pytest.raises(PolicyFailed, match="no row is left for step 4"):
+        plan.take()
+    plan.replace(np.array([[6.0], [7.0], [8.0]], np.float32), step=2)  # two of its rows would have been executed before
+    assert plan.take().row == 2
+    assert plan.next is None

@@ -1,0 +1,124 @@
+"""Nothing that a command says is cut off, wrapped where it is copied from, or taken for markup."""
+
+from __future__ import annotations
+
+import io
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from vlagents_ray.cli import console
+from vlagents_ray.cli.console import PlainConsole, table
+from vlagents_ray.cli.doctor import listing
+from vlagents_ray.cli.main import envs, policies
+from vlagents_ray.envs.tabletop import Tabletop
+
+CLI = Path(console.__file__).parent
+CURE = "pip install 'vlagents-ray[libero]' [/] \\[red] and /a/very/long/path/" + "of-an-interpreter/" * 8 + "bin/python"
+
+
+@pytest.fixture(params=[True, False], ids=["terminal", "pipe"])
+def shown(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> io.StringIO:
+    """What is printed, at a terminal of 80 columns or into a pipe."""
+    text = io.StringIO()
+    colours = {"color_system": None, "_environ": {"COLUMNS": "80", "TERM": "xterm"}}
+    one = PlainConsole(file=text, force_terminal=request.param, **colours)
+    for module in (console, sys.modules[envs.__module__]):
+        monkeypatch.setattr(module, "out", one, raising=False)
+    monkeypatch.setattr(console, "err", one)
+    return text
+
+
+def test_a_line_and_an_error_are_shown_as_they_are(shown: io.StringIO) -> None:
+    console.progress(CURE)
+    console.say_error(CURE)
+    assert shown.getvalue() == f"{CURE}\nerror {CURE}\n"
+
+
+def test_a_table_cuts_nothing_off(shown: io.StringIO) -> None:
+    rows = table("name", "cure", box=None)
+    rows.add_row("libero", CURE)
+    console.out.print(rows)
+    said = shown.getvalue()
+    assert re.sub(r"\s", "", CURE) in re.sub(r"\s|libero(?= )", "", said.replace("name", "").replace("cure", ""))
+    assert "…" not in said
+    if not console.out.is_terminal:
+        assert f"libero {CURE}" in re.sub(" +", " ", said)
+
+
+class Elsewhere(Tabletop):
+    @classmethod
+    def missing(cls) -> str | None:
+        return CURE
+
+    @classmethod
+    def tasks(cls) -> list[str]:
+        return [*(f"goal/{number}" for number in range(50)), "other", "long/1", "long/2", "odd/1", "odd/3"]
+
+
+def test_envs_are_listed_with_their_cures_and_ranges_of_tasks(
+    shown: io.StringIO, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(listing, "names", lambda _: {"elsewhere": f"{__name__}:Elsewhere"})
+    monkeypatch.setattr(listing, "env_class", lambda _: Elsewhere)
+    envs()
+    assert shown.getvalue().splitlines() == [
+        f"elsewhere: {CURE}",
+        "  55 tasks: goal/0..49, other, long/1..2, odd/1, odd/3",
+    ]
+
+
+def test_policies_and_wrappers_say_what_they_are_what_is_missing_and_what_can_be_set(
+    shown: io.StringIO, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(listing.importlib.util, "find_spec", lambda _: None)
+    for variable in ("OPENPI_SRC", "VJEPA2_SRC"):
+        monkeypatch.delenv(variable, raising=False)
+    policies()
+    found = {part.partition(":")[0]: part.splitlines() for part in shown.getvalue().split("\n\n")}
+    assert found["noop"][0].startswith("noop: A policy that does nothing, ")
+    assert found["noop"][1:] == ["  ready", "  settings: action_dim=7, chunk=1, base_ms=0.0, per_item_ms=0.0"]
+    assert "requirements/lerobot.txt`" in found["lerobot"][1]
+    assert "OPENPI_SRC=FOLDER of a checkout" in found["openpi"][1]
+    assert "VJEPA2_SRC=FOLDER" in found["vjepa2_ac"][1]
+    assert "settings: checkpoint, checkpoint_step=None, " in found["openvla"][2]
+    assert found["arro"][0].startswith("arro: ARRO (arXiv")
+    assert "…" not in shown.getvalue()
+
+
+def test_an_environment_that_has_a_family_is_ready_for_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(listing.importlib.util, "find_spec", lambda name: None if name == "openpi" else object())
+    monkeypatch.delenv("OPENPI_SRC", raising=False)
+    assert "its source" in str(listing.missing_packages("openpi"))
+    monkeypatch.setenv("OPENPI_SRC", "/src/openpi")
+    assert listing.missing_packages("openpi") is None
+    assert listing.missing_packages("lerobot") is None
+
+
+def test_no_command_prints_on_a_console_or_in_a_table_of_its_own() -> None:
+    for file in CLI.rglob("*.py"):
+        text = file.read_text()
+        if file.name != "console.py":
+            assert not re.search(r"\bConsole\(|Console\(stderr|\[bold\]|\[/\]|from_markup", text), file.name
+            for made in re.findall(r"\bTable\((.*)\)", text):  # dry_run.py, checks.py, which fold
+                assert 'overflow="fold"' in text, (file.name, made)
+
+
+def test_a_command_ends_without_looking_for_garbage_once_more() -> None:
+    """In all of Ray, for half a second."""
+    code = (
+        "import atexit, gc, sys; from vlagents_ray.cli import main; "
+        "atexit.register(lambda: print('frozen', gc.get_freeze_count() > 0)); sys.argv = ['vlagents-ray', '--help']; "
+        "main()"
+    )
+    ran = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, timeout=120)
+    assert ran.stdout.splitlines()[-1] == "frozen True"
+
+
+def test_the_commands_load_neither_ray_nor_torch_before_they_need_them() -> None:
+    code = "import sys; import vlagents_ray.cli.main; print(sorted({'ray', 'torch'} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,87 @@
+"""A command whose Ray is lost ends with one sentence and status 1, whatever it is doing."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+# A Ray whose head is lost as soon as somebody looks; `{body}` is what the command does meanwhile.
+COMMAND = """
+import atexit, sys, time, types
+sys.modules["ray"] = types.ModuleType("ray")  # not asked here, and a second to import
+import typer
+from vlagents_ray.ray_tools import head_monitor
+from vlagents_ray.cli import ray_session
+from vlagents_ray.cli.console import errors
+from vlagents_ray.errors import ClusterLost, EnvFailed
+
+class Lost:
+    node = "a node"
+    def __init__(self, cure):
+        self.cure = cure
+    def answers(self):
+        raise ClusterLost(f"the raylet has ended; {{self.cure}}")
+
+head_monitor.PERIOD_S, head_monitor.HeadMonitor, head_monitor.keep_from_printing_last_words = 0.05, Lost, lambda: None
+nodes = ["a node"]
+ray_session.node_of_this_process = lambda: nodes[0]
+ray_session._LEAVE_S, ray_session._EXIT_S = {leave_s}, 0.2
+atexit.register(time.sleep, 60)  # as Ray's farewell to a cluster that is not there
+
+def command():
+    with errors(), ray_session.exit_if_ray_is_lost("start it again") as loss:
+        {body}
+
+typer.run(command)
+"""
+
+
+@pytest.mark.parametrize(
+    ("body", "leave_s"),
+    [
+        ("time.sleep(60)", 0.2),  # a call of Ray's that does not return
+        ("loss.wait()", 30),  # `serve`
+        ("time.sleep(0.5); raise EnvFailed('workers do not start')", 30),  # what Ray says of it
+        ("Lost('start it again').answers()", 30),  # noticed by the evaluation itself
+    ],
+    ids=["stuck", "waiting", "failing", "noticing"],
+)
+def test_it_ends_with_one_sentence(body: str, leave_s: float) -> None:
+    ended = run(COMMAND.format(body=body, leave_s=leave_s))
+    assert ended.returncode == 1
+    assert ended.stderr.strip() == "error ClusterLost: the raylet has ended; start it again"
+
+
+def test_a_command_that_leaves_ray_by_itself_is_left_alone() -> None:
+    body = "nodes[0] = None; time.sleep(0.5); atexit.unregister(time.sleep)"
+    ended = run(COMMAND.format(body=body, leave_s=0.1).replace("0.05, Lost", "0.3, Lost"))
+    assert (ended.returncode, ended.stderr) == (0, "")
+
+
+@pytest.mark.parametrize("noticed", [True, False])
+def test_one_that_was_interrupted_says_so_though_the_signal_ended_ray_as_well(noticed: bool) -> None:
+    farewell = "atexit.unregister(time.sleep); atexit.register(time.sleep, 1)"
+    body = f"time.sleep({0.5 if noticed else 0}); {farewell}; raise KeyboardInterrupt"
+    ended = run(COMMAND.format(body=body, leave_s=30))
+    assert (ended.returncode, ended.stderr.strip()) == (130, "error interrupted")
+
+
+def test_a_server_that_hangs_while_it_leaves_ends_and_says_where() -> None:
+    """What Ctrl-C had begun once took for ever, and nobody knew what hung."""
+    interrupt = "import os, threading; threading.Timer(0.5, os.kill, (os.getpid(), 2)).start()"
+    body = f"{interrupt}; ray_session._END_S = 1.0; loss.wait()"
+    ended = run(COMMAND.format(body=body, leave_s=30).replace("0.05, Lost", "60, Lost"))  # Ray is well
+    assert ended.returncode == 1
+    assert "Timeout (0:00:01)!" in ended.stderr
+    assert "most recent call first" in ended.stderr
+
+
+def run(code: str) -> subprocess.CompletedProcess[str]:
+    """In a process of its own."""
+    environment = os.environ | {"COLUMNS": "200"}
+    return subprocess.run(
+        [sys.executable, "-c", code], check=False, capture_output=True, text=True, timeout=60, env=environment
+    )

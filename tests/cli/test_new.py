@@ -1,0 +1,90 @@
+"""`vlagents-ray new`: what it writes works at once, and what was there stays."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import dialect_server
+import numpy as np
+import pytest
+import yaml
+from readme_blocks import ENV, Block, run
+from serve_command import serving
+from typer.testing import CliRunner
+
+from vlagents_ray import Obs, RemoteAgent
+from vlagents_ray.cli.main import app
+from vlagents_ray.policies.noop import Noop
+
+KINDS = ["policy", "env", "dialect"]
+
+
+def new(kind: str, name: str) -> tuple[int, str]:
+    done = CliRunner().invoke(app, ["new", kind, name])
+    return done.exit_code, done.output
+
+
+@pytest.fixture(autouse=True)
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_skeleton_passes_its_own_test(kind: str, folder: Path) -> None:
+    assert new(kind, "my_own")[0] == 0
+    assert {path.name for path in folder.iterdir()} == {"my_own.py", "my_own.yaml", "test_my_own.py"}
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "test_my_own.py"]
+    done = subprocess.run(command, check=False, cwd=folder, env=ENV, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.server
+@pytest.mark.slow
+def test_a_skeleton_of_a_policy_is_served_and_one_of_an_environment_evaluated(folder: Path) -> None:
+    assert [new("policy", "my_policy")[0], new("env", "my_env")[0]] == [0, 0]
+    log = folder / "log"
+    with serving("my_policy.yaml", log, cwd=folder) as host, RemoteAgent(f"http://{host}") as agent:
+        obs = Obs({"front": np.zeros((96, 96, 3), np.uint8)}, state={"xyzrpy": np.ones(6, np.float32)})
+        agent.reset(obs, "lift the cup")
+        assert agent.act(obs).action.shape == (4,)
+        run(
+            Block("bash", 1, f"vlagents-ray eval tabletop --policy http://{host} --episodes 2 --out runs/policy"),
+            folder,
+        )
+    run(Block("bash", 1, "vlagents-ray eval my_env.yaml --video none"), folder)
+    assert (folder / "runs" / "my_env" / "results.db").is_file()
+
+
+def test_clients_of_a_skeleton_of_a_dialect_are_answered(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert new("dialect", "my_dialect")[0] == 0
+    monkeypatch.syspath_prepend(folder)
+    [application] = yaml.safe_load((folder / "my_dialect.yaml").read_text())["applications"]
+    with dialect_server.serving(Noop(), application["args"]["dialects"]) as (client, _):
+        answer = client.post("/my_dialect", json={"q": [0, 0], "task": "lift the cup"})
+        assert (answer.status_code, answer.json()) == (200, [0.0] * 7)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("there", ["mine.py", "test_mine.py", "mine.yaml"])
+def test_what_is_there_stays_and_nothing_is_written_beside_it(kind: str, there: str, folder: Path) -> None:
+    (folder / there).write_text("years of work")
+    status, said = new(kind, "mine")
+    assert (status, there in said) == (2, True)
+    assert [(path.name, path.read_text()) for path in folder.iterdir()] == [(there, "years of work")]
+
+
+@pytest.mark.parametrize("name", ["", "My", "my-policy", "../up", "a/b", "class", "1st", "numpy", "vlagents_ray"])
+def test_a_name_that_is_no_module_of_ones_own_is_refused(name: str, folder: Path) -> None:
+    status, said = new("policy", name)
+    assert (status, "NAME" in said) == (2, True)
+    assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_the_commands_to_run_next_are_said(kind: str) -> None:
+    said = new(kind, "mine")[1]
+    assert "pytest test_mine.py" in said
+    assert f"vlagents-ray {'eval' if kind == 'env' else 'serve'} mine.yaml" in said

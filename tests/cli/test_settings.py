@@ -1,0 +1,166 @@
+"""Own modules are found where the command is typed, and what is mistyped is said before anything starts."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from vlagents_ray.cli.doctor import listing
+from vlagents_ray.cli.evaluation import policies
+from vlagents_ray.cli.main import app
+from vlagents_ray.client.transports import base
+from vlagents_ray.serve.ports import free_port
+
+ROOT = Path(__file__).parents[2]
+POLICY = """
+from vlagents_ray import Act, Agent
+
+class Reach(Agent):
+    def __init__(self, gain=0.5):
+        self.gain = gain
+"""
+ENV = """
+from vlagents_ray.envs.tabletop import Tabletop
+
+class MyEnv(Tabletop):
+    pass
+"""
+# What the console script does, whose first entry of `sys.path` is its own folder and not the working directory.
+SCRIPT = """
+import sys
+sys.path[0] = sys.argv.pop(1)
+from vlagents_ray.cli import main
+main()
+"""
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "my_policies.py").write_text(POLICY)
+    (tmp_path / "my_envs.py").write_text(ENV)
+    return tmp_path
+
+
+def said_by_a_process(folder: Path, *words: str, **variables: str) -> str:
+    """What the command says, typed in that folder, that fails before anything starts."""
+    environment = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, str(ROOT), *words],
+        cwd=folder,
+        env=environment | variables,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode == 2, done.stdout + done.stderr
+    return done.stderr
+
+
+def said_by(*words: str) -> str:
+    """The same, in this process."""
+    done = CliRunner().invoke(app, words, env={"COLUMNS": "40"})
+    assert done.exit_code == 2, done.output
+    return done.stderr
+
+
+EVAL = ("--out", "runs/x", "--policy")
+
+
+@pytest.mark.parametrize(
+    ("words", "wanted"),
+    [
+        (("serve", "my_policies:Reach", "--set", "gian=1"), "it takes ['gain']; did you mean 'gain'?"),
+        (("serve", "my_policies:Reach", "--set", "gain=high"), "policy Reach: gain: got 'high', want float"),
+        (("eval", "my_envs:MyEnv", *EVAL, "my_policies:Reach", "--env-set", "width=wide"), "width: got 'wide', want "),
+        (("serve", "my_policies:Reech"), "module 'my_policies' has no class 'Reech'; did you mean 'Reach'?"),
+        (("serve", "my_polices:Reach"), "did you mean 'my_policies'?"),
+        (("serve", "scriptd"), "did you mean 'scripted'?"),
+        (("serve", "noop", "--set", "chnk=3"), "chnk: there is no such setting; want one of ['action_dim', "),
+        (("serve", "noop", "--set", "chnk=3"), "did you mean 'chunk'?"),
+        (("serve", "noop", "--serve-set", "batch.maxsize=3"), "batch.maxsize: there is no such setting"),
+        (("serve", "noop", "--serve-set", "batch.maxsize=3"), "did you mean 'max_size'?"),
+        (("serve", "noop", "--serve-set", "wrapers=[arro]"), "did you mean 'wrappers'?"),
+        (("eval", "my_envs:MyEnv", *EVAL, "my_policies:Reach", "--set", "gian=1"), "did you mean 'gain'?"),
+        (("eval", "my_envs:MyEnv", *EVAL, "my_policies:Reach", "--env-set", "widht=9"), "did you mean 'width'?"),
+        (("eval", "tabletop/lft", *EVAL, "scripted"), "tabletop has no task 'lft': want one of "),
+        (("eval", "tabletop/lft", *EVAL, "scripted"), "did you mean 'lift'?"),
+        (("eval", "libero/libero_spatail/1", *EVAL, "scripted"), "did you mean 'libero_spatial'?"),
+        (("eval", "libero/libero_spatial/12", *EVAL, "scripted"), "has no task '12': want 0 to 9, or a name"),
+        (("eval", "tabeltop", *EVAL, "scripted"), "did you mean 'tabletop'?"),
+        (
+            ("eval", "tabletop", *EVAL, "scripted", "--worker-gpus", "0.5"),
+            "a worker wants 0.5 GPUs, this",
+        ),
+        (("eval", "tabletop", *EVAL, "scripted", "--video", "alll"), "video: Input should be 'none', "),
+    ],
+)
+def test_what_is_wrong_is_said_at_once_in_one_line_and_with_what_was_meant(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...], wanted: str
+) -> None:
+    monkeypatch.chdir(folder)
+    monkeypatch.syspath_prepend(folder)
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "")
+    for name in ("my_policies", "my_envs"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    said = said_by(*words)
+    assert wanted in said
+    assert said.count("\n") == 1
+    assert not (folder / "runs").exists()
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("serve", "lerobot", "--set", "checkpoint=weights"),
+        ("eval", "tabletop", *EVAL, "lerobot", "--set", "checkpoint=weights"),
+        ("eval", "tabletop", *EVAL, "lerobot", "--set", "checkpoint=weights/{step}", "--watch", "weights"),
+    ],
+)
+def test_a_family_whose_packages_are_missing_is_said_before_anything_starts_or_is_waited_for(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, words: tuple[str, ...]
+) -> None:
+    monkeypatch.chdir(folder)
+    monkeypatch.setitem(listing._NEEDS, "lerobot", (("no_such_package",), (), "hf.txt"))
+    monkeypatch.setattr(policies, "running_server", lambda *_, **__: pytest.fail("a server was started"))
+    done = CliRunner().invoke(app, words)
+    assert "policy 'lerobot': not in this environment (no_such_package): `vlagents-ray env make " in done.stderr
+    assert done.exit_code == 1
+    assert not (folder / "runs").exists()
+
+
+def test_modules_are_found_in_the_folder_where_a_command_is_typed(folder: Path) -> None:
+    words = ("eval", "my_envs:MyEnv", *EVAL, "my_policies:Reach", "--set", "gian=1")
+    assert "policy Reach: got an unexpected keyword argument 'gian'" in said_by_a_process(folder, *words)
+
+
+def test_a_module_that_is_nowhere_is_looked_for_in_the_working_directory_which_is_named(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(folder)
+    said = said_by("serve", "elsewhere:Policy")
+    assert f"no module 'elsewhere' is installed, or lies in the working directory {folder}; go to its folder" in said
+
+
+@pytest.mark.skipif(sys.version_info < (3, 11), reason="Python 3.10 does not know PYTHONSAFEPATH")
+def test_python_is_kept_from_the_working_directory_by_its_own_variable(folder: Path) -> None:
+    assert "no module 'my_policies'" in said_by_a_process(folder, "serve", "my_policies:Reach", PYTHONSAFEPATH="1")
+
+
+def test_a_url_where_nothing_answers_is_told_once_and_waited_for(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(base, "_SILENT_S", 0.0)
+    monkeypatch.setattr(policies, "_STARTING_S", 0.2)
+    url = f"http://127.0.0.1:{free_port()}"
+    done = CliRunner().invoke(app, ["eval", "tabletop", "--out", "runs/x", "--policy", url])
+    assert done.exit_code == 1
+    [warned] = caplog.messages
+    assert warned.startswith(f"{url}: not ready; trying again for up to 0 s (")
+    assert "is it running?" in warned
+    assert done.stderr.startswith(f"error PolicyUnavailable: {url}: not ready within 0.2 s")

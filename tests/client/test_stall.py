@@ -1,0 +1,162 @@
+"""A policy that stalls, and where the robot goes on afterwards. Time is counted in ticks; no clock is read."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from in_process_replicas import Replicas
+
+from vlagents_ray import Act, ActionSpec, Agent, ChunkPlayer, Contract, Obs, StateSpec
+from vlagents_ray.evaluate.episode.latency import ChunkExecutor
+from vlagents_ray.evaluate.plan.config import ClockConfig
+from vlagents_ray.robot import Guard
+
+HZ = 50
+ROWS = 20
+ANSWER = 5  # ticks that an answer takes
+STALLS = [30, 150]  # ticks: 0.6 s and 3 s
+GOAL, GAIN = 3.0, 0.004  # the way to the goal that is made in a tick
+
+
+class Approaching(Agent):
+    """Plans the way to the goal from where it sees the robot: each row a little shorter than the one before."""
+
+    def __init__(self, delta: bool) -> None:
+        self.delta = delta
+
+    @property
+    def contract(self) -> Contract:
+        return Contract(state={"joints": StateSpec(1)}, action=ActionSpec(dim=1, delta=self.delta), chunk=ROWS)
+
+    def act(self, obs: Obs) -> Act:
+        left = (GOAL - float(obs.state["joints"][0])) * (1 - GAIN) ** np.arange(ROWS + 1)
+        return Act((left[:-1] - left[1:] if self.delta else GOAL - left[1:]).astype(np.float32)[:, np.newaxis])
+
+
+class Delayed(Agent):
+    """Between a player and its policy: an answer comes when the test lets it."""
+
+    def __init__(self, agent: Agent) -> None:
+        self.agent = agent
+        self.asked = 0
+        self.called, self.gate = threading.Semaphore(0), threading.Semaphore(0)
+
+    @property
+    def contract(self) -> Contract | None:
+        return self.agent.contract
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        return self.agent.reset(obs, instruction)
+
+    def act(self, obs: Obs) -> Act:
+        self.asked += 1
+        if self.asked > 1:  # the first is what `reset` waits for
+            self.called.release()
+            assert self.gate.acquire(timeout=60)
+        return self.agent.act(obs)
+
+    def close(self) -> None:
+        self.agent.close()
+
+
+class Run(NamedTuple):
+    at: np.ndarray  # (T,) where the robot was at each tick
+    moved: np.ndarray  # (T,) and how far it went
+    fresh: int  # tick at which the stalled answer came
+
+
+def drive(
+    agent: Agent, delta: bool, stall: int, check: Guard | None, stalled: Callable[[], None] = lambda: None
+) -> Run:
+    """The robot goes exactly where it is commanded. The sixth answer takes `stall` ticks, all others `ANSWER`."""
+    delayed = Delayed(agent)
+    at: list[float] = []
+    moved: list[float] = []
+    position, fresh = 0.0, 0
+    due: int | None = None  # tick at which the request under way is answered
+    with ChunkPlayer(delayed, mode="async", check=check) as player:
+        see = lambda: Obs(state={"joints": np.array([position], np.float32)})  # noqa: E731
+        player.reset(see(), "go")
+        asker = player._asker
+        assert asker is not None
+        for tick in range(60 + 2 * stall):
+            if tick == due:
+                delayed.gate.release()
+                with asker._changed:
+                    assert asker._changed.wait_for(lambda: asker._job is None, 60)
+                due, fresh = None, tick if delayed.asked == 6 else fresh
+            act = player.act(see())
+            if due is None and not asker.idle:
+                assert delayed.called.acquire(timeout=60)
+                due = tick + (stall if delayed.asked == 6 else ANSWER)
+                if delayed.asked == 6:
+                    stalled()
+            step = float(act.action[0]) - (0.0 if delta else position)
+            at.append(position)
+            moved.append(step)
+            position += step
+        delayed.gate.release(1000)
+    return Run(np.array(at), np.array(moved), fresh)
+
+
+def evaluated(agent: Agent, delta: bool, stall: int) -> Run:
+    """The same in a real-time evaluation, which asks when a part of the chunk is left."""
+    contract = Contract(action=ActionSpec(dim=1, delta=delta), control_hz=HZ)
+    player = ChunkExecutor(ROWS - ANSWER, ClockConfig(latency=0.1, neutral=[0.0]), contract)
+    at: list[float] = []
+    moved: list[float] = []
+    position, fresh = 0.0, 0
+    for answer in range(20):
+        rows = agent.act(Obs(state={"joints": np.array([position], np.float32)})).action
+        ticks = stall if answer == 6 else ANSWER
+        fresh = len(at) + stall if answer == 6 else fresh
+        for tick in player.ticks(rows, ticks / HZ):
+            step = float(tick.action[0]) - (0.0 if delta else position)
+            at.append(position)
+            moved.append(step)
+            position += step
+    return Run(np.array(at), np.array(moved), fresh)
+
+
+def check_recovery(run: Run, stall: int) -> None:
+    wanted = GAIN * (GOAL - run.at)  # of the policy, where the robot is
+    still = np.abs(run.moved) < 1e-5
+    assert still.sum() >= stall - ROWS  # it did stall
+    # Not a tick's action is for another place than that at which the robot was: neither a jump, nor a part left out.
+    assert run.moved[~still] == pytest.approx(wanted[~still], rel=1e-2)
+    normal = np.abs(run.moved[: run.fresh - stall]).max()
+    assert np.abs(run.moved[run.fresh :]).max() <= 1.5 * normal
+    resumed = run.fresh + int(np.argmin(still[run.fresh :]))
+    assert not still[resumed]
+    assert (resumed - run.fresh) / HZ <= 0.5
+    assert still[resumed:].mean() < 0.1  # and goes on moving
+
+
+@pytest.mark.parametrize("guarded", [False, True])
+@pytest.mark.parametrize("delta", [False, True])
+@pytest.mark.parametrize("stall", STALLS)
+def test_after_a_stall_the_robot_goes_on_from_where_it_is(stall: int, delta: bool, guarded: bool) -> None:
+    agent = Approaching(delta)
+    guard = Guard(agent.contract, max_step=1.5 * GAIN * GOAL) if guarded else None
+    check_recovery(drive(agent, delta, stall, guard), stall)
+
+
+@pytest.mark.parametrize("guarded", [False, True])
+@pytest.mark.parametrize("delta", [False, True])
+@pytest.mark.parametrize("stall", STALLS)
+def test_after_a_replica_was_killed_the_robot_goes_on_from_where_it_is(stall: int, delta: bool, guarded: bool) -> None:
+    served = Replicas([Approaching(delta), Approaching(delta)])
+    agent = served.agent()
+    guard = Guard(agent.contract, max_step=1.5 * GAIN * GOAL) if guarded else None
+    check_recovery(drive(agent, delta, stall, guard, lambda: served.dead.add(0)), stall)
+    served.close()
+
+
+@pytest.mark.parametrize("delta", [False, True])
+@pytest.mark.parametrize("stall", STALLS)
+def test_a_real_time_evaluation_goes_on_in_the_same_way(stall: int, delta: bool) -> None:
+    check_recovery(evaluated(Approaching(delta), delta, stall), stall)

@@ -1,0 +1,186 @@
+"""The link is measured, and what is fastest over it is chosen: on a simulated link, loopback and shaped ones."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import network_links
+import numpy as np
+import pytest
+from camera_images import photograph, rendered
+
+from vlagents_ray import Obs, RemoteAgent
+from vlagents_ray.client.transports.codec_selection import (
+    CodecChoice,
+    LinkSpeed,
+    fastest,
+    measure,
+)
+from vlagents_ray.client.transports.select import TransportName
+from vlagents_ray.errors import MessageTooLarge, TooManyRequests
+from vlagents_ray.images.codecs import JPEG, LOSSLESS, RAW
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS
+
+pytestmark = pytest.mark.alone
+
+OBS = Obs({"front": photograph(seed=1), "wrist": photograph(seed=2)})
+CAMERAS = list(OBS.cameras.values())
+FLAT = Obs({"front": rendered(), "wrist": rendered()})  # PNG makes it many times smaller
+CANDIDATES = (JPEG, LOSSLESS, RAW)
+
+
+class Simulated:
+    """A link of a given speed, with a clock of its own; the first bytes of each message may pass at once."""
+
+    def __init__(self, round_trip_s: float, bandwidth: float, burst: int = 0, limit: float = float("inf")) -> None:
+        self._link = LinkSpeed(round_trip_s, bandwidth)
+        self._burst = burst
+        self._limit = limit
+        self.now = 0.0
+        self.carried = 0
+
+    def send(self, message: bytes) -> None:
+        if len(message) > self._limit:
+            raise MessageTooLarge("too large")
+        self.carried += len(message)
+        self.now += self._link.seconds(max(0, len(message) - self._burst))
+
+
+@pytest.mark.parametrize("bandwidth", [1e5, 1.25e6, 12.5e6, 125e6])
+@pytest.mark.parametrize("round_trip_s", [2e-4, 5e-3, 0.1])
+def test_bandwidth_is_found_in_bounded_time(round_trip_s: float, bandwidth: float) -> None:
+    link = Simulated(round_trip_s, bandwidth)
+    found = measure(link.send, lambda: link.now)
+    assert found.round_trip_s == pytest.approx(round_trip_s, rel=0.5)  # a few bytes take their time on a slow link
+    assert found.bandwidth == pytest.approx(bandwidth, rel=0.1)
+    one_probe_s = 16_384 / bandwidth + round_trip_s
+    assert link.now < 0.15 + 12 * round_trip_s + one_probe_s
+
+
+def test_a_key_whose_rate_is_too_low_to_measure_by_costs_no_request() -> None:
+    waited_s: list[float] = []
+    for allowed in (0, 7):
+        sent: list[bytes] = []
+
+        def send(message: bytes, allowed: int = allowed, sent: list[bytes] = sent) -> None:
+            sent.append(message)
+            if len(sent) > allowed:
+                error = TooManyRequests("too fast")
+                error.retry_after_s = 0.01
+                raise error
+
+        choice = CodecChoice("auto")
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("vlagents_ray.client.transports.codec_selection.time.sleep", waited_s.append)
+            assert choice.codec_for(OBS, send) == JPEG
+            assert choice.codec_for(OBS, send) == JPEG  # without another probe
+        assert len(sent) == allowed + 1
+    assert waited_s == [0.01] * 2
+
+
+def test_a_slow_link_carries_few_bytes() -> None:
+    link = Simulated(0.02, 1.25e5)  # 1 Mbit/s
+    measure(link.send, lambda: link.now)
+    assert link.carried < 40_000
+
+
+def test_a_burst_that_passes_at_once_does_not_hide_the_bandwidth() -> None:
+    link = Simulated(2e-4, 12.5e6, burst=64 * 1024)
+    assert measure(link.send, lambda: link.now).bandwidth == pytest.approx(12.5e6, rel=0.5)
+
+
+def test_a_server_that_takes_little_is_measured_with_little() -> None:
+    link = Simulated(2e-4, 125e6, limit=100_000)
+    assert measure(link.send, lambda: link.now).bandwidth == pytest.approx(125e6, rel=0.2)
+
+
+@pytest.mark.parametrize(
+    ("bandwidth", "auto", "exact"),
+    [(1.25e6, JPEG, LOSSLESS), (12.5e6, JPEG, LOSSLESS), (1e11, RAW, RAW)],
+)
+def test_what_is_fastest_over_the_link_is_chosen(bandwidth: float, auto: object, exact: object) -> None:
+    link = Simulated(2e-4, bandwidth)
+    found = LinkSpeed(2e-4, bandwidth)
+    assert fastest(CAMERAS, CANDIDATES, found, link.send) == auto
+    assert fastest(CAMERAS, CANDIDATES[1:], found, link.send) == exact
+
+
+def test_a_message_over_the_limit_is_never_chosen() -> None:
+    link = Simulated(2e-4, 1e11)
+    assert fastest(CAMERAS, CANDIDATES, LinkSpeed(2e-4, 1e11), link.send, most_bytes=250_000) == JPEG
+    strict = Simulated(2e-4, 1e11, limit=250_000)
+    assert fastest(CAMERAS, CANDIDATES, LinkSpeed(2e-4, 1e11), strict.send) == JPEG
+
+
+def test_images_beyond_the_default_limits_are_left_to_the_server() -> None:
+    """Its `limits` may be higher; the client does not know them."""
+    huge = [np.zeros((2400, 8200, 3), np.uint8)]
+    link = Simulated(2e-4, 1.25e6)
+    assert huge[0].size > 3 * DEFAULT_LIMITS.pixels
+    assert fastest(huge, CANDIDATES, LinkSpeed(2e-4, 1.25e6), link.send) != RAW
+
+
+def test_the_choice_stands_until_images_change_much_or_the_connection_is_new() -> None:
+    sent: list[bytes] = []
+    choice = CodecChoice("auto")
+    choice.codec_for(OBS, sent.append)
+    chosen, once = choice.link, len(sent)
+    assert once > 0
+    choice.codec_for(Obs({"front": OBS.cameras["front"][:, :160], "wrist": OBS.cameras["wrist"]}), sent.append)
+    choice.codec_for(Obs(state={"joints": np.zeros(7)}), sent.append)
+    choice.codec_for(None, sent.append)
+    assert len(sent) == once
+    choice.codec_for(Obs({"front": photograph(480, 640)}), sent.append)
+    assert len(sent) > once
+    assert choice.link is chosen
+    choice.forget()
+    assert (choice.link, choice.codec) == (None, None)
+
+
+@pytest.fixture(scope="module")
+def near() -> Iterator[str]:
+    with network_links.loopback() as url:
+        yield url
+
+
+@pytest.mark.parametrize("transport", ["websocket", "http"])
+def test_loopback_gets_raw_pixels(near: str, transport: TransportName) -> None:
+    with RemoteAgent(near, transport=transport) as agent:
+        assert agent.codec is None
+        assert network_links.measure_until(agent, OBS, lambda: agent.codec == RAW), agent.link
+        agent.act(OBS)
+
+
+@pytest.mark.parametrize("transport", ["websocket", "http"])
+@pytest.mark.parametrize("rate", ["1gbit", "100mbit"])
+def test_a_network_gets_jpeg_unless_pixels_must_arrive_as_they_are(rate: str, transport: TransportName) -> None:
+    bits = {"1gbit": 1e9, "100mbit": 1e8}[rate]
+    with network_links.shaped(rate) as url:
+        with RemoteAgent(url, transport=transport) as agent:
+
+            def is_right() -> bool:  # a busy machine does not fill a fast link
+                return agent.link is not None and 0.3 < agent.link.bandwidth * 8 / bits < 1.5 and agent.codec == JPEG
+
+            assert network_links.measure_until(agent, OBS, is_right), agent.link
+        with RemoteAgent(url, transport=transport, codec="exact") as agent:
+            right = (LOSSLESS,) if rate == "100mbit" else (LOSSLESS, RAW)
+            assert network_links.measure_until(agent, FLAT, lambda: agent.codec in right), agent.link
+
+
+def test_the_choice_is_the_fastest_of_all_over_a_true_link() -> None:
+    with network_links.shaped("100mbit") as url, RemoteAgent(url, transport="websocket") as chooser:
+        chooser.reset(OBS, "look")
+        taken: dict[str, list[float]] = {"raw": [], "lossless": [], "jpeg": []}
+        agents = {codec: RemoteAgent(url, transport="websocket", codec=codec) for codec in taken}
+        for agent in agents.values():
+            agent.reset(OBS, "look")
+        for _ in range(9):
+            for codec, agent in agents.items():
+                begun = time.perf_counter()
+                agent.act(OBS)
+                taken[codec].append(time.perf_counter() - begun)
+        for agent in agents.values():
+            agent.close()
+        assert chooser.codec is not None
+        assert chooser.codec.name == min(taken, key=lambda codec: np.median(taken[codec]))

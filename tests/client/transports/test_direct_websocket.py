@@ -1,0 +1,144 @@
+"""A connection that its server ends politely, as RFC 6455 has it: a last message, and then the line."""
+
+from __future__ import annotations
+
+import logging
+import socket
+import threading
+from collections.abc import Iterator
+from http import HTTPStatus
+from urllib.parse import SplitResult, urlsplit
+
+import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.http11 import Request, Response
+from websockets.server import ServerProtocol
+from websockets.sync.server import ServerConnection, serve
+
+from vlagents_ray.client.credentials import Credentials
+from vlagents_ray.client.transports import websocket
+from vlagents_ray.client.transports.base import first_timeout_s
+from vlagents_ray.client.transports.codec_selection import CodecChoice
+from vlagents_ray.client.transports.direct_websocket import Stream
+from vlagents_ray.client.transports.websocket import ProxiedSocket, WebSocketTransport
+from vlagents_ray.errors import PolicyUnavailable
+
+
+@pytest.fixture
+def base() -> Iterator[SplitResult]:
+    def answer_and_close(connection: ServerConnection) -> None:
+        if connection.recv() == b"answer first":
+            connection.send(b"answered")
+        connection.close()
+
+    with serve(answer_and_close, "127.0.0.1", 0) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        yield urlsplit(f"http://127.0.0.1:{server.socket.getsockname()[1]}")
+        server.shutdown()
+        thread.join()
+
+
+@pytest.fixture
+def stream(base: SplitResult) -> Iterator[Stream]:
+    assert base.port is not None
+    stream = Stream(base, base.port, "/", 5)
+    yield stream
+    stream.close()
+
+
+def test_a_server_that_closes_in_place_of_an_answer_is_a_connection_that_is_gone(stream: Stream) -> None:
+    stream.send(b"nothing", 5)
+    with pytest.raises((ConnectionClosed, OSError), match="1000"):
+        stream.recv(30)
+
+
+def test_a_server_that_closes_after_an_answer_is_noticed_by_the_next_request(stream: Stream) -> None:
+    stream.send(b"answer first", 5)
+    assert stream.recv(30) == b"answered"
+    with pytest.raises((ConnectionClosed, OSError)):  # noqa: PT012 - by whichever hears of it
+        stream.send(b"answer first", 5)
+        stream.recv(30)
+
+
+def test_the_key_is_in_no_log(base: SplitResult, caplog: pytest.LogCaptureFixture) -> None:
+    credentials = Credentials("the-secret-key")
+    assert base.port is not None
+    with caplog.at_level(logging.DEBUG):
+        Stream(base, base.port, "/", 5, credentials.headers).close()
+        ProxiedSocket(f"ws://127.0.0.1:{base.port}/", credentials, 5).close()
+    client = [record.getMessage() for record in caplog.records if not record.name.startswith("websockets.server")]
+    assert "> Sec-WebSocket-Version: 13" in client  # the others are logged
+    assert not [line for line in client if "the-secret-key" in line]
+
+
+def test_a_proxy_that_takes_nothing_does_not_hold_up_the_sender() -> None:
+    def shake_hands() -> None:
+        connection, _ = listener.accept()
+        with connection:
+            protocol = ServerProtocol()
+            protocol.receive_data(connection.recv(65536))
+            [request] = protocol.events_received()
+            assert isinstance(request, Request)
+            protocol.send_response(protocol.accept(request))
+            connection.sendall(b"".join(protocol.data_to_send()))
+            given_up.wait(30)
+
+    given_up = threading.Event()
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        thread = threading.Thread(target=shake_hands)
+        thread.start()
+        proxied = ProxiedSocket(f"ws://127.0.0.1:{listener.getsockname()[1]}/", Credentials(""), 5)
+        with pytest.raises((ConnectionClosed, OSError)):
+            proxied.send(bytes(32 * 1024 * 1024), 0.2)
+        in_time = not given_up.is_set() and thread.is_alive()
+        given_up.set()
+        thread.join()
+        proxied.close()
+    assert in_time  # not because the other side ended
+
+
+@pytest.mark.parametrize(("statuses", "accepted"), [([408, 503], True), ([404], False)])
+def test_a_proxy_that_waits_for_a_replica_is_asked_again_and_no_other_refusal_is(
+    statuses: list[int], accepted: bool
+) -> None:
+    left = list(statuses)
+
+    def refuse(connection: ServerConnection, request: Request) -> Response | None:
+        return connection.respond(HTTPStatus(left.pop(0)), "not now\n") if left else None
+
+    with serve(lambda connection: connection.close(), "127.0.0.1", 0, process_request=refuse) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        transport = WebSocketTransport(f"ws://127.0.0.1:{server.socket.getsockname()[1]}", CodecChoice("raw"))
+        try:
+            if accepted:
+                transport._proxied(10).close()
+            else:
+                with pytest.raises(PolicyUnavailable, match="404"):
+                    transport._proxied(10)
+        finally:
+            server.shutdown()
+            thread.join()
+    assert not left
+
+
+def test_a_proxy_that_says_nothing_is_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It may have chosen a replica that hangs. All of a `reset`'s minute went to that."""
+    waited: list[float] = []
+
+    def proxied(url: str, credentials: Credentials, timeout_s: float) -> str:
+        waited.append(timeout_s)
+        if len(waited) < 3:
+            raise TimeoutError("timed out while waiting for handshake response")
+        return "connected"
+
+    monkeypatch.setattr(websocket, "ProxiedSocket", proxied)
+    monkeypatch.setattr(websocket, "_PAUSE_S", 0.0)
+    transport = WebSocketTransport("http://127.0.0.1:1", CodecChoice("raw"))
+    assert transport._stream(60.0) == "connected"  # type: ignore[comparison-overlap]
+    first = first_timeout_s(60)
+    assert waited == [first, 2 * first, 4 * first]
+    waited.clear()
+    with pytest.raises(PolicyUnavailable):
+        WebSocketTransport("http://127.0.0.1:1", CodecChoice("raw"))._stream(0.0)

@@ -1,0 +1,104 @@
+"""What a Ray that broke makes of a call through a Serve handle: an infrastructure failure, never the policy's."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import ray
+from ray import serve
+from ray.exceptions import ActorDiedError, LocalRayletDiedError, ObjectStoreFullError, OutOfDiskError, RayTaskError
+
+from vlagents_ray.client.transports import serve_handle
+from vlagents_ray.client.transports.base import first_timeout_s
+from vlagents_ray.client.transports.serve_handle import HandleTransport
+from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable
+from vlagents_ray.interface import Obs
+from vlagents_ray.protocol.messages import Request
+
+REQUEST = Request("act", Obs(gripper=1.0), session="s", request_id="r")
+
+
+def failing(error: Exception) -> Any:
+    def fail(*_: object, **__: object) -> None:
+        raise error
+
+    return fail
+
+
+@pytest.mark.parametrize("error", [ObjectStoreFullError("full"), OutOfDiskError("full")])
+def test_a_frame_that_neither_store_nor_disk_has_room_for_is_not_sent(
+    monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    monkeypatch.setattr(ray, "put", failing(error))
+    with pytest.raises(PolicyUnavailable, match=r"\d+ bytes cannot be sent") as raised:
+        HandleTransport("app").call([REQUEST], 1)
+    assert not isinstance(raised.value, ConnectionLost), "that would say that it may have been executed"
+
+
+@pytest.mark.parametrize("error", [ActorDiedError(), LocalRayletDiedError()])
+def test_an_answer_that_is_lost_with_its_node_is_a_lost_connection(
+    monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    monkeypatch.setattr(ray, "put", lambda _: None)
+    monkeypatch.setattr(serve_handle, "call_replica", lambda *_, **__: None)
+    monkeypatch.setattr(ray, "get", failing(error))
+    with pytest.raises(ConnectionLost, match=f"replica is gone \\({type(error).__name__}\\)"):
+        HandleTransport("app").call([REQUEST], 1)
+
+
+def test_a_replica_that_fails_says_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ray, "put", lambda _: None)
+    monkeypatch.setattr(serve_handle, "call_replica", lambda *_, **__: None)
+    monkeypatch.setattr(ray, "get", failing(RayTaskError("call", "its traceback", ValueError("no such layout"))))
+    with pytest.raises(ConnectionLost, match="the replica failed: no such layout"):
+        HandleTransport("app").call([REQUEST], 1)
+
+
+class TestConnecting:
+    @pytest.fixture(autouse=True)
+    def in_a_cluster(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(ray, "is_initialized", lambda: True)
+
+    def test_another_replica_is_chosen_in_place_of_one_that_is_gone(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        answers: Iterator[Any] = iter([ConnectionLost("gone"), ConnectionLost("gone"), {"policy": "p"}])
+
+        def attach(self: HandleTransport, timeout_s: float) -> Any:
+            answer = next(answers)
+            if isinstance(answer, Exception):
+                raise answer
+            return answer
+
+        monkeypatch.setattr(HandleTransport, "_attach", attach)
+        assert HandleTransport("app").connect(30) == {"policy": "p"}
+
+    def test_where_all_are_gone_the_time_limit_holds(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(HandleTransport, "_attach", failing(ConnectionLost("gone")))
+        with pytest.raises(PolicyUnavailable, match="gone"):
+            HandleTransport("app").connect(0.5)
+
+    def test_one_that_hangs_is_not_waited_for_while_another_may_answer(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        """`reset` connects with `connect_timeout_s`, a minute: all of it went to the replica that was chosen first."""
+        waited: list[float] = []
+        cancelled: list[bool] = []
+
+        def result(timeout_s: float) -> Any:
+            waited.append(timeout_s)
+            if len(waited) < 3:
+                raise TimeoutError
+            return {"policy": "p"}, "replica"
+
+        attaching = SimpleNamespace(result=result, cancel=lambda: cancelled.append(True))
+        attach = SimpleNamespace(remote=lambda *_: attaching)
+        monkeypatch.setattr(serve, "get_app_handle", lambda _: SimpleNamespace(attach=attach))
+        assert HandleTransport("app").connect(60) == {"policy": "p"}
+        first = first_timeout_s(60)
+        assert waited == [first, 2 * first, 4 * first]
+        assert len(cancelled) == 2, "asked on, of a replica whose answer nobody wants"
+
+    def test_where_all_hang_the_time_limit_holds(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(HandleTransport, "_attach", failing(DeadlineExceeded("no answer")))
+        with pytest.raises(PolicyUnavailable, match="no replica within 0"):
+            HandleTransport("app").connect(0.0)

@@ -1,0 +1,141 @@
+"""What is kept of an episode, and where it lies."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+from eval_fakes import LINE
+from in_process_evaluation import play
+
+from vlagents_ray.errors import ConfigError, EnvFailed
+from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.evaluate.artifacts.recorder import Recording
+from vlagents_ray.evaluate.artifacts.trajectory import Trajectory, TrajectoryRecorder, videos_of
+from vlagents_ray.evaluate.artifacts.video import VideoRecorder
+from vlagents_ray.interface import HIGH_RES, Obs
+
+Config = Callable[..., EvalConfig]
+CAMERA = {"camera": [32, 32]}
+
+
+def test_a_trajectory_is_what_was_seen_and_done(config: Config) -> None:
+    results = play(config(episodes=4, record="all", env_options=CAMERA))
+    for episode in results.cells[0].episodes:
+        result = episode.result
+        path = results.out / str(episode.trajectory)
+        found = Trajectory.load(path)
+        assert found.actions.shape == (result.steps, 1)
+        assert found.rewards.sum() == pytest.approx(result.episode_return)
+        assert bool(found.success[-1]) == result.success_at_end
+        assert bool(found.success.any()) == result.success_once
+        moves = np.clip(found.actions, -1, 1)
+        assert np.diff(found.state["position"], axis=0) == pytest.approx(moves, abs=1e-5)
+        assert hashlib.sha256(found.actions.tobytes()).hexdigest() == result.actions_sha256
+        with av.open(str(videos_of(path, ["front"])["front"])) as video:
+            assert sum(1 for _ in video.decode(video=0)) == result.steps + 1
+
+
+@pytest.mark.parametrize(("record", "kept"), [("none", [False] * 2), ("failures", [True, False]), ("all", [True] * 2)])
+def test_trajectories_are_kept_of_the_episodes_that_are_wanted(config: Config, record: str, kept: list[bool]) -> None:
+    results = play(config(episodes=12, record=record))
+    found = {bool(one.result.success_once): one.trajectory is not None for one in results.cells[0].episodes}
+    assert [found[False], found[True]] == kept
+    stored = {str(path.relative_to(results.out)) for path in results.out.rglob("*.npz")}
+    assert stored == {one.trajectory for one in results.cells[0].episodes} - {None}
+
+
+def test_a_checkpoint_of_a_sweep_has_not_the_files_of_a_policy_named_almost_like_it(config: Config) -> None:
+    settings = config(episodes=1, record="all", policy="pi0", steps=[2])
+    other = settings.policies[0].model_copy(update={"name": "pi0_2", "steps": []})
+    results = play(settings.model_copy(update={"policies": [*settings.policies, other]}))
+    paths = [episode.trajectory for cell in results.cells for episode in cell.episodes]
+    assert len(set(paths)) == 2
+
+
+def test_a_video_that_is_also_the_trajectorys_is_there_once(config: Config) -> None:
+    results = play(config(episodes=1, record="all", video="all", env_options=CAMERA))
+    [episode] = results.cells[0].episodes
+    paths = results.out / episode.videos[0], videos_of(results.out / str(episode.trajectory), ["front"])["front"]
+    assert os.path.samefile(*paths)
+
+
+def test_a_trajectory_has_what_the_policy_saw_and_a_video_the_view_for_people(config: Config) -> None:
+    obs = Obs({"front": np.zeros((32, 32, 3), np.uint8)}, info={HIGH_RES: {"front": np.zeros((64, 64, 3), np.uint8)}})
+    with VideoRecorder(seen=True) as recorder:
+        recorder.add(obs)
+        footage = recorder.finish()
+    assert (height(footage.shown["front"]), height(footage.seen["front"])) == (64, 32)
+
+
+def height(video: bytes) -> int:
+    with av.open(io.BytesIO(video)) as container:
+        return container.streams.video[0].height
+
+
+def test_nothing_is_encoded_or_collected_unless_it_is_asked_for(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*args: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(VideoRecorder, "add", fail)
+    monkeypatch.setattr(TrajectoryRecorder, "add_observation", fail)
+    with Recording(config(video="none", record="none"), 10.0) as recording:
+        recording.add_observation(Obs(state={"position": np.zeros(1, np.float32)}))
+        assert not recording.wants_images
+
+
+def test_an_observation_that_lacks_a_part_of_the_state_is_the_simulators_failure() -> None:
+    recorder = TrajectoryRecorder()
+    recorder.add_observation(Obs(state={"joints": np.zeros(7, np.float32)}))
+    with pytest.raises(EnvFailed, match=r"'joints': \(6,\).*want.*'joints': \(7,\)"):
+        recorder.add_observation(Obs(state={"joints": np.zeros(6, np.float32)}))
+
+
+def test_states_of_several_arms_and_a_gripper_survive_the_file(tmp_path: Path) -> None:
+    recorder = TrajectoryRecorder()
+    for i in range(3):
+        parts = {"left/joints": np.full(7, i, np.float32), "right/joints": np.full(6, -i, np.float32)}
+        recorder.add_observation(Obs(gripper=i / 2, state=parts))
+        if i < 2:
+            recorder.add_action(np.full(13, i, np.float32), 0.5, i == 1)
+    (tmp_path / "a.npz").write_bytes(recorder.finish().to_bytes())
+    found = Trajectory.load(tmp_path / "a.npz")
+    assert {part: values.shape for part, values in found.state.items()} == {
+        "left/joints": (3, 7),
+        "right/joints": (3, 6),
+    }
+    assert found.gripper is not None
+    assert found.gripper.tolist() == [0, 0.5, 1]
+    assert found.success.tolist() == [False, True]
+    assert found.cameras == ()
+
+
+def test_a_trajectory_that_is_gone_is_said_to_be(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"a\.npz: got no file, want the one that results\.db names"):
+        Trajectory.load(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"{}"])
+def test_a_file_that_is_no_trajectory_is_said_to_be_none(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "a.npz"
+    path.write_bytes(content)
+    with pytest.raises(ConfigError, match=r"a\.npz: cannot be read as a trajectory"):
+        Trajectory.load(path)
+
+
+def test_a_repeated_episode_replaces_its_trajectory(config: Config) -> None:
+    settings = config(episodes=1, record="all", envs=[LINE], env_options=CAMERA)
+    folder = settings.out / "trajectories" / "policy" / "eval_fakes_Line"
+    folder.mkdir(parents=True)
+    for left in ("ep0000_seed0_side.mp4", "ep0000_seed0.npz.part"):
+        (folder / left).write_bytes(b"of an attempt that died")
+    play(settings)
+    assert sorted(path.name for path in folder.iterdir()) == ["ep0000_seed0.npz", "ep0000_seed0_front.mp4"]

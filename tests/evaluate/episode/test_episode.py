@@ -1,0 +1,406 @@
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from eval_fakes import Line, ToZero
+
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.envs import EvalEnv
+from vlagents_ray.errors import (
+    ConnectionLost,
+    EnvFailed,
+    InvalidAction,
+    NotReset,
+    PolicyFailed,
+    PolicyUnavailable,
+    UnknownSession,
+    VLAgentsError,
+)
+from vlagents_ray.evaluate.episode.episode import run_episode
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey
+from vlagents_ray.interface import HIGH_RES, Act, Agent, Obs
+
+KEY = EpisodeKey("script", 3, 11, "0")
+
+
+class Script(EvalEnv):
+    """Succeeds in the states whose numbers are in `solved`; keeps the actions it was given."""
+
+    max_steps = 6
+
+    def __init__(self, solved: tuple[int, ...] = (), terminates_at: int | None = None, obs: Obs | None = None) -> None:
+        self.solved, self.terminates_at = solved, terminates_at
+        self.obs = obs or Obs()
+        self.actions: list[list[float]] = []
+        self.resets: list[tuple[int, Mapping[str, Any] | None]] = []
+
+    @property
+    def contract(self) -> Contract:
+        return Contract(action=ActionSpec(dim=2))
+
+    @property
+    def instruction(self) -> str:
+        return "do it"
+
+    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+        self.resets.append((seed, options))
+        return self.obs, {}
+
+    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        self.actions.append(act.action.tolist())
+        n = len(self.actions)
+        return self.obs, 0.5, n == self.terminates_at, n == self.max_steps, {"success": n in self.solved}
+
+    def close(self) -> None:
+        self.actions = []
+
+
+class Chunks(Agent):
+    """Answers with the given actions, one after another; remembers what it was asked."""
+
+    def __init__(self, *answers: Any) -> None:
+        self.answers: Iterator[Any] = iter(answers)
+        self.seen: list[Obs] = []
+        self.began: dict[str, Any] = {}
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self.began = {"instruction": instruction, **kwargs}
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        self.seen.append(obs)
+        answer = next(self.answers)
+        if isinstance(answer, Exception):
+            raise answer
+        return answer if isinstance(answer, Act) else Act(np.asarray(answer, np.float32))
+
+
+ROW = [1.0, 2.0]
+CHUNK = [[1.0, 0.0], [2.0, 0.0], [3.0, 0.0]]
+
+
+def test_a_chunk_is_executed_row_by_row_without_asking_again() -> None:
+    env, agent = Script(), Chunks(CHUNK, CHUNK)
+    result = run_episode(env, agent, KEY)
+    assert env.actions == [[1, 0], [2, 0], [3, 0]] * 2
+    assert (result.steps, result.acts) == (6, 2)
+
+
+def test_only_the_first_rows_of_a_chunk_are_executed_when_so_set() -> None:
+    env = Script()
+    result = run_episode(env, Chunks(CHUNK, CHUNK, CHUNK), KEY, execute=2)
+    assert env.actions == [[1, 0], [2, 0]] * 3
+    assert (result.steps, result.acts) == (6, 3)
+
+
+def test_a_finished_policy_ends_the_episode_after_its_rows() -> None:
+    env = Script(solved=(4,))
+    result = run_episode(env, Chunks(ROW, Act(np.asarray(CHUNK, np.float32), done=True)), KEY)
+    assert (result.steps, result.ending, result.success_at_end) == (4, "policy_done", True)
+
+
+def test_a_terminated_env_ends_the_episode_within_a_chunk() -> None:
+    result = run_episode(Script(terminates_at=2), Chunks(CHUNK), KEY)
+    assert (result.steps, result.ending) == (2, "terminated")
+
+
+def test_the_step_limit_truncates() -> None:
+    result = run_episode(Script(), Chunks(*[ROW] * 6), KEY)
+    assert (result.steps, result.ending, result.episode_return) == (6, "truncated", 3.0)
+
+
+def test_the_step_limit_holds_for_an_env_that_forgets_it() -> None:
+    class Endless(Script):
+        def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+            return (*super().step(act)[:3], False, {"success": False})
+
+    assert run_episode(Endless(), Chunks(*[ROW] * 9), KEY).steps == 6
+
+
+@pytest.mark.parametrize(
+    ("solved", "once", "at_end"), [((), False, False), ((2,), True, False), ((2, 6), True, True), ((6,), True, True)]
+)
+def test_success_once_and_at_the_end_are_told_apart(solved: tuple[int, ...], once: bool, at_end: bool) -> None:
+    result = run_episode(Script(solved), Chunks(*[ROW] * 6), KEY)
+    assert (result.success_once, result.success_at_end) == (once, at_end)
+
+
+def test_the_key_decides_both_resets() -> None:
+    env, agent = Script(), Chunks(*[ROW] * 6)
+    run_episode(env, agent, KEY, reset_options={"layout": 2})
+    assert env.resets == [(11, {"layout": 2})]
+    assert agent.began == {"instruction": "do it", "seed": 11, "env": "script"}
+
+
+def test_a_remote_policy_is_told_the_contract_of_the_env() -> None:
+    class Remote(Chunks):
+        metadata: ClassVar[dict[str, Any]] = {}
+        transport = "websocket"
+
+    agent = Remote(*[ROW] * 6)
+    result = run_episode(Script(), agent, KEY)
+    assert Contract.from_json(agent.began["contract"]) == Script().contract
+    assert result.transport == "websocket"
+
+
+@pytest.mark.parametrize(
+    ("answer", "code"),
+    [
+        (RuntimeError("CUDA out of memory"), "policy_failed"),
+        ([float("nan"), 0.0], "invalid_action"),
+        ([1.0, 2.0, 3.0], "invalid_action"),
+        ("none", "policy_failed"),
+    ],
+)
+def test_a_policy_that_fails_ends_its_episode_without_success(answer: Any, code: str) -> None:
+    result = run_episode(Script(solved=(1,)), Chunks(ROW, answer), KEY)
+    assert (result.status, result.ending, result.steps) == ("policy_error", "error", 1)
+    assert (result.success_once, result.success_at_end) == (False, False)
+    assert result.error is not None
+    assert result.error.startswith(code)
+
+
+def test_a_lost_connection_is_no_failure_of_the_policy() -> None:
+    with pytest.raises(ConnectionLost):
+        run_episode(Script(), Chunks(ROW, ConnectionLost("gone")), KEY)
+
+
+@pytest.mark.parametrize("error", [RuntimeError("physics exploded"), SystemExit("an asset is missing")])
+def test_whatever_a_simulator_raises_is_an_env_failure(error: BaseException) -> None:
+    class Broken(Script):
+        def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+            raise error
+
+    with pytest.raises(EnvFailed, match=str(error)):
+        run_episode(Broken(), Chunks(ROW), KEY)
+
+
+def test_an_action_that_the_env_refuses_counts_against_the_policy() -> None:
+    class Narrow(Script):
+        def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+            raise InvalidAction("got 2 numbers, want 7")
+
+    assert run_episode(Narrow(), Chunks(ROW), KEY).status == "policy_error"
+
+
+def test_an_env_that_does_not_say_whether_it_is_solved_is_an_env_failure() -> None:
+    class Silent(Script):
+        def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+            return (*super().step(act)[:4], {})
+
+    with pytest.raises(EnvFailed, match="want 'success'"):
+        run_episode(Silent(), Chunks(ROW), KEY)
+
+
+@pytest.mark.parametrize("reward", [math.nan, math.inf])
+def test_a_reward_that_is_no_number_is_an_env_failure(reward: float) -> None:
+    class Diverged(Script):
+        def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+            obs, _, *rest = super().step(act)
+            return obs, reward, *rest
+
+    with pytest.raises(EnvFailed, match=f"got the reward {reward}, want a finite number"):
+        run_episode(Diverged(), Chunks(ROW), KEY)
+
+
+JOINTS = {"joints": np.zeros(6, np.float32)}
+FRONT = {"front": np.zeros((4, 4, 3), np.uint8)}
+
+
+class Stated(Script):
+    """Returns `after` from the second step on, or `before` from its reset; its contract states what it gives."""
+
+    def __init__(self, *, after: tuple[Any, ...] | None = None, before: Any = None, words: Any = "do it") -> None:
+        super().__init__(obs=Obs(dict(FRONT), 0.5, dict(JOINTS)))
+        self.after, self.before, self.words = after, before, words
+
+    @property
+    def contract(self) -> Contract:
+        return Contract({"front": CameraSpec(4, 4)}, {"joints": StateSpec(6)}, gripper=True, action=ActionSpec(dim=2))
+
+    @property
+    def instruction(self) -> str:
+        text: str = self.words
+        return text
+
+    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+        answer: tuple[Obs, dict[str, Any]] = self.before or super().reset(seed=seed)
+        return answer
+
+    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        good = super().step(act)
+        return good if self.after is None or len(self.actions) < 2 else self.after  # type: ignore[return-value]
+
+
+GOOD = Obs(dict(FRONT), 0.5, dict(JOINTS))
+SOLVED = {"success": True}
+
+
+@pytest.mark.parametrize(
+    ("obs", "said"),
+    [
+        (None, "got NoneType in place of the observation"),
+        ({"joints": 1}, "got dict in place of the observation"),
+        (Obs(dict(FRONT), 0.5), "state 'joints' is missing"),
+        (Obs(dict(FRONT), 0.5, {"joints": np.zeros(3, np.float32)}), r"got \(3,\), want \(6,\)"),
+        (Obs(dict(FRONT), 0.5, {"joints": np.full(6, np.nan, np.float32)}), "got NaN"),
+        (Obs(dict(FRONT), None, dict(JOINTS)), "gripper: got none"),
+        (Obs(dict(FRONT), "open", dict(JOINTS)), "'open' as the gripper"),  # type: ignore[arg-type]
+        (Obs({}, 0.5, dict(JOINTS)), "camera 'front' is missing"),
+        (Obs({"front": np.zeros((4, 4), np.uint8)}, 0.5, dict(JOINTS)), "camera 'front': got"),
+        (Obs(None, 0.5, dict(JOINTS)), "NoneType as the observation's cameras"),  # type: ignore[arg-type]
+        (Obs(dict(FRONT), 0.5, dict(JOINTS), info=None), "NoneType as the observation's info"),  # type: ignore[arg-type]
+    ],
+)
+def test_an_observation_that_is_none_is_the_envs_failure_and_never_the_policys(obs: Any, said: str) -> None:
+    with pytest.raises(EnvFailed, match=f"env step: .*{said}"):
+        run_episode(Stated(after=(obs, 0.0, False, False, SOLVED)), Chunks(*[ROW] * 6), KEY)
+    with pytest.raises(EnvFailed, match=f"env reset: .*{said}"):
+        run_episode(Stated(before=(obs, {})), Chunks(*[ROW] * 6), KEY)
+
+
+@pytest.mark.parametrize(
+    ("answer", "said"),
+    [
+        ((GOOD, 0.0, False, False, {"success": "yes"}), "got 'yes' as info\\['success'\\], want a bool"),
+        ((GOOD, 0.0, False, False, {"success": None}), "got None as info"),
+        ((GOOD, 0.0, False, False, {"success": 0.7}), "got 0.7 as info"),
+        ((GOOD, 0.0, False, False, None), "got NoneType as info, want 'success' among it"),
+        ((GOOD, 0.0, "no", False, SOLVED), "got 'no' as terminated"),
+        ((GOOD, 0.0, False, [False], SOLVED), ".*as truncated"),
+        ((GOOD, None, False, False, SOLVED), "got the reward None"),
+        ((GOOD, "1.0", False, False, SOLVED), "got the reward '1.0'"),
+        ((GOOD, 0.0, False, SOLVED), "got a tuple of 4"),
+        ((None,), "got a tuple of 1"),
+    ],
+)
+def test_what_a_step_returns_is_never_guessed(answer: Any, said: str) -> None:
+    with pytest.raises(EnvFailed, match=f"env step: {said}"):
+        run_episode(Stated(after=answer), Chunks(*[ROW] * 6), KEY)
+
+
+@pytest.mark.parametrize("words", [None, 3])
+def test_an_instruction_that_is_no_text_is_an_env_failure(words: Any) -> None:
+    with pytest.raises(EnvFailed, match=f"got the instruction {words}"):
+        run_episode(Stated(words=words), Chunks(ROW), KEY)
+
+
+@pytest.mark.parametrize("success", [np.True_, 1, 1.0, np.float32(1)])
+def test_a_number_that_is_a_bool_is_one(success: Any) -> None:
+    after = (GOOD, np.float32(0.5), np.False_, 0, {"success": success})
+    result = run_episode(Stated(after=after), Chunks(*[ROW] * 6), KEY)
+    assert (result.status, result.success_at_end, result.episode_return) == ("done", True, 3.0)
+
+
+def test_images_may_be_left_out_where_nobody_looks() -> None:
+    class Sparing(Stated):
+        def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+            obs, *rest = super().step(act)
+            return (obs if self.looked_at else replace(obs, cameras={})), *rest
+
+    assert run_episode(Sparing(), Chunks(CHUNK, CHUNK), KEY, images=False).status == "done"
+    with pytest.raises(EnvFailed, match="camera 'front' is missing"):
+        run_episode(Stated(after=(replace(GOOD, cameras={}), 0.0, False, False, SOLVED)), Chunks(CHUNK), KEY)
+
+
+@pytest.mark.parametrize(
+    "error", [PolicyFailed("mine"), PolicyUnavailable("gone"), UnknownSession("who"), NotReset("")]
+)
+def test_no_error_of_this_package_that_an_env_raises_is_anothers(error: VLAgentsError) -> None:
+    class Relayed(Script):
+        def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+            raise error
+
+    with pytest.raises(EnvFailed, match=type(error).__name__):
+        run_episode(Relayed(), Chunks(ROW), KEY)
+
+
+def test_a_contract_that_cannot_be_made_is_an_env_failure() -> None:
+    class Broken(Script):
+        @property
+        def contract(self) -> Contract:
+            raise RuntimeError("no robot")
+
+    with pytest.raises(EnvFailed, match="no robot"):
+        run_episode(Broken(), Chunks(ROW), KEY)
+
+
+def test_views_for_the_record_are_recorded_and_never_reach_the_policy() -> None:
+    obs = Obs(info={HIGH_RES: {"front": np.zeros((8, 8, 3), np.uint8)}, "note": "kept"})
+    agent, recorded = Chunks(*[ROW] * 6), list[Obs]()
+    run_episode(Script(obs=obs), agent, KEY, record=recorded.append)
+    assert all(seen.info == {"note": "kept"} for seen in agent.seen)
+    assert len(recorded) == 7
+    assert all(HIGH_RES in one.info for one in recorded)
+
+
+def test_every_call_is_announced_to_the_watch() -> None:
+    phases: list[tuple[str, int]] = []
+    run_episode(
+        Script(terminates_at=2), Chunks(ROW, ROW), KEY, watch=lambda phase, steps: phases.append((phase, steps))
+    )
+    assert phases == [
+        ("env reset", 0),
+        ("policy reset", 0),
+        ("policy act", 0),
+        ("env step", 0),
+        ("policy act", 1),
+        ("env step", 1),
+    ]
+
+
+def test_two_runs_of_one_key_are_the_same_episode() -> None:
+    def outcome() -> tuple[Any, ...]:
+        result = run_episode(Line(), ToZero(chunk=2), EpisodeKey("line", 0, 5, "0"))
+        return result.steps, result.episode_return, result.success_once, result.instruction
+
+    assert outcome() == outcome()
+
+
+def test_the_policys_options_reach_its_reset_and_the_result_says_what_checkpoint_played() -> None:
+    class Named(Chunks):
+        def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+            super().reset(obs, instruction, **kwargs)
+            return {"checkpoint": f"runs/{kwargs['checkpoint_step']}"}
+
+    agent = Named(*[np.zeros(2)] * 6)
+    result = run_episode(Script(), agent, KEY, policy_options={"checkpoint_step": 20})
+    assert agent.began["checkpoint_step"] == 20
+    assert result.checkpoint == "runs/20"
+    assert run_episode(Script(), Chunks(*[np.zeros(2)] * 6), KEY).checkpoint is None
+
+
+def test_the_result_says_which_versions_of_the_weights_played() -> None:
+    class Trained(Chunks):
+        version = 4
+
+        def act(self, obs: Obs) -> Act:
+            act = super().act(obs)
+            act.info["policy"] = {"version": self.version, "fingerprint": f"digest {self.version}"}
+            self.version += 1
+            return act
+
+    result = run_episode(Script(), Trained(*[np.zeros(2)] * 6), KEY)
+    versions = result.first_policy_version, result.policy_version, result.policy_fingerprint
+    assert versions == (4, 3 + result.acts, f"digest {3 + result.acts}")
+    unserved = run_episode(Script(), Chunks(*[np.zeros(2)] * 6), KEY)
+    assert (unserved.first_policy_version, unserved.policy_version, unserved.policy_fingerprint) == (None,) * 3
+
+
+@pytest.mark.parametrize(("images", "looked_at"), [(True, [True] * 6), (False, [False, False, True] * 2)])
+def test_an_env_is_told_whether_anybody_looks(images: bool, looked_at: list[bool]) -> None:
+    class Told(Script):
+        def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+            told.append(self.looked_at)
+            return super().step(act)
+
+    told: list[bool] = []
+    chunk = np.zeros((3, 2), np.float32)
+    result = run_episode(Told(), Chunks(chunk, chunk), KEY, images=images)
+    assert result.steps == 6
+    assert told == looked_at

@@ -1,0 +1,220 @@
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from eval_fakes import LINE, OTHER_LINE
+from flat_config import flat_config
+
+from vlagents_ray.envs.tabletop import Tabletop
+from vlagents_ray.errors import ConfigError, UnknownEnv
+from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig
+from vlagents_ray.evaluate.plan.cases import cells, expand
+from vlagents_ray.evaluate.plan.config import ClockConfig
+from vlagents_ray.evaluate.plan.jobs import (
+    EpisodeKey,
+    Job,
+    JobQueue,
+    plan,
+)
+
+Config = Callable[..., EvalConfig]
+
+
+def jobs_of(env: str, count: int, **settings: Any) -> list[Job]:
+    return plan(cells(flat_config(envs=[env], episodes=count, out="out", **settings)))
+
+
+def keys(config: EvalConfig) -> list[EpisodeKey]:
+    return [job.key for job in plan(cells(config))]
+
+
+def test_a_plan_numbers_and_seeds_every_episode_of_every_env(config: Config) -> None:
+    found = keys(config(envs=[LINE, OTHER_LINE], episodes=3, seed=7))
+    assert [(key.env, key.episode, key.seed) for key in found] == [
+        (LINE, 0, 7),
+        (LINE, 1, 8),
+        (LINE, 2, 9),
+        (OTHER_LINE, 0, 7),
+        (OTHER_LINE, 1, 8),
+        (OTHER_LINE, 2, 9),
+    ]
+    assert len(set(map(str, found))) == 6
+
+
+def test_a_further_seed_is_a_further_set_of_episodes(config: Config) -> None:
+    found = keys(config(episodes=2, seeds=[0, 100]))
+    assert [(key.episode, key.seed) for key in found] == [(0, 0), (1, 1), (0, 100), (1, 101)]
+
+
+def test_a_sweep_plays_checkpoint_by_checkpoint(config: Config) -> None:
+    jobs = plan(cells(config(envs=[LINE, OTHER_LINE], episodes=1, steps=[10, 20])))
+    assert [(job.cell.contender, job.key.env) for job in jobs] == [
+        ("policy@10", LINE),
+        ("policy@10", OTHER_LINE),
+        ("policy@20", LINE),
+        ("policy@20", OTHER_LINE),
+    ]
+    assert [job.cell.policy_options for job in jobs[::2]] == [{"checkpoint_step": 10}, {"checkpoint_step": 20}]
+    assert len({str(job.key) for job in jobs}) == 4
+    assert jobs[0].cell.place == jobs[2].cell.place, "checkpoints share the env that a worker has made"
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"policy": "other"},
+        {"policy_config": {"speed": 2}},
+        {"policy_options": {"checkpoint_step": 2}},
+        {"checkpoint": "step-100"},
+        {"env_options": {"width": 128}},
+        {"reset_options": {"layout": 1}},
+        {"execute": 4},
+        {"codec": "jpeg"},
+    ],
+)
+def test_what_changes_the_outcome_changes_the_key(config: Callable[..., EvalConfig], change: dict[str, Any]) -> None:
+    assert not set(map(str, keys(config()))) & set(map(str, keys(config(**change))))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"workers": 9},
+        {"video": "all"},
+        {"policy_url": "http://there:1"},
+        {"retries": 0},
+        {"threads": 4},
+        {"resume": True},
+        {"codec": "raw"},
+        {"codec": "lossless"},
+    ],
+)
+def test_what_does_not_change_the_outcome_keeps_the_key(
+    config: Callable[..., EvalConfig], change: dict[str, Any]
+) -> None:
+    assert keys(config()) == keys(config(**change))
+
+
+def test_suites_have_options_of_their_own(config: Config) -> None:
+    plain, changed = (
+        keys(
+            EvalConfig(
+                policies=[PolicyConfig()],
+                suites=[SuiteConfig(envs=[LINE]), SuiteConfig(envs=[OTHER_LINE], env_options=options)],
+                out=Path("out"),
+            )
+        )
+        for options in ({}, {"width": 8})
+    )
+    assert {key.env for key in plain if key in changed} == {LINE}
+
+
+def test_an_env_in_two_suites_of_one_name_is_refused() -> None:
+    suites = [SuiteConfig(envs=[LINE]), SuiteConfig(envs=[LINE], env_options={"width": 8})]
+    with pytest.raises(ConfigError, match="stand in two suites of one name"):
+        cells(EvalConfig(policies=[PolicyConfig()], suites=suites, out=Path("out")))
+
+
+def test_an_env_in_two_suites_that_do_not_differ_is_refused() -> None:
+    suites = [SuiteConfig(name="few", envs=[LINE]), SuiteConfig(name="all", envs=[LINE, OTHER_LINE], seeds=[100])]
+    with pytest.raises(ConfigError, match=r"\['eval_fakes:Line'\] stand in two suites with the same settings"):
+        cells(EvalConfig(policies=[PolicyConfig()], suites=suites, out=Path("out")))
+
+
+def test_episodes_in_real_time_are_others_than_before_rows_were_placed_by_executed_actions(
+    config: Callable[..., EvalConfig], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def prints() -> tuple[str, str]:
+        suites = [SuiteConfig(envs=[LINE]), SuiteConfig(name="clock", envs=[LINE], clock=ClockConfig(neutral=[0]))]
+        synchronous, real_time = cells(config().model_copy(update={"suites": suites}))
+        return synchronous.fingerprint, real_time.fingerprint
+
+    now = prints()
+    monkeypatch.setattr("vlagents_ray.evaluate.plan.cases._COUNTS", "ticks")
+    before = prints()
+    assert now[0] == before[0]
+    assert now[1] != before[1]
+
+
+def test_policies_whose_episodes_would_share_their_files_are_refused(config: Callable[..., EvalConfig]) -> None:
+    [policy] = config().policies
+    policies = [policy.model_copy(update={"name": name}) for name in ("pi0/fast", "pi0_fast")]
+    with pytest.raises(ConfigError, match="would share their files"):
+        cells(config().model_copy(update={"policies": policies}))
+
+
+def test_a_pattern_stands_for_the_tasks_that_match() -> None:
+    assert expand("tabletop/*") == [f"tabletop/{task}" for task in Tabletop.tasks()]
+    assert expand("tabletop") == ["tabletop"]
+    with pytest.raises(UnknownEnv, match="matches none of the tasks of 'tabletop'"):
+        expand("tabletop/x*")
+
+
+def test_a_worker_stays_with_the_env_it_has_made() -> None:
+    first, other = jobs_of(LINE, 2), jobs_of(OTHER_LINE, 5)
+    queue = JobQueue(first + other)
+    kind, made = first[0].cell.kind, first[0].cell.place
+    taken = [queue.take(kind, made, Counter()) for _ in range(3)]
+    assert [job.key.env for [job] in taken] == [LINE, LINE, OTHER_LINE]
+
+
+def test_workers_without_an_env_spread_over_the_envs() -> None:
+    jobs = jobs_of(LINE, 4) + jobs_of(OTHER_LINE, 4)
+    queue = JobQueue(jobs)
+    working: Counter[str] = Counter()
+    for _ in range(4):
+        [job] = queue.take(jobs[0].cell.kind, None, working)
+        working[job.cell.place] += 1
+    assert sorted(working.values()) == [2, 2]
+
+
+def test_no_worker_idles_while_any_episode_of_its_kind_waits() -> None:
+    [only] = jobs_of(LINE, 1)
+    queue = JobQueue([only])
+    assert queue.take("another kind", None, Counter()) == ()
+    assert queue.take(only.cell.kind, "elsewhere", Counter({only.cell.place: 5})) == (only,)
+    assert queue.take(only.cell.kind, only.cell.place, Counter()) == ()
+    assert len(queue) == 0
+
+
+def test_a_further_attempt_comes_before_new_episodes() -> None:
+    jobs = jobs_of(LINE, 3)
+    queue = JobQueue(jobs)
+    kind, made = jobs[0].cell.kind, jobs[0].cell.place
+    [first] = queue.take(kind, made, Counter())
+    queue.put_back(first.again())
+    assert queue.take(kind, made, Counter()) == (first.again(),)
+    assert first.again().attempt == 2
+
+
+def test_workers_are_wanted_where_most_wait_for_each() -> None:
+    many, few = jobs_of(LINE, 6), jobs_of(OTHER_LINE, 2, cpus_per_worker=2.0)
+    queue = JobQueue(many + few)
+    kinds: Counter[str] = Counter()
+    while (cell := queue.needs_worker(kinds, kinds)) is not None:
+        kinds[cell.kind] += 1
+    assert kinds == {many[0].cell.kind: 6, few[0].cell.kind: 2}, "no more than there are episodes"
+    assert queue.needs_worker({many[0].cell.kind: 6}, {}) == few[0].cell
+
+
+def test_a_cell_that_is_dropped_leaves_the_others() -> None:
+    jobs = jobs_of(LINE, 6, steps=[1, 2])
+    queue = JobQueue(jobs)
+    assert queue.drop(jobs[0].cell.fingerprint) == 6
+    assert len(queue) == 6
+    [job] = queue.take(jobs[0].cell.kind, None, Counter())
+    assert job.cell.step == 2
+
+
+def test_episodes_side_by_side_are_of_one_cell() -> None:
+    jobs = jobs_of(LINE, 5, steps=[1, 2], num_envs=3)
+    queue = JobQueue(jobs)
+    kind = jobs[0].cell.kind
+    assert queue.needs_worker({}, {kind: 3}) is not None, "ten episodes, three at a time, are for four workers"
+    assert queue.needs_worker({}, {kind: 4}) is None
+    taken = [queue.take(kind, None, Counter()) for _ in range(4)]
+    assert [[job.cell.step for job in some] for some in taken] == [[1, 1, 1], [1, 1], [2, 2, 2], [2, 2]]

@@ -1,0 +1,128 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.stats import binomtest
+
+from vlagents_ray.errors import InvalidInput
+from vlagents_ray.evaluate.results.statistics import (
+    Pairs,
+    difference_interval,
+    holm,
+    mcnemar,
+)
+
+COUNTS = st.integers(0, 60)
+
+
+@given(COUNTS, COUNTS)
+def test_mcnemar_is_the_binomial_test_of_what_only_one_solved(only_a: int, only_b: int) -> None:
+    want = binomtest(only_a, only_a + only_b, 0.5).pvalue if only_a + only_b else 1.0
+    assert mcnemar(only_a, only_b) == pytest.approx(want, rel=1e-9)
+
+
+# From the paper that `mcnemar` names, table 3: airway hyper-responsiveness before and after stem cell transplantation,
+# 1 and 7 discordant pairs.
+def test_mcnemar_agrees_with_published_values() -> None:
+    assert mcnemar(1, 7) == pytest.approx(0.070, abs=5e-4)
+    assert mcnemar(1, 7, mid=True) == pytest.approx(0.039, abs=5e-4)
+
+
+@given(COUNTS, COUNTS)
+def test_mid_p_is_symmetric_and_no_larger(only_a: int, only_b: int) -> None:
+    mid = mcnemar(only_a, only_b, mid=True)
+    assert mid == mcnemar(only_b, only_a, mid=True)
+    assert 0.0 < mid <= mcnemar(only_a, only_b) <= 1.0
+
+
+def test_thousands_of_episodes_do_not_overflow() -> None:
+    assert 0.0 < mcnemar(4000, 4200) < 0.05
+    assert mcnemar(0, 5000) == 0.0  # 2^-4999 is less than any float
+
+
+def test_mcnemar_rejects_a_true_hypothesis_no_more_often_than_it_says() -> None:
+    only_a = np.random.default_rng(0).binomial(30, 0.5, 20_000)
+    p = np.array([mcnemar(k, 30 - k) for k in range(31)])
+    assert np.mean(p[only_a] < 0.05) < 0.05
+
+
+# Chances of both, only A, only B, neither.
+ALIKE, APART = [[0.5, 0.1, 0.1, 0.3]] * 2, [[0.2, 0.2, 0.1, 0.5], [0.7, 0.15, 0.05, 0.1]]
+FAR = [[0.02, 0.9, 0.0, 0.08]]
+
+
+@pytest.mark.parametrize("episodes", [10, 50])
+@pytest.mark.parametrize("chances", [ALIKE, APART, FAR])
+def test_the_interval_covers_the_difference_at_least_about_as_often_as_it_says(
+    chances: list[list[float]], episodes: int
+) -> None:
+    rng = np.random.default_rng(1)
+    true = np.mean([one[1] - one[2] for one in chances])
+    covered = 0
+    for _ in range(200):
+        strata = [Pairs(*map(int, rng.multinomial(episodes, one))) for one in chances]
+        low, high = difference_interval(strata)
+        covered += low <= true <= high
+    assert covered / 200 > 0.915  # 0.95 less two and a quarter standard deviations of 200 trials
+
+
+def test_the_interval_is_narrower_for_knowing_the_tasks() -> None:
+    strata = [Pairs(only_a=18, neither=2), Pairs(only_b=18, neither=2)]
+    low, high = difference_interval(strata)
+    pooled_low, pooled_high = difference_interval([strata[0] + strata[1]])
+    assert pooled_low < 2 * low < 0 < 2 * high < pooled_high
+
+
+@given(st.builds(Pairs, COUNTS, COUNTS, COUNTS, COUNTS).filter(lambda pairs: pairs.total > 0))
+def test_the_interval_holds_the_difference_and_is_never_certain(pairs: Pairs) -> None:
+    low, high = difference_interval([pairs])
+    assert pairs.difference is not None
+    assert -1.0 <= low <= pairs.difference <= high <= 1.0
+    assert low < high
+
+
+def test_the_interval_is_what_drawing_again_comes_to() -> None:
+    strata = [Pairs(10, 8, 3, 9), Pairs(2, 12, 1, 35)]
+    rng, drawn = np.random.default_rng(0), np.zeros(200_000)
+    for one in strata:
+        outcomes = np.array([one.only_a, one.only_b, one.both, one.neither]) + 0.5 * one.total / 80
+        counts = rng.multinomial(one.total, outcomes / outcomes.sum(), len(drawn))
+        drawn += counts[:, 0] - counts[:, 1]
+    assert difference_interval(strata) == pytest.approx(tuple(np.quantile(drawn / 80, [0.025, 0.975])), abs=1e-9)
+
+
+def test_thousands_of_episodes_narrow_the_interval() -> None:
+    few, many = (difference_interval([Pairs(5 * k, 2 * k, k, 2 * k)] * 3) for k in (10, 1000))
+    assert many[0] == pytest.approx(0.1 - 1.96 * (0.29 / 30_000) ** 0.5, abs=5e-4)
+    assert few[0] < many[0] < 0.1 < many[1] < few[1]
+
+
+def test_nothing_is_known_of_the_difference_without_episodes() -> None:
+    assert difference_interval([]) == difference_interval([Pairs()]) == (-1.0, 1.0)
+
+
+def test_holm_agrees_with_a_worked_example() -> None:
+    # Sorted 0.005, 0.01, 0.03, 0.04 times 4, 3, 2, 1, and never less than the one before.
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([]) == []
+
+
+@given(st.lists(st.floats(0.0, 1.0), max_size=20))
+def test_holm_lies_between_the_p_value_and_bonferronis(p_values: list[float]) -> None:
+    for p, adjusted in zip(p_values, holm(p_values), strict=True):
+        assert p <= adjusted <= min(1.0, p * len(p_values))
+
+
+def test_holm_keeps_the_chance_of_any_error_below_five_percent() -> None:
+    drawn = np.random.default_rng(2).uniform(size=(4000, 10))  # ten true hypotheses
+    wrong = np.mean([min(holm(list(p_values))) < 0.05 for p_values in drawn])
+    assert 0.03 < wrong < 0.06
+
+
+def test_impossible_counts_are_refused() -> None:
+    with pytest.raises(InvalidInput, match="no count below 0"):
+        mcnemar(-1, 2)
+    with pytest.raises(InvalidInput, match="no count below 0"):
+        Pairs(both=-1)

@@ -1,0 +1,119 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from eval_fakes import LINE, OTHER_LINE
+from recorded_results import record, runs
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate import Results
+from vlagents_ray.evaluate.results.combine import combined
+from vlagents_ray.evaluate.results.comparison import (
+    clock_gaps,
+    comparable,
+    compare,
+    comparisons,
+)
+from vlagents_ray.evaluate.results.statistics import Pairs
+
+
+def solved_by(**seeds: set[int]) -> Any:
+    """An outcome: who solves which seeds, by policy."""
+    return lambda cell, seed: 5 if seed in seeds[cell.policy.name] else None
+
+
+def test_pairs_are_episodes_of_the_same_env_and_seed(tmp_path: Path) -> None:
+    config = runs(tmp_path, episodes=5, steps=[])
+    found = compare(record(config, solved_by(learner={0, 1, 2}, base={2, 3})), "learner", "base")
+    in_each = Pairs(both=1, only_a=2, only_b=1, neither=1)
+    assert found.total.strata == (in_each,) * 3
+    assert found.total.pairs == in_each + in_each + in_each
+    assert [(line.suite, len(line.strata)) for line in found.suites] == [("one", 2), ("two", 1)]
+    low, high = found.total.interval
+    assert low < found.total.pairs.difference < high  # type: ignore[operator]
+
+
+def test_what_infrastructure_lost_is_in_no_pair(tmp_path: Path) -> None:
+    results = record(runs(tmp_path, episodes=5, steps=[]), solved_by(learner=set(), base={0, 1}), troubles=True)
+    first = compare(results, "learner", "base").total.strata[0]
+    assert first == Pairs(only_b=1, neither=3)  # of seed 1 there is but base's; the policy's error of seed 0 counts
+
+
+def test_p_values_of_more_comparisons_are_larger(tmp_path: Path) -> None:
+    results = record(runs(tmp_path, episodes=20))
+    pairs, reasons = comparable(results)
+    assert pairs == [("base", "learner@1000"), ("base", "learner@2000"), ("learner@1000", "learner@2000")]
+    assert reasons == []
+    together = comparisons(results, pairs)
+    alone = [compare(results, a, b) for a, b in pairs]
+    assert [one.total.adjusted for one in alone] == [one.total.pairs.p_value for one in alone]
+    assert all(one.total.adjusted >= single.total.adjusted for one, single in zip(together, alone, strict=True))
+    smallest = min(range(3), key=lambda index: alone[index].total.adjusted)
+    assert together[smallest].total.adjusted == pytest.approx(3 * alone[smallest].total.adjusted)
+
+
+def test_a_comparison_as_json_has_every_line(tmp_path: Path) -> None:
+    found = compare(record(runs(tmp_path)), "learner@1000", "base").to_json()
+    assert [line["suite"] for line in found["lines"]] == ["one", "two", "all"]
+    assert {"pairs", "both", "difference", "interval_95", "p_value", "p_holm"} <= found["lines"][0].keys()
+
+
+def test_unknown_contenders_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"got \['best'\], want two of the contenders"):
+        compare(record(runs(tmp_path)), "best", "base")
+
+
+def folder(out: Path, name: str, **suite: Any) -> Results:
+    """One policy in one env."""
+    settings = {
+        "policies": [{"name": name, "url": "http://localhost:1"}], "suites": [{"envs": [LINE], "episodes": 4} | suite]
+    }  # fmt: skip
+    config = type(runs(out)).model_validate(settings | {"out": out})
+    return record(config, lambda _cell, seed: 3 if seed % 2 else None, videos=True)
+
+
+def test_other_settings_of_an_env_are_no_pair(tmp_path: Path) -> None:
+    results = combined([folder(tmp_path / "a", "a"), folder(tmp_path / "b", "b", env_options={"state_dim": 1})])
+    with pytest.raises(ConfigError, match=r"had env_options {} for 'a', but {'state_dim': 1} for 'b'"):
+        compare(results, "a", "b")
+    assert comparable(results)[0] == []
+
+
+def test_no_shared_episode_is_no_comparison(tmp_path: Path) -> None:
+    results = combined([folder(tmp_path / "a", "a"), folder(tmp_path / "b", "b", envs=[OTHER_LINE])])
+    with pytest.raises(ConfigError, match="share no finished episode"):
+        compare(results, "a", "b")
+
+
+def test_folders_are_read_as_one(tmp_path: Path) -> None:
+    results = combined([folder(tmp_path / "a", "a"), folder(tmp_path / "b", "b")])
+    assert results.contenders == ["a", "b"]
+    assert compare(results, "a", "b").total.pairs == Pairs(both=2, neither=2)
+    videos = [video for cell in results.cells for one in cell.episodes for video in one.videos]
+    assert len(videos) == 4
+    assert all((results.out / video).is_file() for video in videos)
+    assert [run.run for run in results.runs] == [1, 2]
+
+
+def test_policies_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
+    first = folder(tmp_path / "first", "pi0")
+    second = folder(tmp_path / "second", "pi0", reset_options={"instruction": "go"})
+    assert combined([first, second]).contenders == ["pi0 (first)", "pi0 (second)"]
+
+
+def test_parts_of_one_evaluation_are_to_be_merged(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="merge them"):
+        combined([folder(tmp_path / "a", "pi0"), folder(tmp_path / "b", "pi0")])
+
+
+def test_the_gap_to_the_synchronous_score_pairs_suites_that_differ_in_their_clock(tmp_path: Path) -> None:
+    suites: list[dict[str, Any]] = [{"name": name, "envs": [LINE], "episodes": 4} for name in ("live", "waiting")]
+    suites[0]["clock"] = {"latency": 0.1, "meanwhile": "hold"}
+    config = runs(tmp_path, steps=[], suites=suites)
+    gaps = clock_gaps(record(config, lambda cell, seed: 5 if cell.suite.name == "waiting" or seed == 0 else None))
+    assert [(gap.a, gap.b) for gap in gaps] == [
+        ("learner, live in real time", "learner, waiting"), ("base, live in real time", "base, waiting")
+    ]  # fmt: skip
+    assert gaps[0].total.pairs == Pairs(both=1, only_b=3)

@@ -1,0 +1,191 @@
+"""results.db on a disk of this host, on one that hosts share, and where nothing can be written."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import pytest
+from eval_fakes import PYTHONPATH
+from faulty_disks import READ_ONLY, python_on
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate import EvalConfig, Results
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.merge import merge
+from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.results import database
+from vlagents_ray.evaluate.results.store import Store
+
+Config = Callable[..., EvalConfig]
+COUNT = """
+import sys
+from pathlib import Path
+from vlagents_ray.evaluate import Results
+print(sum(len(cell.episodes) for cell in Results.load(Path(sys.argv[1])).cells))
+"""
+KILLED = """
+import os, sys
+from pathlib import Path
+from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.results.store import Store
+config = EvalConfig.model_validate_json(sys.argv[1])
+store = Store(config)
+store.begin_run(config, {})
+store.record(EpisodeResult(plan(store.cells)[0].key, "done", True, True), 1)
+os._exit(9)
+"""
+
+
+def begun(config: EvalConfig) -> Store:
+    """A store with an episode in it."""
+    store = Store(config)
+    store.begin_run(config, {})
+    store.record(EpisodeResult(plan(cells(config))[0].key, "done", True, True), 1)
+    return store
+
+
+def kill_in(config: EvalConfig) -> None:
+    """Have a process record an episode and die."""
+    command = [sys.executable, "-c", KILLED, config.model_dump_json()]
+    assert subprocess.run(command, check=False, env=os.environ | {"PYTHONPATH": PYTHONPATH}).returncode == 9
+
+
+def journal(out: Path) -> str:
+    with closing(sqlite3.connect(out / "results.db")) as db:
+        return str(db.execute("PRAGMA journal_mode").fetchone()[0])
+
+
+def episodes(results: Results) -> int:
+    return sum(len(cell.episodes) for cell in results.cells)
+
+
+@pytest.fixture
+def shared(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The disk is one that other hosts may mount."""
+    monkeypatch.setattr(database, "is_local", lambda _folder: False)
+
+
+def test_a_file_system_is_local_if_it_is_known_to_be(tmp_path: Path) -> None:
+    assert database.is_local(Path("/dev/shm"))
+    assert not database.is_local(Path("/proc"))  # stands for whatever is not on the list
+    assert not database.is_local(tmp_path / "gone")
+
+
+def test_a_log_that_readers_look_beside_is_for_local_disks(config: Config) -> None:
+    with begun(config()):
+        assert journal(config().out) == "wal"
+
+
+def test_on_a_shared_disk_there_is_no_write_ahead_log_and_commits_reach_the_disk(shared: None, config: Config) -> None:
+    with begun(config()) as store:
+        assert journal(config().out) == "delete"  # of this connection: a rollback journal
+        [[synchronous]] = store._db.execute("PRAGMA synchronous")
+        assert synchronous == 2
+        assert not [path.name for path in config().out.glob("results.db-*") if path.suffix != ".db-journal"]
+        done = subprocess.run([sys.executable, "-c", COUNT, config().out], capture_output=True, text=True, check=True)
+        assert done.stdout.split() == ["1"]  # read by another process, meanwhile
+
+
+def test_results_that_were_begun_on_a_local_disk_are_gone_on_with_on_a_shared_one(
+    config: Config, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kill_in(config())
+    assert (config().out / "results.db-wal").stat().st_size
+    monkeypatch.setattr(database, "is_local", lambda _folder: False)
+    with Store(config(resume=True)) as store:
+        assert len(store.finished()) == 1
+        assert not (config().out / "results.db-wal").exists()
+
+
+def test_a_reader_that_keeps_the_wrong_journal_is_named(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(database, "WAIT_S", 0.1)
+    with begun(config()):
+        other = sqlite3.connect(config().out / "results.db")
+        other.execute("BEGIN")
+        other.execute("SELECT * FROM runs").fetchone()
+    with closing(other):
+        monkeypatch.setattr(database, "is_local", lambda _folder: False)
+        with pytest.raises(ConfigError, match=r"results.db.* end what reads it"):
+            Store(config(resume=True))
+
+
+def test_results_at_rest_are_one_file(config: Config) -> None:
+    begun(config()).close()
+    assert sorted(path.name for path in config().out.iterdir()) == ["results.db", "results.lock"]
+    assert journal(config().out) == "delete"
+
+
+def test_a_reader_cannot_write(config: Config) -> None:
+    with (
+        begun(config()),
+        closing(database.read_only(config().out)) as db,
+        pytest.raises(sqlite3.OperationalError, match="readonly"),
+    ):
+        db.execute("DELETE FROM episodes")
+
+
+def test_what_a_killed_evaluation_left_is_read(config: Config) -> None:
+    kill_in(config())
+    assert episodes(Results.load(config().out)) == 1
+
+
+@pytest.mark.parametrize("damage", [b"not a database", b"SQLite format 3\0" + bytes(4000)])
+def test_a_file_that_is_no_results_is_one_sentence(tmp_path: Path, damage: bytes) -> None:
+    (tmp_path / "results.db").write_bytes(damage)
+    with pytest.raises(ConfigError, match=r"results.db: "):
+        Results.load(tmp_path)
+
+
+@pytest.mark.hosts
+@pytest.mark.parametrize("mode", ["delete", "wal"])
+def test_a_folder_that_cannot_be_written_to_is_read(config: Config, mode: str) -> None:
+    begun(config()).close()
+    with closing(sqlite3.connect(config().out / "results.db")) as db:
+        db.execute(f"PRAGMA journal_mode = {mode}")  # "wal": as older versions left it
+    done = python_on(READ_ONLY, config().out, COUNT)
+    assert done.stdout.split() == ["1"], done.stderr
+
+
+FOREIGN = 'x") VALUES (1); DROP TABLE episodes; --'
+
+
+@pytest.mark.parametrize("table", ["runs", "policies", "cells", "episodes", "attempts", "workers", "tracked"])
+@pytest.mark.parametrize("kind", ["", " AS (1)"], ids=["stored", "generated"])
+def test_a_column_of_somebody_else_is_refused_by_all_that_open_the_file(
+    config: Config, tmp_path: Path, table: str, kind: str
+) -> None:
+    begun(config()).close()
+    name = '"' + FOREIGN.replace('"', '""') + '"'
+    with closing(sqlite3.connect(config().out / "results.db")) as db, db:
+        db.execute(f"ALTER TABLE {table} ADD COLUMN {name}{kind}")
+        before = list(db.iterdump())
+    opened: list[Callable[[], object]] = [
+        lambda: Results.load(config().out),
+        lambda: merge(tmp_path / "merged", [config().out]),
+        lambda: Store(config(resume=True)),
+    ]
+    for read in opened:
+        with pytest.raises(ConfigError, match=r"got the unknown columns .*DROP TABLE.* read it with the version"):
+            read()
+    assert not (tmp_path / "merged").exists()
+    with closing(sqlite3.connect(config().out / "results.db")) as db:
+        assert list(db.iterdump()) == before
+
+
+@pytest.mark.parametrize(("table", "column"), [("episodes", "status"), ("cells", "stop"), ("runs", "config")])
+def test_a_column_that_is_missing_is_named(config: Config, table: str, column: str) -> None:
+    begun(config()).close()
+    with closing(sqlite3.connect(config().out / "results.db")) as db, db:
+        db.execute(f"ALTER TABLE {table} RENAME COLUMN {column} TO odd")
+        db.execute(f"ALTER TABLE {table} DROP COLUMN odd")
+    with pytest.raises(ConfigError, match=rf"got none of the columns \['{column}'\] in its table '{table}'"):
+        Results.load(config().out)

@@ -1,0 +1,329 @@
+from __future__ import annotations
+
+import sqlite3
+import sys
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import replace
+from subprocess import PIPE, Popen
+
+import pytest
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.evaluate.episode.failures import Failure
+from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, WorkerInfo
+from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan
+from vlagents_ray.evaluate.results.reader import Results
+from vlagents_ray.evaluate.results.store import Store
+from vlagents_ray.evaluate.results.summary import summarize
+
+
+def planned(config: EvalConfig) -> list[Job]:
+    return plan(cells(config))
+
+
+FAILURE = Failure("worker", "env_failed", "it hung", "Traceback ...")
+Config = Callable[..., EvalConfig]
+
+
+def recorded(config: EvalConfig) -> list[EpisodeResult]:
+    return [one.result for cell in Results.load(config.out).cells for one in cell.episodes]
+
+
+def done(key: EpisodeKey, success: bool = True) -> EpisodeResult:
+    return EpisodeResult(key, "done", success, success, steps=4, ending="truncated", seconds=1.0)
+
+
+def test_recorded_episodes_are_finished_and_lost_ones_are_not(config: Config) -> None:
+    keys = [job.key for job in planned(config())]
+    with Store(config()) as store:
+        store.begin_run(config(), {})
+        store.record(done(keys[0]), attempts=1)
+        store.record(EpisodeResult(keys[1], "policy_error", False, False, error="NaN"), attempts=1)
+        store.record(EpisodeResult(keys[2], "infra_failed", error="hung"), attempts=4)
+        assert store.finished() == {str(keys[0]), str(keys[1])}
+
+
+def test_an_episode_is_recorded_once(config: Config) -> None:
+    key = planned(config())[0].key
+    with Store(config()) as store:
+        store.begin_run(config(), {})
+        store.record(done(key), attempts=1)
+        with pytest.raises(sqlite3.IntegrityError):
+            store.record(done(key, success=False), attempts=1)
+        assert [one.success_once for one in recorded(config())] == [True]
+
+
+def test_a_lost_episode_gives_way_to_its_repetition(config: Config) -> None:
+    key = planned(config())[0].key
+    with Store(config()) as store:
+        store.begin_run(config(), {})
+        store.record(EpisodeResult(key, "infra_failed", error="hung"), attempts=4)
+        assert [one.success_once for one in recorded(config())] == [None]
+        store.record(done(key), attempts=1)
+        assert [(one.status, one.success_once) for one in recorded(config())] == [("done", True)]
+
+
+def test_what_is_recorded_is_there_for_another_process_at_once(config: Config) -> None:
+    settings = config()
+    with Store(settings) as store:
+        store.begin_run(settings, {})
+        store.record(done(planned(settings)[0].key), attempts=2, videos=["videos/a.mp4"])
+        with closing(sqlite3.connect(settings.out / "results.db")) as db:
+            assert db.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+            assert db.execute("SELECT steps, attempts, videos FROM episodes").fetchall() == [(4, 2, '["videos/a.mp4"]')]
+
+
+def test_every_failed_attempt_is_kept_with_its_error(config: Config) -> None:
+    job = planned(config())[0]
+    with Store(config()) as store:
+        store.begin_run(config(), {})
+        store.record_attempt(job, FAILURE, retried=True)
+        store.record_attempt(job.again(), FAILURE, retried=False)
+        [cell] = Results.load(config().out).cells
+    assert [(one.attempt, one.retried, one.error) for one in cell.attempts] == [
+        (1, True, "it hung"),
+        (2, False, "it hung"),
+    ]
+
+
+def test_results_are_not_touched_without_resume(config: Config) -> None:
+    with Store(config()) as store:
+        store.begin_run(config(), {})
+        store.record(done(planned(config())[0].key), attempts=1)
+    with pytest.raises(ConfigError, match=r"already has results \(1 episodes\).*--resume"):
+        Store(config())
+    with Store(config(resume=True)) as store:
+        assert len(store.finished()) == 1
+
+
+def test_a_folder_that_was_opened_and_not_used_needs_no_resume(config: Config) -> None:
+    Store(config()).close()
+    Store(config(seed=5)).close()
+    found = Results.load(config().out)
+    assert found.runs == ()
+    assert [cell.cell for cell in found.cells] == [cell.fingerprint for cell in cells(config(seed=5))]
+
+
+def test_a_run_that_a_wrong_setting_ended_before_its_first_episode_leaves_nothing_to_resume(config: Config) -> None:
+    with Store(config()) as store:
+        store.begin_run(config(), {})
+        store.record_attempt(planned(config())[0], Failure("user", "unknown_env", "no such task"), retried=False)
+    with Store(config(seed=5)) as store:
+        store.begin_run(config(seed=5), {})
+        found = Results.load(config().out)
+    assert [run.config["suites"][0]["seeds"] for run in found.runs] == [[5]]
+    assert [cell.attempts for cell in found.cells] == [()]
+
+
+@pytest.mark.parametrize(
+    ("change", "differing"),
+    [
+        ({"seed": 100}, "seeds"),
+        ({"seeds": [100, 0]}, "seeds"),
+        ({"checkpoint": "b"}, "checkpoint"),
+        ({"execute": 2}, "execute"),
+        ({"policy_config": {"a": 1}}, "policy_config"),
+        ({"env_options": {"camera": [8, 8]}}, "env_options"),
+    ],
+)
+def test_results_of_other_settings_are_not_resumed(config: Config, change: dict[str, object], differing: str) -> None:
+    with Store(config()) as store:
+        store.begin_run(config(), {})
+    with pytest.raises(ConfigError, match=f"{differing}: the results have .*, now it is"):
+        Store(config(resume=True, **change))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"episodes": 50},
+        {"seeds": [0, 100]},
+        {"workers": 7},
+        {"video": "all"},
+        {"envs": ["eval_fakes:OtherLine"]},
+        {"policy": "other"},
+        {"steps": [1, 2]},
+    ],
+)
+def test_more_of_the_same_is_resumed(config: Config, change: dict[str, object]) -> None:
+    with Store(config()) as store:
+        store.begin_run(config(), {})
+    Store(config(resume=True, **change)).close()
+    known = {cell.cell for cell in Results.load(config().out).cells}
+    assert known >= {cell.fingerprint for one in (config(), config(**change)) for cell in cells(one)}
+
+
+def test_two_evaluations_do_not_write_to_one_folder(config: Config) -> None:
+    with Store(config()), pytest.raises(ConfigError, match="another evaluation is writing there"):
+        Store(config(resume=True))
+    Store(config()).close()
+
+
+def test_another_checkpoint_on_the_server_is_noticed(config: Config) -> None:
+    with Store(config()) as store:
+        store.begin_run(config(), {})
+        store.note_policy("policy", {"policy": "act", "checkpoint": "a", "uptime_s": 3})
+        store.note_policy("policy", {"policy": "act", "checkpoint": "a", "uptime_s": 9})
+        with pytest.raises(ConfigError, match=r"checkpoint 'b'.*are of 'a'"):
+            store.note_policy("policy", {"policy": "act", "checkpoint": "b"})
+        assert Results.load(config().out).policies == {"policy": {"policy": "act", "checkpoint": "a", "uptime_s": 9}}
+
+
+def test_what_is_known_of_an_env_survives_a_resume(config: Config) -> None:
+    [cell] = cells(config())
+    with Store(config()) as store:
+        store.begin_run(config(), {})
+        store.note_env(cell.place, EnvInfo({"simulator": "line"}, {}))
+    with Store(config(resume=True)) as store:
+        assert store.cells == [cell]
+    assert [one.described for one in Results.load(config().out).cells] == [{"simulator": "line"}]
+
+
+def test_where_workers_ran_is_kept(config: Config) -> None:
+    near = WorkerInfo("gpu1", "ab12", 7, "pi0", "shm", "llvmpipe")
+    with Store(config()) as store:
+        store.begin_run(config(), {})
+        store.note_worker(near)
+        store.note_worker(replace(near, host="cpu1", transport="handle", renderer=None))
+    found = Results.load(config().out).workers
+    assert [(one.run, one.host, one.node, one.pid, one.policy, one.transport, one.renderer) for one in found] == [
+        (1, "gpu1", "ab12", 7, "pi0", "shm", "llvmpipe"),
+        (1, "cpu1", "ab12", 7, "pi0", "handle", None),
+    ]
+
+
+def test_results_from_before_workers_were_noted_are_read_and_gone_on_with(config: Config) -> None:
+    with Store(config()) as store:
+        store.begin_run(config(), {})
+        store.record(done(planned(config())[0].key), attempts=1)
+    with closing(sqlite3.connect(config().out / "results.db")) as db:
+        db.execute("DROP TABLE workers")
+    assert Results.load(config().out).workers == ()
+    with Store(config(resume=True)) as store:
+        store.begin_run(config(resume=True), {})
+        store.note_worker(WorkerInfo("here", None, 1, "policy", "local", None))
+    assert [(one.run, one.host) for one in Results.load(config().out).workers] == [(2, "here")]
+
+
+def test_a_results_file_of_another_version_is_refused(config: Config) -> None:
+    Store(config()).close()
+    with closing(sqlite3.connect(config().out / "results.db")) as db:
+        db.execute("PRAGMA user_version = 99")
+    with pytest.raises(ConfigError, match="got version 99"):
+        Store(config(resume=True))
+
+
+WRITER = """
+import sys
+from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.results.store import Store
+
+config = EvalConfig.model_validate_json(sys.argv[1])
+with Store(config) as store:
+    store.begin_run(config, {})
+    for job in plan(store.cells):
+        store.record(EpisodeResult(job.key, "done", True, True), 1)
+        print(job.key, flush=True)
+"""
+
+
+def test_a_killed_writer_loses_nothing_that_it_recorded(config: Config) -> None:
+    settings = config(envs=["tabletop"], episodes=50_000)
+    with Popen([sys.executable, "-c", WRITER, settings.model_dump_json()], stdout=PIPE, text=True) as writer:
+        assert writer.stdout is not None
+        told = [writer.stdout.readline().strip() for _ in range(200)]
+        writer.kill()
+        told += [line.strip() for line in writer.stdout if line.endswith("\n")]
+    with Store(config(envs=["tabletop"], episodes=50_000, resume=True)) as store:
+        finished = store.finished()
+    assert set(told) <= finished
+    assert len(finished) <= len(told) + 1
+
+
+def test_an_episode_of_another_checkpoint_is_not_added(config: Config) -> None:
+    first, second, third = (job.key for job in planned(config(episodes=3)))
+    with Store(config(episodes=3)) as store:
+        store.begin_run(config(episodes=3), {})
+        store.record(replace(done(first), checkpoint="runs/1"), attempts=1)
+        store.record(replace(done(second), checkpoint="runs/1"), attempts=1)
+        with pytest.raises(ConfigError, match=r"played by checkpoint 'runs/2'.* are of 'runs/1'"):
+            store.record(replace(done(third), checkpoint="runs/2"), attempts=1)
+        assert [one.checkpoint for one in recorded(config())] == ["runs/1", "runs/1"]
+
+
+def test_an_env_that_has_changed_between_runs_is_noticed(config: Config) -> None:
+    place = cells(config())[0].place
+    with Store(config()) as store:
+        store.begin_run(config(), {})
+        store.note_env(place, EnvInfo({"simulator": "line", "version": 1}, {}))
+        store.note_env(place, EnvInfo({"simulator": "line", "version": 1, "node": "b"}, {}))
+        store.record(done(planned(config())[0].key), attempts=1)
+    with (
+        Store(config(resume=True)) as store,
+        pytest.raises(ConfigError, match=r"has changed since the results in .*: version: 1, now 2; go on with"),
+    ):
+        store.note_env(place, EnvInfo({"simulator": "line", "version": 2}, {}))
+
+
+def test_what_is_not_planned_any_more_is_kept_and_not_counted(config: Config) -> None:
+    with Store(config()) as store:
+        store.begin_run(config(), {})
+        for job in planned(config())[::2]:  # those that happened to come back first
+            store.record(done(job.key), attempts=1)
+    with Store(config(episodes=3, resume=True)) as store:
+        store.begin_run(config(episodes=3), {})
+        [cell] = Results.load(config().out).cells
+        assert [(one.result.key.episode, one.counts) for one in cell.episodes] == [(0, True), (2, True), (4, False)]
+        [group] = summarize(Results.load(config().out)).cells
+        assert (group.episodes, group.planned) == (2, 3)
+    with Store(config(resume=True)):
+        assert [one.counts for one in Results.load(config().out).cells[0].episodes] == [True] * 3
+
+
+def test_an_episode_of_other_weights_under_the_same_name_is_not_added(config: Config) -> None:
+    first, second, third = (job.key for job in planned(config())[:3])
+    with Store(config()) as store:
+        store.begin_run(config(), {})
+        store.record(replace(done(first), checkpoint="runs/1", weights="a"), attempts=1)
+        store.record(replace(done(second), checkpoint="runs/1", weights="a"), attempts=1)
+    with Store(config(resume=True)) as store:
+        store.begin_run(config(), {})
+        with pytest.raises(ConfigError, match=r"other weights .*'runs/1' is b now, and was a.* choose another out"):
+            store.record(replace(done(third), checkpoint="runs/1", weights="b"), attempts=1)
+        store.record(done(third), attempts=1)  # of a server that does not tell
+    assert [one.weights for one in recorded(config())] == ["a", "a", None]
+
+
+def test_a_server_with_other_weights_is_noticed_before_anything_is_played(config: Config) -> None:
+    said = {"policy": "act", "checkpoint": "a"}
+    with Store(config()) as store:
+        store.begin_run(config(), {})
+        store.note_policy("policy", said)  # of an older server, which tells no weights
+        store.note_policy("policy", said | {"weights": {"digest": "x", "revision": None}})
+        store.note_policy("policy", said | {"weights": {"digest": "x", "revision": "c0ffee"}})
+        with pytest.raises(ConfigError, match=r"has weights .*'y'.*are of .*'x'.*choose another out folder"):
+            store.note_policy("policy", said | {"weights": {"digest": "y", "revision": None}})
+
+
+def test_results_that_were_begun_without_weights_are_gone_on_with(config: Config) -> None:
+    first, second = (job.key for job in planned(config())[:2])
+    with Store(config()) as store:
+        store.begin_run(config(), {})
+        store.record(done(first), attempts=1)
+    with closing(sqlite3.connect(config().out / "results.db")) as db:
+        for column in ("weights", "policy_version", "policy_fingerprint", "first_policy_version"):
+            db.execute(f"ALTER TABLE episodes DROP COLUMN {column}")
+        db.commit()
+    assert [one.weights for one in recorded(config())] == [None]  # as it is
+    played = {"weights": "a", "policy_version": 7, "policy_fingerprint": "9f3c", "first_policy_version": 6}
+    with Store(config(resume=True)) as store:
+        store.begin_run(config(), {})
+        store.record(replace(done(second), **played), attempts=1)
+    for name, value in played.items():
+        assert [getattr(one, name) for one in recorded(config())] == [None, value]

@@ -1,0 +1,265 @@
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from io import StringIO
+from pathlib import Path
+
+import pytest
+from eval_fakes import LINE, OTHER_LINE
+from rich.console import Console
+
+from vlagents_ray.evaluate import EvalConfig, Summary, print_summary, synchronous_twin
+from vlagents_ray.evaluate.artifacts.provenance import versions
+from vlagents_ray.evaluate.episode.failures import Failure
+from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult
+from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.jobs import plan
+from vlagents_ray.evaluate.report.html import write_report
+from vlagents_ray.evaluate.results.reader import Results
+from vlagents_ray.evaluate.results.store import Store
+from vlagents_ray.evaluate.results.summary import summarize, write_summary
+
+Config = Callable[..., EvalConfig]
+
+
+@pytest.fixture
+def summary(config: Config) -> Summary:
+    """Two envs with 3 planned episodes each: one finished but for a lost episode, one begun."""
+    settings = config(envs=[LINE, OTHER_LINE], episodes=3, policy="act", policy_url="http://localhost:1")
+    jobs = plan(cells(settings))
+    keys = [job.key for job in jobs]
+    with Store(settings) as store:
+        store.begin_run(settings, versions())
+        store.note_env(jobs[0].cell.place, EnvInfo({"simulator": "line"}, {}))
+        store.note_policy("act", {"policy": "act", "checkpoint": "a"})
+        store.record(
+            EpisodeResult(
+                keys[0], "done", True, False, steps=10, episode_return=2.0, seconds=1.0, transport="http", policy_ms=3.0
+            ),
+            1,
+        )
+        store.record(
+            EpisodeResult(
+                keys[1], "policy_error", False, False, steps=2, episode_return=1.0, seconds=0.5, transport="http"
+            ),
+            2,
+        )
+        store.record_attempt(jobs[1], Failure("policy", "connection_lost", "gone"), retried=True)
+        store.record_attempt(replace(jobs[2], attempt=4), Failure("worker", "env_failed", "hung"), retried=False)
+        store.record(EpisodeResult(keys[2], "infra_failed", error="hung"), 4)
+        store.record(
+            EpisodeResult(keys[3], "done", True, True, steps=6, episode_return=3.0, seconds=1.0, transport="websocket"),
+            1,
+        )
+        store.end_run("interrupted")
+    return summarize(Results.load(settings.out))
+
+
+def test_infrastructure_failures_are_in_no_rate(summary: Summary) -> None:
+    group = summary.cells[0]
+    assert (group.planned, group.episodes, group.infra_failures, group.policy_errors) == (3, 2, 1, 1)
+    assert (group.success_once.successes, group.success_at_end.successes) == (1, 0)
+    assert (group.success_once.rate, group.mean_steps, group.mean_return) == (0.5, 6.0, 1.5)
+    assert group.retries == 1
+
+
+def test_the_total_counts_all_envs(summary: Summary) -> None:
+    total = summary.total
+    assert (total.planned, total.episodes, total.steps, total.retries) == (6, 3, 18, 1)
+    assert (total.success_once.successes, total.success_at_end.successes) == (2, 1)
+    assert total.policy_ms == 3.0
+    assert summary.transports == ["http", "websocket"]
+    assert summary.steps_per_second == pytest.approx(18 / summary.wall_seconds)
+
+
+def test_a_summary_is_plain_json_with_all_that_made_it(summary: Summary) -> None:
+    written = json.loads(write_summary(summary).read_text())
+    assert written["state"] == "interrupted"
+    assert [cell["env"] for cell in written["cells"]] == [LINE, OTHER_LINE]
+    [total] = written["totals"]
+    assert (total["contender"], total["env"]) == ("act", "total")
+    assert total["success_once"]["wilson_95"] == pytest.approx([0.2077, 0.9385], abs=1e-4)
+    assert written["config"]["suites"][0]["episodes"] == 3
+    assert written["policies"] == {"act": {"policy": "act", "checkpoint": "a"}}
+    assert [cell["described"] for cell in written["cells"]] == [{"simulator": "line"}, {}]
+    assert {"python", "ray", "numpy", "vlagents-ray", "code"} <= set(written["versions"])
+
+
+def test_a_summary_replaces_the_one_before_whole(summary: Summary) -> None:
+    write_summary(summary)
+    write_summary(summary)
+    assert not list(Path(summary.out).glob("*.part"))
+
+
+def test_the_report_shows_rates_and_what_was_not_the_policys_fault(summary: Summary) -> None:
+    console = Console(file=StringIO(), width=100)
+    print_summary(console, summary)
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert "50% [9, 91]" in text
+    assert "67% [21, 94]" in text
+    assert "1 attempts lost to infrastructure and repeated" in text
+    assert "1 episodes lost to infrastructure" in text
+    assert "--resume" in text
+    assert "report:" not in text  # there is none
+
+
+def test_the_page_is_named_where_there_is_one(summary: Summary) -> None:
+    page = write_report(summary.results, Path(summary.out) / "report.html")
+    console = Console(file=StringIO(), width=100)
+    print_summary(console, summary)
+    assert f"report: {page}" in console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def recorded(settings: EvalConfig, outcomes: dict[str, list[bool]], **fields: int) -> Summary:
+    """The summary of an evaluation whose suites had these outcomes."""
+    with Store(settings) as store:
+        store.begin_run(settings, versions())
+        for job in plan(store.cells):
+            if job.key.episode < len(outcomes[job.cell.suite.name]):
+                success = outcomes[job.cell.suite.name][job.key.episode]
+                waited = fields if job.cell.suite.clock else {}
+                store.record(EpisodeResult(job.key, "done", success, success, **{"steps": 10} | waited), 1)
+        store.end_run("complete")
+    return summarize(Results.load(settings.out))
+
+
+def printed(summary: Summary) -> str:
+    console = Console(file=StringIO(), width=200)
+    print_summary(console, summary)
+    return str(console.file.getvalue())  # type: ignore[attr-defined]
+
+
+def test_a_cell_in_real_time_tells_its_gap_to_the_synchronous_one(tmp_path: Path) -> None:
+    suites = [
+        {"name": "waits", "envs": [LINE], "episodes": 4},
+        {"name": "moves on", "envs": [LINE], "episodes": 4, "clock": {"latency": 0.2}},
+        {"name": "smaller", "envs": [LINE], "episodes": 4, "env_options": {"state_dim": 2}, "clock": {"latency": 0.2}},
+    ]
+    settings = EvalConfig.model_validate({"policies": [{}], "suites": suites, "out": tmp_path / "out"})
+    outcomes = {"waits": [True] * 4, "moves on": [True] + [False] * 3, "smaller": [True] * 4}
+    summary = recorded(settings, outcomes, ticks_waited=5, ticks_held=2)
+    waits, moves, smaller = summary.results.cells
+    assert synchronous_twin(summary.results, moves) is waits
+    assert synchronous_twin(summary.results, waits) is None
+    assert synchronous_twin(summary.results, smaller) is None, "it differs in more than its clock"
+    assert [cell["gap_to_synchronous"] for cell in summary.to_json()["cells"]] == [None, -0.75, None]
+    text = printed(summary)
+    assert "policy, moves on in real time: -75.0 points to the synchronous score (" in text
+    assert ", 4 pairs); 50% of its ticks waited for an answer, 20% with nothing to execute" in text
+
+
+def test_a_cell_in_real_time_without_a_single_step_has_no_ticks_that_waited(tmp_path: Path) -> None:
+    suites = [
+        {"name": "waits", "envs": [LINE], "episodes": 2},
+        {"name": "moves on", "envs": [LINE], "episodes": 2, "clock": {"latency": 0.2}},
+    ]
+    settings = EvalConfig.model_validate({"policies": [{}], "suites": suites, "out": tmp_path / "out"})
+    summary = recorded(settings, {"waits": [True] * 2, "moves on": [False] * 2}, steps=0)
+    assert "in real time: -100.0 points to the synchronous score (" in printed(summary)
+    assert "; 0% of its ticks" in printed(summary)
+
+
+def test_console_report_and_summary_tell_the_same_gap(tmp_path: Path) -> None:
+    suites = [
+        {"name": "waits", "envs": [LINE, OTHER_LINE], "episodes": 6},
+        {"name": "moves on", "envs": [LINE, OTHER_LINE], "episodes": 4, "clock": {"latency": 0.2}},
+    ]  # of the six episodes that wait, two have no pair: rates differ by -60 points, pairs by -50
+    settings = EvalConfig.model_validate({"policies": [{}], "suites": suites, "out": tmp_path / "out"})
+    outcomes = {"waits": [True] * 3 + [False] + [True] * 2, "moves on": [True] + [False] * 3}
+    summary = recorded(settings, outcomes)
+    assert [cell["gap_to_synchronous"] for cell in summary.to_json()["cells"]] == [None, None, -0.5, -0.5]
+    assert "moves on in real time: -50.0 points to the synchronous score (" in printed(summary)
+    assert ", 8 pairs)" in printed(summary)
+    page = write_report(summary.results, tmp_path / "report.html").read_text()
+    assert "<strong>\N{MINUS SIGN}50.0</strong>" in page
+
+
+def test_real_time_and_synchronous_episodes_are_in_no_rate_together(tmp_path: Path) -> None:
+    suites = [
+        {"name": "waits", "envs": [LINE], "episodes": 4},
+        {"name": "moves on", "envs": [LINE], "episodes": 4, "clock": {"latency": 0.2}},
+    ]
+    settings = EvalConfig.model_validate({"policies": [{}], "suites": suites, "out": tmp_path / "out"})
+    summary = recorded(settings, {"waits": [True] * 4, "moves on": [False] * 4})
+    [total] = summary.to_json()["totals"]
+    assert (total["success_once"]["rate"], total["episodes"]) == (None, 8)
+    assert "50%" not in printed(summary)
+    assert "total synchronous" in printed(summary)
+    page = write_report(summary.results, tmp_path / "report.html").read_text()
+    assert ">50.0" not in page
+    assert "solved, synchronous" in page
+    for sentence in ("policy, synchronous solved 100.0 % of 4", "policy, in real time solved 0.0 % of 4"):
+        assert sentence in page
+
+
+def test_cells_that_stopped_after_different_numbers_have_no_rate_in_common(config: Config, tmp_path: Path) -> None:
+    settings = config(envs=[LINE, OTHER_LINE], episodes=40, stop={"target": 0.5, "at_least": 5})
+    with Store(settings) as store:
+        store.begin_run(settings, {})
+        for job in plan(store.cells):  # one task is solved at once, the other every second time
+            success = job.cell.env == LINE or bool(job.key.episode % 2)
+            if job.cell.env == OTHER_LINE or job.key.episode < 12:
+                store.record(EpisodeResult(job.key, "done", success, success, first_success=3, steps=9), 1)
+        store.end_run("complete")
+    summary = summarize(Results.load(settings.out))
+    first, second = summary.results.cells
+    assert first.stopped_at is not None
+    assert second.stopped_at is None
+    [total] = summary.to_json()["totals"]
+    assert total["success_once"]["rate"] is None
+    assert total["success_once"]["confidence_sequence"] == [0.0, 1.0]
+    assert "have no rate in common" in printed(summary)
+    page = write_report(summary.results, tmp_path / "report.html").read_text()
+    assert "50.0 to 100.0 %" in page  # from task to task, as the headline
+    pooled = 100 * (first.stopped_at + 20) / (first.stopped_at + 40)
+    assert f"{pooled:.1f}" not in page
+
+
+def test_cells_that_stopped_alike_have_one(config: Config) -> None:
+    settings = config(envs=[LINE, OTHER_LINE], episodes=40, stop={"target": 0.5, "at_least": 5})
+    summary = recorded(settings, {"": [True] * 12})
+    assert {cell.stopped_at for cell in summary.results.cells} != {None}
+    assert summary.totals[0].success_once.rate == 1.0
+
+
+def test_a_cell_that_stopped_early_says_after_how_many_and_at_which_error_rate(config: Config) -> None:
+    settings = config(episodes=40, stop={"target": 0.5, "error_rate": 0.01})
+    summary = recorded(settings, {"": [True] * 20})
+    [cell] = summary.to_json()["cells"]
+    at = cell["stopped_at"]
+    assert 5 < at < 20
+    assert cell["success_once"]["confidence_sequence"][0] > 0.5
+    assert (cell["success_once"]["error_rate"], cell["episodes"], cell["planned"]) == (0.01, at, 40)
+    text = printed(summary)
+    assert f"stopped after {at} of 40 (error rate 1 %)" in text
+    assert "Wilson" not in text
+
+
+@pytest.mark.parametrize(
+    ("versions", "says"),
+    [
+        ([(None, None), (None, None)], None),
+        ([(0, 0), (0, 0)], None),
+        ([(3, 3), (3, 3)], "version 3 (digest 3)"),
+        ([(0, 0), (2, 3)], "versions 0 to 3, one after the other"),
+    ],
+)
+def test_pushed_weights_are_named_with_the_checkpoint(
+    config: Config, versions: list[tuple[int | None, int | None]], says: str | None
+) -> None:
+    settings = config(envs=[LINE], episodes=2, policy="act")
+    with Store(settings) as store:
+        store.begin_run(settings, {})
+        for job, (first, last) in zip(plan(cells(settings)), versions, strict=True):
+            done = EpisodeResult(job.key, "done", True, True, first_policy_version=first, policy_version=last)
+            store.record(replace(done, policy_fingerprint=f"digest {last}"), 1)
+    summary = summarize(Results.load(settings.out))
+    assert summary.to_json()["cells"][0]["pushed_weights"] == says
+    page = write_report(summary.results, settings.out / "report.html").read_text()
+    printed = StringIO()
+    print_summary(Console(file=printed, width=200), summary)
+    for shown in (page, printed.getvalue()):
+        assert ("version" in shown) >= (says is not None)
+        assert says is None or says in shown

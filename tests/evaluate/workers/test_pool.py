@@ -1,0 +1,106 @@
+"""What the pool of workers makes of nodes that are lost."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from time import monotonic
+from typing import Any
+
+import pytest
+import ray
+from eval_fakes import LINE, ToZero, wait_for
+from ray.exceptions import RaySystemError
+
+from vlagents_ray.errors import EnvFailed
+from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.evaluate.episode.failures import Failure
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job
+from vlagents_ray.evaluate.workers import pool
+from vlagents_ray.evaluate.workers.pool import WorkerPool
+from vlagents_ray.evaluate.workers.rollout import Report
+from vlagents_ray.evaluate.workers.worker import WorkerHandle
+
+pytestmark = pytest.mark.usefixtures("cluster")
+
+Config = Callable[..., EvalConfig]
+
+
+@ray.remote
+def lost() -> None:
+    raise RuntimeError("its node died")
+
+
+@ray.remote(num_cpus=0)
+class Process:
+    """Of a worker, whatever it runs."""
+
+
+def worker(config: EvalConfig, starting: Any = None, **known: Any) -> WorkerHandle:
+    return WorkerHandle(config.worker, "kind", Process.remote(), starting=starting, started_at=monotonic(), **known)
+
+
+def test_workers_that_are_lost_together_while_they_start_are_no_row_of_failures(config: Config) -> None:
+    settings = config(workers=5)
+
+    def lose(workers: int) -> None:
+        started._workers = [worker(settings, lost.remote()) for _ in range(workers)]
+        while started.kinds():
+            assert list(started.wait(1)) == []
+
+    with WorkerPool(settings, ToZero) as started:
+        lose(5)
+        lose(5)
+        with pytest.raises(EnvFailed, match="workers do not start, 3 in a row"):
+            lose(1)
+
+
+def test_workers_play_on_while_there_is_no_room_for_all(config: Config, caplog: pytest.LogCaptureFixture) -> None:
+    settings = config(workers=2, place_timeout_s=0.2)
+    job = Job(EpisodeKey(LINE, 0, 0, "settings"), None)  # type: ignore[arg-type]
+    waiting = worker(settings, Process.options(num_cpus=64).remote().__ray_ready__.remote())
+    playing = worker(settings, jobs=(job,), heartbeat_at=math.inf, queried_at=math.inf)  # nobody asks how it gets on
+    reports: list[tuple[Job, Report]] = []
+    with WorkerPool(settings, ToZero) as short:
+        short._workers = [waiting, playing]
+        wait_for(lambda: reports.extend(short.wait(0.1)) or "going on with 1 of 2 workers: the cluster" in caplog.text)
+        assert short._workers == [waiting, playing]
+    assert reports == []
+
+
+def test_a_host_that_does_not_answer_is_waited_for_once(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    def silent(host: str, paths: object) -> str:
+        asked.append(host)
+        raise TimeoutError
+
+    monkeypatch.setattr(pool, "tail_at", silent)
+    failure = Failure("worker", EnvFailed.code, "the worker died")
+    with WorkerPool(config(), ToZero) as watched:
+        for host in ("host1", "host1", "host2"):
+            process = {"host": host, "logs": ["/log"]}
+            assert watched._with_log(failure, worker(config(), process=process)) == failure
+    assert asked == ["host1", "host2"]
+
+
+def test_a_worker_that_cannot_be_killed_saves_no_other_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    killed = []
+
+    def kill(actor: str) -> None:
+        killed.append(actor)
+        raise RaySystemError("no answer")
+
+    monkeypatch.setattr(ray, "kill", kill)
+    pool._kill(["one", "other"])
+    assert killed == ["one", "other"]
+
+
+def test_who_kills_workers_of_a_ray_that_was_left_meanwhile_starts_no_other_ray(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[str] = []  # anything, which Ray takes for a wish to be started
+    monkeypatch.setattr(ray, "is_initialized", lambda: False)
+    monkeypatch.setattr(ray, "kill", asked.append)
+    pool._kill(["one"])
+    assert asked == []

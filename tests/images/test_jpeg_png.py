@@ -1,0 +1,119 @@
+"""JPEG keeps as much as the peers', PNG keeps everything, and broken files are refused by name."""
+
+from __future__ import annotations
+
+import io
+import struct
+import zlib
+
+import numpy as np
+import pytest
+import simplejpeg
+from camera_images import photograph, psnr, rendered
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from PIL import Image
+
+from vlagents_ray.bench.clients import observation
+from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge
+from vlagents_ray.images import jpeg_png, png
+
+PICTURES = {"bench": observation().cameras["camera_0"], "rendered": rendered(), "photograph": photograph()}
+pixels = hnp.arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9), st.just(3)))
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_a_jpeg_loses_no_more_than_by_vlagents(name: str) -> None:
+    image = PICTURES[name]
+    theirs = simplejpeg.decode_jpeg(simplejpeg.encode_jpeg(image))  # both ends of vlagents 0.3: all defaults
+    assert psnr(image, jpeg_png.decode(jpeg_png.encode_jpeg(image))) >= psnr(image, theirs)
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_any_reader_reads_our_png(name: str) -> None:
+    image = PICTURES[name]
+    file = jpeg_png.encode_png(image)
+    with Image.open(io.BytesIO(file)) as opened:
+        np.testing.assert_array_equal(np.array(opened), image)
+    assert len(file) < 0.8 * image.nbytes
+
+
+@given(pixels)
+def test_png_is_lossless(image: np.ndarray) -> None:
+    assert png.is_plain(jpeg_png.encode_png(image))
+    assert png.declared(jpeg_png.encode_png(image)) == jpeg_png.size(jpeg_png.encode_png(image)) == image.shape[:2]
+    np.testing.assert_array_equal(jpeg_png.decode(jpeg_png.encode_png(image)), image)
+
+
+@given(pixels)
+def test_a_view_is_written_as_it_is_seen(image: np.ndarray) -> None:
+    turned = image[::-1, ::-1]
+    np.testing.assert_array_equal(jpeg_png.decode(jpeg_png.encode_png(turned)), turned)
+
+
+@pytest.mark.parametrize("mode", ["RGB", "L", "P", "RGBA"])
+def test_png_files_of_others_are_read(mode: str) -> None:
+    file = io.BytesIO()
+    with Image.fromarray(rendered()) as picture:
+        picture.convert(mode).save(file, "PNG")
+    assert jpeg_png.decode(file.getvalue()).shape == (224, 224, 3)
+
+
+@given(st.data())
+def test_a_damaged_png_is_refused_or_harmless(data: st.DataObject) -> None:
+    file = bytearray(jpeg_png.encode_png(PICTURES["bench"][:16, :16]))
+    for _ in range(data.draw(st.integers(1, 3))):
+        file[data.draw(st.integers(8, len(file) - 1))] = data.draw(st.integers(0, 255))
+    try:
+        jpeg_png.decode(bytes(file), max_pixels=4096)
+    except (MalformedMessage, MessageTooLarge):
+        return  # refused by name; anything else fails the test
+
+
+def test_a_png_that_unpacks_to_more_than_it_declares_is_refused() -> None:
+    file = jpeg_png.encode_png(np.zeros((4, 4, 3), np.uint8))
+    data = zlib.compress(bytes(50_000_000))
+    chunk = struct.pack(">I", len(data)) + b"IDAT" + data + struct.pack(">I", zlib.crc32(b"IDAT" + data))
+    with pytest.raises(MalformedMessage, match="4 rows"):
+        jpeg_png.decode(file[:33] + chunk + file[-12:])
+
+
+def test_a_png_that_declares_too_much_is_refused() -> None:
+    with pytest.raises(MessageTooLarge, match="declares 8x9"):
+        jpeg_png.decode(jpeg_png.encode_png(np.zeros((8, 9, 3), np.uint8)), max_pixels=71)
+
+
+@pytest.mark.parametrize("encode", [jpeg_png.encode_jpeg, jpeg_png.encode_png])
+@pytest.mark.parametrize("shape", [(4, 4), (4, 4, 4), (0, 4, 3)])
+def test_what_is_no_image_is_refused(encode: object, shape: tuple[int, ...]) -> None:
+    with pytest.raises(InvalidObservation, match="want \\(H, W, 3\\) uint8 RGB"):
+        encode(np.zeros(shape, np.uint8))
+
+
+@pytest.mark.parametrize("in_chunks", [False, True])
+def test_a_16_bit_grey_png_is_scaled_and_not_clipped(in_chunks: bool) -> None:
+    """Pillow's own conversion makes 255 of all that is over it; of 16-bit colours it takes the upper 8 bits."""
+    ramp = np.arange(0, 65536, 64, dtype=np.uint16).reshape(32, 32)
+    file = io.BytesIO()
+    Image.fromarray(ramp).save(file, "PNG")
+    if in_chunks:
+        rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in ramp)
+        header = struct.pack(">2I5B", 32, 32, 16, 0, 0, 0, 0)
+        data = zlib.compress(rows)
+        chunks = [(b"IHDR", header), (b"IDAT", data[:100]), (b"IDAT", data[100:]), (b"IEND", b"")]
+        parts = [struct.pack(">I", len(d)) + k + d + struct.pack(">I", zlib.crc32(k + d)) for k, d in chunks]
+        file = io.BytesIO(png.MAGIC + b"".join(parts))
+    image = jpeg_png.decode(file.getvalue())
+    np.testing.assert_array_equal(image, np.repeat((ramp >> 8).astype(np.uint8)[:, :, None], 3, axis=2))
+
+
+def test_exif_orientation_turns_nothing() -> None:
+    """As documented: a camera's driver that only marks the file has to turn the pixels itself."""
+    picture = rendered()[:100]
+    plain, marked = io.BytesIO(), io.BytesIO()
+    exif = Image.Exif()
+    exif[0x0112] = 6  # to be turned by 90 degrees
+    Image.fromarray(picture).save(plain, "JPEG")
+    Image.fromarray(picture).save(marked, "JPEG", exif=exif)
+    np.testing.assert_array_equal(jpeg_png.decode(marked.getvalue()), jpeg_png.decode(plain.getvalue()))

@@ -1,0 +1,102 @@
+"""A policy that never returns from an act: its sessions go on elsewhere, the cause is told, and Serve replaces it."""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+import urllib.request
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import psutil
+import pytest
+import ray
+import served_agents
+from eval_fakes import wait_for
+
+from tests.integration.conftest import serving
+from vlagents_ray import DeadlineExceeded, Obs, PolicyUnavailable, RemoteAgent
+from vlagents_ray.client.transports.select import TransportName
+from vlagents_ray.serve.launch.server import Server
+
+ACT_S = 3
+INSIDE: list[TransportName] = ["handle", "plasma"]
+OUTSIDE: list[TransportName] = ["shm", "websocket", "http"]
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Server]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_metrics_report_interval_ms", "500")  # instead of 10 s
+        with serving("served_agents:Hanging", replicas=2, limits={"act_s": ACT_S, "warm_up_s": ACT_S}) as server:
+            yield server
+
+
+def hung_calls() -> list[str]:
+    """What Prometheus would read of them: the op of each, and their number."""
+    (node,) = ray.nodes()
+    url = f"http://{node['NodeManagerAddress']}:{node['MetricsExportPort']}/metrics"
+    with urllib.request.urlopen(url, timeout=10) as answer:
+        text = answer.read().decode()
+    return re.findall(r'^ray_vlagents_hung_calls_total\{.*op="(\w+)".*\} ([\d.]+)$', text, re.MULTILINE)
+
+
+def logged() -> str:
+    """What the workers of this Ray have written."""
+    logs = Path(ray._private.worker._global_node.get_logs_dir_path())  # type: ignore[union-attr]
+    return "".join(file.read_text(errors="replace") for file in logs.glob("worker-*.err"))
+
+
+def line_of(code: str) -> int:
+    """The number of the only line of the policies that holds it."""
+    [number] = [n for n, line in enumerate(Path(served_agents.__file__).read_text().splitlines(), 1) if code in line]
+    return number
+
+
+def persist(agent: RemoteAgent, left: int) -> None:
+    """Act until another replica answers than that one."""
+    while True:
+        with suppress(DeadlineExceeded, PolicyUnavailable):
+            if agent.act(Obs()).info["pid"] != left:
+                return
+
+
+@pytest.mark.parametrize("how", ["sleep", "lock"])
+def test_its_sessions_go_on_elsewhere_the_cause_is_told_and_it_is_replaced(how: str, server: Server) -> None:
+    """One that keeps the interpreter's lock ("lock") can say nothing itself: clients and Serve notice its silence."""
+    made = [RemoteAgent("serve://Hanging", transport=one, timeout_s=2) for one in INSIDE * 3]
+    made += [RemoteAgent(server.url, transport=one, timeout_s=2) for one in OUTSIDE * 3]
+    for agent in made:
+        agent.reset(Obs())
+    at = {agent: agent.act(Obs()).info["pid"] for agent in made}
+    first = set(at.values())
+    hung = at[made[0]]
+    hit = [agent for agent in made if at[agent] == hung]
+    with pytest.raises(DeadlineExceeded):
+        hit[0].act(Obs(info={"hang": how}))
+    begun = time.monotonic()
+    threads = [threading.Thread(target=persist, args=(agent, hung), daemon=True) for agent in hit]
+    for thread in threads:
+        thread.start()
+    wait_for(lambda: not any(thread.is_alive() for thread in threads), 60)
+    print(f"{how}: {len(hit)} sessions were there; the last acted elsewhere after {time.monotonic() - begun:.1f} s")
+    if how == "sleep":
+        wait_for(lambda: hung_calls() == [("act", "1.0")], 30)
+        wait_for(lambda: f"has not returned from 'act' for {ACT_S}" in logged(), 30)
+        assert "threading.Event().wait()" in logged(), "the log does not say where it hangs"
+    else:
+        place = f'served_agents.py", line {line_of("sleep(10_000)")} in act'
+        wait_for(lambda: place in logged(), 30)
+
+    def replaced() -> bool:
+        with RemoteAgent(server.url, transport="http") as agent:
+            return agent.reset(Obs())["pid"] not in first
+
+    wait_for(replaced, 90)
+    print(f"{how}: replaced after {time.monotonic() - begun:.1f} s")
+    wait_for(lambda: not psutil.pid_exists(hung), 90)
+    print(f"{how}: its process ended after {time.monotonic() - begun:.1f} s")
+    for agent in made:
+        agent.close()

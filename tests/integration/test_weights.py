@@ -1,0 +1,82 @@
+"""New weights for two replicas of a server, through Ray's object store."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from eval_fakes import wait_for
+from ray.serve.schema import ServeDeploySchema
+
+from vlagents_ray import Obs, RemoteAgent
+from vlagents_ray.errors import InvalidWeights, UnchangedWeights
+from vlagents_ray.learn import Publisher
+from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.server import Server, running_server
+
+TRANSPORTS = ("shm", "plasma", "websocket", "http", "handle")
+
+
+def deployed(replicas: int) -> ServeDeploySchema:
+    """A policy that can be trained."""
+    document = deployment("served_agents:Trainable", replicas=2).model_dump(exclude_unset=True)
+    document["applications"][0]["deployments"] = [{"name": "Policy", "num_replicas": replicas}]
+    return ServeDeploySchema(**document)
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[Server]:
+    with running_server(deployed(2), num_cpus=3) as server:
+        yield server
+
+
+def gain(value: float) -> dict[str, np.ndarray]:
+    return {"gain": np.full(200_000, value, np.float32)}
+
+
+def acts(server: Server, transport: str) -> tuple[int, float]:
+    url = "serve://Trainable" if transport in ("handle", "plasma") else server.url
+    with RemoteAgent(url, transport=transport, rank="simulation") as agent:
+        agent.reset(Obs(), None)
+        act = agent.act(Obs())
+        return act.info["policy"]["version"], float(act.action[0])
+
+
+def test_both_replicas_act_with_a_push_on_every_transport(server: Server) -> None:
+    assert [acts(server, transport) for transport in TRANSPORTS] == [(0, 0.0)] * 5
+    weights = Publisher("serve://Trainable")
+    version = weights.push(gain(1))
+    assert weights.acknowledged(version) == 2
+    assert [acts(server, transport) for transport in TRANSPORTS for _ in range(2)] == [(1, 1.0)] * 10
+    for wrong, error in ((gain(np.nan), InvalidWeights), (gain(1), UnchangedWeights)):
+        with pytest.raises(error):
+            weights.push(wrong)
+    assert weights.push(gain(2)) == 2
+
+
+def test_a_push_over_the_network_reaches_both_replicas(server: Server) -> None:
+    with Publisher(server.url) as weights:
+        version = weights.push(gain(5))
+        assert weights.acknowledged(version) == 2
+        assert [acts(server, "http") for _ in range(4)] == [(version, 5.0)] * 4
+        with pytest.raises(UnchangedWeights):
+            weights.push(gain(5))
+
+
+def test_a_replica_that_starts_later_has_the_weights_of_the_others(server: Server) -> None:
+    from ray.serve.context import _get_global_client
+
+    client = _get_global_client()
+    assert client is not None
+    weights = Publisher("serve://Trainable")
+    version = weights.push(gain(7))
+    client.deploy_apps(deployed(3))
+    wait_for(lambda: running() == 3, 60)
+    assert weights.acknowledged(version) == 3
+
+
+def running() -> int:
+    from ray.serve import status
+
+    return int(status().applications["Trainable"].deployments["Policy"].replica_states.get("RUNNING", 0))

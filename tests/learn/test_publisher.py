@@ -1,0 +1,138 @@
+"""A learner in the process of the policy."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Iterator
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from vlagents_ray.errors import ConfigError, InvalidInput, InvalidWeights, UnchangedWeights
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.learn import Publisher
+from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.weights.check import fingerprint
+
+
+class Linear(Agent):
+    """Acts with two named arrays."""
+
+    trainable: ClassVar[str | None] = "tree"
+
+    def initialize(self) -> None:
+        self.tree = {"w": np.zeros(2, np.float32), "b": np.zeros(2, np.float32)}
+
+    def act(self, obs: Obs) -> Act:
+        return Act(self.tree["w"] + self.tree["b"])
+
+
+def act(engine: Engine, session: str = "s") -> Act:
+    """The first act of an episode of a simulation."""
+    replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
+    for request in (Request("reset", Obs(), rank="simulation"), Request("act", Obs(), rank="simulation")):
+        engine.submit(session, request, replies.put)
+        reply = replies.get(timeout=30)
+    assert reply.act is not None, reply.error
+    return reply.act
+
+
+@pytest.fixture
+def engine() -> Iterator[Engine]:
+    found = Engine(Linear())
+    found.start()
+    yield found
+    found.close()
+
+
+def test_the_learner_and_the_policy_name_the_same_weights(engine: Engine) -> None:
+    model = {"w": np.ones(2, np.float32), "b": np.ones(2, np.float32)}
+    with Publisher(engine) as weights:
+        for version in (1, 2, 3):
+            model["w"] += 1  # as an optimizer does, in place
+            assert weights.push(model) == version
+            acted = act(engine)
+            assert acted.info["policy"] == {"version": version, "fingerprint": fingerprint(model)}
+            assert acted.action[0] == version + 2
+            assert (weights.acknowledged(version), weights.acknowledged(version + 1)) == (1, 0)
+
+
+def test_a_part_of_the_weights_leaves_the_rest(engine: Engine) -> None:
+    weights = Publisher(engine)
+    weights.push({"w": np.full(2, 3.0), "b": np.full(2, 4.0)})
+    with pytest.raises(InvalidWeights, match="'b': missing; push it, or set partial=True"):
+        weights.push({"w": np.zeros(2)})
+    assert weights.push({"w": np.ones(2)}, partial=True) == 2
+    assert act(engine).action[0] == 5
+
+
+def test_mistakes_are_refused_by_name(engine: Engine) -> None:
+    weights = Publisher(engine)
+    with pytest.raises(UnchangedWeights):
+        weights.push(engine.models.own_weights._agent.parameters())
+    with pytest.raises(InvalidWeights, match="got list, want values by name"):
+        weights.push([np.zeros(2)])  # type: ignore[arg-type]
+    with pytest.raises(InvalidInput, match="mode: got 'abort'"):
+        weights.push({}, mode="abort")  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="Publisher: got 7"):
+        Publisher(7)  # type: ignore[arg-type]
+    assert act(engine).info["policy"]["version"] == 0
+
+
+def test_pushes_of_several_learners_are_versions_in_some_order(engine: Engine) -> None:
+    found: list[Any] = []
+
+    def learn(seed: int) -> None:
+        weights = Publisher(engine)
+        rng = np.random.default_rng(seed)
+        for _ in range(10):
+            try:
+                found.append(weights.push({"w": rng.random(2), "b": rng.random(2)}))
+            except Exception as error:  # noqa: BLE001 - compared below
+                found.append(type(error).__name__)
+
+    threads = [threading.Thread(target=learn, args=(seed,)) for seed in range(3)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60)
+    pushed = [version for version in found if isinstance(version, int)]
+    assert sorted(pushed) == list(range(1, len(pushed) + 1))
+    assert set(found) - set(pushed) <= {"Overloaded"}
+    assert act(engine).info["policy"]["version"] == len(pushed)
+
+
+@pytest.mark.torch
+def test_a_module_is_trained_and_served_in_one_process() -> None:
+    torch = pytest.importorskip("torch")
+
+    class Module(Agent):
+        trainable: ClassVar[str | None] = "module"
+
+        def initialize(self) -> None:
+            self.module = torch.nn.Linear(3, 2)
+
+        def act(self, obs: Obs) -> Act:
+            with torch.no_grad():
+                return Act(self.module(torch.ones(3)).numpy().copy())
+
+    engine = Engine(Module())
+    engine.start()
+    try:
+        learner = torch.nn.Linear(3, 2)
+        optimizer = torch.optim.SGD(learner.parameters(), lr=0.1)
+        weights = Publisher(engine)
+        for version in (1, 2):
+            weights.push(learner.state_dict())
+            with torch.no_grad():
+                wanted = learner(torch.ones(3)).numpy()
+            learner(torch.ones(3)).sum().backward()
+            optimizer.step()  # in place, after the push
+            acted = act(engine, f"s{version}")
+            np.testing.assert_array_equal(acted.action, wanted)
+            assert acted.info["policy"]["version"] == version
+    finally:
+        engine.close()

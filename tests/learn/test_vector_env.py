@@ -1,0 +1,290 @@
+from __future__ import annotations
+
+import itertools
+import sys
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from eval_fakes import LINE, Line
+from gymnasium.utils import env_checker
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+from vlagents_ray.contract import CameraSpec, Contract
+from vlagents_ray.envs.batch import SequentialBatch
+from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, MissingDependency, NotReset
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey
+from vlagents_ray.interface import Act, Obs
+from vlagents_ray.learn import as_vector_env
+from vlagents_ray.learn.spaces import observation_space
+from vlagents_ray.learn.vector_env import BatchVectorEnv
+
+TABLETOP: dict[str, Any] = {"env_options": {"width": 32, "height": 32, "max_steps": 6}}
+
+
+class Ending(Line):
+    """Ends with success, so that episodes have several lengths."""
+
+    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+        obs, reward, _, truncated, info = super().step(act)
+        return obs, reward, info["success"], truncated, info
+
+
+class Single(gymnasium.Env[Any, Any]):
+    """One of our environments as an `Env` of Gymnasium, for its own vector env and its own checker."""
+
+    metadata = {"render_modes": []}  # noqa: RUF012 - as Gymnasium has it
+
+    def __init__(self, venv: BatchVectorEnv) -> None:
+        self._venv = venv
+        self.observation_space, self.action_space = venv.single_observation_space, venv.single_action_space
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        obs, infos = self._venv.reset(seed=seed, options=options)
+        return first(obs), first(infos)
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        obs, rewards, terminated, truncated, infos = self._venv.step(action[np.newaxis])
+        return first(obs), float(rewards[0]), bool(terminated[0]), bool(truncated[0]), first(infos)
+
+
+def first(rows: Any) -> Any:
+    """Row 0 of nested arrays, without the masks of infos."""
+    if isinstance(rows, Mapping):
+        return {name: first(value) for name, value in rows.items() if not name.startswith("_")}
+    return rows[0]
+
+
+class Numbered(gymnasium.Env[Any, Any]):
+    """An `Env` that begins a numbered episode where it is given no seed, with the numbers that ours has."""
+
+    def __init__(self, env: Line, numbers: Iterator[int]) -> None:
+        self._env, self._numbers = env, numbers
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float32)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        seed = next(self._numbers) if seed is None else seed
+        obs, _ = self._env.reset(seed=seed, options=options)
+        return obs.state["position"], {"instruction": self._env.instruction, "episode_seed": seed}
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        obs, reward, terminated, truncated, info = self._env.step(Act(action))
+        return obs.state["position"], reward, terminated, truncated and not terminated, info
+
+
+def of(env: type[Line], number: int, mode: AutoresetMode = AutoresetMode.SAME_STEP) -> BatchVectorEnv:
+    return BatchVectorEnv(SequentialBatch([env() for _ in range(number)]), "state", mode)
+
+
+def same(one: Any, other: Any) -> None:
+    """Compare nested arrays, dtypes included."""
+    if isinstance(one, Mapping):
+        assert one.keys() == other.keys()
+        for name, value in one.items():
+            same(value, other[name])
+    elif isinstance(one, tuple) or (isinstance(one, np.ndarray) and one.dtype == object):
+        for mine, theirs in zip(one, other, strict=True):
+            same(mine, theirs)
+    else:
+        np.testing.assert_array_equal(one, other)
+        assert np.asarray(one).dtype == np.asarray(other).dtype
+
+
+@pytest.mark.parametrize("mode", [AutoresetMode.SAME_STEP, AutoresetMode.NEXT_STEP])
+def test_it_does_what_gymnasiums_own_vector_env_does(mode: AutoresetMode) -> None:
+    ours, numbers = of(Ending, 3, mode), itertools.count(8)
+    theirs = SyncVectorEnv([lambda: Numbered(Ending(), numbers)] * 3, autoreset_mode=mode)
+    same(ours.reset(seed=5), theirs.reset(seed=5))
+    rng, ends = np.random.default_rng(0), 0
+    for _ in range(60):
+        actions = rng.uniform(-2, 0.5, (3, 1)).astype(np.float32)
+        got, want = ours.step(actions), theirs.step(actions)
+        same(got, want)
+        ends += int((got[2] | got[3]).sum())
+    assert ends > 10, "or the test shows nothing"
+
+
+def test_without_autoreset_those_that_are_over_are_reset_by_their_mask() -> None:
+    venv = of(Line, 3, AutoresetMode.DISABLED)
+    venv.reset(seed=0)
+    for _ in range(10):
+        _, _, _, truncated, _ = venv.step(np.zeros((3, 1)))
+    assert truncated.all()
+    with pytest.raises(NotReset, match=r"environments \[0, 1, 2\] are over"):
+        venv.step(np.zeros((3, 1)))
+    _, infos = venv.reset(options={"reset_mask": np.array([True, False, True])})
+    assert infos["episode_seed"].tolist() == [3, 0, 4]
+    assert infos["_episode_seed"].tolist() == [True, False, True]
+    with pytest.raises(NotReset, match=r"environments \[1\] are over"):
+        venv.step(np.zeros((3, 1)))
+
+
+@pytest.mark.parametrize("observation", ["all", "state"])
+@pytest.mark.filterwarnings("ignore:.*A Box observation space m.*imum value is:UserWarning")  # positions have no bounds
+@pytest.mark.filterwarnings("ignore:.*Not able to test alternative render modes:UserWarning")  # as there are none
+def test_it_passes_gymnasiums_checkers(observation: Any) -> None:
+    with as_vector_env_of_tabletop(1, observation) as venv:
+        env_checker.check_env(Single(venv))
+        env_checker.check_returned_data_not_reused(venv)  # of one environment: it asks whether the array is true
+    with as_vector_env_of_tabletop(3, observation) as venv:
+        env_checker.check_reset_seed_determinism(venv)
+        env_checker.check_reset_options(venv)
+        env_checker.check_seed_deprecation(venv)
+        env_checker.check_reset_return_info_deprecation(venv)
+        env_checker.check_reset_return_type(venv)
+        for _ in range(20):
+            obs, rewards, terminated, truncated, infos = venv.step(venv.action_space.sample())
+            assert obs in venv.observation_space
+            assert [part.shape for part in (rewards, terminated, truncated)] == [(3,)] * 3
+            assert infos.get("final_obs") is None or infos["final_obs"][0] in venv.single_observation_space
+
+
+class as_vector_env_of_tabletop:  # noqa: N801 - a context manager
+    """`as_vector_env` of a tabletop with small images, closed at the end."""
+
+    def __init__(self, num_envs: int, observation: Any) -> None:
+        self._venv = as_vector_env("tabletop", num_envs, observation=observation, **TABLETOP)
+
+    def __enter__(self) -> BatchVectorEnv:
+        return self._venv
+
+    def __exit__(self, *_: object) -> None:
+        self._venv.close()
+
+
+def test_episodes_have_the_seeds_of_an_evaluation() -> None:
+    key = EpisodeKey("tabletop", episode=4, seed=104, settings="")
+    with as_vector_env_of_tabletop(3, "all") as venv:
+        venv.reset(seed=100)
+        seen: dict[int, np.ndarray] = {}
+        for _ in range(6):
+            obs, _, _, _, infos = venv.step(np.zeros((3, 4), np.float32))
+        seen = {seed: obs["cameras/front"][i] for i, seed in enumerate(infos["episode_seed"].tolist())}
+        assert sorted(seen) == [103, 104, 105]
+        again, _ = venv.reset(seed=key.seed)
+        np.testing.assert_array_equal(seen[key.seed], again["cameras/front"][0])
+        assert (seen[103] != seen[104]).any()
+
+
+def test_spaces_are_those_of_the_contract() -> None:
+    with as_vector_env_of_tabletop(2, "all") as venv:
+        shapes = {name: (space.shape, space.dtype) for name, space in venv.single_observation_space.items()}
+        assert shapes == {
+            "cameras/front": ((32, 32, 3), np.uint8),
+            "gripper": ((1,), np.float32),
+            "state/xyzrpy": ((6,), np.float32),
+        }
+        assert (venv.action_space.low == -1).all()
+        assert venv.action_space.shape == (2, 4)
+        assert venv.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    with as_vector_env_of_tabletop(2, "state") as venv:
+        assert venv.observation_space.shape == (2, 7)
+
+
+def test_a_size_that_the_contract_leaves_open_is_an_error_that_names_it() -> None:
+    with pytest.raises(ConfigError, match="front: height: the env's contract does not state it"):
+        observation_space(gymnasium.spaces, Contract(cameras={"front": CameraSpec()}), "all")
+    with pytest.raises(ConfigError, match="got 'state', but the env's contract has none"):
+        observation_space(gymnasium.spaces, Contract(), "state")
+
+
+def test_wrong_actions_and_a_step_before_the_reset_are_errors() -> None:
+    venv = of(Line, 2)
+    with pytest.raises(NotReset, match="reset"):
+        venv.step(np.zeros((2, 1)))
+    with pytest.raises(NotReset, match="before the first reset"):
+        venv.reset(options={"reset_mask": np.array([True, False])})
+    venv.reset(seed=0)
+    with pytest.raises(InvalidAction, match=r"got \(1, 1\), want \(2, 1\)"):
+        venv.step(np.zeros((1, 1)))
+    with pytest.raises(ConfigError, match="reset_mask: got"):
+        venv.reset(options={"reset_mask": np.zeros(2, np.bool_)})
+
+
+def test_an_error_of_the_simulator_is_the_envs() -> None:
+    venv = as_vector_env(LINE, 2, observation="state", env_options={"trouble": {"raise": [1]}})
+    venv.reset(seed=0)
+    for _ in range(3):
+        venv.step(np.zeros((2, 1)))
+    with pytest.raises(EnvFailed, match="the simulator exploded"):
+        venv.step(np.zeros((2, 1)))
+
+
+def play(venv: BatchVectorEnv, actions: np.ndarray, steps: int) -> None:
+    for _ in range(steps):
+        venv.step(actions)
+
+
+class Together(SequentialBatch):
+    """As a simulator on a GPU, which resets all its environments at once."""
+
+    restarts = False
+
+
+def test_a_simulator_that_resets_all_at_once_serves_episodes_that_end_together() -> None:
+    venv = BatchVectorEnv(Together([Line(), Line()]), "state")
+    venv.reset(seed=0)
+    for _ in range(10):
+        _, _, _, truncated, infos = venv.step(np.zeros((2, 1)))
+    assert truncated.all()
+    assert infos["episode_seed"].tolist() == [2, 3]
+    apart = BatchVectorEnv(Together([Ending(), Ending()]), "state")
+    apart.reset(seed=0)
+    with pytest.raises(ConfigError, match="1 of 2 episodes are over, and this simulator resets all"):
+        play(apart, np.array([[-1.0], [0.0]]), 10)
+
+
+@pytest.mark.vulkan
+def test_maniskill_on_the_cpu() -> None:
+    options = {"width": 32, "height": 32, "max_steps": 3}
+    venv = as_vector_env("maniskill/PushCube-v1", env_options=options)
+    obs, infos = venv.reset(seed=3)
+    assert infos["episode_seed"].tolist() == [3]
+    for _ in range(3):
+        assert obs in venv.observation_space
+        obs, rewards, _, truncated, infos = venv.step(venv.action_space.sample())
+        assert np.isfinite(rewards).all()
+    assert truncated.all()
+    assert infos["final_obs"][0] in venv.single_observation_space
+    assert infos["episode_seed"].tolist() == [4]
+    venv.close()
+
+
+def test_without_gymnasium_the_error_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(sys.modules, "vlagents_ray.learn.vector_env")
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    with pytest.raises(MissingDependency, match=r"vlagents-ray\[learn\]"):
+        __import__("importlib").import_module("vlagents_ray.learn.vector_env")
+
+
+def test_a_linear_policy_learns_to_reach_a_point_over_the_tabletop() -> None:
+    """The cross-entropy method, each environment with weights of its own; what it sees is the state alone."""
+    goal = np.array([0.1, -0.1, 0.15])
+    options = {"width": 32, "height": 32, "max_steps": 12}
+    venv, rng = as_vector_env("tabletop", 16, observation="state", env_options=options), np.random.default_rng(0)
+
+    def returns(weights: np.ndarray) -> np.ndarray:
+        """Minus the mean distance to the goal, m, of one episode with each (16, 3, 4)."""
+        obs, _ = venv.reset(seed=0)
+        total = np.zeros(16)
+        for _ in range(11):
+            inputs = np.concatenate([obs[:, :3], np.ones((16, 1))], axis=1)
+            actions = np.concatenate([np.einsum("nij,nj->ni", weights, inputs), np.zeros((16, 1))], axis=1)
+            obs, *_ = venv.step(np.clip(actions, -1, 1))
+            total -= np.linalg.norm(obs[:, :3] - goal, axis=1) / 11
+        return total
+
+    mean, std = np.zeros((3, 4)), np.full((3, 4), 3.0)
+    curve = []
+    for _ in range(12):
+        weights = rng.normal(mean, std, (16, 3, 4))
+        scores = returns(weights)
+        curve.append(scores.mean())
+        best = weights[np.argsort(scores)[-5:]]
+        mean, std = best.mean(axis=0), best.std(axis=0) + 0.2
+    venv.close()
+    assert curve[-1] > 0.6 * curve[0], curve  # distances: the smaller the better

@@ -1,0 +1,133 @@
+"""The digest of a checkpoint: equal for equal files wherever they are, another one for other weights."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.policies.base.checkpoint import find_checkpoint, used_checkpoints
+from vlagents_ray.policies.base.checkpoint_files import digest, revision, weights_of
+
+TENSORS, LENGTH = 40, 300_000  # bytes of each: 12 MB together, more than is read from end to end
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
+
+
+def save(file: Path, tensors: list[bytes]) -> None:
+    header, end = {}, 0
+    for i, one in enumerate(tensors):
+        header[f"t{i}"] = {"data_offsets": [end, end := end + len(one)]}
+    text = json.dumps({"__metadata__": {}, **header}).encode()
+    file.write_bytes(len(text).to_bytes(8, "little") + text + b"".join(tensors))
+
+
+def tensors() -> list[bytes]:
+    return [bytes([i]) * LENGTH for i in range(TENSORS)]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    made = tmp_path / "checkpoint"
+    (made / "sub").mkdir(parents=True)
+    save(made / "model.safetensors", tensors())
+    (made / "config.json").write_text('{"a": 1}')
+    (made / "sub" / "opaque").write_bytes(bytes(9 * 2**20))
+    with zipfile.ZipFile(made / "old.pt", "w") as archive:
+        archive.writestr("archive/data/0", bytes(9 * 2**20))
+    return made
+
+
+def change_a_tensor(folder: Path) -> None:
+    other = tensors()
+    other[17] = bytes([99]) * LENGTH
+    save(folder / "model.safetensors", other)
+
+
+def change_a_byte_of_the_zip(folder: Path) -> None:
+    with zipfile.ZipFile(folder / "old.pt", "w") as archive:
+        archive.writestr("archive/data/0", bytes(5 * 2**20) + b"x" + bytes(4 * 2**20 - 1))
+
+
+CHANGES: dict[str, Callable[[Path], object]] = {
+    "one tensor of many": change_a_tensor,
+    "a byte in a zip file": change_a_byte_of_the_zip,
+    "another file throughout": lambda folder: (folder / "sub" / "opaque").write_bytes(b"x" * 9 * 2**20),
+    "settings": lambda folder: (folder / "config.json").write_text('{"a": 2}'),
+    "a name": lambda folder: (folder / "config.json").rename(folder / "b.json"),
+    "a place": lambda folder: (folder / "config.json").rename(folder / "sub" / "config.json"),
+    "one more file": lambda folder: (folder / "more.json").touch(),
+}
+
+
+@pytest.mark.parametrize("change", CHANGES.values(), ids=list(CHANGES))
+def test_what_changes_the_weights_changes_the_digest(change: Callable[[Path], object], folder: Path) -> None:
+    before = digest([folder])
+    change(folder)
+    assert digest([folder]) != before
+
+
+def test_a_copy_has_the_same_and_what_is_written_about_it_does_not_count(folder: Path, tmp_path: Path) -> None:
+    before = digest([folder])
+    assert before.startswith("sampled-sha256:")
+    copy = Path(shutil.copytree(folder, tmp_path / "copy"))
+    (copy / "README.md").write_text("of an ACT")
+    (copy / ".cache").mkdir()
+    (copy / ".cache" / "lock").touch()
+    assert digest([copy]) == before
+    assert digest([folder / "config.json"]) == digest([copy / "config.json"]) != before
+    assert weights_of([]) is None
+
+
+def test_what_a_policy_found_stands_for_its_weights_and_a_part_for_the_whole(folder: Path) -> None:
+    other = folder.with_name("other")
+    other.mkdir()
+    with used_checkpoints() as found:
+        find_checkpoint(str(folder))
+        find_checkpoint(str(other))
+        find_checkpoint(str(folder / "config.json"))
+        find_checkpoint(str(folder / "sub"))
+        find_checkpoint(str(folder / "sub"))
+    assert found == [other, folder / "config.json", folder / "sub"]
+    find_checkpoint(str(folder))
+    assert len(found) == 3
+
+
+def test_a_hub_id_takes_a_commit_and_says_which_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    snapshot = tmp_path / "models--org--name" / "snapshots" / COMMIT
+    (snapshot / "sub").mkdir(parents=True)
+    asked = []
+
+    def download(name: str, revision: str | None) -> str:
+        asked.append((name, revision))
+        if revision == "gone":
+            raise ValueError("no such revision")
+        return str(snapshot)
+
+    monkeypatch.setitem(sys.modules, "huggingface_hub", SimpleNamespace(snapshot_download=download))
+    with caplog.at_level("INFO"):
+        assert find_checkpoint(f"org/name@{COMMIT}") == find_checkpoint("org/name") == snapshot
+    assert asked == [("org/name", COMMIT), ("org/name", None)]
+    assert f"checkpoint org/name: commit {COMMIT}" in caplog.text
+    assert revision(snapshot / "sub") == COMMIT
+    assert revision(tmp_path) is None
+    assert weights_of([snapshot]) == {"digest": digest([snapshot]), "revision": COMMIT}
+    with pytest.raises(ConfigError, match=r"org/name@gone.*org/name@COMMIT"):
+        find_checkpoint("org/name@gone")
+
+
+@pytest.mark.parametrize("start", [b"", (2**62).to_bytes(8, "little"), (9).to_bytes(8, "little") + b'{"a": 1}!'])
+def test_a_file_that_is_not_what_its_name_says_has_a_digest_too(start: bytes, tmp_path: Path) -> None:
+    found = []
+    for rest in (b"x", b"x", b"y"):
+        (tmp_path / "model.safetensors").write_bytes(start + rest * 2**21)
+        found.append(digest([tmp_path]))
+    assert found[0] == found[1] != found[2]

@@ -1,0 +1,332 @@
+"""Frames: what goes in comes out, and nothing else gets in."""
+
+from __future__ import annotations
+
+import json
+import struct
+import tracemalloc
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from many import many
+
+from vlagents_ray.errors import (
+    InvalidInput,
+    InvalidObservation,
+    MalformedMessage,
+    MessageTooLarge,
+    MissingCamera,
+    VLAgentsError,
+)
+from vlagents_ray.images.codecs import JPEG, RAW, ImageCodec
+from vlagents_ray.images.jpeg_png import encode_jpeg
+from vlagents_ray.interface import Act, Obs
+from vlagents_ray.protocol.budget import Budget
+from vlagents_ray.protocol.frame_layout import pack
+from vlagents_ray.protocol.frames import (
+    decode_replies,
+    decode_reply,
+    decode_request,
+    decode_requests,
+    encode_replies,
+    encode_reply,
+    encode_request,
+    encode_requests,
+)
+from vlagents_ray.protocol.json_messages import request_from_parts
+from vlagents_ray.protocol.messages import (
+    DEFAULT_LIMITS,
+    Limits,
+    Reply,
+    Request,
+)
+
+names = st.text(min_size=1, max_size=8).filter(lambda name: name != "$")
+arrays = hnp.arrays(
+    dtype=st.sampled_from([np.dtype(t) for t in ("?", "u1", "i2", "i4", "i8", "f2", "f4", "f8")]),
+    shape=hnp.array_shapes(min_dims=0, max_dims=3, max_side=5),
+)
+leaves = st.none() | st.booleans() | st.integers(-(2**53), 2**53) | st.floats(allow_nan=False) | st.text(max_size=10)
+infos = st.dictionaries(
+    names,
+    st.recursive(
+        leaves | st.binary(max_size=20) | arrays,
+        lambda inner: st.lists(inner, max_size=3) | st.dictionaries(names, inner, max_size=3),
+        max_leaves=10,
+    ),
+    max_size=4,
+)
+observations = st.builds(
+    Obs,
+    cameras=st.dictionaries(
+        names, hnp.arrays(np.uint8, st.tuples(st.integers(1, 9), st.integers(1, 9), st.just(3))), max_size=3
+    ),
+    gripper=st.none() | st.floats(0, 1),
+    state=st.dictionaries(names, hnp.arrays(np.float32, st.integers(0, 9)), max_size=3),
+    info=infos,
+)
+
+
+def same(a: object, b: object) -> bool:
+    if isinstance(a, np.ndarray) or isinstance(b, np.ndarray):
+        if not (isinstance(a, np.ndarray) and isinstance(b, np.ndarray)):
+            return False
+        return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+    if isinstance(a, dict):
+        return isinstance(b, dict) and a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
+    if isinstance(a, (list, tuple)):
+        return isinstance(b, (list, tuple)) and len(a) == len(b) and all(map(same, a, b))
+    return type(a) is type(b) and a == b
+
+
+@given(observations, st.none() | st.text(max_size=20), infos)
+def test_a_request_comes_back_as_it_was(obs: Obs, instruction: str | None, kwargs: dict) -> None:
+    sent = Request("reset", obs, instruction, kwargs, request_id="r1", deadline_ms=20.0)
+    got = decode_request(encode_request(sent, RAW))
+    assert (got.op, got.instruction, got.request_id, got.deadline_ms) == ("reset", instruction, "r1", 20.0)
+    assert got.obs is not None
+    for part in ("cameras", "gripper", "state", "info"):
+        assert same(getattr(obs, part), getattr(got.obs, part)), part
+    assert same(kwargs, got.kwargs)
+
+
+@given(hnp.arrays(np.float32, hnp.array_shapes(min_dims=1, max_dims=2)), st.booleans(), infos)
+def test_a_reply_comes_back_as_it_was(action: np.ndarray, done: bool, info: dict) -> None:
+    got = decode_reply(encode_reply(Reply("r1", Act(action, done, info), timing={"queue_ms": 0.5})))
+    assert got.act is not None
+    assert same(action, got.act.action)
+    assert (got.request_id, got.act.done, got.timing) == ("r1", done, {"queue_ms": 0.5})
+    assert same(info, got.act.info)
+
+
+def test_an_error_comes_back_as_its_own_class() -> None:
+    got = decode_reply(encode_reply(Reply("r1", error=MissingCamera("wrist", have=["front"]))))
+    assert type(got.error) is MissingCamera
+    assert "wrist" in str(got.error)
+
+
+def test_encoding_leaves_the_observation_alone() -> None:
+    image = np.zeros((8, 8, 3), np.uint8)
+    obs = Obs({"front": image}, state={"joints": np.zeros(3)})
+    encode_request(Request("act", obs), JPEG)
+    assert obs.cameras["front"] is image
+    assert obs.state["joints"].dtype == np.float64
+
+
+def test_jpeg_is_close_and_smaller() -> None:
+    y, x = np.mgrid[0:64, 0:64]
+    image = np.stack([x * 4, y * 4, (x + y) * 2], axis=-1).astype(np.uint8)
+    request = Request("act", Obs({"front": image}))
+    frame = encode_request(request, ImageCodec("jpeg", quality=90))
+    got = decode_request(frame).obs
+    assert got is not None
+    assert len(frame) < len(encode_request(request, RAW)) / 2
+    assert np.abs(got.cameras["front"].astype(int) - image).mean() < 3
+
+
+@settings(max_examples=many(300))
+@given(st.binary(max_size=200))
+@example(b"VLA\x01\x00\x00\x00\x00")
+def test_garbage_is_refused_by_name(data: bytes) -> None:
+    with pytest.raises(InvalidInput):
+        decode_request(data)
+    with pytest.raises(InvalidInput):
+        decode_request(b"VLA\x01" + data)
+
+
+@settings(max_examples=many(500))
+@given(observations, st.data())
+def test_a_damaged_frame_is_refused_or_harmless(obs: Obs, data: st.DataObject) -> None:
+    frame = bytearray(encode_request(Request("act", obs)))
+    for _ in range(data.draw(st.integers(1, 4))):
+        frame[data.draw(st.integers(0, len(frame) - 1))] = data.draw(st.integers(0, 255))
+    try:
+        decode_request(bytes(frame))
+    except VLAgentsError:
+        return  # refused by name; anything else fails the test
+
+
+@given(observations, st.data())
+def test_a_truncated_frame_is_malformed(obs: Obs, data: st.DataObject) -> None:
+    frame = encode_request(Request("act", obs))
+    with pytest.raises(MalformedMessage):
+        decode_request(frame[: data.draw(st.integers(0, len(frame) - 1))])
+
+
+def _frame(header: dict, *blobs: bytes) -> bytes:
+    head = json.dumps({**header, "blobs": [len(b) for b in blobs]}).encode()
+    frame = struct.pack("<3sBI", b"VLA", 1, len(head)) + head
+    for blob in blobs:
+        frame += b"\0" * (-len(frame) % 8) + blob
+    return frame
+
+
+@pytest.mark.parametrize(
+    ("header", "blobs", "error"),
+    [
+        ({"op": "act"}, (), MalformedMessage),  # no observation
+        ({"op": "fly", "obs": {}}, (), MalformedMessage),
+        ({"op": "act", "obs": {}, "extra": 1}, (), MalformedMessage),
+        ({"op": "act", "obs": {"camera": {}}}, (), MalformedMessage),
+        ({"op": "act", "obs": {"cameras": {"a": {"$": ["nd", 0, "|O", [1]]}}}}, (b"x",), MalformedMessage),
+        ({"op": "act", "obs": {"cameras": {"a": {"$": ["nd", 0, "|u1", [2, 2, 3]]}}}}, (b"x" * 11,), MalformedMessage),
+        ({"op": "act", "obs": {"cameras": {"a": {"$": ["nd", 0, "|u1", [3, 4]]}}}}, (b"x" * 12,), InvalidObservation),
+        ({"op": "act", "obs": {"cameras": {"a": {"$": ["nd", 7, "|u1", [1]]}}}}, (b"x",), MalformedMessage),
+        ({"op": "act", "obs": {"cameras": {"a": {"$": ["img", 0]}}}}, (b"not an image",), MalformedMessage),
+        ({"op": "act", "obs": {"state": {"joints": ["a"]}}}, (), InvalidObservation),
+        ({"op": "act", "obs": {"state": {"joints": [[1.0]]}}}, (), InvalidObservation),
+        ({"op": "act", "obs": {"state": {"joints": 1}}}, (), InvalidObservation),
+        ({"op": "act", "obs": {"gripper": "open"}}, (), InvalidObservation),
+        ({"op": "act", "obs": {}, "deadline_ms": -1}, (), MalformedMessage),
+        ({"op": "act", "obs": {}, "instruction": 3}, (), MalformedMessage),
+        ({"op": "act", "obs": {"cameras": {str(i): 0 for i in range(99)}}}, (), MessageTooLarge),
+        ({"op": "act", "obs": {"state": {"joints": [0.0] * 5000}}}, (), MessageTooLarge),
+        ({"op": "act", "obs": {"info": {"a": [[[[[[[[[[1]]]]]]]]]]}}}, (), MessageTooLarge),
+        ({"op": "act", "obs": {"info": {"a": [0] * 20_000}}}, (), MessageTooLarge),
+        ({"op": "reset", "obs": {}, "instruction": "x" * 100_000}, (), MessageTooLarge),
+    ],
+)
+def test_each_fault_has_its_error(header: dict, blobs: tuple[bytes, ...], error: type[Exception]) -> None:
+    with pytest.raises(error):
+        decode_request(_frame(header, *blobs))
+
+
+@pytest.mark.parametrize("act", [3, {}, {"action": {"$": ["nd", 0, "<f4", [1]]}}, {"action": 1, "done": 1, "info": {}}])
+def test_a_broken_reply_is_malformed(act: object) -> None:
+    with pytest.raises(MalformedMessage):
+        decode_reply(_frame({"act": act}, b"1234"))
+
+
+def test_pixels_are_limited_before_memory_is_taken() -> None:
+    jpeg = bytearray(encode_request(Request("act", Obs({"a": np.zeros((8, 8, 3), np.uint8)})), JPEG))
+    at = jpeg.index(b"\xff\xc0")  # start of frame: length, precision, height, width
+    jpeg[at + 5 : at + 9] = struct.pack(">HH", 60_000, 60_000)
+    with pytest.raises(MessageTooLarge, match="60000x60000"):
+        decode_request(bytes(jpeg))
+
+
+IMAGE_NODE, BYTES_NODE = {"$": ["img", 0]}, {"$": ["bin", 1]}
+
+
+@pytest.mark.parametrize(
+    "requests",
+    [
+        [{"op": "act", "obs": {"cameras": {"a": IMAGE_NODE}}}] * 400,
+        [{"op": "act", "obs": {"info": {"a": [IMAGE_NODE] * 400}}}],
+        [{"op": "act", "obs": {"info": {"a": [BYTES_NODE] * 1500}}}],
+    ],
+)
+def test_a_small_file_that_is_named_again_and_again_does_not_become_much_memory(requests: list[dict]) -> None:
+    limits = Limits(body_bytes=100_000, pixels=256 * 256, cameras=2, decoded_bytes=10_000_000)
+    file = encode_jpeg(np.zeros((256, 256, 3), np.uint8))
+    frame = b"".join(pack({"requests": requests}, [file, bytes(50_000)]))
+    tracemalloc.start()
+    answers = decode_requests(frame, Budget(limits))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    if len(requests) == 1:
+        assert isinstance(answers[-1], Reply)
+        assert isinstance(answers[-1].error, MessageTooLarge)
+    assert peak < 50 * limits.body_bytes  # 750 without a limit
+
+
+def test_images_of_as_many_requests_as_a_frame_may_hold_are_decoded() -> None:
+    seen = [Obs({"front": np.zeros((224, 224, 3), np.uint8)})] * 1000
+    answers = decode_requests(encode_requests([Request("act", obs) for obs in seen], JPEG), Budget(DEFAULT_LIMITS))
+    assert all(isinstance(answer, Request) for answer in answers)
+
+
+def test_a_header_of_millions_of_values_is_refused_unread() -> None:
+    header = b'{"op":"act","blobs":[],"obs":{"info":{"a":[' + b"[]," * 1_000_000 + b"1]}}}"
+    tracemalloc.start()
+    with pytest.raises(MessageTooLarge, match="values"):
+        decode_requests(b"VLA\x01" + struct.pack("<I", len(header)) + header, Budget(DEFAULT_LIMITS))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 5 * len(header)
+
+
+def test_a_body_over_the_limit_is_too_large() -> None:
+    frame = encode_request(Request("act", Obs({"a": np.zeros((64, 64, 3), np.uint8)})))
+    with pytest.raises(MessageTooLarge, match="limit is 4096"):
+        decode_request(frame, Limits(body_bytes=4096))
+
+
+@pytest.mark.parametrize("value", [object(), {1: 2}, {"$": 1}, np.array(["text"]), np.array([1j])])
+def test_what_the_wire_cannot_carry_is_named_by_the_sender(value: object) -> None:
+    with pytest.raises(InvalidInput):
+        encode_request(Request("act", Obs(info={"x": value})))
+
+
+@given(st.lists(observations, min_size=1, max_size=4))
+def test_requests_that_share_a_frame_come_back_in_order(seen: list[Obs]) -> None:
+    sent = [
+        Request("act", obs, session=f"s{i}", rank="simulation", step=i, request_id=f"r{i}")
+        for i, obs in enumerate(seen)
+    ]
+    got = decode_requests(encode_requests(sent), Budget(DEFAULT_LIMITS))
+    assert len(got) == len(sent)
+    for i, (one, obs) in enumerate(zip(got, seen, strict=True)):
+        assert isinstance(one, Request)
+        assert (one.session, one.rank, one.step, one.request_id) == (f"s{i}", "simulation", i, f"r{i}")
+        assert one.obs is not None
+        assert same(obs.cameras, one.obs.cameras)
+        assert same(obs.info, one.obs.info)
+
+
+def test_a_wrong_request_in_a_frame_is_answered_alone() -> None:
+    good, bad = Request("act", Obs(), request_id="a"), Request("act", None, request_id="b")
+    got = decode_requests(encode_requests([good, bad, good]), Budget(DEFAULT_LIMITS))
+    assert [type(one) for one in got] == [Request, Reply, Request]
+    assert isinstance(got[1], Reply)
+    assert (got[1].request_id, type(got[1].error)) == ("b", MalformedMessage)
+
+
+def test_replies_that_share_a_frame_come_back_in_order() -> None:
+    sent = [Reply("a", Act(np.ones(3)), step=4), Reply("b", error=MissingCamera("wrist", have=[])), Reply("c", info={})]
+    sent[0].draining = True
+    got = decode_replies(encode_replies(sent))
+    assert [reply.request_id for reply in got] == ["a", "b", "c"]
+    assert (got[0].step, got[0].draining, got[1].draining) == (4, True, False)
+    assert type(got[1].error) is MissingCamera
+
+
+@pytest.mark.parametrize(
+    ("change", "error"),
+    [
+        ({"rank": "king"}, MalformedMessage),
+        ({"step": -1}, MalformedMessage),
+        ({"step": True}, MalformedMessage),
+        ({"session": "x" * 200}, MessageTooLarge),
+        ({"session": 7}, MalformedMessage),
+        ({"history": {"a": 1}}, MalformedMessage),
+        ({"history": [{}] * 300}, MessageTooLarge),
+        ({"op": "export"}, MalformedMessage),
+    ],
+)
+def test_fields_of_a_request_are_checked(change: dict, error: type[VLAgentsError]) -> None:
+    frame = b"".join(pack({"op": "act", "obs": {}, **change}, []))
+    with pytest.raises(error):
+        decode_request(frame)
+
+
+@pytest.mark.parametrize("requests", [{}, [], [1], None])
+def test_a_frame_of_requests_is_a_list(requests: object) -> None:
+    with pytest.raises(MalformedMessage):
+        decode_requests(b"".join(pack({"requests": requests}, [])), Budget(DEFAULT_LIMITS))
+    with pytest.raises(MessageTooLarge):
+        decode_requests(b"".join(pack({"requests": [{}] * 5}, [])), Budget(Limits(requests=4)))
+
+
+@pytest.mark.parametrize("name", ["a b", "a\nERROR forged", "a\x1b[2K", "é", "a\u2028b", "\x7f", "\0"])
+@pytest.mark.parametrize("field", ["request_id", "session"])
+def test_names_forge_no_line_in_a_log(field: str, name: str) -> None:
+    [reply] = decode_requests(encode_requests([Request("close", **{field: name})]), Budget(DEFAULT_LIMITS))
+    assert isinstance(reply, Reply)
+    assert isinstance(reply.error, MalformedMessage)
+    assert reply.request_id == ""
+    with pytest.raises(MalformedMessage):
+        request_from_parts("close", json.dumps({field: name}).encode(), {}, Budget(DEFAULT_LIMITS))

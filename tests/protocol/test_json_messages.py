@@ -1,0 +1,75 @@
+"""JSON and separate images: what curl sends and reads."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, NotReset
+from vlagents_ray.images.jpeg_png import encode_jpeg
+from vlagents_ray.interface import Act
+from vlagents_ray.protocol.budget import Budget
+from vlagents_ray.protocol.json_messages import problem, reply_to_json, request_from_parts
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits, Reply
+
+IMAGE = np.full((16, 16, 3), 200, np.uint8)
+
+
+def test_a_document_of_millions_of_values_is_refused_unread() -> None:
+    document = b'{"info":{"a":[' + b"[]," * 1_000_000 + b"1]}}"
+    with pytest.raises(MessageTooLarge, match="values in its JSON"):
+        request_from_parts("act", document, {}, Budget(Limits()))
+
+
+def test_a_request_is_read_from_json_and_images() -> None:
+    document = {
+        "instruction": "push",
+        "gripper": 1,
+        "state": {"joints": [0, 1.5]},
+        "info": {"a": [1]},
+        "kwargs": {"seed": 3},
+    }
+    request = request_from_parts("reset", json.dumps(document), {"front": encode_jpeg(IMAGE)}, Budget(DEFAULT_LIMITS))
+    assert request.obs is not None
+    assert request.instruction == "push"
+    assert request.kwargs == {"seed": 3}
+    assert request.obs.gripper == 1.0
+    assert request.obs.state["joints"].dtype == np.float32
+    np.testing.assert_allclose(request.obs.state["joints"], [0, 1.5])
+    np.testing.assert_allclose(request.obs.cameras["front"], IMAGE, atol=3)
+
+
+@pytest.mark.parametrize(
+    ("text", "images", "error"),
+    [
+        ("{", {}, MalformedMessage),
+        ("[]", {}, MalformedMessage),
+        ("[" * 100_000, {}, MalformedMessage),
+        ('{"instructions": "x"}', {}, MalformedMessage),
+        ('{"cameras": {}}', {}, MalformedMessage),
+        ('{"state": {"joints": {"x": 1}}}', {}, MalformedMessage),
+        ('{"state": {"joints": [true]}}', {}, InvalidObservation),
+        ("{}", {"front": b"GIF89a"}, MalformedMessage),
+        ("{}", {"front": b""}, MalformedMessage),
+        ("{}", {"front": encode_jpeg(IMAGE)[:-20]}, MalformedMessage),
+        ("{}", {str(i): b"" for i in range(99)}, MessageTooLarge),
+    ],
+)
+def test_each_fault_has_its_error(text: str, images: dict, error: type[Exception]) -> None:
+    with pytest.raises(error):
+        request_from_parts("act", text, images, Budget(Limits()))
+
+
+def test_a_reply_becomes_plain_json() -> None:
+    info = {"array": np.arange(2), "bytes": b"abc", "scalar": np.float32(0.5), "deep": [{"x": np.zeros(1)}]}
+    document = json.loads(json.dumps(reply_to_json(Reply("r", Act(np.zeros((2, 3), np.float32), True, info)))))
+    assert document["action"] == [[0, 0, 0], [0, 0, 0]]
+    assert document["done"] is True
+    assert document["info"] == {"array": [0, 1], "bytes": "YWJj", "scalar": 0.5, "deep": [{"x": [0.0]}]}
+
+
+def test_a_problem_names_its_stable_code() -> None:
+    document = problem(NotReset("reset first"), "r7")
+    assert (document["status"], document["code"], document["request_id"]) == (409, "not_reset", "r7")

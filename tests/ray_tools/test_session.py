@@ -1,0 +1,209 @@
+"""Joining a Ray cluster that runs already."""
+
+from __future__ import annotations
+
+import os
+import re
+import socket
+from contextlib import suppress
+from pathlib import Path
+
+import psutil
+import pytest
+import ray
+from flat_config import flat_config
+from ray._private.ray_constants import DEFAULT_DASHBOARD_AGENT_LISTEN_PORT
+from ray_processes import processes, words
+from ray_processes import ray_folder as ray_folder_of_test
+from secret_leaks import leaked
+
+from vlagents_ray import ConfigError
+from vlagents_ray.client.credentials import KEY_VARIABLE
+from vlagents_ray.evaluate.workers.cluster import ray_cluster
+from vlagents_ray.ray_tools import session as joining
+from vlagents_ray.ray_tools.session import joined, ray_folder
+
+# A start-up file of Python's that holds one of Ray's helpers back for longer than Ray's daemon waits for it.
+SLOW = """
+import os, time
+from pathlib import Path
+asked = Path({asked!r})
+if "dashboard/agent.py" in Path("/proc/self/cmdline").read_text():
+    with asked.open("a") as file:
+        file.write("x")
+    if asked.stat().st_size <= {slow}:
+        time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize(
+    "error", [ConnectionError("nobody there"), ray.exceptions.AuthenticationError("another token")], ids=repr
+)
+def test_a_cluster_that_cannot_be_joined_is_a_wrong_setting(error: Exception, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(**_options: object) -> None:
+        raise error
+
+    monkeypatch.setattr(ray, "init", refuse)
+    monkeypatch.setattr(joining, "local_servers", list)
+    with pytest.raises(ConfigError, match=re.escape(f"Ray cluster at 'auto': {error}")), joined("auto"):
+        pytest.fail("joined it")
+
+
+@pytest.mark.parametrize(
+    ("address", "started", "wanted"),
+    [
+        ("http://127.0.0.1:8000", None, "http://127.0.0.1:8000"),
+        ("http://127.0.0.1:8000", "198.18.0.9:6379", "http://127.0.0.1:8000"),
+        ("auto", None, None),
+        ("auto", "198.18.0.9:6379", "Ray's"),  # by `ray start`, which says where
+    ],
+)
+def test_the_url_of_a_server_stands_for_its_ray_and_so_does_auto_where_no_other_was_started(
+    address: str, started: str | None, wanted: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    joins: list[str | None] = []
+    monkeypatch.delenv("RAY_ADDRESS", raising=False)
+    monkeypatch.setattr(joining, "local_servers", lambda: ["a server"])
+    monkeypatch.setattr("ray._private.utils.read_ray_address", lambda: started)
+    monkeypatch.setattr(joining, "join", lambda server, **_: joins.append(server))
+    monkeypatch.setattr(ray, "init", lambda **_: joins.append("Ray's"))
+    with joined(address):
+        assert joins == [wanted]
+
+
+def test_the_cluster_that_the_environment_names_is_named_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(**_options: object) -> None:
+        raise ConnectionError("nobody there")
+
+    monkeypatch.setattr(ray, "init", refuse)
+    monkeypatch.setenv("RAY_ADDRESS", "198.18.0.9:6379")
+    with pytest.raises(ConfigError, match=r"Ray cluster at '198\.18\.0\.9:6379'"), joined():
+        pytest.fail("joined it")
+
+
+def slow_helpers(folder: Path, monkeypatch: pytest.MonkeyPatch, slow: int) -> Path:
+    """The first `slow` of them; returns a file of as many bytes as were started."""
+    asked = folder / "asked"
+    (folder / "sitecustomize.py").write_text(SLOW.format(asked=str(asked), slow=slow))
+    monkeypatch.setenv("PYTHONPATH", f"{folder}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    return asked
+
+
+@pytest.mark.ray
+def test_a_machine_that_is_slow_to_start_ray_gets_another_attempt(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    asked = slow_helpers(tmp_path, monkeypatch, 1)
+    before = set(psutil.Process().children(recursive=True))
+    with joined("local", num_cpus=1, include_dashboard=False):
+        assert ray.get(ray.put(5)) == 5
+        assert len(ray.nodes()) == 1
+    assert asked.read_text() == "xx"
+    assert "attempt 2 of 3" in caplog.text
+    assert re.search("Ray's daemon: .*Timed out waiting for file .*agent", caplog.text)
+    _, left = psutil.wait_procs(set(psutil.Process().children(recursive=True)) - before, 30)
+    assert not left
+
+
+@pytest.mark.parametrize(
+    ("error", "said", "attempts"),
+    [
+        (Exception("it timed out"), r"did not start .* in 3 attempts: it timed out\. .* Logs: /", 3),
+        (ValueError("no"), "^no$", 1),
+    ],
+    ids=["time", "option"],
+)
+@pytest.mark.ray
+def test_a_ray_that_does_not_start_leaves_nothing(
+    error: Exception, said: str, attempts: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Once its processes are there; what is wrong with an option is not tried again."""
+    failures: list[object] = []
+
+    def fail(*_: object) -> None:
+        failures.append(None)
+        raise error
+
+    monkeypatch.setattr("ray._private.services.get_node", fail)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))  # where the logs stay
+    before = set(psutil.Process().children(recursive=True))
+    with pytest.raises(ValueError, match=said), joined("local", num_cpus=1, include_dashboard=False):
+        pytest.fail("started")
+    assert len(failures) == attempts
+    assert not ray.is_initialized()
+    _, left = psutil.wait_procs(set(psutil.Process().children(recursive=True)) - before, 30)
+    assert not left
+
+
+def test_a_folder_that_ray_may_not_write_is_said_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """/tmp/ray of another user's: there are no logs then, and no other attempt would do better."""
+    tries: list[object] = []
+
+    def refuse(*_: object) -> None:
+        tries.append(None)
+        raise PermissionError("/tmp/ray")
+
+    monkeypatch.setattr("ray._private.node.Node._init_temp", refuse)
+    with pytest.raises(PermissionError, match="/tmp/ray"), joined("local", num_cpus=1, include_dashboard=False):
+        pytest.fail("started")
+    assert len(tries) == 1
+    assert not ray.is_initialized()
+
+
+@pytest.mark.ray
+def test_a_helper_of_ray_leaves_the_port_alone_that_every_ray_has_for_it() -> None:
+    """The second Ray on a machine would try for seconds, and go without."""
+    with socket.socket() as taken:
+        taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        with suppress(OSError):  # another Ray's: as well
+            taken.bind(("127.0.0.1", DEFAULT_DASHBOARD_AGENT_LISTEN_PORT))
+            taken.listen()
+        with joined("local", num_cpus=1, include_dashboard=False):
+            (file,) = session().glob("dashboard_agent_listen_*")
+            assert int(file.read_text()) > 0
+
+
+@pytest.mark.ray
+def test_a_ray_of_ones_own_starts_neither_an_autoscaler_nor_the_dashboard_that_nobody_asked_for() -> None:
+    """They take two seconds of a processor each, at every start. The autoscaler's metrics have a port of their own."""
+    with joined("local", num_cpus=1, include_dashboard=False):
+        started = {Path(word).name for one in psutil.Process().children() for word in words(one)}
+    assert {"gcs_server", "raylet"} <= started
+    assert not {"monitor.py", "dashboard.py"} & started
+
+
+def session() -> Path:
+    """The folder of this process's Ray."""
+    return Path(ray._private.worker.global_worker.node.get_session_dir_path())
+
+
+@pytest.mark.ray
+def test_a_ray_of_ones_own_is_in_a_folder_that_no_other_user_enters_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its own folders are everybody's to write to: whose sockets and logs are in them would be a matter of luck."""
+    with ray_folder_of_test() as place:
+        place.chmod(0o755)
+        monkeypatch.setenv("RAY_TMPDIR", str(place / "new"))
+        key = f"vlr_{os.urandom(8).hex()}"
+        monkeypatch.setenv(KEY_VARIABLE, key)
+        with ray_cluster(flat_config(envs=["tabletop/reach"], out=tmp_path)):
+            (sockets,) = session().glob("sockets")
+            assert (sockets / "raylet").is_socket()
+            closed = [one for one in sockets.parents if one.stat().st_mode & 0o077 == 0]
+            assert closed == [*(place / "new").iterdir()]
+            assert leaked(key, [place]) == []
+        assert os.environ[KEY_VARIABLE] == key
+        assert [*place.rglob("*")] == [place / "new"]
+        assert not processes(place)
+
+
+def test_a_folder_whose_name_is_too_long_for_sockets_is_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of Ray's, and of HAProxy's, each of which has the number of its process in its name."""
+    monkeypatch.setenv("RAY_TMPDIR", str(tmp_path / ("x" * 40)))
+    with ray_folder() as folder:
+        assert folder.parent == Path("/tmp")
+        assert folder.stat().st_mode & 0o777 == 0o700
+    assert not folder.exists()

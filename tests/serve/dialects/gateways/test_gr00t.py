@@ -1,0 +1,396 @@
+"""ZMQ clients: their sessions, and what a bad client can do to the others."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import socket
+import threading
+import time
+from typing import Any
+
+import gr00t_client
+import msgpack
+import numpy as np
+import psutil
+import pytest
+import zmq
+from eval_fakes import wait_for
+from gr00t_client import PolicyClient
+from in_memory_keys import ChangingKeys
+from in_process_replicas import Replicas
+from many import many
+
+from vlagents_ray.errors import InvalidInput
+from vlagents_ray.serve.access import api_keys
+from vlagents_ray.serve.access.api_keys import NoKey
+
+FRAMES = int(os.environ.get("VLAGENTS_RAY_FUZZ", many(5000)))
+GROWTH = 64 * 2**20  # bytes, whatever the number of frames
+
+
+def sessions(replicas: Replicas) -> int:
+    return len(replicas.engines[0].sessions)
+
+
+def seen(pixel: int, text: str = "abc", batch: int = 1) -> dict[str, Any]:
+    pixels = np.arange(pixel, pixel + batch, dtype=np.uint8).reshape(batch, 1, 1, 1, 1)
+    return {
+        "video": {"ego": pixels * np.ones((8, 8, 3), np.uint8)},
+        "state": {"arm": np.full((batch, 1, 3), 0.5, np.float32)},
+        "language": {"task": [[text]] * batch},
+    }
+
+
+def so100(pixel: int, text: str) -> dict[str, Any]:
+    """As N1.5's SO-100 client builds it: examples/SO-100/eval_lerobot.py, two cameras, batched by itself."""
+    return {
+        "video.front": np.full((1, 8, 8, 3), pixel, np.uint8),
+        "video.wrist": np.zeros((1, 8, 8, 3), np.uint8),
+        "state.single_arm": np.full((1, 5), 3.0),
+        "state.gripper": np.ones((1, 1)),
+        "annotation.human.task_description": [text],
+    }
+
+
+def rows(action: dict[str, np.ndarray], of: int = 0) -> list[float]:
+    return action["action"][of, 0].tolist()
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_each_client_has_a_session(open_gr00t, replicas: Replicas, packed: bool) -> None:
+    port = open_gr00t()
+    with PolicyClient(port, packed=packed) as red, PolicyClient(port) as blue:
+        assert red.ping() == {"status": "ok", "message": "Server is running"}
+        action, info = red.get_action(seen(10))
+        assert action["action"].shape == (1, 2, 5)
+        assert action["action"].dtype == np.float32
+        assert rows(action) == [10, 0.5, -1, 3, 1]
+        assert info["done"] == [False]
+        assert rows(blue.get_action(seen(20, "abcdef"))[0]) == [20, 0.5, -1, 6, 1]
+        assert rows(red.get_action(seen(11))[0]) == [11, 0.5, -1, 3, 2]
+        assert sessions(replicas) == 2
+        assert red.reset() == {}
+        assert rows(red.get_action(seen(12))[0])[-1] == 1
+        assert rows(blue.get_action(seen(21, "abcdef"))[0])[-1] == 2
+
+
+def test_a_batch_is_as_many_sessions(open_gr00t, replicas: Replicas) -> None:
+    with PolicyClient(open_gr00t()) as client:
+        for step in (1, 2):
+            action, _ = client.get_action(seen(100, batch=4))
+            assert [rows(action, i) for i in range(4)] == [[100 + i, 0.5, -1, 3, step] for i in range(4)]
+        assert sessions(replicas) == 4
+        assert rows(client.get_action(seen(7))[0]) == [7, 0.5, -1, 3, 3]
+        assert sessions(replicas) == 1
+
+
+def test_a_client_of_n1_5_sends_flat_keys(open_gr00t) -> None:
+    mapping = {"preset": "gr00t", "action": {"arm": {"stop": 3}, "hand": {"start": 3}}}
+    flat = {
+        "video.ego": np.full((1, 8, 8, 3), 9, np.uint8),
+        "state.arm": np.ones((1, 3)),
+        "annotation.human.action.task_description": ["abcd"],
+    }
+    with PolicyClient(open_gr00t(mapping=mapping), n15=True) as client:
+        action = client.get_action_n15(flat)
+        assert action["action.arm"][0].tolist() == [9, 1, -1]
+        assert action["action.hand"].tolist() == [[4, 1], [4, 2]]
+        assert client.get_modality_config()["action"]["modality_keys"] == ["action.arm", "action.hand"]
+
+
+@pytest.mark.parametrize("preset", ["gr00t", "gr00t-n1.5"])
+def test_each_preset_delivers_what_either_generation_sends(open_gr00t, replicas: Replicas, preset: str) -> None:
+    port = open_gr00t(mapping={"preset": preset, "action": {"action.arm": {"stop": 3}, "hand": {"start": 3}}})
+    with PolicyClient(port, n15=True) as client:
+        action = client.get_action_n15(so100(9, "abcd"))
+        assert (action["action.arm"][0].tolist(), action["action.hand"][0].tolist()) == ([9, 3, -1], [4, 1])
+    with PolicyClient(port) as client:
+        action, _ = client.get_action(seen(10))
+        assert (action["arm"][0, 0].tolist(), action["hand"][0, 0].tolist()) == ([10, 0.5, -1], [3, 1])
+
+
+def test_a_config_is_as_its_generation_reads_it_before_it_has_acted(open_gr00t) -> None:
+    mapping = {"preset": "gr00t-n1.5", "cameras": {"front": "video.webcam"}, "state": {"joints": "state.single_arm"}}
+    with PolicyClient(open_gr00t(mapping=mapping), n15=True) as client:
+        config = client.get_modality_config()
+    assert {name: one["modality_keys"] for name, one in config.items()} == {
+        "video": ["video.webcam"],
+        "state": ["state.single_arm"],
+        "action": ["action"],
+        "language": ["annotation.human.task_description"],
+    }
+
+
+def test_a_modality_without_known_keys_is_left_out_of_the_config(open_gr00t) -> None:
+    with PolicyClient(open_gr00t()) as client:  # the policy states no contract
+        assert sorted(client.get_modality_config()) == ["action", "language"]
+
+
+def test_cameras_that_the_mapping_does_not_read_are_logged_once(open_gr00t, caplog: pytest.LogCaptureFixture) -> None:
+    port = open_gr00t(mapping={"cameras": {"front": "video/front"}, "state": {"*": "state/*"}})
+    for _ in range(2):
+        with PolicyClient(port, n15=True) as client:
+            for _ in range(2):
+                client.get_action_n15(so100(9, "abcd"))
+    [said] = [one for one in caplog.messages if "which the policy does not get" in one]
+    assert said.startswith("gr00t: a client sends the cameras ['video/wrist']")
+
+
+def test_an_observation_of_which_the_mapping_reads_nothing_is_refused(open_gr00t) -> None:
+    mapping = {"cameras": {"*": "images/*"}, "state": {"*": "proprio/*"}}
+    told = pytest.raises(RuntimeError, match=r"invalid_observation: .*the mapping reads nothing")
+    with PolicyClient(open_gr00t(mapping=mapping)) as client, told:
+        client.get_action(seen(1))
+
+
+def test_a_client_is_told_its_own_names(open_gr00t) -> None:
+    mapping = {"cameras": {"front": "video/ego_view"}, "state": {"joints": ["state/arm", "state/hand"]}}
+    with PolicyClient(open_gr00t(mapping=mapping)) as client:
+        config = client.get_modality_config()
+    assert config["video"] == {"delta_indices": [0], "modality_keys": ["ego_view"]}
+    assert config["state"]["modality_keys"] == ["arm", "hand"]
+
+
+def test_errors_are_told_without_a_traceback_and_the_client_goes_on(open_gr00t) -> None:
+    with PolicyClient(open_gr00t(mapping={"cameras": {"front": "video/front"}})) as client:
+        with pytest.raises(RuntimeError, match="missing_camera: camera 'video/front' is missing") as error:
+            client.get_action(seen(1))
+        assert ".py" not in str(error.value)
+        with pytest.raises(RuntimeError, match="unknown endpoint 'kill'"):
+            client.call_endpoint("kill", requires_input=False)
+        assert client.ping()["status"] == "ok"
+
+
+def test_a_key_is_checked_before_anything_is_done(open_gr00t, replicas: Replicas) -> None:
+    def check(key: str | None) -> NoKey:
+        if key != "right":
+            raise InvalidInput("no such key")
+        return NoKey.OPEN
+
+    port = open_gr00t(check=check)
+    for token in (None, "wrong"):
+        with PolicyClient(port, token) as client:
+            for ask in (client.ping, client.reset, client.get_modality_config, lambda: client.get_action(seen(1))):
+                with pytest.raises(RuntimeError, match="no such key"):
+                    ask()
+    assert sessions(replicas) == 0
+    with PolicyClient(port, "right") as client:
+        assert rows(client.get_action(seen(1))[0])[0] == 1
+
+
+class Limited:
+    """Clients of a gateway with keys, whose replica knows of no key: as one on another machine."""
+
+    def __init__(self, open_gr00t: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(api_keys, "_CHECK_S", 0.0)
+        self.known = ChangingKeys()
+        self.port = open_gr00t(check=lambda key: self.known.keys.check(key, "noop"))
+
+    def client(self, name: str, **allowed: Any) -> PolicyClient:
+        return PolicyClient(self.port, self.known.add(name, **allowed))
+
+
+@pytest.fixture
+def limited(open_gr00t: Any, monkeypatch: pytest.MonkeyPatch) -> Limited:
+    return Limited(open_gr00t, monkeypatch)
+
+
+def test_a_keys_rate_holds_wherever_the_replica_is(limited: Limited, replicas: Replicas) -> None:
+    with limited.client("slow", rate=1e-3) as client, limited.client("lab") as other:
+        assert client.ping()["status"] == "ok"
+        for ask in (client.ping, client.reset, lambda: client.get_action(seen(1))):
+            with pytest.raises(RuntimeError, match="too_many_requests"):
+                ask()
+        assert sessions(replicas) == 0
+        assert rows(other.get_action(seen(7))[0])[-1] == 1
+    with limited.client("lone", rate=1) as client:  # what begins an episode counts once
+        assert rows(client.get_action(seen(1))[0])[-1] == 1
+    with limited.client("some", rate=3) as client:
+        assert rows(client.get_action(seen(1))[0])[-1] == 1
+        with pytest.raises(RuntimeError, match="too_many_requests"):
+            client.get_action(seen(1, batch=9))
+        wait_for(lambda: _went_on(client))  # the refusal began no other episode
+
+
+def test_who_is_over_the_rate_of_its_key_is_not_read_for_a_while(limited: Limited) -> None:
+    with limited.client("greedy", rate=1e-3) as client, limited.client("lab") as other:
+        client.ping()
+        begun = time.monotonic()
+        for _ in range(3):
+            with pytest.raises(RuntimeError, match="too_many_requests"):
+                client.ping()
+        assert time.monotonic() - begun >= 2.0  # a second after each refusal, of which the last one's is to come
+        assert other.ping()["status"] == "ok"
+
+
+def _went_on(client: PolicyClient) -> bool:
+    try:
+        action, _ = client.get_action(seen(1))
+    except RuntimeError as refused:
+        if "too_many_requests" in str(refused):
+            return False
+        raise
+    assert rows(action)[-1] == 2
+    return True
+
+
+def test_a_keys_sessions_hold_wherever_the_replica_is(limited: Limited, replicas: Replicas) -> None:
+    with limited.client("pair", sessions=2) as one, PolicyClient(limited.port, "vlr_pair") as two:
+        one.get_action(seen(1))
+        with pytest.raises(RuntimeError, match="too_many_requests"):
+            two.get_action(seen(1, batch=2))
+        two.get_action(seen(1))
+        with pytest.raises(RuntimeError, match="too_many_requests"):
+            one.get_action(seen(1, batch=2))
+        assert sessions(replicas) == 2
+        assert rows(one.get_action(seen(1))[0])[-1] == 2
+
+
+@pytest.mark.parametrize(("allowed", "rank"), [({"rank": "simulation"}, "SIMULATION"), ({}, "ROBOT")])
+def test_a_keys_class_holds_wherever_the_replica_is(
+    limited: Limited, replicas: Replicas, allowed: dict[str, Any], rank: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ranks: set[str] = set()
+    put = replicas.engines[0].queue.put
+    monkeypatch.setattr(
+        replicas.engines[0].queue, "put", lambda *tickets: (ranks.update(t.rank.name for t in tickets), put(*tickets))
+    )
+    with limited.client("one", **allowed) as client:
+        client.get_action(seen(1))
+        assert ranks == {rank}
+        limited.known.change("one", rank="simulation")
+        ranks.clear()
+        client.get_action(seen(1))
+        assert "SIMULATION" in ranks
+
+
+def test_sessions_of_a_revoked_key_end_by_themselves(limited: Limited, replicas: Replicas) -> None:
+    with limited.client("leaver") as client, limited.client("lab") as other:
+        client.get_action(seen(1))
+        other.get_action(seen(1))
+        limited.known.change("leaver", revoked=True)
+        wait_for(lambda: sessions(replicas) == 1)
+        assert rows(other.get_action(seen(1))[0])[-1] == 2
+        with pytest.raises(RuntimeError, match="revoked"):
+            client.get_action(seen(1))
+        wait_for(lambda: limited.known.keys._held == {"lab": 1})
+
+
+def test_nothing_of_a_message_is_read_before_its_key(limited: Limited, monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[bytes] = []
+    monkeypatch.setattr("vlagents_ray.serve.dialects.gr00t.codec.read_request", lambda *_: read.append(b""))
+    limited.known.add("lab")
+    deep = b"\x91" * 100_000
+    head = b"\x82\xa9api_token\xa5wrong\xa4data"
+    for message in (deep, head + deep, b"\x82\xa4data" + deep, b"\xdf\xff\xff\xff\xff", b"\x81\xa9api_token" + deep):
+        assert b"error" in _raw(limited.port, message)
+    assert not read
+
+
+def _raw(port: int, message: bytes) -> bytes:
+    with zmq.Context() as context, context.socket(zmq.REQ) as client:
+        client.setsockopt(zmq.LINGER, 0)
+        client.setsockopt(zmq.RCVTIMEO, 10_000)
+        client.connect(f"tcp://127.0.0.1:{port}")
+        client.send(message)
+        return client.recv()
+
+
+@pytest.mark.parametrize("greeting", [b"\x04\x00one\x02\x00x", b"\xff" + bytes(8) + b"\x7f\x01\x05\x00\x00"])
+def test_peers_of_zmqs_first_protocols_are_hung_up_on(open_gr00t, greeting: bytes) -> None:
+    """ZMQ kept the dead connections of some of them for ever: about one in 6,000 of the fuzzer's."""
+    port = open_gr00t()
+    with socket.create_connection(("127.0.0.1", port), timeout=30) as peer, contextlib.suppress(ConnectionError):
+        peer.sendall(greeting)
+        while peer.recv(4096):
+            pass
+    with PolicyClient(port) as client:
+        client.ping()
+
+
+def test_a_client_that_says_nothing_is_forgotten(open_gr00t, replicas: Replicas) -> None:
+    with PolicyClient(open_gr00t(idle_s=0.5)) as client:
+        client.get_action(seen(1))
+        assert sessions(replicas) == 1
+        wait_for(lambda: sessions(replicas) == 0)
+        assert rows(client.get_action(seen(2))[0]) == [2, 0.5, -1, 3, 1]
+
+
+def test_one_client_more_than_the_limit_is_told_so_unless_another_has_no_session(open_gr00t) -> None:
+    port = open_gr00t(sessions=2)
+    with PolicyClient(port) as one, PolicyClient(port) as two, PolicyClient(port) as three:
+        one.get_action(seen(1))
+        two.ping()
+        three.get_action(seen(3))  # takes the place of the one that only pinged
+        with pytest.raises(RuntimeError, match="unavailable: 2 clients"):
+            two.ping()
+        assert rows(one.get_action(seen(1))[0])[-1] == 2
+
+
+def test_a_slow_and_a_greedy_client_hold_up_nobody(open_gr00t) -> None:
+    port = open_gr00t()
+    context = zmq.Context()
+    deaf = context.socket(zmq.DEALER)  # sends and never reads
+    deaf.setsockopt(zmq.LINGER, 0)
+    deaf.setsockopt(zmq.SNDTIMEO, 50)
+    deaf.setsockopt(zmq.RCVHWM, 1)
+    deaf.connect(f"tcp://127.0.0.1:{port}")
+    request = {"endpoint": "get_action", "data": {"observation": seen(1), "options": None}}
+    message = msgpack.packb(request, default=gr00t_client.encode)
+    try:
+        for _ in range(200):
+            try:
+                deaf.send_multipart([b"", message])
+            except zmq.Again:
+                break
+        with socket.create_connection(("127.0.0.1", port)), PolicyClient(port) as good:  # one that never greets
+            for step in range(1, 6):
+                assert rows(good.get_action(seen(5))[0]) == [5, 0.5, -1, 3, step]
+    finally:
+        deaf.close()
+        context.term()
+
+
+def test_mutated_messages_get_an_error_or_an_answer(open_gr00t, replicas: Replicas) -> None:
+    """A good client acts all the while; memory and threads stay what they were."""
+    port = open_gr00t(sessions=16)
+    choose = random.Random(3)
+    request = {"endpoint": "get_action", "data": {"observation": seen(9), "options": None}}
+    messages = [msgpack.packb(request, default=encode) for encode in (gr00t_client.encode, gr00t_client.encode_packed)]
+    messages.append(msgpack.packb({"endpoint": "ping"}))
+    context = zmq.Context()
+    bad = context.socket(zmq.REQ)
+    bad.setsockopt(zmq.RCVTIMEO, 20_000)
+    bad.setsockopt(zmq.LINGER, 0)
+    bad.connect(f"tcp://127.0.0.1:{port}")
+    try:
+        with PolicyClient(port) as good:
+            good.ping()
+            threads, held = threading.active_count(), psutil.Process().memory_info().rss
+            for number in range(FRAMES):
+                message = bytearray(choose.choice(messages))
+                for _ in range(choose.randrange(1, 4)):
+                    message[choose.randrange(len(message))] = choose.randrange(256)
+                bad.send(bytes(message[: choose.randrange(1, len(message) + 1)] if number % 4 == 0 else message))
+                msgpack.unpackb(bad.recv())
+                if number % 200 == 0:
+                    assert rows(good.get_action(seen(5))[0])[-1] == number // 200 + 1
+            assert threading.active_count() <= threads + 2
+            assert psutil.Process().memory_info().rss - held < GROWTH
+    finally:
+        bad.close()
+        context.term()
+
+
+def test_bytes_that_are_no_zmq_are_hung_up_on(open_gr00t) -> None:
+    port = open_gr00t()
+    choose = random.Random(1)
+    for _ in range(200):
+        with socket.create_connection(("127.0.0.1", port), timeout=20) as stranger:
+            stranger.sendall(choose.randbytes(choose.randrange(1, 200)))
+    with PolicyClient(port) as good:
+        begun = time.monotonic()
+        assert good.ping()["status"] == "ok"
+        assert time.monotonic() - begun < 10

@@ -1,0 +1,212 @@
+"""What holds for all dialects."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from dialect_server import ALL, LIMITS, METADATA, body, call, image, libero, receive, seen, send, serving
+from served_agents import Mirror
+from starlette.testclient import TestClient, WebSocketDenialResponse
+from starlette.websockets import WebSocketDisconnect
+
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract
+from vlagents_ray.errors import ConfigError, PolicyFailed
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.serve.config.deployment import ServerArgs
+from vlagents_ray.serve.config.dialects import DialectArgs
+from vlagents_ray.serve.dialects.base import ReplicaContext
+from vlagents_ray.serve.dialects.openpi import codec as openpi_codec
+from vlagents_ray.serve.dialects.openvla import codec as openvla_codec
+from vlagents_ray.serve.dialects.routes import describe, dialect_routes, require_fit
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.docs_page import docs_page
+from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.launch.deployment_file import deployment
+
+
+def test_a_replica_that_stops_keeps_no_session_that_nobody_will_ask_for() -> None:
+    with serving(Mirror(), ALL) as (client, engine):
+        with client.websocket_connect("/openpi") as pi, client.websocket_connect("/vla-eval") as benchmark:
+            pi.receive_bytes()
+            call(pi, libero(1))
+            send(benchmark, "observation", seen(1), 1)
+            assert receive(benchmark).kind == "action"
+            engine.drain()
+            assert client.post("/act", json=body(5)).status_code == 200
+            assert len(engine.sessions) == 2
+        assert len(engine.sessions) == 0
+
+
+def test_a_connection_that_the_replica_has_no_room_for_is_told_to_come_later() -> None:
+    with serving(Mirror(), ALL, session_limit=1) as (client, _), client.websocket_connect("/openpi") as socket:
+        socket.receive_bytes()
+        call(socket, libero(1))
+        for path in ("/openpi", "/vla-eval"):
+            with pytest.raises(WebSocketDenialResponse) as refused, client.websocket_connect(path):
+                pass
+            assert (refused.value.status_code, refused.value.json()["code"]) == (503, "unavailable")
+
+
+def test_dialects_count_in_the_statistics_by_their_names() -> None:
+    with serving(Mirror(), ALL) as (client, engine):
+        engine.stats.enable()
+        with client.websocket_connect("/openpi") as socket:
+            socket.receive_bytes()
+            call(socket, libero(1))
+        client.post("/act", json=body(1))
+        client.post("/act", content=b"")
+        with client.websocket_connect("/vla-eval") as socket:
+            send(socket, "observation", seen(4), 4)
+            receive(socket)
+        handled = engine.stats.collect().requests
+    assert list(handled) == [
+        ("reset", "openpi", "robot", "ok"),
+        ("act", "openpi", "robot", "ok"),
+        ("reset", "openvla", "robot", "ok"),
+        ("act", "openvla", "robot", "ok"),
+        ("act", "openvla", "robot", "malformed"),
+        ("reset", "vla_eval", "simulation", "ok"),
+        ("act", "vla_eval", "simulation", "ok"),
+    ]
+
+
+def test_until_the_policy_is_loaded_every_dialect_answers_503() -> None:
+    context = ReplicaContext(Engine(Mirror()), lambda: METADATA, LIMITS)
+    inside = build_http_app(
+        context.engine, lambda: METADATA, LIMITS, dialects=dialect_routes(DialectArgs(**ALL), context)
+    )
+    with TestClient(AccessMiddleware(inside, None, "app")) as client:
+        assert client.get("/health").status_code == 503
+        assert client.post("/act", json=body(1)).status_code == 503
+        for path in ("/", "/openpi", "/roboarena", "/vla-eval"):
+            with pytest.raises(WebSocketDenialResponse) as refused, client.websocket_connect(path):
+                pass
+            assert refused.value.status_code == 503
+
+
+def test_a_dialect_that_is_off_is_not_there() -> None:
+    with serving(Mirror(), {"openvla": {}}) as (client, _):
+        for path in ("/", "/openpi", "/vla-eval"):
+            with pytest.raises(WebSocketDisconnect), client.websocket_connect(path):
+                pass
+        assert client.get("/health").status_code == 404
+        assert client.get("/act").status_code == 405
+
+
+@pytest.mark.parametrize(
+    ("dialects", "said"),
+    [
+        ({"openpi": {"mapping": "libero"}}, "openpi-droid"),
+        ({"openpi": {}}, "mapping"),
+        ({"open_pi": {}}, "open_pi"),
+        ({"openvla": {"mapping": {"camera": {}}}}, "cameras"),
+        ({"roboarena": {"n_external_cameras": 3}}, "n_external_cameras"),
+        ({"openpi": {"mapping": "openpi-droid"}}, "mapping wants 8"),
+    ],
+)
+def test_a_wrong_setting_is_refused_before_anything_starts(dialects: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        deployment("served_agents:Mirror", dialects=dialects)
+
+
+def test_a_mapping_that_lacks_what_the_policy_needs_is_refused_at_the_start() -> None:
+    args = DialectArgs(openvla={})  # type: ignore[arg-type]
+
+    class Two(Agent):
+        contract = Contract({"front": CameraSpec(), "wrist": CameraSpec()}, action=ActionSpec(dim=7))
+
+        def act(self, obs: Obs) -> Act:
+            return Act(np.zeros(7))
+
+    with pytest.raises(ConfigError, match=r"dialects.openvla: camera 'wrist'"):
+        require_fit(args, Two.contract)
+    engine = Engine(Two(), check=lambda contract: require_fit(args, contract))
+    with pytest.raises(PolicyFailed, match="wrist"):
+        engine.start()
+
+
+def test_what_is_on_stands_in_the_metadata_and_on_the_page() -> None:
+    told = describe(DialectArgs(**ALL))
+    assert told["vla_eval"]["paths"] == ["WS /vla-eval"]
+    assert describe(DialectArgs(vla_eval={}))["vla_eval"]["paths"] == ["WS /", "WS /vla-eval"]  # type: ignore[arg-type]
+    assert told["openvla"]["mapping"]["instruction"] == "instruction"
+    page = docs_page(METADATA | {"dialects": told})
+    assert "WS /, WS /openpi" in page
+    assert "Clients of OpenVLA. An episode is one request" in page
+    assert "<code>reset</code> or a new <code>session_id</code> begins an episode" in page
+    ports = {"gr00t": {"port": 5556, "host": "10.0.0.7"}, "vlagents": {}}
+    told = describe(DialectArgs(**ports))  # type: ignore[arg-type]
+    assert {name: one["address"] for name, one in told.items()} == {
+        "gr00t": "tcp://10.0.0.7:5556",
+        "vlagents": "rpyc://127.0.0.1:8080",
+    }
+    assert told["gr00t"]["mapping"]["instruction"]
+    assert told["vlagents"]["mapping"] is None
+    assert "tcp://10.0.0.7:5556" in docs_page(METADATA | {"dialects": told})
+    assert ServerArgs(policy="noop").dialects.model_dump(exclude_none=True) == {}
+
+
+def test_the_settings_of_dialects_survive_the_way_to_the_replicas_and_to_the_gateway() -> None:
+    args = ServerArgs(policy="noop", dialects=ALL | {"gr00t": {}, "vlagents": {"robots": {"arm": {"stop": 6}}}})
+    assert list(args.dialects.gateways()) == ["gr00t", "vlagents"]
+    assert ServerArgs(**args.model_dump(mode="json")) == args
+    replica = ServerArgs(**args.model_dump(mode="json", exclude={"dialects": set(args.dialects.gateways())}))
+    assert list(replica.dialects.on()) == list(ALL)
+    assert replica.dialects.gateways() == {}
+
+
+def test_every_dialect_refuses_an_observation_of_which_its_mapping_reads_nothing() -> None:
+    """A benchmark or robot of another system, or of another version, is not acted for blindly."""
+    with serving(Mirror(), ALL) as (client, engine):
+        theirs = {"their_pictures": {"front": image(1)}, "their_state": np.ones(3), "prompt": "task 1"}
+        for path, more in (("/openpi", {}), ("/roboarena", {"endpoint": "infer"})):
+            with client.websocket_connect(path) as socket:
+                socket.receive_bytes()
+                socket.send_bytes(openpi_codec.encode(theirs | more))
+                assert "their_state" in socket.receive_text()
+        answer = client.post("/act", content=b'{"their_state": [1, 2]}')
+        assert (answer.status_code, "their_state" in answer.json()["detail"]) == (422, True)
+        with client.websocket_connect("/vla-eval") as socket:
+            send(socket, "observation", theirs, 1)
+            error = receive(socket)
+        assert error.kind == "error"
+        assert "of which the mapping reads nothing" in error.payload["error"]
+        assert len(engine.sessions) == 0
+
+
+def test_cameras_that_the_mapping_does_not_read_are_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    """openpi's simple_client in ALOHA mode, of whose four cameras pi0 takes three, was answered without a word."""
+    keyed = {"cameras": {"front": "images/front"}, "state": {"joints": "state"}, "instruction": "task_description"}
+    odd = json.loads(openvla_codec.encode(image(0), twice=False))
+    with serving(Mirror(), ALL | {"vla_eval": {"mapping": keyed}}) as (client, _):
+        for _ in range(2):
+            with client.websocket_connect("/openpi") as socket:
+                socket.receive_bytes()
+                for pixel in range(2):
+                    call(socket, libero(pixel, images={"cam_low": image(0)}))
+            assert client.post("/act", json=body(1, top=odd)).status_code == 200
+            assert client.post("/act", json=body(1, top=odd), headers={"x-session-id": "a"}).status_code == 200
+            with client.websocket_connect("/vla-eval") as socket:
+                more = seen(1)
+                more["images"] |= {"side": image(0)}
+                send(socket, "observation", more, 1)
+                assert receive(socket).kind == "action"
+    said = sorted(one for one in caplog.messages if "which the policy does not get" in one)
+    assert [one.partition(", which")[0] for one in said] == [
+        "openpi: a client sends the cameras ['images/cam_low']",
+        "openvla: a client sends the cameras ['top']",
+        "vla_eval: a client sends the cameras ['images/side']",
+    ]
+    assert "the mapping reads ['observation/image', 'observation/wrist_image']; if the policy takes them" in said[0]
+
+
+@pytest.mark.parametrize("key", ["states", "state"])
+def test_vla_evals_state_arrives_by_either_name(key: str) -> None:
+    theirs = {"images": {"agentview": image(4), "front": image(4)}, "task_description": "task 1", key: np.full(8, 0.5)}
+    with serving(Mirror(), {"vla_eval": {}}) as (client, _), client.websocket_connect("/vla-eval") as socket:
+        send(socket, "observation", theirs, 1)
+        assert receive(socket).payload["actions"][:2].tolist() == [4, 4]

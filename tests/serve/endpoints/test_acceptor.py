@@ -1,0 +1,80 @@
+"""Letting clients in at a listening socket, whatever goes wrong with one of them."""
+
+from __future__ import annotations
+
+import os
+import resource
+import socket
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+
+import pytest
+
+from vlagents_ray.serve.endpoints.acceptor import Acceptor
+
+
+class Endpoint:
+    """Keeps who comes, or refuses to."""
+
+    def __init__(self) -> None:
+        self.listener = socket.create_server(("127.0.0.1", 0))
+        self.listener.settimeout(5)
+        self.clients: list[socket.socket] = []
+        self.broken = False
+        self.acceptor = Acceptor(self.listener, self.on_connection)
+
+    def on_connection(self, connection: socket.socket) -> None:
+        if self.broken:
+            raise OSError
+        self.clients.append(connection)
+
+    def connect(self) -> socket.socket:
+        return socket.create_connection(self.listener.getsockname(), 5)
+
+
+@pytest.fixture
+def endpoint() -> Iterator[Endpoint]:
+    endpoint = Endpoint()
+    yield endpoint
+    endpoint.acceptor.close()
+    for each in (endpoint.listener, *endpoint.clients):
+        each.close()
+
+
+@contextmanager
+def no_descriptors_left() -> Iterator[None]:
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    highest = max(map(int, os.listdir("/proc/self/fd")))
+    resource.setrlimit(resource.RLIMIT_NOFILE, (highest + 1, limits[1]))
+    try:
+        with ExitStack() as held:
+            while True:
+                try:
+                    held.enter_context(open(os.devnull))
+                except OSError:
+                    break
+            yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+
+
+def test_who_comes_when_no_descriptor_is_left_is_turned_away_and_the_next_let_in(endpoint: Endpoint) -> None:
+    for _ in range(2):
+        with endpoint.connect() as refused:
+            with no_descriptors_left():
+                endpoint.acceptor.accept()
+            assert refused.recv(1) == b""
+    with endpoint.connect():
+        endpoint.acceptor.accept()
+    assert len(endpoint.clients) == 1
+
+
+def test_whom_the_endpoint_cannot_take_is_turned_away_and_the_next_let_in(endpoint: Endpoint) -> None:
+    endpoint.broken = True
+    with endpoint.connect() as refused:
+        endpoint.acceptor.accept()
+        assert refused.recv(1) == b""
+    endpoint.broken = False
+    with endpoint.connect():
+        endpoint.acceptor.accept()
+    assert len(endpoint.clients) == 1

@@ -1,0 +1,329 @@
+"""The guard before the robots' endpoint: keys and slow clients, on a real HTTP server without Ray."""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import json
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+from asgi_server import served
+from eval_fakes import wait_for
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from vlagents_ray import Forbidden, Obs, RemoteAgent, TooManyRequests, Unauthorized
+from vlagents_ray.interface import Act, Agent
+from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Limits
+from vlagents_ray.serve.access import api_keys
+from vlagents_ray.serve.access.api_keys import Keys
+from vlagents_ray.serve.access.key_store import new_key, revoke
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.engine.engine import Engine
+
+SLOW_S = 1.0
+TOKENS = {
+    "arm": {"sessions": 2},
+    "lab": {},
+    "other": {"apps": ("pi0",)},
+    "slow": {"rate": 3},
+    "sim": {"rank": "simulation"},
+    "leaver": {},
+    "goer": {},
+    "ending": {},
+}
+
+
+class Big(Agent):
+    """Tells more than any socket takes without being read."""
+
+    def act(self, obs: Obs) -> Act:
+        return Act(np.zeros(2, np.float32), info={"much": np.zeros(int(obs.info.get("bytes", 1)), np.uint8)})
+
+
+@dataclass
+class Endpoint:
+    url: str
+    port: int
+    engine: Engine
+    file: Path
+    tokens: dict[str, str]
+
+    def agent(self, name: str, transport: str = "http", **options: object) -> RemoteAgent:
+        return RemoteAgent(self.url, transport=transport, api_key=self.tokens[name], **options)  # type: ignore[arg-type]
+
+    def get(self, path: str, headers: dict[str, str] | None = None) -> tuple[int, dict[str, str], bytes]:
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=10)
+        with contextlib.closing(connection):
+            connection.request("GET", path, headers=headers or {})
+            answer = connection.getresponse()
+            return answer.status, {k.lower(): v for k, v in answer.getheaders()}, answer.read()
+
+    def stream(self, headers: dict[str, str]):
+        url = self.url.replace("http", "ws") + "/v1/stream"
+        return connect(url, additional_headers=headers, ping_interval=None, close_timeout=1)
+
+
+@pytest.fixture(scope="module")
+def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Endpoint]:
+    before, api_keys._CHECK_S = api_keys._CHECK_S, 0.0
+    file = tmp_path_factory.mktemp("keys") / "keys.json"
+    tokens = {name: new_key(file, name, **allowed) for name, allowed in TOKENS.items()}  # type: ignore[arg-type]
+    engine = Engine(Big())
+    engine.start()
+    inside = build_http_app(
+        engine, lambda: {"policy": "p", "version": "0", "protocol": PROTOCOL_VERSION}, Limits(body_bytes=2**24)
+    )
+    guard = AccessMiddleware(inside, Keys.from_file(file), "noop", slow_s=SLOW_S, idle_s=3600)
+    with served(guard) as port:
+        yield Endpoint(f"http://127.0.0.1:{port}", port, engine, file, tokens)
+    engine.close()
+    api_keys._CHECK_S = before
+
+
+def bearer(token: str) -> dict[str, str]:
+    return {"authorization": f"Bearer {token}"}
+
+
+@pytest.mark.parametrize(
+    "path", ["/docs", "/v1/metadata", "/v1/act", "/v1/probe", "/", "/nope", "/healthz/", "//healthz"]
+)
+def test_no_path_answers_without_a_key(endpoint: Endpoint, path: str) -> None:
+    for headers in ({}, bearer("wrong"), {"x-api-key": "wrong"}):
+        status, said, body = endpoint.get(path, headers)
+        assert status == 401
+        assert said["www-authenticate"].startswith("Bearer")
+        document = json.loads(body)
+        assert document["code"] == "unauthorized"
+        assert document["request_id"]
+    status, said, body = endpoint.get(path, bearer(endpoint.tokens["other"]))
+    assert (status, json.loads(body)["code"]) == (403, "forbidden")
+
+
+def test_without_keys_pages_of_other_sites_are_refused(endpoint: Endpoint) -> None:
+    """A browser on the robot's machine says whose page asks, and reaches loopback."""
+    unkeyed = AccessMiddleware(
+        build_http_app(
+            endpoint.engine, lambda: {"policy": "p", "version": "0", "protocol": PROTOCOL_VERSION}, Limits()
+        ),
+        None,
+        "noop",
+    )
+    with served(unkeyed) as port:
+        own = Endpoint(f"http://127.0.0.1:{port}", port, endpoint.engine, endpoint.file, {})
+        assert own.get("/v1/metadata", {"origin": "https://evil.example"})[0] == 403
+        assert own.get("/v1/metadata", {"origin": "null"})[0] == 403
+        assert own.get("/v1/metadata", {"origin": own.url})[0] == 200
+        rebound = {"origin": "http://evil.example:8000", "host": "evil.example:8000"}
+        assert own.get("/v1/metadata", rebound)[0] == 403  # a name that its site has lead here
+        assert own.get("/v1/metadata")[0] == 200
+        with pytest.raises(InvalidStatus) as refused, own.stream({"origin": "https://evil.example"}):
+            pass
+        assert refused.value.response.status_code == 403
+
+
+def test_a_request_id_of_the_callers_own_comes_back_with_the_refusal(endpoint: Endpoint) -> None:
+    _, _, body = endpoint.get("/v1/metadata", {"x-request-id": "mine"})
+    assert json.loads(body)["request_id"] == "mine"
+
+
+def test_health_alone_needs_no_key_and_tells_nothing(endpoint: Endpoint) -> None:
+    assert endpoint.get("/healthz")[0::2] == (200, b"OK\n")
+
+
+def test_a_right_key_is_let_in_by_each_header(endpoint: Endpoint) -> None:
+    token = endpoint.tokens["lab"]
+    for headers in (bearer(token), {"authorization": f"Api-Key {token}"}, {"x-api-key": token}):
+        assert endpoint.get("/v1/metadata", headers)[0] == 200
+        with endpoint.stream(headers) as stream:
+            stream.ping().wait(5)
+
+
+def test_a_websocket_is_refused_before_it_is_accepted(endpoint: Endpoint) -> None:
+    for headers, status in (({}, 401), (bearer("wrong"), 401), (bearer(endpoint.tokens["other"]), 403)):
+        with pytest.raises(InvalidStatus) as refused, endpoint.stream(headers):
+            pytest.fail("was let in")
+        assert refused.value.response.status_code == status
+        assert json.loads(refused.value.response.body or b"")["status"] == status
+
+
+@pytest.mark.parametrize("transport", ["http", "websocket", "auto"])
+def test_a_client_without_a_right_key_hears_so_at_once(endpoint: Endpoint, transport: str) -> None:
+    begun = time.monotonic()
+    for token, error in ((None, Unauthorized), ("wrong", Unauthorized), (endpoint.tokens["other"], Forbidden)):
+        with pytest.raises(error), RemoteAgent(endpoint.url, transport=transport, api_key=token) as agent:  # type: ignore[arg-type]
+            agent.reset(Obs(), "x")
+    assert time.monotonic() - begun < 20  # it tries no further for the 60 s that a server may take to start
+
+
+def test_the_key_may_come_from_the_environment(endpoint: Endpoint, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("VLAGENTS_RAY_API_KEY", endpoint.tokens["lab"])
+    with RemoteAgent(endpoint.url, transport="websocket") as agent:
+        agent.reset(Obs(), "x")
+        assert endpoint.tokens["lab"] not in repr(vars(agent._connection.transport))
+
+
+def test_one_keys_session_is_out_of_reach_for_another(endpoint: Endpoint) -> None:
+    def post(token: str, op: str) -> tuple[int, bytes]:
+        connection = http.client.HTTPConnection("127.0.0.1", endpoint.port, timeout=10)
+        with contextlib.closing(connection):
+            headers = {"x-session-id": "shared", "content-type": "application/json", **bearer(token)}
+            connection.request("POST", f"/v1/{op}", b'{"obs": {}}' if op == "close" else b"{}", headers)
+            answer = connection.getresponse()
+            return answer.status, answer.read()
+
+    assert post(endpoint.tokens["lab"], "reset")[0] == 200
+    assert post(endpoint.tokens["lab"], "act")[0] == 200
+    status, body = post(endpoint.tokens["arm"], "act")
+    assert (status, json.loads(body)["code"]) == (404, "unknown_session")
+    assert post(endpoint.tokens["arm"], "close")[0] in (200, 400)
+    assert post(endpoint.tokens["lab"], "act")[0] == 200
+
+
+@pytest.mark.parametrize("transport", ["http", "websocket"])
+def test_a_key_holds_no_more_sessions_than_it_may(endpoint: Endpoint, transport: str) -> None:
+    with endpoint.agent("arm", transport) as first, endpoint.agent("arm", transport) as second:
+        first.reset(Obs(), "x")
+        second.reset(Obs(), "x")
+        with endpoint.agent("arm", transport) as third, pytest.raises(TooManyRequests, match="2 sessions"):
+            third.reset(Obs(), "x")
+        with endpoint.agent("lab", transport) as other:
+            other.reset(Obs(), "x")
+        first.reset(Obs(), "again")
+        second.close()
+        wait_for(lambda: sum(name.startswith("arm/") for name in endpoint.engine.sessions.ids()) < 2)
+        with endpoint.agent("arm", transport) as third:
+            third.reset(Obs(), "x")
+    wait_for(lambda: not any(name.startswith("arm/") for name in endpoint.engine.sessions.ids()))
+
+
+def test_too_many_requests_are_told_when_to_come_again(endpoint: Endpoint) -> None:
+    found = [endpoint.get("/v1/metadata", bearer(endpoint.tokens["slow"])) for _ in range(12)]
+    limited = [headers for status, headers, _ in found if status == 429]
+    assert limited
+    assert all(int(headers["retry-after"]) >= 1 for headers in limited)
+    with endpoint.agent("slow", "websocket") as agent:
+        wait_for(lambda: endpoint.get("/v1/metadata", bearer(endpoint.tokens["slow"]))[0] == 200)
+        errors = []
+        for _ in range(12):
+            try:
+                agent.reset(Obs(), "x")
+            except TooManyRequests as error:
+                errors.append(error)
+        assert errors
+
+
+def test_a_simulations_key_makes_all_its_requests_simulations(endpoint: Endpoint) -> None:
+    ranks = []
+    queue = endpoint.engine.queue
+    put = queue.put
+
+    def watched(*tickets: object) -> None:
+        ranks.extend(ticket.rank.name for ticket in tickets)  # type: ignore[attr-defined]
+        put(*tickets)  # type: ignore[arg-type]
+
+    queue.put = watched  # type: ignore[method-assign]
+    try:
+        for name in ("sim", "lab"):
+            with endpoint.agent(name, rank="robot") as agent:
+                agent.reset(Obs(), "x")
+                agent.act(Obs())
+    finally:
+        queue.put = put  # type: ignore[method-assign]
+    assert ranks == ["SIMULATION"] * 3 + ["ROBOT"] * 3  # reset, act, close
+
+
+def test_a_revoked_key_hangs_up_its_websockets_and_no_others(endpoint: Endpoint) -> None:
+    with endpoint.stream(bearer(endpoint.tokens["leaver"])) as idle, endpoint.agent("lab", "websocket") as other:
+        other.reset(Obs(), "x")
+        revoke(endpoint.file, "leaver")
+        with pytest.raises(ConnectionClosed) as closed:
+            idle.recv(timeout=10)
+        assert closed.value.rcvd is not None
+        assert closed.value.rcvd.code == 1008
+        assert "revoked" in closed.value.rcvd.reason
+        other.act(Obs())
+
+
+def test_a_look_at_a_websocket_that_fails_is_not_the_last(endpoint: Endpoint, monkeypatch: pytest.MonkeyPatch) -> None:
+    refusal, failed = api_keys.Caller.refusal, threading.Event()
+
+    def fail_once(caller: api_keys.Caller) -> str | None:
+        if not failed.is_set():
+            failed.set()
+            raise RuntimeError("once")
+        return refusal(caller)
+
+    monkeypatch.setattr(api_keys.Caller, "refusal", fail_once)
+    with endpoint.stream(bearer(endpoint.tokens["goer"])) as idle:
+        assert failed.wait(10)
+        revoke(endpoint.file, "goer")
+        with pytest.raises(ConnectionClosed, match="revoked"):
+            idle.recv(timeout=10)
+
+
+def test_a_body_that_does_not_come_is_cut_off(endpoint: Endpoint) -> None:
+    with endpoint.agent("lab") as bystander, socket.create_connection(("127.0.0.1", endpoint.port), timeout=30) as slow:
+        bystander.reset(Obs(), "x")
+        head = f"POST /v1/reset HTTP/1.1\r\nhost: x\r\nauthorization: Bearer {endpoint.tokens['lab']}\r\n"
+        head += "x-session-id: slow\r\ncontent-type: application/json\r\ncontent-length: 100\r\n\r\n{"
+        slow.sendall(head.encode())
+        answer = slow.recv(65536)
+        assert answer.startswith(b"HTTP/1.1 408")
+        assert b"problem+json" in answer
+        bystander.act(Obs())
+    assert "lab/slow" not in endpoint.engine.sessions.ids()
+
+
+def test_a_websocket_that_never_reads_its_replies_ends_with_its_sessions_alone(endpoint: Endpoint) -> None:
+    from vlagents_ray.protocol.frames import encode_request
+    from vlagents_ray.protocol.messages import Request
+
+    with endpoint.agent("lab", "websocket") as bystander:
+        bystander.reset(Obs(), "x")
+        before = set(endpoint.engine.sessions.ids())
+        deaf = socket.create_connection(("127.0.0.1", endpoint.port), timeout=30)
+        with connect(
+            endpoint.url.replace("http", "ws") + "/v1/stream",
+            sock=deaf,
+            additional_headers=bearer(endpoint.tokens["ending"]),
+            max_queue=1,
+            ping_interval=None,
+            close_timeout=1,
+        ) as stream:
+            stream.send(encode_request(Request("reset", Obs())))
+            wait_for(lambda: set(endpoint.engine.sessions.ids()) > before)
+            for _ in range(30):
+                stream.send(encode_request(Request("act", Obs(info={"bytes": 2**20}))))
+            wait_for(lambda: set(endpoint.engine.sessions.ids()) == before)
+            bystander.act(Obs())
+            with contextlib.suppress(OSError):
+                deaf.shutdown(socket.SHUT_RDWR)
+
+
+def test_a_websocket_that_stays_silent_or_sends_half_a_message_is_cut_off() -> None:
+    engine = Engine(Big())
+    engine.start()
+    with served(AccessMiddleware(build_http_app(engine, dict, Limits()), None, "noop", idle_s=SLOW_S)) as port:
+        with socket.create_connection(("127.0.0.1", port), timeout=30) as half:
+            half.sendall(
+                b"GET /v1/stream HTTP/1.1\r\nhost: x\r\nconnection: upgrade\r\nupgrade: websocket\r\n"
+                b"sec-websocket-version: 13\r\nsec-websocket-key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+            )
+            assert half.recv(4096).startswith(b"HTTP/1.1 101")
+            half.sendall(b"\x82\xfe\x00\x7e" + bytes(8))  # of a masked frame of 126 bytes, the first 4
+            assert half.recv(4096)[0] == 0x88  # the server closes
+        with (
+            connect(f"ws://127.0.0.1:{port}/v1/stream", ping_interval=None, close_timeout=1) as silent,
+            pytest.raises(ConnectionClosed, match="silent"),
+        ):
+            silent.recv(timeout=30)
+    engine.close()

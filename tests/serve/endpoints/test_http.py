@@ -1,0 +1,343 @@
+"""The robots' endpoint, over an engine without Ray: every fault has its documented answer."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import struct
+import threading
+import zlib
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from starlette.testclient import TestClient
+
+from vlagents_ray.contract import CameraSpec, Contract, StateSpec
+from vlagents_ray.images.jpeg_png import encode_jpeg
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_reply, encode_request
+from vlagents_ray.protocol.messages import Limits, Request
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.engine.engine import Engine
+
+IMAGE = np.random.default_rng(0).integers(0, 255, (32, 48, 3), np.uint8)
+JPEG = encode_jpeg(IMAGE, quality=95)
+GOOD = {"gripper": 0.5, "state": {"joints": [0.1, 0.2]}}
+LIMITS = Limits(body_bytes=300_000, pixels=64 * 64)
+
+
+class Mean(Agent):
+    """Acts with the mean colour of its camera and its joints."""
+
+    @property
+    def contract(self) -> Contract:
+        return Contract({"front": CameraSpec(32, 48)}, {"joints": StateSpec(2)}, gripper=True)
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self.instruction = instruction
+        return {"seed": kwargs.get("seed")}
+
+    def act(self, obs: Obs) -> Act:
+        if obs.info.get("fail"):
+            raise RuntimeError("no")
+        action = [*obs.cameras["front"].mean((0, 1)), *obs.state["joints"]]
+        return Act(np.array(action), info={"instruction": self.instruction, "array": np.arange(2)})
+
+
+@pytest.fixture(scope="module")
+def client() -> Iterator[TestClient]:
+    engine = Engine(Mean())
+    engine.start()
+    inside = build_http_app(engine, lambda: {"policy": "mean", "version": "0", "protocol": 1}, LIMITS)
+    with TestClient(AccessMiddleware(inside, None, "app")) as client:
+        yield client
+    engine.close()
+
+
+def post(
+    client: TestClient, op: str, obs: Any = GOOD, files: Any = None, session: str | None = "robot-1", **kwargs: Any
+):
+    headers = {**({"x-session-id": session} if session else {}), **kwargs.pop("headers", {})}
+    text = obs if isinstance(obs, (str, bytes)) else json.dumps(obs)
+    parts = {"obs": (None, text, "application/json")} | ({"cameras.front": JPEG} if files is None else files)
+    return client.post(f"/v1/{op}", headers=headers, files=parts, **kwargs)
+
+
+def good_act(client: TestClient) -> None:
+    assert post(client, "reset", {**GOOD, "instruction": "push"}).status_code == 200
+    answer = post(client, "act")
+    assert answer.status_code == 200, answer.text
+    document = answer.json()
+    np.testing.assert_allclose(document["action"][:3], IMAGE.mean((0, 1)), atol=2)
+    np.testing.assert_allclose(document["action"][3:], [0.1, 0.2], atol=1e-6)
+    assert document["info"].pop("policy") == {"version": 0, "fingerprint": ""}
+    assert document["info"] == {"instruction": "push", "array": [0, 1]}
+    assert document["timing"].keys() >= {"queue_ms", "inference_ms", "decode_ms", "encode_ms", "total_ms"}
+
+
+def test_a_form_that_does_not_say_how_long_it_is_has_the_limit_of_all(client: TestClient) -> None:
+    def form() -> Iterator[bytes]:
+        yield b'--b\r\ncontent-disposition: form-data; name="cameras.front"; filename="f"\r\n\r\n'
+        for _ in range(20):
+            yield bytes(100_000)
+        yield b"\r\n--b--\r\n"
+
+    headers = {"x-session-id": "a", "content-type": "multipart/form-data; boundary=b"}
+    answer = client.post("/v1/act", content=form(), headers=headers)
+    assert (answer.status_code, answer.json()["code"]) == (413, "too_large")
+
+
+def test_curl_style_reset_and_act(client: TestClient) -> None:
+    good_act(client)
+
+
+def test_png_is_lossless(client: TestClient) -> None:
+    file = io.BytesIO()
+    Image.fromarray(IMAGE).save(file, "PNG")
+    post(client, "reset", files={"cameras.front": file.getvalue()})
+    document = post(client, "act", files={"cameras.front": file.getvalue()}).json()
+    np.testing.assert_allclose(document["action"][:3], IMAGE.mean((0, 1)), rtol=1e-6)
+
+
+MULTIPART = {"x-session-id": "robot-1", "content-type": "multipart/form-data; boundary=b"}
+
+
+def form(*parts: tuple[str, str | None, bytes]) -> bytes:
+    """Parts of a name, a filename if any, and content."""
+    written = [
+        b'--b\r\ncontent-disposition: form-data; name="%s"%s\r\n\r\n%s\r\n'
+        % (name.encode(), b"" if file is None else b'; filename="%s"' % file.encode(), content)
+        for name, file, content in parts
+    ]
+    return b"".join(written) + b"--b--\r\n"
+
+
+OBS = ("obs", None, json.dumps(GOOD).encode())
+HINTS = [  # what is sent, and what the answer says of it
+    (form(OBS, ("cameras.front", "f", JPEG), ("cameras.front", "f", JPEG)), "'cameras.front' twice, want it once"),
+    (form(OBS, OBS, ("cameras.front", "f", JPEG)), "'obs' twice, want it once"),
+    (form(OBS, ("cameras.", "f", JPEG)), "names no camera, want 'cameras.<name>'"),
+    (form(OBS, ("cameras.front", None, b"text")), "is text, want a file: send it with a filename"),
+    (form(OBS, ("front", "f", JPEG)), "unknown part 'front', want 'obs' and files 'cameras.<name>'"),
+    (form(OBS, ("cameras.front", "f", JPEG), ("cameras.left", "f", JPEG[:-20])), "camera 'left': broken JPEG"),
+    (form(OBS, ("cameras.left", "f", b"GIF89a"), ("cameras.front", "f", JPEG)), "camera 'left': got 6 bytes starting"),
+]
+DOCUMENTS = [
+    (b'{"cameras": {"front": "..."}}', {}, "send multipart/form-data, in it the document as part 'obs' and each image"),
+    (b'{"state": {"joints": [1, 2], "joints": [3, 4]}}', {}, "the key 'joints' stands twice"),
+    (gzip.compress(b"{}"), {"content-encoding": "gzip"}, "content-encoding: got 'gzip', want none"),
+    (gzip.compress(b"{}"), {}, "body: got gzip, want it uncompressed"),
+    (b"{}", {"content-encoding": "br"}, "content-encoding: got 'br', want none"),
+]
+
+
+def test_what_is_misplaced_is_refused_with_the_cure(client: TestClient) -> None:
+    answers = [(client.post("/v1/act", content=body, headers=MULTIPART), said) for body, said in HINTS]
+    plain = {"x-session-id": "robot-1", "content-type": "application/json"}
+    answers += [(client.post("/v1/act", content=body, headers=plain | more), said) for body, more, said in DOCUMENTS]
+    body, more = gzip.compress(HINTS[0][0]), {"content-encoding": "gzip"}
+    answers.append((client.post("/v1/act", content=body, headers=MULTIPART | more), "content-encoding: got 'gzip'"))
+    for answer, said in answers:
+        assert (answer.status_code, answer.json()["code"]) == (400, "malformed"), said
+        assert said in answer.json()["detail"]
+
+
+def test_a_camera_or_state_without_a_name_is_refused(client: TestClient) -> None:
+    good_act(client)
+    for obs in (
+        Obs({"front": IMAGE, "": IMAGE}, None, {"joints": np.zeros(2, np.float32)}),
+        Obs({"front": IMAGE}, None, {"joints": np.zeros(2, np.float32), "": np.zeros(2, np.float32)}),
+    ):
+        headers = {"x-session-id": "robot-1", "content-type": CONTENT_TYPE}
+        answer = client.post("/v1/act", content=encode_request(Request("act", obs)), headers=headers)
+        assert (answer.status_code, answer.json()["code"]) == (422, "invalid_observation")
+        assert "without a name" in answer.json()["detail"]
+
+
+def test_an_identity_coding_is_none(client: TestClient) -> None:
+    assert post(client, "reset", headers={"content-encoding": "identity"}).status_code == 200
+
+
+def test_a_frame_gets_a_frame(client: TestClient) -> None:
+    obs = Obs({"front": IMAGE}, 1.0, {"joints": np.zeros(2, np.float32)})
+    headers = {"x-session-id": "framed", "content-type": CONTENT_TYPE, "accept": CONTENT_TYPE}
+    for op in ("reset", "act"):
+        body = encode_request(Request(op, obs, instruction="lift" if op == "reset" else None, request_id=op))
+        answer = client.post(f"/v1/{op}", content=body, headers=headers)
+        assert answer.headers["content-type"] == CONTENT_TYPE
+        reply = decode_reply(answer.content)
+        assert reply.request_id == op
+    assert reply.act is not None
+    assert reply.act.info["instruction"] == "lift"
+
+
+def test_close_ends_the_session(client: TestClient) -> None:
+    post(client, "reset", session="closing")
+    assert client.post("/v1/close", headers={"x-session-id": "closing"}).status_code == 200
+    assert post(client, "act", session="closing").json()["code"] == "unknown_session"
+
+
+def test_health_metadata_and_docs(client: TestClient) -> None:
+    assert client.get("/healthz").text == "OK\n"
+    assert client.get("/v1/metadata").json()["policy"] == "mean"
+    page = client.get("/docs")
+    assert "/v1/reset" in page.text
+    assert "missing_camera" in page.text
+    assert "encode_ms" in page.text
+
+
+def test_health_is_503_until_the_policy_is_loaded() -> None:
+    endpoint = build_http_app(Engine(Mean()), dict, LIMITS)
+    with TestClient(AccessMiddleware(endpoint, None, "app")) as client:
+        for path in ("/healthz", "/v1/metadata"):
+            answer = client.get(path)
+            assert (answer.status_code, answer.json()["code"]) == (503, "unavailable")
+        assert post(client, "reset").status_code == 503
+
+
+NAN, HUGE = float("nan"), 10**400
+_IHDR = b"IHDR" + struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0)
+_IDAT = b"IDAT" + zlib.compress(b"few")
+HUGE_PNG = b"\x89PNG\r\n\x1a\n" + b"".join(
+    struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) for chunk in (_IHDR, _IDAT)
+)
+HUGE_JPEG = bytearray(JPEG)
+_SOF = HUGE_JPEG.index(b"\xff\xc0")
+HUGE_JPEG[_SOF + 5 : _SOF + 9] = struct.pack(">HH", 65_000, 65_000)
+FRAME = encode_request(Request("act", Obs({"front": IMAGE}, 1.0, {"joints": np.zeros(2, np.float32)})))
+FRAMED = {"content-type": CONTENT_TYPE}
+
+# (request, status, code): each kind of fault that a robot's software can commit.
+FAULTS: list[tuple[dict[str, Any], int, str]] = [
+    *[({"files": {"cameras.front": JPEG[:cut]}}, 400, "malformed") for cut in range(0, len(JPEG) - 2, len(JPEG) // 20)],
+    *[({"content": FRAME[: len(FRAME) * i // 20], "headers": FRAMED}, 400, "malformed") for i in range(20)],
+    *[({"obs": text}, 400, "malformed") for text in ("", "{", "null", "[1]", "nan", "[" * 9999, '{"a": 1}', "\xff")],
+    *[({"obs": {**GOOD, key: 1}}, 400, "malformed") for key in ("camera", "images", "prompt", "session", "x" * 999)],
+    *[({"obs": {**GOOD, "state": {"joints": x}}}, 422, "invalid_observation")
+      for x in ([NAN, 0], [float("inf"), 0], [1], [1, 2, 3], [[1, 2]], ["1", "2"], [None, 1], [True, 1], [HUGE, 1], 1)],
+    *[({"obs": {**GOOD, "gripper": x}}, 422, "invalid_observation") for x in (-0.1, 1.1, "open", [1], NAN, True, HUGE)],
+    *[({"obs": {**GOOD, "state": x}}, 400, "malformed") for x in ([1], "joints", 3)],
+    ({"obs": {**GOOD, "state": {}}}, 422, "missing_state"),
+    ({"obs": {**GOOD, "state": {"joint": [1, 2]}}}, 422, "missing_state"),
+    ({"obs": {"state": GOOD["state"]}}, 422, "invalid_observation"),
+    ({"files": {}}, 422, "missing_camera"),
+    ({"files": {"cameras.wrist": JPEG}}, 422, "missing_camera"),
+    ({"files": {"cameras.front": encode_jpeg(IMAGE[:8])}}, 422, "invalid_observation"),
+    ({"files": {"cameras.front": b"GIF89a" + JPEG}}, 400, "malformed"),
+    ({"files": {"cameras.front": b""}}, 400, "malformed"),
+    ({"files": {"cameras.front": bytes(HUGE_JPEG)}}, 413, "too_large"),
+    ({"files": {"cameras.front": HUGE_PNG}}, 413, "too_large"),
+    ({"files": {"cameras.front": encode_jpeg(np.zeros((65, 65, 3), np.uint8))}}, 413, "too_large"),
+    ({"files": {"cameras.front": JPEG, "image": JPEG}}, 400, "malformed"),
+    ({"files": {f"cameras.{i}": JPEG for i in range(30)}}, 400, "malformed"),
+    ({"files": {"cameras.front": JPEG, "x": bytes(400_000)}}, 413, "too_large"),
+    ({"obs": {**GOOD, "info": {"a": [[[[[[[[[1]]]]]]]]]}}}, 413, "too_large"),
+    ({"obs": {**GOOD, "info": {"a": list(range(20_000))}}}, 413, "too_large"),
+    ({"obs": {**GOOD, "info": [1]}}, 400, "malformed"),
+    ({"obs": {**GOOD, "info": {"$": 1}}}, 400, "malformed"),
+    ({"obs": {**GOOD, "info": {"a": {"$": ["nd", 0, "|O", [1]]}}}}, 400, "malformed"),
+    ({"obs": {**GOOD, "instruction": 3}}, 400, "malformed"),
+    ({"obs": {**GOOD, "instruction": "x" * 20_000}}, 413, "too_large"),
+    ({"obs": {**GOOD, "deadline_ms": 0}}, 400, "malformed"),
+    ({"obs": {**GOOD, "info": {"fail": 1}}}, 500, "policy_failed"),
+    ({"session": None}, 400, "malformed"),
+    ({"session": "x" * 200}, 400, "malformed"),
+    ({"session": "never-reset"}, 404, "unknown_session"),
+    ({"headers": {"x-deadline-ms": "soon"}}, 400, "malformed"),
+    ({"headers": {"x-deadline-ms": "nan"}}, 400, "malformed"),
+    ({"content": FRAME, "headers": {"content-type": "text/plain"}}, 400, "malformed"),
+    ({"content": FRAME}, 400, "malformed"),
+    ({"content": b"{}", "headers": {"content-type": "multipart/form-data"}}, 400, "malformed"),
+    ({"content": b"--x", "headers": {"content-type": "multipart/form-data; boundary=x"}}, 400, "malformed"),
+    ({"content": bytes(400_000), "headers": FRAMED}, 413, "too_large"),
+    ({"content": FRAME.replace(b'"op":"act"', b'"op":"fly"'), "headers": FRAMED}, 400, "malformed"),
+    ({"content": encode_request(Request("close")), "headers": FRAMED}, 400, "malformed"),
+    ({"content": FRAME.replace(b'"<f4"', b'"|O8"'), "headers": FRAMED}, 400, "malformed"),
+    ({"content": FRAME.replace(b'"<f4"', b'"<c8"'), "headers": FRAMED}, 400, "malformed"),
+    ({"content": FRAME.replace(b'"<f4"', b'"<i2"'), "headers": FRAMED}, 400, "malformed"),
+    ({"content": FRAME.replace(b"[32,48,3]", b"[32,48,4]"), "headers": FRAMED}, 400, "malformed"),
+    ({"content": FRAME.replace(b"VLA\x01", b"VLA\x02"), "headers": FRAMED}, 400, "malformed"),
+]  # fmt: skip
+
+
+def send(client: TestClient, fault: dict[str, Any]):
+    if "content" in fault:
+        headers = {"x-session-id": fault.get("session", "robot-1"), **fault.get("headers", {})}
+        return client.post("/v1/act", content=fault["content"], headers=headers)
+    return post(client, "act", **fault)
+
+
+def test_a_hundred_faults_each_get_their_code_and_harm_nobody(client: TestClient) -> None:
+    assert len(FAULTS) >= 100
+    good_act(client)
+    for fault, status, code in FAULTS:
+        answer = send(client, fault)
+        summary = {key: str(value)[:80] for key, value in fault.items()}
+        assert (answer.status_code, answer.json().get("code")) == (status, code), (summary, answer.text[:300])
+        assert answer.headers["content-type"] == "application/problem+json"
+        assert answer.json()["request_id"]
+        assert "Traceback" not in answer.text
+        good = post(client, "act")
+        assert good.status_code == 200, (summary, good.text)
+
+
+def test_a_deadline_that_passed_is_504(client: TestClient) -> None:
+    class Slow(Mean):
+        def act(self, obs: Obs) -> Act:
+            nonlocal acts
+            acts += 1
+            gate.wait(5)
+            return super().act(obs)
+
+    acts = 0
+    gate = threading.Event()
+    engine = Engine(Slow())
+    engine.start()
+    with TestClient(AccessMiddleware(build_http_app(engine, dict, LIMITS), None, "app")) as slow:
+        post(slow, "reset")
+        answer = post(slow, "act", headers={"x-deadline-ms": "30"})  # the policy is at work on it
+        assert (answer.status_code, answer.json()["code"]) == (504, "outcome_unknown")
+        answer = post(slow, "act", headers={"x-deadline-ms": "30"})  # it waits behind that
+        assert (answer.status_code, answer.json()["code"]) == (504, "deadline_exceeded")
+        gate.set()
+        assert post(slow, "act").status_code == 200
+        assert acts == 2, "what was answered with deadline_exceeded was acted on"
+    engine.close()
+
+
+def test_unknown_paths_and_methods_are_problems(client: TestClient) -> None:
+    assert (client.get("/nope").status_code, client.get("/nope").json()["code"]) == (404, "unknown_app")
+    assert client.get("/v1/act").status_code == 405
+    assert client.get("/v1/act").headers["content-type"] == "application/problem+json"
+
+
+def test_a_stream_is_a_session(client: TestClient) -> None:
+    obs = Obs({"front": IMAGE}, 1.0, {"joints": np.zeros(2, np.float32)})
+    with client.websocket_connect("/v1/stream") as first, client.websocket_connect("/v1/stream") as second:
+
+        def call(socket: Any, op: str, **fields: Any):
+            socket.send_bytes(encode_request(Request(op, obs, **fields)))  # type: ignore[arg-type]
+            return decode_reply(socket.receive_bytes())
+
+        assert call(first, "act").error.code == "not_reset"
+        call(first, "reset", instruction="one")
+        call(second, "reset", instruction="two")
+        assert call(first, "act").act.info["instruction"] == "one"
+        assert call(second, "act").act.info["instruction"] == "two"
+        first.send_bytes(b"garbage")
+        assert decode_reply(first.receive_bytes()).error.code == "malformed"
+        first.send_text("hello")
+        assert decode_reply(first.receive_bytes()).error.code == "malformed"
+        assert call(first, "act").act.info["instruction"] == "one"
+
+
+@pytest.mark.parametrize("name", ["a b", "\xe9", "x" * 129])
+def test_a_request_id_that_could_forge_a_line_in_the_log_is_replaced(client: TestClient, name: str) -> None:
+    answer = client.get("/nope", headers=[(b"x-request-id", name.encode("latin-1"))])
+    assert answer.json()["request_id"].isalnum()
+    assert client.get("/nope", headers={"x-request-id": "mine-1"}).json()["request_id"] == "mine-1"

@@ -1,0 +1,298 @@
+"""A replica's own port for WebSockets, over an engine without Ray."""
+
+from __future__ import annotations
+
+import os
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from eval_fakes import wait_for
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from vlagents_ray.client.transports.direct_websocket import Stream
+from vlagents_ray.client.transports.probe import bytes_probe, is_answer
+from vlagents_ray.errors import (
+    ConfigError,
+    MalformedMessage,
+    MessageTooLarge,
+    NotReset,
+)
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.protocol.budget import Budget
+from vlagents_ray.protocol.frames import decode_reply, decode_requests, encode_request
+from vlagents_ray.protocol.messages import (
+    STREAM_BYTES,
+    Limits,
+    Reply,
+    Request,
+)
+from vlagents_ray.serve.access.api_keys import Keys, NoKey
+from vlagents_ray.serve.access.key_store import new_key
+from vlagents_ray.serve.endpoints.websocket import WebSocketServer
+from vlagents_ray.serve.engine.engine import Engine
+
+BASE = urlsplit("http://127.0.0.1")
+
+
+class Echo(Agent):
+    """Answers what the camera shows, and as many bytes as it is asked for."""
+
+    def act(self, obs: Obs) -> Act:
+        return Act(np.array([obs.cameras["front"][0, 0, 0]]), info={"bytes": bytes(obs.info.get("bytes", 0))})
+
+
+@pytest.fixture
+def endpoint() -> Iterator[WebSocketServer]:
+    engine = Engine(Echo(), session_limit=3)
+    endpoint = WebSocketServer(engine, Limits(), "127.0.0.1", None, NoKey.OPEN)
+    endpoint.open()
+    engine.start()
+    yield endpoint
+    engine.close()
+    endpoint.close()
+
+
+def stream(endpoint: WebSocketServer) -> Stream:
+    return Stream(BASE, endpoint.address.port, endpoint.address.path, 5)
+
+
+def ask(client: Stream, op: Any, pixel: int = 0, **info: Any) -> Reply:
+    obs = Obs({"front": np.full((16, 16, 3), pixel, np.uint8)}, info=info)
+    client.send(encode_request(Request(op, obs, request_id=os.urandom(4).hex())), 5)
+    return decode_reply(client.recv(5))
+
+
+def test_each_connection_is_a_session_that_ends_with_it(endpoint: WebSocketServer) -> None:
+    clients = [stream(endpoint) for _ in range(3)]
+    for client in clients:
+        assert ask(client, "reset").error is None
+    for step in range(20):
+        for number, client in enumerate(clients):
+            act = ask(client, "act", 3 * step + number).act
+            assert act is not None
+            assert act.action.tolist() == [3 * step + number]
+    assert len(endpoint._engine.sessions) == 3
+    clients[0].close()
+    clients[1]._socket.close()  # without a word
+    wait_for(lambda: len(endpoint._engine.sessions) == 1)
+    assert ask(clients[2], "act", 9).act is not None
+    clients[2].close()
+    wait_for(lambda: len(endpoint._engine.sessions) == 0)
+
+
+def test_who_does_not_know_the_path_is_not_let_in(endpoint: WebSocketServer) -> None:
+    for path in ("/", "/v1/stream", endpoint.address.path[:-1], endpoint.address.path + "x"):
+        with pytest.raises(InvalidStatus) as refused:
+            Stream(BASE, endpoint.address.port, path, 5)
+        assert refused.value.response.status_code == 404
+    wait_for(lambda: not endpoint._clients)
+
+
+def test_an_ordinary_websocket_client_is_served_too(endpoint: WebSocketServer) -> None:
+    with connect(f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}", compression=None) as socket_:
+        socket_.ping().wait(5)
+        probe = bytes_probe(300_000)
+        socket_.send(probe)
+        assert is_answer(socket_.recv(5))
+        socket_.send(encode_request(Request("reset", Obs())))
+        assert decode_reply(socket_.recv(5)).error is None
+
+
+def test_wrong_messages_are_answered_and_the_session_stays(endpoint: WebSocketServer) -> None:
+    with connect(f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}", compression=None) as client:
+
+        def error_of(message: str | bytes) -> Exception | None:
+            client.send(message)
+            return decode_reply(client.recv(5)).error
+
+        assert isinstance(error_of(encode_request(Request("act", Obs()))), NotReset)
+        assert error_of(encode_request(Request("reset", Obs()))) is None
+        assert isinstance(error_of("text"), MalformedMessage)
+        assert isinstance(error_of(b"nonsense"), MalformedMessage)
+        assert isinstance(error_of(b"VLA?\x00"), MalformedMessage)
+        images = {f"c{i}": np.zeros((2, 2, 3), np.uint8) for i in range(17)}
+        assert isinstance(error_of(encode_request(Request("act", Obs(images)))), MessageTooLarge)
+        client.send(encode_request(Request("act", Obs({"front": np.full((8, 8, 3), 5, np.uint8)}))))
+        act = decode_reply(client.recv(5)).act
+        assert act is not None
+        assert act.action.tolist() == [5]
+
+
+@pytest.mark.parametrize("fragments", [True, False])
+def test_what_is_too_long_or_in_pieces_ends_the_connection_that_sent_it_alone(
+    endpoint: WebSocketServer, fragments: bool
+) -> None:
+    other = stream(endpoint)
+    ask(other, "reset")
+    url = f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}"
+
+    def send() -> None:
+        with connect(url, compression=None) as client:
+            client.send([b"a", b"b"] if fragments else bytes(STREAM_BYTES + 1))
+            client.recv(5)
+
+    with pytest.raises(ConnectionClosed):
+        send()
+    act = ask(other, "act", 7).act
+    assert act is not None
+    assert act.action.tolist() == [7]
+    other.close()
+
+
+def test_a_client_that_takes_no_replies_holds_up_nobody(
+    endpoint: WebSocketServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("vlagents_ray.serve.endpoints.send_buffer._SLOW_S", 0.5)
+    slow, other = stream(endpoint), stream(endpoint)
+    for client in (slow, other):
+        ask(client, "reset")
+    frame = encode_request(Request("act", Obs({"front": np.zeros((2, 2, 3), np.uint8)}, info={"bytes": 3_000_000})))
+    for _ in range(4):
+        slow.send(frame, 5)
+    for pixel in range(50):
+        act = ask(other, "act", pixel).act
+        assert act is not None
+        assert act.action.tolist() == [pixel]
+    wait_for(lambda: len(endpoint._engine.sessions) == 1)  # it was cut off
+    wait_for(lambda: not [thread for thread in threading.enumerate() if thread.name == "send-slowly"])
+    slow.close()
+    other.close()
+
+
+def test_a_reply_longer_than_the_connection_holds_arrives_whole(endpoint: WebSocketServer) -> None:
+    client = stream(endpoint)
+    ask(client, "reset")
+    for _ in range(3):
+        act = ask(client, "act", 1, bytes=9_000_000).act
+        assert act is not None
+        assert len(act.info["bytes"]) == 9_000_000
+    client.close()
+
+
+def test_the_limit_of_sessions_is_one_of_streams(endpoint: WebSocketServer) -> None:
+    clients = [stream(endpoint) for _ in range(3)]
+    for client in clients:
+        ask(client, "reset")
+    with pytest.raises(InvalidStatus) as refused:
+        stream(endpoint)
+    assert refused.value.response.status_code == 503  # before it is accepted, so that its client tries the proxy
+    assert refused.value.response.headers["retry-after"] == "1"
+    clients.pop().close()
+    wait_for(lambda: len(endpoint._clients) == 2)
+    clients.append(stream(endpoint))
+    assert ask(clients[-1], "reset").error is None
+    for client in clients:
+        client.close()
+
+
+def test_connections_that_say_nothing_make_way(endpoint: WebSocketServer) -> None:
+    silent = [socket.create_connection(("127.0.0.1", endpoint.address.port)) for _ in range(70)]
+    client = stream(endpoint)
+    assert ask(client, "reset").error is None
+    assert len(endpoint._clients) <= 65
+    for each in silent:
+        each.close()
+    client.close()
+    wait_for(lambda: not endpoint._clients)
+
+
+def test_what_nobody_foresaw_ends_the_connection_that_it_came_by_alone(
+    endpoint: WebSocketServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def decode(frame: bytes, budget: Budget) -> list[Request | Reply]:
+        if frame == b"surprise":
+            raise RuntimeError
+        return decode_requests(frame, budget)
+
+    monkeypatch.setattr("vlagents_ray.serve.endpoints.websocket_connection.decode_requests", decode)
+    other, client = stream(endpoint), stream(endpoint)
+    for each in (other, client):
+        ask(each, "reset")
+    client.send(b"surprise", 5)
+    with pytest.raises(ConnectionClosed):
+        client.recv(5)
+    client.close()
+    wait_for(lambda: len(endpoint._engine.sessions) == len(endpoint._clients) == 1)
+    assert ask(other, "act", 7).act is not None
+    other.close()
+
+
+def test_who_does_not_wait_for_answers_fills_no_memory_and_gets_them_all(
+    endpoint: WebSocketServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hurry = threading.Event()
+
+    def act(_self: Echo, obs: Obs) -> Act:
+        if not hurry.is_set():
+            time.sleep(0.005)
+        return Act(obs.cameras["front"][0, :1, 0])
+
+    monkeypatch.setattr(Echo, "act", act)
+    frames = [
+        encode_request(Request("act", Obs({"front": np.full((64, 64, 3), i % 256, np.uint8)}), request_id=str(i)))
+        for i in range(1000)
+    ]
+    with connect(f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}", compression=None) as client:
+        client.send(encode_request(Request("reset", Obs())))
+        assert decode_reply(client.recv(5)).error is None
+        sending = threading.Thread(target=lambda: [client.send(frame) for frame in frames])
+        sending.start()
+        (one,) = endpoint._clients
+        wait_for(lambda: one._paused or not sending.is_alive())
+        assert sending.is_alive()
+        assert endpoint._engine.queue.depth() < 300
+        hurry.set()
+        replies = [decode_reply(client.recv(10)) for _ in frames]
+        sending.join(10)
+    assert [reply.request_id for reply in replies] == [str(i) for i in range(1000)]
+    assert all(reply.act is not None for reply in replies)
+    wait_for(lambda: not endpoint._clients)
+
+
+def test_without_keys_pages_of_other_sites_are_refused(endpoint: WebSocketServer) -> None:
+    """Of a name that leads here, too."""
+    where = (BASE, endpoint.address.port, endpoint.address.path, 5)
+    for host in ("evil.example", f"evil.example:{endpoint.address.port}"):
+        with pytest.raises(InvalidStatus) as refused:
+            Stream(*where, {"Origin": f"http://{host}"})
+        assert refused.value.response.status_code == 403
+
+
+def test_an_endpoint_takes_a_free_port_of_those_it_may() -> None:
+    engine = Engine(Echo())
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(ConfigError, match=str(port)):
+            WebSocketServer(engine, Limits(), "127.0.0.1", (port, port), NoKey.OPEN)
+        endpoint = WebSocketServer(engine, Limits(), "127.0.0.1", (port, port + 20), NoKey.OPEN)
+        assert port < endpoint.address.port <= port + 20
+        endpoint.close()
+    engine.close()
+
+
+def test_where_there_are_keys_the_path_alone_is_not_enough(tmp_path: Path) -> None:
+    token, other = (new_key(tmp_path / "keys.json", name, apps=apps) for name, apps in (("arm", ()), ("x", ("pi0",))))
+    keys = Keys.from_file(tmp_path / "keys.json")
+    engine = Engine(Echo())
+    endpoint = WebSocketServer(engine, Limits(), "127.0.0.1", None, lambda key: keys.check(key, "noop"))
+    endpoint.open()
+    engine.start()
+    where = (BASE, endpoint.address.port, endpoint.address.path, 5)
+    for headers, status in (({}, 401), ({"x-api-key": "wrong"}, 401), ({"x-api-key": other}, 403)):
+        with pytest.raises(InvalidStatus) as refused:
+            Stream(*where, headers)
+        assert refused.value.response.status_code == status
+    client = Stream(*where, {"Authorization": f"Bearer {token}"})
+    assert ask(client, "reset").error is None
+    assert [name.partition("/")[0] for name in engine.sessions.ids()] == ["arm"]
+    client.close()
+    engine.close()
+    endpoint.close()

@@ -1,0 +1,303 @@
+"""Pushes of learners on other machines: one connection is one push, by a key with the scope for it."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing, suppress
+from types import SimpleNamespace
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from asgi_server import served
+from eval_fakes import wait_for
+from in_memory_keys import ChangingKeys
+from websockets.exceptions import ConnectionClosed
+
+from vlagents_ray.client.credentials import Credentials
+from vlagents_ray.client.transports.websocket import ProxiedSocket, open_websocket
+from vlagents_ray.errors import (
+    Forbidden,
+    InvalidInput,
+    InvalidWeights,
+    MalformedMessage,
+    MessageTooLarge,
+    NotTrainable,
+    Overloaded,
+    PolicyUnavailable,
+    TooManyRequests,
+    Unauthorized,
+    UnchangedWeights,
+    VLAgentsError,
+)
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.learn import Publisher
+from vlagents_ray.protocol.frames import read_error
+from vlagents_ray.protocol.messages import Limits
+from vlagents_ray.serve.access import api_keys
+from vlagents_ray.serve.access.api_keys import Keys
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.endpoints.weights import weights_routes
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.scaling.weight_push import OwnWeights, WeightPusher
+from vlagents_ray.serve.weights.updates import PushOptions, PushResult
+from vlagents_ray.weights.safetensors import MESSAGE_BYTES, PART_BYTES, header_of, parts_of
+
+LENGTH = 3 * 2**20  # 12 MiB, so that there are several parts
+
+
+class Gain(Agent):
+    trainable: ClassVar[str | None] = "tree"
+
+    def initialize(self) -> None:
+        self.tree = {"gain": np.zeros(LENGTH, np.float32), "offset": np.zeros(2, np.float32)}
+
+    def act(self, obs: Obs) -> Act:
+        return Act(self.tree["offset"])
+
+
+class Fixed(Agent):
+    def act(self, obs: Obs) -> Act:
+        return Act(np.zeros(1))
+
+
+class Alone:
+    """One replica."""
+
+    def __init__(self, engine: Engine) -> None:
+        own = OwnWeights("this", engine.weights)
+
+        async def others() -> tuple[()]:
+            return ()
+
+        self.require_fit = engine.weights.require_fit
+        self._pusher = WeightPusher(own, others)
+        self._engine = engine
+
+    async def push_received(self, named: Mapping[str, Any], options: PushOptions) -> PushResult:
+        return await self._pusher.push(named, options)
+
+    async def versions_of_weights(self) -> list[int]:
+        return [self._engine.weights.number]
+
+
+Serving = Callable[..., SimpleNamespace]
+
+
+@pytest.fixture
+def serving(monkeypatch: pytest.MonkeyPatch) -> Iterator[Serving]:
+    monkeypatch.setattr(api_keys, "_CHECK_S", 0.0)
+    opened: list[Any] = []
+
+    def open_one(
+        agent: Agent | None = None, keys: Keys | None = None, slow_s: float = 30.0, *, insecure: bool = False
+    ) -> SimpleNamespace:
+        engine = Engine(agent or Gain())
+        engine.start()
+        routes = weights_routes(Alone(engine), slow_s, open_to_network=insecure)
+        inside = build_http_app(engine, dict, Limits(), weights=routes)
+        server = served(AccessMiddleware(inside, keys, "app"))
+        opened.extend((server, engine))
+        return SimpleNamespace(url=f"http://127.0.0.1:{server.__enter__()}", engine=engine)
+
+    yield open_one
+    for server, engine in zip(opened[::2], opened[1::2], strict=True):
+        server.__exit__(None, None, None)
+        engine.close()
+
+
+def gains(value: float) -> dict[str, np.ndarray]:
+    return {"gain": np.full(LENGTH, value, np.float32), "offset": np.full(2, value, np.float32)}
+
+
+def opened(server: SimpleNamespace, query: str = "", key: str = "") -> closing[ProxiedSocket]:
+    url = server.url.replace("http", "ws") + f"/v1/weights{query}"
+    return closing(open_websocket(url, Credentials(key), 10))
+
+
+def answer(socket: ProxiedSocket, part: bytes) -> dict[str, Any]:
+    with suppress(ConnectionClosed, OSError):  # refused already
+        socket.send(part, 10)
+    found: dict[str, Any] = json.loads(socket.recv(30))
+    return found
+
+
+def test_a_learner_elsewhere_pushes_and_asks_which_replicas_act_with_it(serving: Serving) -> None:
+    server = serving()
+    with Publisher(server.url) as weights:
+        assert weights.push(gains(1)) == 1
+        assert weights.push({"offset": np.ones(2)}, partial=True, mode="keep", allow_same=True) == 2
+        assert (weights.acknowledged(1), weights.acknowledged(2), weights.acknowledged(3)) == (1, 1, 0)
+    held = server.engine.models.own_weights._agent.tree
+    assert server.engine.weights.describe()["newest"]["version"] == 2
+    assert held["offset"].tolist() == [0, 0]  # no session has begun since
+    newest = server.engine.models.own_weights.newest.values
+    assert (newest["gain"][0], newest["gain"][-1], newest["offset"][0]) == (1, 1, 1)
+
+
+def test_values_that_are_received_are_not_copied_again(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:
+    server = serving()
+    received: list[Mapping[str, Any]] = []
+    stage = server.engine.weights.stage
+    monkeypatch.setattr(server.engine.weights, "stage", lambda *args: (received.append(args[1]), stage(*args))[1])
+    Publisher(server.url).push(gains(1))
+    assert np.shares_memory(server.engine.models.own_weights.newest.values["gain"], received[0]["gain"])
+
+
+def test_what_does_not_fit_is_refused_before_it_is_sent(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:
+    server = serving()
+    weights = Publisher(server.url)
+    sent: list[int] = []
+    send = ProxiedSocket.send
+    monkeypatch.setattr(ProxiedSocket, "send", lambda self, part, s: (sent.append(len(part)), send(self, part, s)))
+    for wrong, says in (
+        (gains(1) | {"other": np.zeros(2**24, np.int8)}, "'other': unknown"),
+        ({"gain": gains(1)["gain"]}, "'offset': missing"),
+        (gains(1) | {"gain": np.zeros((2, LENGTH), np.float32)}, "'gain': got shape"),
+    ):
+        sent.clear()
+        with pytest.raises(InvalidWeights, match=says):
+            weights.push(wrong)
+        assert sum(sent) < 1000
+    for wrong, error in (
+        (gains(np.nan), InvalidWeights),
+        (gains(0), UnchangedWeights),
+        ({"offset": [0.0]}, InvalidWeights),
+    ):
+        with pytest.raises(error):
+            weights.push(wrong)
+    with pytest.raises(NotTrainable):
+        Publisher(serving(Fixed()).url).push(gains(1))
+    assert server.engine.weights.number == 0
+
+
+def test_keys_need_the_scope(serving: Serving) -> None:
+    known = ChangingKeys()
+    server = serving(keys=known.keys)
+    learner, robot = known.add("learner", scopes=["weights"]), known.add("robot")
+    assert Publisher(server.url, api_key=learner).push(gains(1)) == 1
+    for key, error in ((robot, Forbidden), ("", Unauthorized), ("vlr_wrong", Unauthorized)):
+        weights = Publisher(server.url, api_key=key)
+        for ask in (lambda weights=weights: weights.push(gains(2)), lambda weights=weights: weights.acknowledged(1)):
+            with pytest.raises(error):
+                ask()
+    known.change("learner", rate=1e-6)
+    known.keys.check(learner, "app").admit()
+    with pytest.raises(TooManyRequests):
+        Publisher(server.url, api_key=learner).push(gains(2))
+    assert server.engine.weights.number == 1
+
+
+@pytest.mark.parametrize(("change", "error"), [({"revoked": True}, Unauthorized), ({"scopes": []}, Forbidden)])
+def test_a_key_that_loses_its_right_ends_the_push(serving: Serving, change: Any, error: type[Exception]) -> None:
+    known = ChangingKeys()
+    server = serving(keys=known.keys)
+    key, values = known.add("learner", scopes=["weights"]), gains(1)
+    first, second, *_ = parts_of(values)
+    with opened(server, key=key) as socket:
+        assert answer(socket, header_of(values)) == {"received": 0}
+        assert answer(socket, first) == {"received": PART_BYTES}
+        known.change("learner", **change)
+        assert isinstance(read_error(answer(socket, second)), error)
+    assert server.engine.weights.number == 0
+
+
+def test_a_server_that_is_open_to_the_network_without_keys_takes_none(serving: Serving) -> None:
+    server = serving(insecure=True)
+    with pytest.raises(Forbidden, match="--scope weights"):
+        Publisher(server.url).push(gains(1))
+    with pytest.raises(Forbidden):
+        Publisher(server.url).acknowledged(0)
+
+
+def test_a_push_that_dies_half_way_leaves_nothing_behind(serving: Serving) -> None:
+    server = serving()
+    values = gains(1)
+    with opened(server) as socket:
+        answer(socket, header_of(values))
+        answer(socket, next(parts_of(values)))
+        with pytest.raises(Overloaded, match="another push is under way here"):
+            Publisher(server.url).push(gains(2))
+    weights = Publisher(server.url)
+
+    def pushed() -> bool:
+        try:
+            return weights.push(gains(3)) == 1
+        except Overloaded:  # the server has not seen the end yet
+            return False
+
+    wait_for(pushed)
+    assert server.engine.models.own_weights._staged is None
+
+
+def test_a_learner_that_is_silent_is_not_waited_for(serving: Serving) -> None:
+    server = serving(slow_s=0.2)
+    with opened(server) as socket:
+        assert answer(socket, header_of(gains(1))) == {"received": 0}
+        refused = read_error(json.loads(socket.recv(30)))
+        assert isinstance(refused, MalformedMessage)
+        assert "no part within 0.2 s" in str(refused)
+    server = serving()
+    assert Publisher(server.url).push(gains(1)) == 1
+
+
+@pytest.mark.parametrize(
+    ("query", "parts", "error"),
+    [
+        ("?mode=abort", [], InvalidInput),
+        ("?partial=yes", [], InvalidInput),
+        ("?pickle=true", [], InvalidInput),
+        ("", [b"garbage"], MalformedMessage),
+        ("", [b"\0" * (MESSAGE_BYTES + 1)], MessageTooLarge),
+        ("?partial=true", [header_of({"offset": np.zeros(2, np.float32)}), b"\0" * 9], MalformedMessage),
+    ],
+)
+def test_garbage_is_refused_with_its_reason(serving: Serving, query: str, parts: list[bytes], error: type) -> None:
+    server = serving()
+    with opened(server, query) as socket:
+        for part in parts or [b""]:
+            found = answer(socket, part)
+        assert type(read_error(found)) is error
+    assert server.engine.weights.number == 0
+
+
+def test_text_is_no_part(serving: Serving) -> None:
+    with opened(serving()) as socket:
+        assert "want a binary one" in str(read_error(answer(socket, "{}")))  # type: ignore[arg-type]
+
+
+def test_an_error_of_the_server_itself_is_not_shown(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:
+    server = serving()
+
+    def fail(*args: Any) -> str:
+        raise RuntimeError("secret")
+
+    monkeypatch.setattr(server.engine.weights, "stage", fail)
+    with pytest.raises(VLAgentsError, match="internal error"):
+        Publisher(server.url).push(gains(1))
+
+
+def test_a_push_whose_learner_leaves_after_the_last_part_is_completed(
+    serving: Serving, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server = serving()
+    begun, may_go_on = threading.Event(), threading.Event()
+    stage = server.engine.weights.stage
+    monkeypatch.setattr(
+        server.engine.weights, "stage", lambda *args: (begun.set(), may_go_on.wait(30), stage(*args))[2]
+    )
+    values = {"offset": np.ones(2, np.float32)}
+    with opened(server, "?partial=true") as socket:
+        answer(socket, header_of(values))
+        socket.send(next(parts_of(values)), 10)
+        assert begun.wait(30)
+    may_go_on.set()
+    wait_for(lambda: server.engine.weights.number == 1)
+
+
+def test_a_server_that_is_not_there_is_named() -> None:
+    with pytest.raises(PolicyUnavailable, match="cannot connect"):
+        Publisher("http://127.0.0.1:9").push(gains(1))

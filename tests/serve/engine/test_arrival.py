@@ -1,0 +1,207 @@
+"""A deadline is counted from when the request came, not from when the policy's thread had time to read it."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import asdict
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from eval_fakes import wait_for
+
+from vlagents_ray.client.transports.direct_websocket import Stream
+from vlagents_ray.client.transports.local.shm import ShmTransport
+from vlagents_ray.errors import DeadlineExceeded
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.protocol.frames import decode_reply, encode_request
+from vlagents_ray.protocol.messages import Limits, Reply, Request
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.endpoints.local.shm import ShmServer
+from vlagents_ray.serve.endpoints.websocket import WebSocketServer
+from vlagents_ray.serve.engine.arrival import SPACE, PauseDetector, enable_timestamps, waited_s
+from vlagents_ray.serve.engine.dispatch import Dispatcher
+from vlagents_ray.serve.engine.engine import Engine
+
+DEADLINE_MS = 300.0
+
+
+class Gated(Agent):
+    """Counts its acts; waits for the gate where it is told to."""
+
+    gate = threading.Event()
+    entered = threading.Event()
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self.acts = 0
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        self.acts += 1
+        if obs.info.get("wait"):
+            self.entered.set()
+            assert self.gate.wait(20)
+        return Act(np.array([self.acts], np.float32))
+
+
+class Shm:
+    """A client that can send without waiting for the answer."""
+
+    def __init__(self, endpoint: ShmServer) -> None:
+        self._transport = ShmTransport(asdict(endpoint.address))
+        self._socket = self._transport._open(5)
+
+    def send(self, request: Request) -> None:
+        self._transport._send(self._socket, [request], time.monotonic() + 5)
+
+    def receive(self) -> Reply:
+        return self._transport._await(self._socket, [Request("act")], time.monotonic() + 20)[0]
+
+    def close(self) -> None:
+        self._transport.close()
+
+
+class WebSocket:
+    """The same at the replica's own port."""
+
+    def __init__(self, endpoint: WebSocketServer) -> None:
+        self._stream = Stream(urlsplit("http://127.0.0.1"), endpoint.address.port, endpoint.address.path, 5)
+        self.close = self._stream.close
+
+    def send(self, request: Request) -> None:
+        self._stream.send(encode_request(request), 5)
+
+    def receive(self) -> Reply:
+        return decode_reply(self._stream.recv(20))
+
+
+@pytest.fixture
+def timestamps() -> Iterator[None]:
+    """The kernel stamps what arrives by TCP; it begins to a little after the first connection asks for it."""
+    with socket.create_server(("127.0.0.1", 0)) as listener, socket.create_connection(listener.getsockname()) as sender:
+        receiver, _ = listener.accept()
+        with receiver:
+            enable_timestamps(receiver)
+
+            def stamped() -> bool:
+                sender.send(b"x")
+                time.sleep(0.01)
+                return waited_s(receiver.recvmsg(1, SPACE)[1]) > 0
+
+            wait_for(stamped)
+            yield
+
+
+@pytest.mark.usefixtures("timestamps")
+@pytest.mark.parametrize("behind", ["an act", "a process that stood still"])
+@pytest.mark.parametrize("transport", ["shm", "websocket"])
+def test_an_act_that_lay_in_the_socket_until_its_deadline_is_not_executed(transport: str, behind: str) -> None:
+    Gated.gate.clear()
+    Gated.entered.clear()
+    engine = Engine(Gated())
+    endpoint = (
+        ShmServer(engine, Limits(), NoKey.OPEN)
+        if transport == "shm"
+        else WebSocketServer(engine, Limits(), "127.0.0.1", None, NoKey.OPEN)
+    )
+    endpoint.open()
+    engine.start()
+    slow, hasty = [Shm(endpoint) if isinstance(endpoint, ShmServer) else WebSocket(endpoint) for _ in range(2)]
+    for client in (slow, hasty):
+        client.send(Request("reset", Obs()))
+        assert client.receive().error is None
+    if behind == "an act":  # the only thread that reads is busy with it
+        slow.send(Request("act", Obs(info={"wait": True})))
+    else:
+        engine.queue.call_soon(lambda: (Gated.entered.set(), Gated.gate.wait(20)))
+    assert Gated.entered.wait(20)
+    hasty.send(Request("act", Obs(), deadline_ms=DEADLINE_MS))
+    time.sleep(2 * DEADLINE_MS / 1e3)
+    Gated.gate.set()
+    if behind == "an act":
+        assert slow.receive().error is None
+    assert type(hasty.receive().error) is DeadlineExceeded
+    hasty.send(Request("act", Obs(), deadline_ms=20e3))  # one that is read at once has all of its time
+    act = hasty.receive().act
+    assert act is not None
+    assert act.action.tolist() == [1], "the late one was acted on"
+    for client in (slow, hasty):
+        client.close()
+    engine.close()
+    endpoint.close()
+
+
+def test_a_pause_counts_for_what_is_read_right_after_it_alone() -> None:
+    now = 100.0
+    pauses = PauseDetector(lambda: now)
+    assert pauses.waited_s() == 0  # nobody looks
+    pauses._checked = now
+    for _ in range(5):  # looks that come in time, or a little late
+        now += 0.2
+        pauses.check()
+        assert pauses.waited_s() == 0
+    now += 7.0
+    assert pauses.waited_s() == pytest.approx(7.0)  # read before the thread has looked
+    pauses.check()
+    now += 0.1
+    assert pauses.waited_s() == pytest.approx(7.1)
+    pauses.check()
+    now += 0.6  # a pause within the backlog, as a busy machine makes them: what came in the long one is still unread
+    assert pauses.waited_s() == pytest.approx(7.7)
+    pauses.check()
+    now += 0.2
+    assert pauses.waited_s() == pytest.approx(7.9)
+    for _ in range(20):
+        now += 0.2
+        pauses.check()
+    assert pauses.waited_s() == 0
+    now += 0.6
+    pauses.check()
+    now += 0.2
+    assert pauses.waited_s() == pytest.approx(0.8)  # a short one has a short backlog
+    pauses.check()
+    for _ in range(2):
+        now += 0.2
+        pauses.check()
+    assert pauses.waited_s() == 0
+
+
+def test_a_machine_that_is_always_starved_refuses_only_what_may_have_waited() -> None:
+    """Pauses that follow upon each other make a backlog longer by themselves alone, and not for ever."""
+    now = 100.0
+    pauses = PauseDetector(lambda: now)
+    pauses._checked = now
+    longest_s = 0.0
+    for _ in range(100):
+        for step_s in (0.35, 0.15):
+            now += step_s
+            longest_s = max(longest_s, pauses.waited_s())
+            pauses.check()
+    assert 0.35 < longest_s < 3.0
+
+
+def test_a_request_that_serve_read_late_after_a_pause_is_not_acted_on() -> None:
+    now = 0.0
+    engine = Engine(Gated())
+    engine.start()
+    engine.pauses.stop()
+    engine.pauses = PauseDetector(lambda: now)
+    engine.pauses._checked = now
+    sender = Dispatcher(engine, "http", caller=NoKey.OPEN)
+
+    def ask(op: str) -> Reply:
+        request = Request(op, Obs(), request_id="1", deadline_ms=2000.0)
+        (reply,) = asyncio.run(sender.ask([request]))
+        return reply
+
+    assert ask("reset").error is None
+    now = 5.0
+    assert isinstance(ask("act").error, DeadlineExceeded)
+    engine.pauses._checked = now
+    assert ask("act").act is not None
+    engine.close()

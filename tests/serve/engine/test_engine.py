@@ -1,0 +1,240 @@
+"""The engine: requests in, replies out, sessions apart."""
+
+from __future__ import annotations
+
+import queue
+import random
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.errors import (
+    ContractMismatch,
+    InvalidAction,
+    InvalidObservation,
+    NotOffered,
+    NotReset,
+    PolicyFailed,
+    PolicyUnavailable,
+    UnknownSession,
+)
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.serve.engine.engine import Engine
+
+
+class Echo(Agent):
+    """Answers with what the session was told: instruction, seed and number of steps."""
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        if kwargs.get("fail"):
+            raise RuntimeError("secret /path/of/the/server")
+        self.instruction, self.seed, self.step = instruction, kwargs.get("seed", 0), 0
+        return {"hello": instruction}
+
+    def act(self, obs: Obs) -> Act:
+        self.step += 1
+        if obs.info.get("fail"):
+            raise RuntimeError("secret /path/of/the/server")
+        if obs.info.get("nan"):
+            return Act(np.array([np.nan]))
+        if obs.info.get("odd"):
+            return {"action": [1]}  # type: ignore[return-value]
+        if obs.info.get("unsendable"):
+            return Act(np.zeros(1), info={"x": object()})
+        return Act(
+            np.array([self.seed, self.step]), info={"instruction": self.instruction, "value": obs.info.get("value")}
+        )
+
+
+def ask(engine: Engine, session: str, op: str, info: dict[str, Any] | None = None, **fields: Any) -> Reply:
+    replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
+    engine.submit(session, Request(op, Obs(info=info or {}), **fields), replies.put)  # type: ignore[arg-type]
+    return replies.get(timeout=10)
+
+
+@pytest.fixture
+def serving() -> Iterator[Callable[..., Engine]]:
+    engines: list[Engine] = []
+
+    def serve(agent: Agent, **options: Any) -> Engine:
+        engine = Engine(agent, **options)
+        engines.append(engine)
+        engine.start()
+        return engine
+
+    yield serve
+    for engine in engines:
+        engine.close()
+
+
+def test_sessions_interleaved_at_random_never_mix(serving: Callable[..., Engine]) -> None:
+    engine = serving(Echo())
+    steps = dict.fromkeys(("a", "b", "c"), 0)
+    for seed, name in enumerate(steps):
+        assert ask(engine, name, "reset", instruction=f"task {name}", kwargs={"seed": seed}).info == {
+            "hello": f"task {name}"
+        }
+    choose = random.Random(0)
+    for value in range(1000):
+        name = choose.choice(sorted(steps))
+        steps[name] += 1
+        act = ask(engine, name, "act", {"value": value}).act
+        assert act is not None
+        assert act.info.pop("policy") == {"version": 0, "fingerprint": ""}
+        assert act.info == {"instruction": f"task {name}", "value": value}
+        assert act.action.tolist() == [sorted(steps).index(name), steps[name]]
+
+
+def test_reset_begins_from_scratch(serving: Callable[..., Engine]) -> None:
+    engine = serving(Echo())
+    for _ in range(2):
+        ask(engine, "a", "reset")
+        reply = ask(engine, "a", "act")
+        assert reply.act is not None
+        assert reply.act.action[1] == 1
+
+
+def test_act_before_reset_and_unknown_sessions_are_refused(serving: Callable[..., Engine]) -> None:
+    engine = serving(Echo())
+    with pytest.raises(UnknownSession):
+        ask(engine, "nobody", "act")
+    assert isinstance(ask(engine, "a", "reset", kwargs={"fail": True}).error, PolicyFailed)
+    with pytest.raises(NotReset):
+        ask(engine, "a", "act")
+
+
+def test_a_closed_session_is_unknown(serving: Callable[..., Engine]) -> None:
+    engine = serving(Echo())
+    ask(engine, "a", "reset")
+    ask(engine, "a", "close")
+    with pytest.raises(UnknownSession):
+        ask(engine, "a", "act")
+
+
+@pytest.mark.parametrize(
+    ("info", "error"),
+    [
+        ({"fail": True}, PolicyFailed),
+        ({"nan": True}, InvalidAction),
+        ({"odd": True}, PolicyFailed),
+        ({"unsendable": True}, PolicyFailed),
+    ],
+)
+def test_a_failing_act_fails_alone(
+    serving: Callable[..., Engine], info: dict[str, Any], error: type[Exception]
+) -> None:
+    engine = serving(Echo())
+    ask(engine, "a", "reset")
+    assert isinstance(ask(engine, "a", "act", info).error, error)
+    assert ask(engine, "a", "act").error is None
+
+
+def test_what_the_policy_raised_stays_on_the_server(serving: Callable[..., Engine]) -> None:
+    engine = serving(Echo())
+    ask(engine, "a", "reset")
+    text = str(ask(engine, "a", "act", {"fail": True}, request_id="r1").error)
+    assert "secret" not in text
+    assert "/path" not in text
+    assert "r1" in text
+
+
+class Contracted(Echo):
+    @property
+    def contract(self) -> Contract:
+        return Contract({"front": CameraSpec(4, 4)}, {"joints": StateSpec(2)}, action=ActionSpec(dim=2))
+
+
+def test_observations_are_checked_before_they_join_a_batch(serving: Callable[..., Engine]) -> None:
+    engine = serving(Contracted())
+    with pytest.raises(InvalidObservation):
+        ask(engine, "a", "reset")
+
+
+def test_what_the_policy_does_not_offer_is_refused_before_it_acts(serving: Callable[..., Engine]) -> None:
+    engine = serving(Echo())
+    ask(engine, "a", "reset")
+    with pytest.raises(NotOffered, match=r"got \['logprob'\], want some of \[\]"):
+        ask(engine, "a", "act", {"want": ["logprob"]})
+    act = ask(engine, "a", "act").act
+    assert act is not None
+    assert act.action[1] == 1, "the policy's step was not counted"
+
+
+def test_contracts_are_compared_at_reset(serving: Callable[..., Engine]) -> None:
+    engine = serving(Contracted())
+    with pytest.raises(ContractMismatch, match=r"action\.dim"):
+        ask(engine, "a", "reset", contract={"action": {"dim": 7}})
+
+
+class Batched(Echo):
+    def initialize(self) -> None:
+        self.sizes: list[int] = []
+
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        self.sizes.append(len(obs))
+        if any(one.info.get("short") for one in obs):
+            return []
+        return [session.act(one) for session, one in zip(sessions, obs, strict=True)]
+
+
+def test_a_batch_goes_to_the_initialized_agent_in_one_call(serving: Callable[..., Engine]) -> None:
+    agent = Batched()
+    engine = serving(agent, max_batch_size=8)
+    names = [f"s{i}" for i in range(8)]
+    for name in names:
+        ask(engine, name, "reset", instruction=name)
+    replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
+    for _ in range(20):
+        for name in names:
+            engine.submit(name, Request("act", Obs(), request_id=name), replies.put)
+    answers = [replies.get(timeout=10) for _ in range(160)]
+    assert all(reply.act is not None and reply.act.info["instruction"] == reply.request_id for reply in answers)
+    assert sum(agent.sizes) == 160
+    assert max(agent.sizes) <= 8
+
+
+def test_a_batch_of_the_wrong_length_is_the_policys_fault(serving: Callable[..., Engine]) -> None:
+    engine = serving(Batched())
+    ask(engine, "a", "reset")
+    assert isinstance(ask(engine, "a", "act", {"short": True}).error, PolicyFailed)
+
+
+def test_every_reply_says_where_the_time_went(serving: Callable[..., Engine]) -> None:
+    engine = serving(Echo())
+    ask(engine, "a", "reset")
+    timing = ask(engine, "a", "act").timing
+    assert timing["batch_size"] == 1
+    assert timing["queue_ms"] >= 0
+    assert timing["inference_ms"] > 0
+
+
+def test_a_loading_policy_is_unavailable_and_a_broken_one_says_why() -> None:
+    class Broken(Agent):
+        def initialize(self) -> None:
+            raise FileNotFoundError("no such checkpoint")
+
+    engine = Engine(Broken())
+    with pytest.raises(PolicyUnavailable):
+        engine.require_ready()
+    with pytest.raises(PolicyFailed, match="no such checkpoint"):
+        engine.start()
+    with pytest.raises(PolicyFailed, match="did not load: FileNotFoundError; the server"):  # no path leaves it
+        ask(engine, "a", "reset")
+
+
+def test_close_closes_the_agent_once() -> None:
+    closed: list[int] = []
+
+    class Closing(Echo):
+        def close(self) -> None:
+            closed.append(1)
+
+    engine = Engine(Closing())
+    engine.start()
+    ask(engine, "a", "reset")
+    engine.close()
+    assert closed == [1]

@@ -1,0 +1,241 @@
+"""Timing in replies and load of a queue, over endpoints without Ray."""
+
+from __future__ import annotations
+
+import gc
+import json
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+import pytest
+from starlette.testclient import TestClient
+
+from vlagents_ray.client.transports.local.shm import ShmTransport
+from vlagents_ray.images.codecs import JPEG
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_reply, encode_request
+from vlagents_ray.protocol.messages import (
+    Limits,
+    Op,
+    Reply,
+    Request,
+)
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.endpoints.local.shm import ShmServer
+from vlagents_ray.serve.engine.dispatch import Dispatcher
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.metrics_buffer import (
+    SAMPLE,
+    LoadMeter,
+    MetricsBuffer,
+    RequestTrace,
+)
+
+OBS = Obs({"front": np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.uint8)}, 0.5)
+
+
+class Large(Agent):
+    """Answers with much to encode; sleeps as long as it is told."""
+
+    def act(self, obs: Obs) -> Act:
+        time.sleep(obs.info.get("sleep", 0.0))
+        if obs.info.get("fail"):
+            raise RuntimeError("no")
+        return Act(np.zeros((50, 7)), info={"list": list(range(5000)), "text": "ünïcode"})
+
+
+@pytest.fixture
+def engine() -> Iterator[Engine]:
+    engine = Engine(Large())
+    yield engine
+    engine.close()
+
+
+@pytest.fixture
+def client(engine: Engine) -> Iterator[TestClient]:
+    engine.start()
+    engine.stats.enable()
+    with TestClient(AccessMiddleware(build_http_app(engine, dict, Limits()), None, "app")) as client:
+        yield client
+
+
+def check(timing: dict[str, float], round_trip_ms: float) -> None:
+    stages = [timing[f"{stage}_ms"] for stage in ("decode", "queue", "inference", "encode")]
+    assert min(stages) > 0, timing
+    assert sum(stages) <= timing["total_ms"] <= round_trip_ms, timing
+
+
+def test_stages_add_up_over_http_in_json_and_in_frames(client: TestClient) -> None:
+    headers = {"x-session-id": "robot", "content-type": CONTENT_TYPE}
+    client.post("/v1/reset", content=encode_request(Request("reset", OBS)), headers=headers)
+    begun = time.perf_counter()
+    answer = client.post("/v1/act", content=encode_request(Request("act", OBS), JPEG), headers=headers)
+    check(answer.json()["timing"], (time.perf_counter() - begun) * 1e3)
+    assert answer.json()["info"]["text"] == "ünïcode"
+    begun = time.perf_counter()
+    answer = client.post(
+        "/v1/act", content=encode_request(Request("act", OBS), JPEG), headers={**headers, "accept": CONTENT_TYPE}
+    )
+    check(decode_reply(answer.content).timing, (time.perf_counter() - begun) * 1e3)
+    form = {"obs": (None, json.dumps({"gripper": 1.0}), "application/json")}
+    begun = time.perf_counter()
+    answer = client.post("/v1/act", files=form, headers={"x-session-id": "robot"})
+    check(answer.json()["timing"], (time.perf_counter() - begun) * 1e3)
+
+
+def test_stages_add_up_over_a_websocket(client: TestClient) -> None:
+    with client.websocket_connect("/v1/stream") as socket:
+        for op in ("reset", "act"):
+            begun = time.perf_counter()
+            socket.send_bytes(encode_request(Request(op, OBS)))  # type: ignore[arg-type]
+            reply = decode_reply(socket.receive_bytes())
+            round_trip_ms = (time.perf_counter() - begun) * 1e3
+        check(reply.timing, round_trip_ms)
+
+
+def test_stages_add_up_in_shared_memory(engine: Engine) -> None:
+    endpoint = ShmServer(engine, Limits(), NoKey.OPEN)
+    endpoint.open()
+    engine.start()
+    transport = ShmTransport(asdict(endpoint.address))
+    transport.connect(5)
+    for op in ("reset", "act"):
+        begun = time.perf_counter()
+        [reply] = transport.call([Request(op, OBS, request_id=op)], 5)  # type: ignore[arg-type]
+        round_trip_ms = (time.perf_counter() - begun) * 1e3
+    check(reply.timing, round_trip_ms)
+    transport.close()
+    engine.close()
+    endpoint.close()
+
+
+def test_what_was_answered_is_recorded_with_its_code(client: TestClient, engine: Engine) -> None:
+    headers = {"x-session-id": "robot", "content-type": CONTENT_TYPE}
+    for op, obs in (("act", OBS), ("reset", OBS), ("act", OBS), ("act", Obs(info={"fail": 1}))):
+        client.post(f"/v1/{op}", content=encode_request(Request(op, obs)), headers=headers)  # type: ignore[arg-type]
+    client.post("/v1/act", content=b"VLA", headers=headers)
+    with client.websocket_connect("/v1/stream") as socket:
+        socket.send_bytes(b"garbage")
+        socket.receive_bytes()
+    collected = engine.stats.collect()
+    assert collected.batches.values == [1, 1]
+    assert {kind: sample.seen for kind, sample in collected.requests.items()} == {
+        ("act", "http", "robot", "unknown_session"): 1,
+        ("reset", "http", "robot", "ok"): 1,
+        ("act", "http", "robot", "ok"): 1,
+        ("act", "http", "robot", "policy_failed"): 1,
+        ("act", "http", "robot", "malformed"): 1,
+        ("unknown", "websocket", "robot", "malformed"): 1,
+    }
+
+
+def test_sessions_are_counted_by_their_endpoint(client: TestClient, engine: Engine) -> None:
+    headers = {"x-session-id": "robot", "content-type": CONTENT_TYPE}
+    client.post("/v1/reset", content=encode_request(Request("reset", OBS)), headers=headers)
+    with client.websocket_connect("/v1/stream") as socket:
+        socket.send_bytes(encode_request(Request("reset", OBS)))
+        socket.receive_bytes()
+        assert engine.sessions.by_transport() == {"http": 1, "websocket": 1}
+
+
+KIND = ("act", "shm", "robot", "ok")
+
+
+def test_nothing_is_kept_for_nobody_and_each_thing_once() -> None:
+    stats = MetricsBuffer()
+    stats.handled(KIND, (1.0,))
+    stats.batch(3, 4)
+    stats.enable()
+    nothing = stats.collect()
+    assert (nothing.requests, nothing.batches.seen, nothing.padding) == ({}, 0, 0)
+    stats.handled(KIND, (2.0,))
+    stats.batch(3, 4)
+    found = stats.collect()
+    assert (found.requests[KIND].values, found.batches.values, found.padding) == ([(2.0,)], [3], 1)
+    assert stats.collect().requests == {}
+
+
+def test_all_are_counted_from_whatever_thread_and_a_fair_sample_is_kept() -> None:
+    stats = MetricsBuffer()
+    stats.enable()
+    threads = [
+        threading.Thread(target=lambda: [stats.handled(KIND, (float(n),)) for n in range(10_000)]) for _ in range(4)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    sample = stats.collect().requests[KIND]
+    assert (sample.seen, len(sample.values)) == (40_000, SAMPLE)
+    mean = sum(value for (value,) in sample.values) / SAMPLE
+    assert abs(mean - 5_000) < 5 * 10_000 / 12**0.5 / SAMPLE**0.5  # five standard errors of a uniform draw
+
+
+def test_a_request_leaves_nothing_to_the_garbage_collector(engine: Engine) -> None:
+    """It would stop the policy for it, again and again."""
+    engine.start()
+    sender, answered = Dispatcher(engine, "shm", caller=NoKey.OPEN), threading.Semaphore(0)
+
+    def ask(op: Op) -> None:
+        sender.send([Request(op, Obs())], lambda _: answered.release())
+        assert answered.acquire(timeout=10)
+
+    ask("reset")
+    ask("act")
+    gc.collect()
+    gc.disable()
+    try:
+        for _ in range(50):
+            ask("act")
+        assert gc.collect() < 50
+    finally:
+        gc.enable()
+
+
+def test_load_is_the_busy_share_and_the_mean_queue(engine: Engine) -> None:
+    engine.start()
+    meter = LoadMeter(engine.queue)
+    answered = threading.Semaphore(0)
+    for name in ("a", "b", "c"):
+        engine.submit(name, Request("reset", Obs()), lambda _: answered.release() and None)
+    assert all(answered.acquire(timeout=10) for _ in range(3))
+    meter.read()
+    time.sleep(0.2)
+    quiet = meter.read()
+    assert quiet.utilisation < 0.2
+    assert quiet.waiting == 0
+    busy = threading.Event()
+    engine.submit("a", Request("act", Obs(info={"sleep": 0.4})), lambda _: answered.release() and None)
+    while engine.queue.depth():  # until it is in its batch
+        time.sleep(0.001)
+    for name in ("b", "c"):
+        engine.submit(name, Request("act", Obs()), lambda _: busy.wait(10) and answered.release() and None)
+    assert answered.acquire(timeout=10)
+    loaded = meter.read()
+    busy.set()
+    assert loaded.utilisation > 0.5
+    assert 0.5 < loaded.waiting <= 2.0
+
+
+def test_recording_costs_a_request_little() -> None:
+    """Against encoding an empty reply, which every request pays, in the same run."""
+    stats = MetricsBuffer()
+    stats.enable()
+
+    def median(run: Any) -> float:
+        times = []
+        for _ in range(2000):
+            begun = time.perf_counter()
+            run()
+            times.append(time.perf_counter() - begun)
+        return sorted(times)[1000]
+
+    recorded = median(lambda: stats.handled(KIND, (1.0, 0.1, 0.2, 0.3, 0.4)))
+    encoded = median(lambda: RequestTrace(stats, "shm").frame([Reply("x", Act(np.zeros(7)))]))
+    assert recorded < encoded / 2

@@ -1,0 +1,84 @@
+"""A reply has a limit at the server, looked at before anything of it is copied or encoded."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vlagents_ray.errors import MessageTooLarge, PolicyFailed
+from vlagents_ray.interface import Act, Obs
+from vlagents_ray.protocol.frames import decode_replies, encode_replies
+from vlagents_ray.protocol.messages import Limits, Reply, Request
+from vlagents_ray.serve.config.deployment import LimitArgs
+from vlagents_ray.serve.engine import responses
+from vlagents_ray.serve.engine.responses import build_reply, require_serializable
+from vlagents_ray.serve.queue.batch_queue import PendingRequest
+from vlagents_ray.serve.sessions import Session
+
+LIMIT = 1000
+
+
+def large(nbytes: int) -> np.ndarray:
+    """An array that takes no memory until it is copied."""
+    return np.broadcast_to(np.float32(0), nbytes // 4)
+
+
+def replied(act: Act) -> tuple[Reply, Session]:
+    session = Session("s")
+    return build_reply(PendingRequest("s", Request("act", Obs()), lambda _: None), session, act, None, LIMIT), session
+
+
+@pytest.mark.parametrize(
+    "act",
+    [
+        Act(large(LIMIT + 4)),
+        Act([0.0] * (LIMIT // 4 + 1)),  # type: ignore[arg-type]
+        Act(np.zeros(1), info={"video": large(LIMIT)}),
+        Act(np.zeros(1), info={"a": {"b": [bytearray(LIMIT // 2), "x" * LIMIT]}}),
+    ],
+    ids=["action", "list", "array", "nested"],
+)
+def test_an_act_over_the_limit_fails_and_is_not_counted(act: Act) -> None:
+    reply, session = replied(act)
+    assert isinstance(reply.error, PolicyFailed)
+    assert "want" in str(reply.error)
+    assert "`limits.reply_bytes`" in str(reply.error)
+    assert (reply.act, session.steps) == (None, 0)
+
+
+def test_one_that_fits_is_sent() -> None:
+    reply, session = replied(Act(np.zeros(2), info={"array": large(LIMIT // 2), "text": "x" * 100}))
+    assert (reply.error, session.steps) == (None, 1)
+
+
+def test_nothing_of_what_is_too_large_is_copied_or_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(responses, "check_action", lambda *_: pytest.fail("looked at"))
+    monkeypatch.setattr(np, "ascontiguousarray", lambda *_: pytest.fail("copied"))
+    replied(Act(large(2**40)))
+    with pytest.raises(PolicyFailed):
+        require_serializable({"array": large(2**40).T})
+
+
+@pytest.mark.parametrize(
+    ("info", "said"),
+    [({"list": [0] * 10_000}, "more than 10000 values"), ({"a": [[[[[[[[0]]]]]]]]}, "nested deeper than 8")],
+)
+def test_what_no_client_would_read_is_refused_where_it_was_made(info: dict[str, Any], said: str) -> None:
+    with pytest.raises(PolicyFailed, match=said):
+        require_serializable(info)
+
+
+def test_replies_of_one_frame_that_are_too_much_together_are_not_joined() -> None:
+    each = Limits().body_bytes // 4
+    replies = [Reply(str(i), Act(large(each))) for i in range(5)]
+    read = decode_replies(encode_replies(replies))
+    assert [reply.request_id for reply in read] == list("01234")
+    assert all(isinstance(reply.error, MessageTooLarge) for reply in read)
+
+
+def test_a_deployment_sets_the_limit_as_far_as_clients_read() -> None:
+    assert LimitArgs(reply_bytes=2000).limits().reply_bytes == 2000
+    with pytest.raises(ValueError, match="reply_bytes"):
+        LimitArgs(reply_bytes=Limits().body_bytes + 1)

@@ -1,0 +1,197 @@
+"""When HAProxy is ready: what its statistics must say of an application's replicas."""
+
+from __future__ import annotations
+
+import re
+import socket
+import subprocess
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from http.client import HTTPConnection
+from http.server import BaseHTTPRequestHandler, HTTPServer, ThreadingHTTPServer
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from eval_fakes import wait_for
+from ray.serve._private.constants import (
+    RAY_SERVE_HAPROXY_HEALTH_CHECK_DOWNINTER,
+    RAY_SERVE_HAPROXY_HEALTH_CHECK_FASTINTER,
+)
+
+from vlagents_ray.client.connection import SILENT_S
+from vlagents_ray.client.transports.http import refusal
+from vlagents_ray.errors import NoReplica, PolicyUnavailable
+from vlagents_ray.serve.launch.haproxy import (
+    _CHECK_FAILURES,
+    _CHECK_INTERVAL,
+    ROBOTS,
+    _launcher,
+    haproxy_binary,
+    wait_for_haproxy,
+)
+from vlagents_ray.serve.ports import free_port
+
+UP, DOWN = "http-app,SERVE_REPLICA::1,UP", "http-app,SERVE_REPLICA::1,DOWN"
+
+
+@contextmanager
+def statistics(*rows: str) -> Iterator[int]:
+    """A page of HAProxy's statistics; yields its port."""
+
+    class Page(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.end_headers()
+            self.wfile.write("\n".join(["# pxname,svname,status", *rows, ""]).encode())
+
+        def log_message(self, *_: Any) -> None:
+            """Nothing."""
+
+    with HTTPServer(("127.0.0.1", 0), Page) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield server.server_port
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def serving(running: int) -> Any:
+    """Serve, with one application of so many replicas."""
+    policy = SimpleNamespace(replica_states={"RUNNING": running})
+    application = SimpleNamespace(deployments={"Policy": policy})
+    return SimpleNamespace(status=lambda: SimpleNamespace(applications={"app": application}))
+
+
+@pytest.mark.parametrize(("running", "rows"), [(1, [UP]), (0, []), (0, [DOWN])])
+def test_it_reaches_all_that_run(running: int, rows: list[str]) -> None:
+    """An application may be down to no replica before HAProxy was asked: nobody waits for that."""
+    with statistics(*rows) as port:
+        wait_for_haproxy(serving(running), {"app": "/"}, port, time.monotonic() + 30)
+
+
+@pytest.mark.parametrize(("running", "rows"), [(1, []), (1, [DOWN]), (2, [UP])])
+def test_it_is_late_while_a_replica_that_runs_is_not_reached(running: int, rows: list[str]) -> None:
+    with statistics(*rows) as port, pytest.raises(PolicyUnavailable, match="'app'"):
+        wait_for_haproxy(serving(running), {"app": "/"}, port, time.monotonic())
+
+
+@contextmanager
+def proxied(folder: Path, *servers: str, settings: str = "") -> Iterator[str]:
+    """The URL of a HAProxy in front of an application with these servers; ADDRESS is one that never answers."""
+    port = free_port()
+    config = folder / "haproxy.cfg"
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        address = f"127.0.0.1:{silent.getsockname()[1]}"
+        text = (
+            "defaults\n    mode http\n    timeout connect 60s\n    timeout client 60s\n    timeout server 60s\n"
+            f"frontend f\n    bind 127.0.0.1:{port}\n    default_backend http-app\n"
+            "backend http-app\n" + settings + "".join(f"    server {one}\n" for one in servers)
+        )
+        config.write_text(text.replace("ADDRESS", address))
+        command = [str(_launcher(folder, str(haproxy_binary()))), "-db", "-f", str(config)]
+        with subprocess.Popen(command) as proxy:
+            try:
+                wait_for(lambda: listens(port), 30)
+                yield f"http://127.0.0.1:{port}"
+            finally:
+                proxy.terminate()
+
+
+def seconds(setting: str) -> float:
+    """A time as HAProxy writes it."""
+    number, unit = re.fullmatch(r"(\d+)(ms|s)", setting).groups()  # type: ignore[union-attr]
+    return int(number) / (1000 if unit == "ms" else 1)
+
+
+REPLICA, FALLBACK = "SERVE_REPLICA_app-Policy-1 ADDRESS", "SERVE_PROXY_ACTOR-fallback ADDRESS backup"
+UPGRADE = {"connection": "upgrade", "upgrade": "websocket", "sec-websocket-key": "dGhlIHNhbXBsZSBub25jZQ=="}
+needs_haproxy = pytest.mark.skipif(haproxy_binary() is None, reason="HAProxy is not installed")
+
+
+@needs_haproxy
+@pytest.mark.parametrize(
+    ("servers", "path", "body"),
+    [
+        ([REPLICA, FALLBACK], "/app/healthz", None),  # frozen
+        ([FALLBACK], "/app/healthz", None),
+        ([FALLBACK], "/v1/metadata", None),
+        ([FALLBACK], "/v1/act", b"{}"),
+    ],
+)
+def test_without_a_replica_that_answers_haproxy_does(
+    servers: list[str], path: str, body: bytes | None, tmp_path: Path
+) -> None:
+    """Serve keeps requests until there is a replica: for ever, where it waits for a GPU that no node has."""
+    with proxied(tmp_path, *servers) as url:
+        with pytest.raises(urllib.error.HTTPError, match="503") as refused:
+            urllib.request.urlopen(urllib.request.Request(url + path, data=body), timeout=30)
+        said = refused.value.read()
+        assert refused.value.headers["retry-after"] == "1"
+        assert isinstance(refusal(503, refused.value.headers["content-type"], said), NoReplica)
+
+
+@needs_haproxy
+@pytest.mark.parametrize(("servers", "headers"), [([REPLICA, FALLBACK], {}), ([FALLBACK], UPGRADE)])
+def test_a_replica_may_take_its_time_and_a_websocket_waits_for_one(
+    servers: list[str], headers: dict[str, str], tmp_path: Path
+) -> None:
+    with proxied(tmp_path, *servers) as url:
+        connection = HTTPConnection(url.removeprefix("http://"), timeout=4)
+        connection.request("GET", "/v1/act", headers=headers)
+        with pytest.raises(TimeoutError):
+            connection.getresponse()
+        connection.close()
+
+
+def test_a_frozen_replica_is_out_of_the_way_when_its_clients_leave_it() -> None:
+    """Each would else come back to it by the hash, now and then, until its next calls had ended, too."""
+    between = max(seconds(RAY_SERVE_HAPROXY_HEALTH_CHECK_FASTINTER), seconds(RAY_SERVE_HAPROXY_HEALTH_CHECK_DOWNINTER))
+    every, failures = seconds(ROBOTS[_CHECK_INTERVAL]), int(ROBOTS[_CHECK_FAILURES])
+    assert every + every + (failures - 1) * (between + every) < SILENT_S
+
+
+@needs_haproxy
+def test_a_replica_that_does_not_answer_gets_no_more_requests(tmp_path: Path) -> None:
+    class Healthy(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            self.send_response(200)
+            self.end_headers()
+
+        def log_message(self, *_: Any) -> None:
+            """Nothing."""
+
+    def answered(url: str) -> bool:
+        try:
+            for number in range(10):
+                request = urllib.request.Request(f"{url}/v1/act", headers={"x-session-id": f"session-{number}"})
+                urllib.request.urlopen(request, timeout=3).close()
+        except OSError:
+            return False
+        return True
+
+    checked = f"check inter {ROBOTS[_CHECK_INTERVAL]} fall {ROBOTS[_CHECK_FAILURES]}"
+    with ThreadingHTTPServer(("127.0.0.1", 0), Healthy) as server:
+        threading.Thread(target=server.serve_forever).start()
+        alive = f"SERVE_REPLICA_app-Policy-2 127.0.0.1:{server.server_port} {checked}"
+        balance = ROBOTS["RAY_SERVE_HAPROXY_BALANCE_ALGORITHM"]
+        settings = f"    balance {balance}    option httpchk GET /-/healthz\n"
+        try:
+            with proxied(tmp_path, f"{REPLICA} {checked}", alive, settings=settings) as url:
+                assert not answered(url)
+                wait_for(lambda: answered(url), 60)
+        finally:
+            server.shutdown()
+
+
+def listens(port: int) -> bool:
+    with suppress(OSError), socket.create_connection(("127.0.0.1", port), 5):
+        return True
+    return False

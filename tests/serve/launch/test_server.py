@@ -1,0 +1,70 @@
+"""Which process builds the applications of a server."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from ray.serve.schema import ServeDeploySchema
+
+from vlagents_ray.serve.launch.deployment_file import deployment, together, with_settings
+from vlagents_ray.serve.launch.server import _deploy
+
+
+class FakeClient:
+    """Serve's client: remembers what it was to deploy."""
+
+    def __init__(self) -> None:
+        self.by_serve: list[ServeDeploySchema] = []
+        self.built_here: list[Any] = []
+
+    def deploy_apps(self, config: ServeDeploySchema) -> None:
+        self.by_serve.append(config)
+
+    def deploy_applications(self, built: list[Any], **_: bool) -> None:
+        self.built_here += built
+
+
+def changed(app: dict[str, Any], **beside: Any) -> ServeDeploySchema:
+    """A file with further keys of an application, and of the file."""
+    document = deployment("noop").model_dump(exclude_unset=True)
+    document["applications"][0] |= app
+    return ServeDeploySchema(**document, **beside)
+
+
+@pytest.mark.parametrize("ends_at_once", [True, False])
+def test_a_server_on_its_own_ray_builds_its_applications_itself(ends_at_once: bool) -> None:
+    """For a file Serve starts a process that imports everything once more, which takes a second."""
+    client = FakeClient()
+    two = together({"a": deployment("noop", replicas=2), "b": with_settings(deployment("noop"), {"action_dim": 3})})
+    _deploy(client, two, own=True, ends_at_once=ends_at_once)
+    assert client.by_serve == []
+    assert [(app.name, app.route_prefix) for app in client.built_here] == [("a", "/a"), ("b", "/b")]
+    parts = [part for app in client.built_here for part in app.deployments]
+    assert [(part.name, part.num_replicas) for part in parts] == [("Policy", 2), ("Policy", 1)]
+    waits = {part._deployment_config.graceful_shutdown_wait_loop_s for part in parts}
+    assert waits == ({0.1} if ends_at_once else {2.0})
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        changed({"deployments": [{"name": "Policy", "num_replicas": 2}]}),
+        changed({"deployments": [{"name": "Policy", "user_config": {"action_dim": 3}}]}),
+        changed({"runtime_env": {"env_vars": {"A": "b"}}}),
+        changed({"import_path": "somebody:elses"}),
+        changed({}, logging_config={"log_level": "DEBUG"}),
+    ],
+)
+def test_what_serve_must_apply_is_deployed_by_serve(config: ServeDeploySchema) -> None:
+    """So that another deployment of the file changes it without new replicas."""
+    client = FakeClient()
+    _deploy(client, config, own=True, ends_at_once=False)
+    assert (client.by_serve, client.built_here) == ([config], [])
+
+
+def test_a_cluster_of_others_keeps_the_file() -> None:
+    """There others may deploy it again."""
+    client, config = FakeClient(), deployment("noop")
+    _deploy(client, config, own=False, ends_at_once=False)
+    assert (client.by_serve, client.built_here) == ([config], [])

@@ -1,0 +1,156 @@
+"""Each preset with what its client really sends: all of it arrives, or the client is told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from client_observations import SENT, TASK, Sent
+
+from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.errors import InvalidObservation
+from vlagents_ray.interface import Obs
+from vlagents_ray.serve.dialects.gr00t import codec as gr00t_codec
+from vlagents_ray.serve.dialects.gr00t.connection import nested_mapping
+from vlagents_ray.serve.mapping.key_paths import lookup
+from vlagents_ray.serve.mapping.mapping import KeyMapping
+from vlagents_ray.serve.mapping.presets import presets
+
+each = pytest.mark.parametrize("sent", SENT, ids=lambda sent: f"{sent.preset}: {sent.source}")
+
+
+def arrive(sent: Sent, change: Callable[[str], str] = str) -> tuple[Obs, str | None]:
+    """What the mapping makes of it, GR00T's on the way that its gateway goes; `change` renames the client's keys."""
+    mapping = presets()[sent.preset]
+    if not sent.preset.startswith("gr00t"):
+        return mapping.obs(renamed(sent.observation, change))
+    [one] = gr00t_codec.read_observations(sent.observation).each
+    return nested_mapping(mapping)[0].obs(renamed(gr00t_codec.newest(one), change))
+
+
+def renamed(nested: dict[str, Any], change: Callable[[str], str]) -> dict[str, Any]:
+    return {change(key): renamed(one, change) if isinstance(one, dict) else one for key, one in nested.items()}
+
+
+def test_every_preset_is_tried_with_its_clients_observation() -> None:
+    assert {sent.preset for sent in SENT} == set(presets())
+
+
+@each
+def test_cameras_state_gripper_and_instruction_arrive(sent: Sent) -> None:
+    obs, instruction = arrive(sent)
+    assert tuple(obs.cameras) == sent.cameras
+    assert all(camera.shape == (32, 32, 3) and camera.max() > 0 for camera in obs.cameras.values())
+    assert {name: part.size for name, part in obs.state.items()} == sent.state
+    assert (obs.gripper is not None) == sent.gripper
+    if sent.preset != "vlagents":  # its gateway takes the instruction from beside the observation
+        assert instruction == ("smoke test" if "smoke" in sent.source else TASK)
+
+
+@each
+def test_an_observation_that_the_preset_does_not_know_is_refused_and_never_empty(sent: Sent) -> None:
+    with pytest.raises(InvalidObservation) as error:
+        arrive(sent, lambda key: f"their_{key}")
+    assert "their_" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("sent", "kind"),
+    [(sent, kind) for sent in SENT for kind in ("cameras", "state") if getattr(sent, kind)],
+    ids=lambda one: one if isinstance(one, str) else f"{one.preset}: {one.source}",
+)
+def test_cameras_or_states_under_other_names_are_refused_too(sent: Sent, kind: str) -> None:
+    mapping = presets()[sent.preset]
+    entries = mapping.cameras.values() if kind == "cameras" else [one for of in mapping.state.values() for one in of]
+    known = {part for one in entries for part in one.key.split("|")}
+    theirs = known | {part.partition("/")[0].partition(".")[0] for part in known}
+    with pytest.raises(InvalidObservation, match="their_"):
+        arrive(sent, lambda key: f"their_{key}" if key in theirs else key)
+
+
+def test_of_two_names_of_one_state_the_first_counts() -> None:
+    obs, _ = presets()["vla-eval"].obs({"images": {}, "states": np.ones(3), "state": np.zeros(8)})
+    assert obs.state["state"].tolist() == [1, 1, 1]
+
+
+def test_a_state_is_taken_from_a_key_that_holds_numbers_and_not_a_map_of_them() -> None:
+    """vla-eval's RoboCasa365 sends a map, which wants a mapping of its own."""
+    theirs = {"images": {"front": np.zeros((8, 8, 3), np.uint8)}, "state": {"state.gripper_qpos": np.zeros(2)}}
+    with pytest.raises(InvalidObservation, match=r"state/state\.gripper_qpos.*mapping\.state"):
+        presets()["vla-eval"].obs(theirs)
+
+
+def test_arrays_that_cannot_be_a_state_and_those_that_are_read_as_info_are_not_missed() -> None:
+    """A camera's matrix, a picture that the mapping does not want, a number."""
+    theirs = {
+        "image": np.zeros((8, 8, 3), np.uint8),
+        "other": np.zeros((8, 8, 3), np.uint8),
+        "intrinsics": np.eye(3),
+        "time": 1.0,
+        "raw": np.zeros(9),
+    }
+    mapping = KeyMapping.from_json(
+        {
+            "cameras": {"front": "image"},
+            "state": {"joints": {"key": "joints", "optional": True}},
+            "info": {"raw": "raw"},
+        }
+    )
+    assert list(mapping.obs(theirs)[0].cameras) == ["front"]
+    with pytest.raises(InvalidObservation, match=r"\['raw'\].*mapping\.info"):
+        KeyMapping.from_json(mapping.to_json() | {"info": {}}).obs(theirs)
+
+
+OPENPI = [sent for sent in SENT if sent.preset in ("openpi-libero", "openpi-droid", "openpi-aloha", "roboarena")]
+
+
+@pytest.mark.parametrize("sent", OPENPI, ids=lambda sent: sent.preset)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64, np.uint8])
+@pytest.mark.parametrize("first", [True, False])
+def test_openpis_images_come_as_its_own_server_takes_them(sent: Sent, dtype: type, first: bool) -> None:
+    """`_parse_image` of openpi's policies: floats in [0, 1] times 255, rounded down; three channels first turned."""
+
+    def theirs(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {key: theirs(one) for key, one in value.items()}
+        if not isinstance(value, np.ndarray) or value.ndim != 3:
+            return value
+        value = value if dtype is np.uint8 else value.astype(dtype) / 255
+        return value.transpose(2, 0, 1) if first and value.shape[2] == 3 else value
+
+    def parsed(image: np.ndarray) -> np.ndarray:
+        if np.issubdtype(image.dtype, np.floating):
+            image = (255 * image).astype(np.uint8)
+        return np.moveaxis(image, 0, -1) if image.shape[0] == 3 else image
+
+    changed, mapping = theirs(sent.observation), presets()[sent.preset]
+    obs, _ = mapping.obs(changed)
+    for name, camera in obs.cameras.items():
+        np.testing.assert_array_equal(camera, parsed(lookup(changed, mapping.cameras[name].key)))
+        assert camera.dtype == np.uint8
+
+
+@pytest.mark.parametrize("value", [1.5, -0.1, np.nan, 255.0])
+def test_floats_that_are_no_picture_are_refused_with_their_range(value: float) -> None:
+    image = np.full((8, 8, 3), 0.5)
+    image[0, 0, 0] = value
+    with pytest.raises(InvalidObservation, match=r"'image'.*\[0, 1\]"):
+        presets()["openvla"].obs({"image": image, "instruction": TASK})
+
+
+@pytest.mark.parametrize("reading", [0.9, -3.0, float("nan")])
+def test_what_the_policy_does_not_want_may_have_any_value(reading: float) -> None:
+    """openpi's examples/simple_client sends `np.random.rand(8)` as LIBERO's state."""
+    [sent] = [one for one in SENT if one.preset == "openpi-libero"]
+    state = np.full(8, 0.5)
+    state[6] = reading
+    theirs = sent.observation | {"observation/state": state}
+    mapping = presets()["openpi-libero"]
+    obs, _ = mapping.obs(theirs, contract=Contract(action=ActionSpec(7)))
+    assert obs.gripper is None
+    np.testing.assert_array_equal(obs.state["gripper_qpos"], np.float32([reading, 0.5]))
+    for contract in (Contract(gripper=True), None):  # of a policy that states nothing, nobody knows what it wants
+        with pytest.raises(InvalidObservation, match=r"mapping\.gripper"):
+            mapping.obs(theirs, contract=contract)

@@ -1,0 +1,422 @@
+"""Sessions choose among the checkpoints of a deployment: loading, sharing, making room."""
+
+from __future__ import annotations
+
+import queue
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from eval_fakes import wait_for
+from in_process_replicas import Replicas, export
+from numbered_checkpoints import Library, act, ask, begin, reset
+
+from vlagents_ray import Agent, Obs
+from vlagents_ray.errors import (
+    CheckpointFailed,
+    DeadlineExceeded,
+    InvalidObservation,
+    PolicyFailed,
+    PolicyUnavailable,
+    UnknownCheckpoint,
+    UnknownSession,
+)
+from vlagents_ray.policies.base.checkpoint import find_checkpoint
+from vlagents_ray.policies.base.checkpoint_files import digest
+from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.models import model_cache
+from vlagents_ray.serve.models.checkpoints import Checkpoints
+from vlagents_ray.serve.queue.batch_queue import PendingRequest
+from vlagents_ray.serve.queue.checkpoint_choice import CheckpointChoice
+from vlagents_ray.serve.sessions import Session
+
+
+@pytest.fixture
+def library() -> Library:
+    return Library()
+
+
+@pytest.fixture
+def serving(library: Library) -> Iterator[Callable[..., Engine]]:
+    engines: list[Engine] = []
+
+    def serve(**options: Any) -> Engine:
+        engines.append(library.engine(**options))
+        return engines[-1]
+
+    yield serve
+    for gate in library.held.values():
+        gate.set()
+    for engine in engines:
+        engine.close()
+
+
+def holders(engine: Engine) -> dict[str | None, int]:
+    """How many sessions keep which checkpoint."""
+    return {model.checkpoint: model.sessions for model in engine.models._cache.loaded.values()}
+
+
+def test_sessions_act_by_the_checkpoint_that_they_chose(serving: Callable[..., Engine]) -> None:
+    engine = serving(choices=["b/2"], steps=True, loaded=3)
+    assert reset(engine, "own") == "a/1"
+    assert reset(engine, "chosen", checkpoint="b") == "b/2"
+    assert reset(engine, "step", checkpoint_step=30) == "a/30"
+    for step in range(1, 20):
+        assert [act(engine, name) for name in ("own", "chosen", "step")] == [[1, step], [2, step], [30, step]]
+
+
+def test_what_a_session_chose_is_not_the_policys_business(serving: Callable[..., Engine]) -> None:
+    engine = serving(choices=["b/2"])
+    reply = begin(engine, "s", checkpoint="b", seed=4).get(timeout=10)
+    assert reply.info == {"checkpoint": "b/2", "options": {"seed": 4}}
+
+
+def test_a_batch_is_run_checkpoint_by_checkpoint(serving: Callable[..., Engine], library: Library) -> None:
+    engine = serving(choices=["b/2"])
+    for i in range(4):
+        reset(engine, f"s{i}", checkpoint="b" if i % 2 else None)
+    replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
+    tickets = [engine.ticket(f"s{i}", Request("act", Obs()), replies.put) for i in range(4)]
+    engine.queue.put(*tickets)
+    numbers = sorted(float(replies.get(timeout=10).act.action[0]) for _ in range(4))  # type: ignore[union-attr]
+    assert numbers == [1, 1, 2, 2]
+    assert sorted(library.batches) == [("a/1", ["a/1", "a/1"]), ("b/2", ["b/2", "b/2"])]
+
+
+@pytest.mark.parametrize(
+    ("offer", "options", "says"),
+    [
+        ({"choices": ["b/2"]}, {"checkpoint": "/etc/passwd"}, r"one of \['b'\]"),
+        ({"choices": ["b/2"]}, {"checkpoint": ["b"]}, r"one of \['b'\]"),
+        ({"choices": ["b/2"]}, {"checkpoint_step": 3}, r"one of \['b'\]"),
+        ({"steps": True}, {"checkpoint": "b"}, "a checkpoint_step"),
+        ({"steps": True}, {"checkpoint_step": -1}, "a number of training steps"),
+        ({"steps": True}, {"checkpoint_step": True}, "a number of training steps"),
+        ({"steps": True}, {"checkpoint_step": "../../b"}, "a number of training steps"),
+        ({}, {"checkpoint": "b"}, "none but its own"),
+    ],
+)
+def test_what_is_not_offered_is_refused_with_what_is(
+    serving: Callable[..., Engine], offer: dict[str, Any], options: dict[str, Any], says: str
+) -> None:
+    engine = serving(**offer)
+    with pytest.raises(UnknownCheckpoint, match=says):
+        begin(engine, "s", **options)
+    assert engine.sessions.ids() == []
+
+
+def test_loading_one_checkpoint_keeps_no_session_of_another_waiting(
+    serving: Callable[..., Engine], library: Library
+) -> None:
+    engine = serving(choices=["b/2"])
+    gate = library.hold("b/2")
+    reset(engine, "own")
+    waiting = begin(engine, "chosen", checkpoint="b")
+    library.wait_for("b/2")
+    assert [act(engine, "own")[1] for _ in range(200)] == list(range(1, 201))
+    assert reset(engine, "another") == "a/1"
+    assert waiting.empty()
+    gate.set()
+    assert waiting.get(timeout=10).error is None
+    assert act(engine, "chosen") == [2, 1]
+
+
+def test_who_asks_for_the_same_checkpoint_at_once_has_it_loaded_once(
+    serving: Callable[..., Engine], library: Library
+) -> None:
+    engine = serving(choices=["b/2"])
+    gate = library.hold("b/2")
+    waiting = [begin(engine, f"s{i}", checkpoint="b") for i in range(8)]
+    library.wait_for("b/2")
+    gate.set()
+    assert [replies.get(timeout=10).error for replies in waiting] == [None] * 8
+    assert library.loads["b/2"] == 1
+
+
+def test_what_does_not_load_says_why_and_is_tried_again(serving: Callable[..., Engine], library: Library) -> None:
+    engine = serving(choices=["broken"])
+    reset(engine, "own")
+    for tried in (1, 2):
+        with pytest.raises(CheckpointFailed, match="checkpoint 'b' did not load: FileNotFoundError; the server"):
+            reset(engine, "chosen", checkpoint="b")
+        assert library.loads["broken"] == tried
+    assert act(engine, "own") == [1, 1]
+    assert engine.models.describe()["loaded"] == ["a/1"]
+
+
+def test_the_least_recently_used_checkpoint_makes_room(serving: Callable[..., Engine], library: Library) -> None:
+    engine = serving(choices=["b/2", "c/3"])
+    reset(engine, "s", checkpoint="b")
+    reset(engine, "s")  # the own one is the last that was used
+    reset(engine, "s", checkpoint="c")
+    assert library.closed == ["b/2"]
+    assert sorted(engine.models.describe()["loaded"]) == ["a/1", "c/3"]
+
+
+def test_memory_is_given_back(serving: Callable[..., Engine], library: Library) -> None:
+    engine = serving(choices=["b/2"], loaded=1, batch_sizes=[4], max_batch_size=4)
+    reset(engine, "s")
+    act(engine, "s")  # padding keeps agents, too
+    reset(engine, "s", checkpoint="b")
+    assert library.closed == ["a/1"]
+    assert set(library.alive) == {"b/2"}
+
+
+def test_a_checkpoint_in_use_stays_until_an_episode_ends(serving: Callable[..., Engine], library: Library) -> None:
+    engine = serving(choices=["b/2", "c/3"])
+    reset(engine, "own")
+    reset(engine, "chosen", checkpoint="b")
+    waiting = begin(engine, "third", checkpoint="c")
+    for step in range(1, 50):
+        assert [act(engine, "own"), act(engine, "chosen")] == [[1, step], [2, step]]
+    assert waiting.empty()
+    assert library.closed == []
+    ask(engine, "chosen", "close")
+    assert waiting.get(timeout=10).error is None
+    assert library.closed == ["b/2"]
+
+
+def test_ten_checkpoints_have_their_turns_with_room_for_two(
+    serving: Callable[..., Engine], library: Library, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ten clients, each with a checkpoint of its own, that begin one episode after the other for ever."""
+    monkeypatch.setattr(model_cache, "PATIENCE_S", 0.0)
+    engine = serving(steps=True)
+    replies: queue.SimpleQueue[tuple[int, Reply]] = queue.SimpleQueue()
+
+    def play(client: int) -> None:
+        request = Request("reset", Obs(), kwargs={"checkpoint_step": client})
+        engine.submit(f"s{client}", request, lambda reply: replies.put((client, reply)))
+
+    for client in range(10):
+        play(client)
+    turns = dict.fromkeys(range(10), 0)
+    while min(turns.values()) < 3:
+        client, reply = replies.get(timeout=20)
+        assert reply.info is not None, reply.error
+        assert reply.info["checkpoint"] == f"a/{client}"
+        turns[client] += 1
+        play(client)
+    assert len(library.alive) <= 3  # one of which may just be on its way out
+
+
+def test_a_reset_whose_time_is_over_is_told_and_nothing_is_loaded_for_it(
+    serving: Callable[..., Engine], library: Library
+) -> None:
+    engine = serving(choices=["b/2"], loaded=1)
+    reset(engine, "own")
+    late = ask(engine, "late", "reset", kwargs={"checkpoint": "b"}, deadline_ms=50)
+    assert isinstance(late.get(timeout=10).error, DeadlineExceeded)
+    ask(engine, "own", "close")
+    assert reset(engine, "own") == "a/1"
+    assert library.loads["b/2"] == 0
+
+
+def test_a_session_that_is_closed_while_it_waits_is_not_opened_again(
+    serving: Callable[..., Engine], library: Library
+) -> None:
+    engine = serving(choices=["b/2"])
+    gate = library.hold("b/2")
+    waiting = begin(engine, "s", checkpoint="b")
+    library.wait_for("b/2")
+    ask(engine, "s", "close").get(timeout=10)
+    gate.set()
+    assert isinstance(waiting.get(timeout=10).error, UnknownSession)
+    assert engine.sessions.ids() == []
+    assert not any(model.sessions for model in engine.models._cache.loaded.values())
+
+
+def test_a_reset_that_waits_gives_way_to_the_next_one_of_its_session(
+    serving: Callable[..., Engine], library: Library
+) -> None:
+    engine = serving(choices=["b/2"])
+    gate = library.hold("b/2")
+    waiting = begin(engine, "s", checkpoint="b")
+    library.wait_for("b/2")
+    assert reset(engine, "s") == "a/1"
+    assert act(engine, "s") == [1, 1]
+    gate.set()
+    assert waiting.get(timeout=10).error is not None
+    assert reset(engine, "other", checkpoint="b") == "b/2"
+    assert act(engine, "s") == [1, 2]
+    assert holders(engine) == {"a/1": 1, "b/2": 1}
+
+
+def test_a_reset_of_a_session_that_is_closed_and_begun_anew_does_not_touch_it(
+    serving: Callable[..., Engine], library: Library, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    engine = serving(choices=["b/2"])
+    put = engine.queue.put
+
+    def late(*tickets: PendingRequest) -> None:
+        """What is asked of the session comes just before its reset that waited."""
+        monkeypatch.undo()
+        others.extend(ask(engine, "s", op) for op in ("close", "reset"))
+        put(*tickets)
+
+    others: list[queue.SimpleQueue[Reply]] = []
+    gate = library.hold("b/2")
+    waiting = begin(engine, "s", checkpoint="b")
+    library.wait_for("b/2")
+    monkeypatch.setattr(engine.queue, "put", late)
+    gate.set()
+    assert isinstance(waiting.get(timeout=10).error, UnknownSession)
+    assert [replies.get(timeout=10).error for replies in others] == [None] * 2
+    assert act(engine, "s") == [1, 1]
+    assert holders(engine) == {"a/1": 1, "b/2": 0}
+
+
+def test_a_reset_that_is_given_up_once_its_checkpoint_is_there_keeps_none(
+    serving: Callable[..., Engine], library: Library, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    engine = serving(choices=["b/2"])
+    put = engine.queue.put
+
+    def given_up(*tickets: PendingRequest) -> None:
+        for ticket in tickets:
+            ticket.cancelled = True
+        put(*tickets)
+
+    gate = library.hold("b/2")
+    begin(engine, "s", checkpoint="b")
+    library.wait_for("b/2")
+    monkeypatch.setattr(engine.queue, "put", given_up)
+    gate.set()
+    wait_for(lambda: holders(engine) == {"a/1": 0, "b/2": 0})
+
+
+def test_a_session_that_closes_while_it_arrives_keeps_no_checkpoint(
+    serving: Callable[..., Engine], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here, there = serving(), serving()
+    reset(here, "s")
+    state = export(here, "s")
+    assert state is not None
+    enter = there.sessions.enter
+
+    def closed_at_once(session: Session) -> None:
+        enter(session)
+        there.sessions.close(session.id)
+
+    monkeypatch.setattr(there.sessions, "enter", closed_at_once)
+    there.transfer.adopt("s", state)
+    assert holders(there) == {"a/1": 0}
+
+
+def test_an_episode_that_could_not_begin_keeps_no_checkpoint(serving: Callable[..., Engine]) -> None:
+    engine = serving(choices=["b/2"], loaded=1)
+    assert isinstance(begin(engine, "s", checkpoint="b", fail=True).get(timeout=10).error, PolicyFailed)
+    assert reset(engine, "another") == "a/1"
+
+
+def test_each_checkpoint_has_a_contract_of_its_own(serving: Callable[..., Engine], library: Library) -> None:
+    library.joints = {"a/1": 2, "b/2": 3}
+    engine = serving(choices=["b/2"])
+    two, three = ({"state": {"joints": np.zeros(n, np.float32)}} for n in (2, 3))
+    chosen = {"checkpoint": "b"}
+    assert ask(engine, "s", "reset", obs=two).get(timeout=10).error is None
+    early = ask(engine, "t", "reset", obs=two, kwargs=chosen).get(timeout=10)  # it is not loaded yet
+    assert isinstance(early.error, InvalidObservation)
+    with pytest.raises(InvalidObservation):
+        ask(engine, "t", "reset", obs=two, kwargs=chosen)
+    assert ask(engine, "t", "reset", obs=three, kwargs=chosen).get(timeout=10).error is None
+    with pytest.raises(InvalidObservation):
+        ask(engine, "t", "act", obs=two)
+    assert ask(engine, "t", "act", obs=three).get(timeout=10).error is None
+    assert ask(engine, "s", "act", obs=two).get(timeout=10).error is None
+
+
+def test_a_stopping_replica_turns_away_who_waits(library: Library) -> None:
+    engine = library.engine(choices=["b/2"], loaded=1)
+    reset(engine, "own")
+    waiting = begin(engine, "chosen", checkpoint="b")
+    assert act(engine, "own") == [1, 1]
+    engine.close()
+    assert isinstance(waiting.get(timeout=10).error, PolicyUnavailable)
+    assert library.closed == ["a/1"]
+
+
+def test_a_session_that_moves_takes_its_checkpoint_along(serving: Callable[..., Engine], library: Library) -> None:
+    here, there = serving(choices=["b/2"]), serving(choices=["b/2"])
+    reset(here, "s", checkpoint="b")
+    act(here, "s")
+    state = export(here, "s")
+    assert state is not None
+    with pytest.raises(UnknownSession, match="'b' is not loaded here"):
+        there.transfer.adopt("s", state)
+    there.transfer.adopt("s", state, timeout_s=10)
+    assert act(there, "s") == [2, 2]
+    assert library.loads["b/2"] == 2
+    wait_for(lambda: not any(model.sessions for model in here.models._cache.loaded.values()))
+
+
+def test_a_session_goes_on_by_its_checkpoint_where_its_replica_sends_it(library: Library) -> None:
+    offered = [Checkpoints(library.make, {"checkpoint": "a/1"}, {"b": {"checkpoint": "b/2"}}) for _ in range(2)]
+    replicas = Replicas(offered)
+    with replicas.agent() as agent:
+        agent.reset(Obs(), "x", checkpoint="b")
+        replicas.engines[0].drain()
+        acts = [agent.act(Obs()) for _ in range(5)]
+        assert [act.action.tolist() for act in acts] == [[2, step] for step in range(1, 6)]
+        assert not any("resumed" in act.info for act in acts)
+        assert [len(engine.sessions) for engine in replicas.engines] == [0, 1]
+    replicas.close()
+
+
+def test_a_session_of_what_is_not_offered_here_does_not_move_here(serving: Callable[..., Engine]) -> None:
+    here, there = serving(choices=["b/2"]), serving(choices=["b/4"])
+    reset(here, "s", checkpoint="b")
+    state = export(here, "s")
+    assert state is not None
+    with pytest.raises(UnknownSession):
+        there.transfer.adopt("s", state, timeout_s=10)
+    assert there.models.describe()["loaded"] == ["a/1"]
+
+
+def test_names_say_what_was_asked_for() -> None:
+    assert str(CheckpointChoice("late")) == "checkpoint 'late'"
+    assert str(CheckpointChoice(step=20000)) == "checkpoint step 20000"
+    assert str(CheckpointChoice("late", 3)) == "checkpoint 'late' at step 3"
+
+
+class Stored(Agent):
+    """Reads a file."""
+
+    def __init__(self, file: Path, weights: dict[str, str | None] | None = None) -> None:
+        self.file, self.weights_id = file, weights
+
+    def initialize(self) -> None:
+        find_checkpoint(str(self.file)).read_bytes()
+
+
+def test_what_is_loaded_is_told_by_its_digest_in_the_metadata_and_with_each_reset(tmp_path: Path) -> None:
+    """Of files that `find_checkpoint` found, or what the agent says itself."""
+    file = tmp_path / "weights.pt"
+    file.write_bytes(b"1")
+    mine: dict[str, str | None] = {"digest": "mine", "revision": "c0ffee"}
+    for own, told in ((None, {"digest": digest([file]), "revision": None}), (mine, mine)):
+        engine = Engine(Stored(file, own))
+        assert engine.models.weights is None
+        engine.start()
+        try:
+            reply = begin(engine, "s").get(timeout=10)
+            assert reply.info == {"weights": told["digest"]}
+            assert engine.models.weights == told
+        finally:
+            engine.close()
+
+
+def test_sessions_move_between_replicas_with_the_same_weights_only(tmp_path: Path) -> None:
+    """A replica that started after training had overwritten the checkpoint has others, by the same settings."""
+    file = tmp_path / "weights.pt"
+    versions = []
+    for content in (b"1", b"1", b"2"):
+        file.write_bytes(content)
+        engine = Engine(Stored(file))
+        engine.start()
+        versions.append(engine.version)
+        engine.close()
+    assert versions[0] == versions[1] != versions[2]

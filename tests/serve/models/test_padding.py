@@ -1,0 +1,170 @@
+"""Batches of fixed sizes for compiled models."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from vlagents_ray.errors import PolicyFailed
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.serve.config.deployment import BatchArgs
+from vlagents_ray.serve.engine.engine import Engine
+
+SIZES = [2, 4, 8]
+
+
+class Compiled(Agent):
+    """Runs batches of `SIZES` alone; its actions hold what was seen and the step."""
+
+    broken = False  # the last row of each batch fails
+
+    def __init__(self) -> None:
+        self.batches: list[list[str | None]] = []
+        self.resets = 0
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self.name, self.step, self.env = instruction, 0, kwargs["env"]
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        self.step += 1
+        return Act(np.array([float(obs.info["value"]), self.step]), info={"name": self.name})
+
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        self.batches.append([session.name for session in sessions])  # type: ignore[attr-defined]
+        self.seen = [one.info["value"] for one in obs]
+        if len(set(map(id, sessions))) != len(sessions) or len(obs) not in SIZES:
+            raise RuntimeError(f"{len(obs)} rows")
+        results: list[Act | Exception] = [s.act(o) for s, o in zip(sessions, obs, strict=True)]
+        if Compiled.broken:
+            results[-1] = RuntimeError("padding")
+        return results
+
+
+class Picky(Compiled):
+    """Can be reset once in all."""
+
+    made: ClassVar[list[int]] = []
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        Picky.made.append(1)
+        if len(Picky.made) > 1:
+            raise RuntimeError("only once")
+        return super().reset(obs, instruction, **kwargs)
+
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        return [session.act(one) for one, session in zip(obs, sessions, strict=True)]
+
+
+def ask(engine: Engine, session: str, op: Any, value: int = 0, **fields: Any) -> Reply:
+    replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
+    if op == "reset":
+        fields |= {"instruction": session, "kwargs": {"env": "lab"}}
+    engine.submit(session, Request(op, Obs(info={"value": value}), **fields), replies.put)
+    return replies.get(timeout=10)
+
+
+@pytest.fixture
+def serving() -> Iterator[Callable[[Compiled], Engine]]:
+    engines: list[Engine] = []
+
+    def serve(agent: Compiled) -> Engine:
+        engines.append(Engine(agent, max_batch_size=8, batch_sizes=SIZES))
+        engines[-1].start()
+        return engines[-1]
+
+    yield serve
+    Compiled.broken = False
+    for engine in engines:
+        engine.close()
+
+
+def test_a_batch_is_padded_up_to_the_next_size(serving: Callable[[Compiled], Engine]) -> None:
+    agent = Compiled()
+    engine = serving(agent)
+    names = [f"s{i}" for i in range(11)]  # ten of them act: 8, and 2
+    for name in names:
+        ask(engine, name, "reset")
+    replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
+    busy, released = threading.Event(), threading.Event()
+    engine.submit("s0", Request("close"), lambda _: busy.set() or (released.wait(10) and None))
+    assert busy.wait(10)  # the policy's thread is in there while all come
+    for name in names[1:]:
+        engine.submit(name, Request("act", Obs(info={"value": int(name[1:])})), replies.put)
+    released.set()
+    answers = [replies.get(timeout=10) for _ in names[1:]]
+    assert [len(batch) for batch in agent.batches] == [8, 2]
+    assert [reply.act.info["name"] for reply in answers if reply.act] == names[1:]
+    assert [reply.act.action.tolist() for reply in answers if reply.act] == [[i, 1] for i in range(1, 11)]
+    assert [reply.timing["batch_size"] for reply in answers] == [8] * 8 + [2] * 2
+
+
+def test_padding_acts_as_a_session_of_its_own_on_what_a_neighbour_sees(serving: Callable[[Compiled], Engine]) -> None:
+    agent = Compiled()
+    engine = serving(agent)
+    ask(engine, "first", "reset")
+    ask(engine, "second", "reset")
+    for step in range(1, 4):
+        reply = ask(engine, "second", "act", value=7)
+        assert reply.act is not None
+        assert (reply.act.action.tolist(), reply.act.info["name"]) == ([7, step], "second")
+        assert reply.timing["batch_size"] == 1
+        assert agent.batches[-1] == ["second", "first"]  # the row beside it began as the first session did
+        assert agent.seen == [7, 7]
+    assert len(engine.sessions) == 2
+    reply = ask(engine, "first", "act")
+    assert reply.act is not None
+    assert reply.act.action[1] == 1  # whose own session has not acted with it
+
+
+def test_nobody_hears_of_paddings_failure(serving: Callable[[Compiled], Engine]) -> None:
+    engine = serving(Compiled())
+    ask(engine, "a", "reset")
+    Compiled.broken = True
+    for step in range(1, 4):
+        reply = ask(engine, "a", "act")
+        assert reply.act is not None
+        assert reply.act.action[1] == step
+
+
+def test_without_padding_the_batch_runs_as_it_is(serving: Callable[[Compiled], Engine]) -> None:
+    Picky.made.clear()
+    engine = serving(Picky())
+    ask(engine, "a", "reset")
+    for _ in range(3):
+        assert ask(engine, "a", "act").error is None
+    assert len(Picky.made) == 2  # it is tried once
+
+
+def test_a_refused_first_reset_is_not_what_padding_begins_with(serving: Callable[[Compiled], Engine]) -> None:
+    engine = serving(Compiled())
+    replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
+    engine.submit("bad", Request("reset", Obs(), "bad"), replies.put)  # lacks the `env` that it wants
+    assert isinstance(replies.get(timeout=10).error, PolicyFailed)
+    ask(engine, "good", "reset")
+    assert ask(engine, "good", "act").error is None
+
+
+@pytest.mark.parametrize(
+    ("args", "max_size"),
+    [({}, 16), ({"max_size": 3}, 3), ({"sizes": [1, 4]}, 4), ({"sizes": [1, 4], "max_size": 4}, 4)],
+)
+def test_the_largest_size_is_the_batch_limit(args: dict[str, Any], max_size: int) -> None:
+    checked = BatchArgs(**args)
+    assert checked.max_size == max_size
+    assert BatchArgs(**checked.model_dump()) == checked
+
+
+@pytest.mark.parametrize(
+    "args", [{"sizes": []}, {"sizes": [0, 1]}, {"sizes": [2, 1]}, {"sizes": [1, 1]}, {"sizes": [1, 8], "max_size": 16}]
+)
+def test_sizes_that_contradict_are_refused(args: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError, match="sizes"):
+        BatchArgs(**args)

@@ -1,0 +1,301 @@
+"""A policy behind an engine, in a process of its own: as if it were in this one."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+from eval_fakes import wait_for
+from in_process_replicas import export
+from virtual_environments import ended
+
+from vlagents_ray import Act, Obs
+from vlagents_ray.errors import (
+    ConnectionLost,
+    DeadlineExceeded,
+    NotReset,
+    NotTrainable,
+    PolicyFailed,
+    PolicyUnavailable,
+    VLAgentsError,
+)
+from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.python_env.child_agent import ChildAgent
+from vlagents_ray.serve.python_env.child_main import Settings
+from vlagents_ray.serve.python_env.child_process import Child
+from vlagents_ray.serve.queue.call_limits import CallLimits
+from vlagents_ray.serve.weights.versions import ModelWeights
+
+SUPPORT = Path(__file__).parents[2] / "support"
+ROOT = Path(__file__).parents[3]
+
+
+def agent(policy: str = "Telling", **config: Any) -> ChildAgent:
+    settings = Settings(f"python_env_agents:{policy}", config, 16, "1")
+    return ChildAgent(Child(sys.executable, settings, {"PYTHONPATH": f"{SUPPORT}:{ROOT}", "VARIABLE": "set"}))
+
+
+@pytest.fixture(scope="module")
+def engine() -> Iterator[Engine]:
+    engine = Engine(agent(), session_limit=100)
+    engine.start()
+    yield engine
+    engine.close()
+
+
+@pytest.fixture(scope="module")
+def other(engine: Engine) -> Iterator[Engine]:
+    """Another replica of the same policy."""
+    other = Engine(agent())
+    other.start()
+    yield other
+    other.close()
+
+
+def observation(value: float = 0.0, **info: Any) -> Obs:
+    return Obs({"front": np.full((8, 8, 3), 7, np.uint8)}, info={"value": value, **info})
+
+
+def ask(engine: Engine, session: str, op: Any, value: float = 0.0, **fields: Any) -> Reply:
+    [reply] = ask_all(engine, [(session, Request(op, observation(value), **fields))])
+    return reply
+
+
+def ask_all(engine: Engine, requests: list[tuple[str, Request]]) -> list[Reply]:
+    """The replies to requests that are put at once."""
+    replies: list[Reply] = []
+    over = threading.Event()
+
+    def done(reply: Reply) -> None:
+        replies.append(reply)
+        if len(replies) == len(requests):
+            over.set()
+
+    engine.queue.put(*[engine.ticket(session, request, done) for session, request in requests])
+    assert over.wait(30)
+    return replies
+
+
+def test_what_was_loaded_there_is_known_here(engine: Engine) -> None:
+    told = engine.models.weights
+    assert told is not None
+    assert told["digest"]
+    assert (ask(engine, "weights", "reset").info or {})["weights"] == told["digest"]
+
+
+def info(reply: Reply) -> dict[str, Any]:
+    if reply.error is not None:
+        raise reply.error
+    found = reply.act.info if reply.act is not None else reply.info
+    assert found is not None
+    return found
+
+
+def test_the_policy_runs_in_another_process_with_its_variables_and_this_ones_devices(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("CUDA_VISIBLE_DEVICES", "3")
+    one = Engine(agent())
+    one.start()
+    told = info(ask(one, "a", "reset", instruction="a task"))
+    assert (told["parent"], told["variable"], told["gpus"]) == (os.getpid(), "set", "3")
+    one.close()
+    assert ended(told["pid"])
+
+
+def test_the_contract_is_the_policys(engine: Engine) -> None:
+    assert engine.contract is not None
+    assert engine.contract.action.dim == 1
+
+
+def test_one_that_hangs_is_noticed_and_keeps_nobody_waiting() -> None:
+    one = Engine(agent(), limits=CallLimits(act_s=0.2, warm_up_s=0.2))
+    one.start()
+    pid = info(ask(one, "a", "reset"))["pid"]
+    assert one.ready
+    os.kill(pid, signal.SIGSTOP)
+    wait_for(lambda: psutil.Process(pid).status() == psutil.STATUS_STOPPED, 30)  # else it may answer once more
+    replies: list[Reply] = []
+    one.submit("a", Request("act", observation()), replies.append)
+    wait_for(lambda: not one.ready, 30)
+    one.notice_hung()
+    assert isinstance(replies[0].error, DeadlineExceeded)
+    os.kill(pid, signal.SIGKILL)
+    one.close()
+
+
+def test_a_batch_stays_a_batch_and_sessions_stay_apart(engine: Engine) -> None:
+    names = [f"session {i}" for i in range(7)]
+    for i, name in enumerate(names):
+        assert info(ask(engine, name, "reset", i, instruction=f"task {i}"))["instruction"] == f"task {i}"
+    for step in (1, 2, 3):
+        replies = ask_all(engine, [(name, Request("act", observation(10 * step + i))) for i, name in enumerate(names)])
+        for i, told in enumerate(map(info, replies)):
+            assert (told["batch"], told["acts"], told["instruction"]) == (7, step, f"task {i}")
+            assert told["seen"] == [i, *(10 * s + i for s in range(1, step + 1))]
+
+
+def test_acts_without_info_travel_as_they_are(engine: Engine) -> None:
+    bare = Obs({"front": np.zeros((8, 8, 3), np.uint8)}, 1.0, {"position": np.full(1, 0.25, np.float32)})
+    ask(engine, "bare", "reset", instruction="a task")
+    [reply] = ask_all(engine, [("bare", Request("act", bare))])
+    assert reply.act is not None
+    assert reply.act.action.tolist() == [-0.25]
+
+
+def test_a_session_that_begins_again_is_shown_its_history(engine: Engine) -> None:
+    history = [observation(1), observation(2)]
+    ask(engine, "again", "reset", instruction="a task", history=history)
+    assert info(ask(engine, "again", "act", 3))["seen"] == [0, 1, 2, 3]
+
+
+def test_a_policys_error_is_its_sessions_alone_and_its_text_stays_in_the_log(
+    engine: Engine, capfd: pytest.CaptureFixture[str]
+) -> None:
+    ask(engine, "good", "reset", instruction="a task")
+    error = ask(engine, "bad", "reset", instruction="fail").error
+    assert isinstance(error, PolicyFailed)
+    assert "RuntimeError" in str(error)
+    assert "/no/path" not in str(error)
+    with pytest.raises(NotReset):
+        engine.ticket("bad", Request("act", observation()), lambda _: None)
+    assert info(ask(engine, "good", "act"))["acts"] == 1
+    wait_for(lambda: "/no/path/of/ours" in capfd.readouterr().err, 10)
+
+
+def test_what_the_replica_drops_the_child_forgets() -> None:
+    child = agent()
+    one, held = Engine(child), child._child.sessions
+    one.start()
+    for i in range(50):
+        told = info(ask(one, f"short {i}", "reset", instruction="a task"))
+    assert (told["alive"], len(held)) == (50, 50)
+    for i in range(50):
+        one.sessions.close(f"short {i}")
+    wait_for(lambda: not held, 10)
+    assert info(ask(one, "short", "reset", instruction="a task"))["alive"] == 1
+    for _ in range(30):
+        ask(one, "short", "reset", instruction="a task")
+    wait_for(lambda: len(held) == 1, 10)
+    one.close()
+
+
+def test_a_session_moves_between_replicas_with_all_its_state(engine: Engine, other: Engine) -> None:
+    first = info(ask(engine, "moving", "reset", 1, instruction="a task"))
+    ask(engine, "moving", "act", 2)
+    state = export(engine, "moving")
+    assert state is not None
+    assert "moving" not in engine.sessions
+    other.transfer.adopt("moving", state)
+    told = info(ask(other, "moving", "act", 3))
+    assert (told["seen"], told["acts"], told["pid"] != first["pid"]) == ([1, 2, 3], 2, True)
+
+
+def test_a_session_that_cannot_move_stays(other: Engine) -> None:
+    one = Engine(agent("Unpicklable"))
+    one.start()
+    ask(one, "staying", "reset", instruction="a task")
+    assert export(one, "staying") is None
+    assert info(ask(one, "staying", "act"))["acts"] == 1
+    one.close()
+
+
+def test_a_child_that_dies_loses_the_connection_and_makes_the_replica_unhealthy() -> None:
+    one = Engine(agent())
+    one.start()
+    told = info(ask(one, "a", "reset", instruction="a task"))
+    one.check_health()
+    os.kill(told["pid"], signal.SIGKILL)
+    error = ask(one, "a", "act").error
+    assert isinstance(error, ConnectionLost)
+    assert str(error) == "the policy's process ended with exit status -9; the replica is being replaced"
+    with pytest.raises(PolicyUnavailable, match="exit status -9"):
+        one.check_health()
+    assert not one.ready
+    one.close()
+
+
+def test_a_policy_that_exits_in_an_act_loses_the_connection() -> None:
+    one = Engine(agent())
+    one.start()
+    ask(one, "a", "reset", instruction="a task")
+    [reply] = ask_all(one, [("a", Request("act", observation(exit=True)))])
+    assert isinstance(reply.error, ConnectionLost)
+    assert "exit status 7" in str(reply.error)
+    one.close()
+
+
+@pytest.mark.parametrize(
+    ("policy", "config", "said"),
+    [
+        ("Broken", {}, "FileNotFoundError: no checkpoint here"),
+        ("Telling", {"nope": 1}, "ConfigError: policy Telling"),
+        ("Telling", {"needs": "no_such_package"}, "No module named 'no_such_package'"),
+        ("Nobody", {}, "no class 'Nobody'"),
+        ("Dying", {}, "exit status 3; it said:\nthe driver is too old"),
+    ],
+)
+def test_why_a_policy_does_not_load_is_said(policy: str, config: dict[str, Any], said: str) -> None:
+    one = Engine(agent(policy, **config))
+    with pytest.raises(VLAgentsError) as error:
+        one.start()
+    assert said in str(error.value)
+    with pytest.raises(PolicyFailed) as seen:  # by the operator
+        one.check_health()
+    assert said in str(seen.value)
+    with pytest.raises(PolicyFailed) as told:  # what its clients are told
+        one.require_ready()
+    assert said not in str(told.value)
+    assert sys.executable not in str(told.value)
+    one.close()
+
+
+def test_the_child_ends_within_a_second_when_its_replica_is_killed() -> None:
+    code = (
+        "import sys, time\n"
+        "from vlagents_ray.serve.python_env.child_process import Child\n"
+        "from vlagents_ray.serve.python_env.child_main import Settings\n"
+        "child = Child(sys.executable, Settings('noop', {}, 1, ''), {}); child.start()\n"
+        "print(child._process.pid, flush=True)\n"
+        "time.sleep(60)\n"
+    )
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, env=environment) as replica:
+        assert replica.stdout is not None
+        pid = int(replica.stdout.readline())
+        assert not ended(pid)
+        replica.send_signal(signal.SIGKILL)
+        wait_for(lambda: ended(pid), 1)
+
+
+def test_an_interpreter_that_is_gone_is_said() -> None:
+    one = Engine(ChildAgent(Child("/no/such/python", Settings("noop", {}, 1, ""), {})))
+    with pytest.raises(PolicyFailed, match="'/no/such/python' cannot be started here"):
+        one.start()
+    one.close()
+
+
+def test_an_act_is_an_act(engine: Engine) -> None:
+    """The agent by itself, as an `Agent` is used."""
+    one = agent()
+    one.initialize()
+    one.reset(observation(), "a task")
+    assert isinstance(one.act(observation()), Act)
+    one.close()
+
+
+def test_the_weights_of_a_policy_in_a_child_process_are_out_of_reach() -> None:
+    weights = ModelWeights(agent(), threading.Lock(), "9f3c")
+    with pytest.raises(NotTrainable, match=r"runs in a child process.* `environment: \{process: replica\}`"):
+        weights.stage(1, {"w": np.zeros(1)})
+    assert weights.newest.describe() == {"version": 0, "fingerprint": "9f3c"}

@@ -1,0 +1,162 @@
+"""`vlagents-ray env make`, but for what it downloads: tests/integration/test_environments.py uses what it makes."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from vlagents_ray.errors import ConfigError, MissingDependency
+from vlagents_ray.serve.python_env import create as making
+from vlagents_ray.serve.python_env.create import create, make_environment
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """What uv is told in the place of installing, overrides with what they hold; nothing is installed."""
+    told: list[str] = []
+
+    def uv(arguments: Sequence[str]) -> str:
+        if arguments[0] == "venv":
+            return real(arguments)
+        files = [Path(arguments[i + 1]) for i, word in enumerate(arguments) if word == "--override"]
+        told.append(" ".join(arguments) + " " + " ".join(file.read_text() for file in files))
+        return ""
+
+    real = making._uv
+    monkeypatch.setattr(making, "_uv", uv)
+    return told
+
+
+@pytest.fixture
+def requirements(tmp_path: Path) -> Path:
+    file = tmp_path / "some.txt"
+    file.write_text("six==1.16.0\n")
+    return file
+
+
+def test_it_holds_this_package_with_the_same_ray_and_the_requirements(
+    asked: list[str], requirements: Path, tmp_path: Path
+) -> None:
+    python = make_environment(requirements, tmp_path / "env")
+    assert python.is_file()
+    source = Path(making.__file__).parents[3]
+    for word in (
+        f"--python {python} --editable {source}[serve] ray=={importlib.metadata.version('ray')}",
+        f"--requirement {requirements}",
+    ):
+        assert word in asked[-1]
+
+
+def test_a_light_one_is_without_ray(asked: list[str], requirements: Path, tmp_path: Path) -> None:
+    make_environment(requirements, tmp_path / "env", light=True)
+    assert "ray==" not in asked[-1]
+    assert "[serve]" not in asked[-1]
+    assert "pydantic>=" in asked[-1]
+
+
+def test_one_of_another_python_is_a_light_one(
+    asked: list[str], requirements: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(making, "_minor", lambda python: "3.11" if python == Path(sys.executable) else "3.12")
+    said: list[str] = []
+    make_environment(requirements, tmp_path / "env", progress=said.append)
+    assert "ray==" not in asked[-1]
+    assert "Python 3.12 is not this one's 3.11: without Ray, for a child process" in said
+
+
+def own_torch() -> str:
+    return f"torch=={importlib.metadata.version('torch')}"
+
+
+class TestWithoutAGpu:
+    @pytest.fixture(autouse=True)
+    def no_gpu(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(making, "_has_gpu", lambda: False)
+
+    @pytest.mark.torch
+    def test_torch_is_this_environments_own(self, asked: list[str], requirements: Path, tmp_path: Path) -> None:
+        make_environment(requirements, tmp_path / "env")
+        assert f"{own_torch()}\n" in asked[-1]
+
+    @pytest.mark.torch
+    def test_a_file_beside_the_requirements_replaces_more(
+        self, asked: list[str], requirements: Path, tmp_path: Path
+    ) -> None:
+        beside = tmp_path / "some.cpu.txt"
+        beside.write_text("torchvision==0.1\n")
+        make_environment(requirements, tmp_path / "env")
+        assert f"--override {beside}" in asked[-1]
+        assert own_torch() in asked[-1], "torchvision is not torch"
+        beside.write_text("torch==1.2.3\n")
+        make_environment(requirements, tmp_path / "env")
+        assert "torch==1.2.3" in asked[-1]
+        assert own_torch() not in asked[-1]
+
+    def test_cuda_packages_are_refused_before_anything_is_downloaded(
+        self, asked: list[str], requirements: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        pretend = making._uv
+
+        def uv(arguments: Sequence[str]) -> str:
+            pretend(arguments)
+            return "Would install 2 packages\n + nvidia-cublas==13.0\n + torch==2.13.0\n"
+
+        create(tmp_path / "env")
+        monkeypatch.setattr(making, "_uv", uv)
+        with pytest.raises(ConfigError, match=r"bring CUDA packages \(nvidia-cublas==13.0, …\).*NAME.cpu.txt"):
+            make_environment(requirements, tmp_path / "env")
+        assert len(asked) == 1
+        assert "--dry-run" in asked[0]
+
+
+def test_with_a_gpu_nothing_is_replaced(
+    asked: list[str], requirements: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(making, "_has_gpu", lambda: True)
+    (tmp_path / "some.cpu.txt").write_text("torchvision==0.1\n")
+    make_environment(requirements, tmp_path / "env")
+    assert len(asked) == 1
+    assert "--override" not in asked[0]
+
+
+def test_it_imports_torchvision_and_lerobot_as_fits_the_machine(
+    asked: list[str], requirements: Path, tmp_path: Path
+) -> None:
+    python = make_environment(requirements, tmp_path / "env")
+    code = "import sys; print(*(type(one).__module__ for one in sys.meta_path))"
+    done = subprocess.run([str(python), "-c", code], capture_output=True, text=True, check=True)
+    assert "vlagents_ray_import_fixes" in done.stdout
+    assert not done.stderr
+
+
+def test_missing_requirements_and_a_folder_of_something_else_are_refused(requirements: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"no such file: got '/no/such\.txt'"):
+        make_environment(Path("/no/such.txt"), tmp_path / "env")
+    with pytest.raises(ConfigError, match="holds no Python environment"):
+        make_environment(requirements, tmp_path)
+
+
+def test_what_uv_says_is_shown(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"(?s)uv venv failed:.*no-such-python"):
+        create(tmp_path / "env", "no-such-python")
+
+
+def test_uv_looks_where_pip_was_told_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in making._PIP_VARIABLES:
+        monkeypatch.delenv(name, raising=False)
+    assert making._places() == {}
+    monkeypatch.setenv("PIP_FIND_LINKS", "/wheels /other")
+    monkeypatch.setenv("PIP_INDEX_URL", "file:///simple")
+    assert making._places() == {"UV_FIND_LINKS": "/wheels,/other", "UV_DEFAULT_INDEX": "file:///simple"}
+
+
+def test_without_uv_the_cure_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(making.importlib.util, "find_spec", lambda _: None)
+    monkeypatch.setattr(making.shutil, "which", lambda *_, **__: None)
+    with pytest.raises(MissingDependency, match=r"'uv' is not installed; pip install 'vlagents-ray\[serve\]'"):
+        create(tmp_path / "env")

@@ -1,0 +1,208 @@
+"""What a deployment file may say of an environment, and what is wrong with the one that it names."""
+
+from __future__ import annotations
+
+import platform
+import re
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from pydantic import ValidationError
+from virtual_environments import ROOT, layered
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.serve.config.python_env import EnvironmentArgs
+from vlagents_ray.serve.launch.deployment_file import read_deployment
+from vlagents_ray.serve.python_env import probe as interpreter
+from vlagents_ray.serve.python_env.create import create
+from vlagents_ray.serve.python_env.probe import check_policy, probe, with_process
+
+
+@pytest.fixture
+def bare(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
+    """An environment with nothing in it, and nothing in the working directory."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PYTHONPATH", raising=False)
+    return str(create(tmp_path / "bare"))
+
+
+def script(path: Path, text: str, mode: int = 0o755) -> str:
+    path.write_text(text)
+    path.chmod(mode)
+    return str(path)
+
+
+def args(**environment: Any) -> EnvironmentArgs:
+    return EnvironmentArgs(**environment)
+
+
+def test_a_relative_interpreter_is_one_from_the_working_directory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert args(python=".venv-a/bin/python").python == str(tmp_path / ".venv-a/bin/python")
+
+
+def test_an_interpreter_that_is_a_link_stays_one(tmp_path: Path) -> None:
+    """A virtual environment's is a link to the one that it was made with, which knows nothing of the environment."""
+    link = tmp_path / "python"
+    link.symlink_to(sys.executable)
+    assert args(python=str(link)).python == str(link)
+
+
+def test_requirements_are_read_from_their_file(tmp_path: Path) -> None:
+    file = tmp_path / "some.txt"
+    file.write_text("# of a policy\nsix==1.16.0  # pinned\n\n  numpy<2\npack @ file:///x#egg=pack\n")
+    assert args(requirements=str(file)).requirements == ["six==1.16.0", "numpy<2", "pack @ file:///x#egg=pack"]
+
+
+@pytest.mark.parametrize(
+    ("environment", "said"),
+    [
+        ({"python": "p", "requirements": ["six"]}, "exclude each other"),
+        ({"requirements": "no/such.txt"}, "no such file: got 'no/such.txt'"),
+        ({"requirements": []}, "got none"),
+        ({"process": "child"}, "got 'child' without `python`"),
+        ({"process": "thread", "python": "p"}, "'auto', 'replica' or 'child'"),
+        ({"pythn": "p"}, "Extra inputs"),
+    ],
+)
+def test_what_contradicts_itself_is_refused(environment: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValidationError, match=said):
+        args(**environment)
+
+
+def test_what_ray_is_told() -> None:
+    assert args().runtime_env() == {}
+    assert args(python="/p", process="replica", env_vars={"A": "b"}).runtime_env() == {
+        "py_executable": "/p",
+        "env_vars": {"A": "b"},
+    }
+    assert args(python="/p", process="child", env_vars={"A": "b"}).runtime_env() == {}
+    assert args(requirements=["six"]).runtime_env() == {"pip": ["six"]}
+    assert args(requirements=["six"], installer="uv").runtime_env() == {"uv": ["six"]}
+
+
+def test_no_environment_is_the_clusters() -> None:
+    assert with_process(args()) == args()
+
+
+def test_the_same_python_and_ray_host_the_replica() -> None:
+    found = probe(sys.executable)
+    assert found.versions["python"] == platform.python_version()
+    assert found.hosts_replicas() is None
+    assert with_process(args(python=sys.executable)).process == "replica"
+    assert with_process(args(python=sys.executable, process="child")).process == "child"
+
+
+def test_another_python_or_ray_makes_a_child(monkeypatch: pytest.MonkeyPatch) -> None:
+    found = probe(sys.executable)
+    for name, version, said in (
+        ("python", "3.10.1", "it is Python 3.10.1, the cluster's is 3."),
+        ("ray", "2.40.0", "it has Ray 2.40.0, the cluster has"),
+        ("ray", None, "it has no Ray, the cluster has"),
+    ):
+        versions = {key: value for key, value in {**found.versions, name: version}.items() if value is not None}
+        other = interpreter.EnvironmentProbe(sys.executable, versions)
+        monkeypatch.setattr(interpreter, "probe", lambda *_, other=other: other)
+        assert with_process(args(python=sys.executable)).process == "child"
+        with pytest.raises(ConfigError, match=rf"got 'replica', which cannot run in .*{said}.*use process 'child'"):
+            with_process(args(python=sys.executable, process="replica"))
+
+
+def test_no_such_interpreter(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"no such file, got '/no/such/python', want an interpreter; make one"):
+        probe("/no/such/python")
+    for deployment in sorted((ROOT / "deployments").glob("*.yaml")):
+        stated = yaml.safe_load(deployment.read_text())["applications"][0]["args"]
+        if (python := stated.get("environment", {}).get("python")) is None:
+            continue
+        with pytest.raises(ConfigError) as caught:
+            probe(str(tmp_path / python))
+        [(requirements, folder)] = re.findall(r"`vlagents-ray env make (\S+) --into (\S+)`", str(caught.value))
+        assert (ROOT / requirements).is_file()
+        assert Path(folder, "bin/python") == tmp_path / python
+    (tmp_path / "bin").mkdir()
+    (tmp_path / "bin" / "python").symlink_to(sys.executable)
+    with pytest.raises(ConfigError, match=rf"did you mean {tmp_path}/bin/python\?"):
+        probe(str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("text", "mode", "said"),
+    [
+        ("#!/bin/sh\necho hello\n", 0o755, "no Python interpreter, or a broken one: hello"),
+        ("#!/bin/sh\nexit 1\n", 0o755, "it said nothing"),
+        ("#!/bin/sh\n", 0o644, "Permission denied"),
+        ("not a program", 0o755, "no Python interpreter"),
+    ],
+)
+def test_not_an_interpreter(tmp_path: Path, text: str, mode: int, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        probe(script(tmp_path / "python", text, mode))
+
+
+def test_settings_stand_on_no_command_line_where_every_user_could_read_them(tmp_path: Path) -> None:
+    echoing = script(tmp_path / "python", '#!/bin/sh\nshift 2\necho "arguments: $@"\n')
+    with pytest.raises(ConfigError, match="arguments: ray") as error:
+        check_policy(args(python=echoing), "noop", {"token": "a secret"})
+    assert "a secret" not in str(error.value)
+
+
+def test_an_old_python(tmp_path: Path) -> None:
+    old = script(tmp_path / "python", '#!/bin/sh\necho \'VLA{"python": "3.8.10"}\'\n')
+    with pytest.raises(ConfigError, match=r"is Python 3.8.10, want 3.10 or newer"):
+        probe(old)
+
+
+def test_an_environment_without_this_package(bare: str) -> None:
+    with pytest.raises(ConfigError, match=r"has no vlagents-ray, want .* as here; install it there"):
+        probe(bare)
+
+
+def test_an_environment_with_another_version_of_this_package(bare: str) -> None:
+    [packages] = Path(bare).parents[1].glob("lib/python*/site-packages")
+    (packages / "vlagents_ray-0.0.9.dist-info").mkdir()
+    (packages / "vlagents_ray-0.0.9.dist-info" / "METADATA").write_text("Name: vlagents-ray\nVersion: 0.0.9\n")
+    with pytest.raises(ConfigError, match=r"has vlagents-ray 0.0.9, want"):
+        probe(bare)
+
+
+def test_the_policy_is_built_where_it_will_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its module is only to be found there."""
+    python = layered(tmp_path / "env", "six==1.15.0")
+    [packages] = python.parents[1].glob("lib/python*/site-packages")
+    (packages / "only_there.py").write_text(
+        "import os, six\n"
+        "from vlagents_ray import ActionSpec, Agent, Contract\n"
+        "print('a greeting')\n"
+        "class Policy(Agent):\n"
+        "    contract = Contract(action=ActionSpec(dim=int(six.__version__.split('.')[1])))\n"
+        "    def __init__(self, gain=1.0):\n"
+        "        os.environ['SOURCE']\n"
+    )
+    environment = args(python=str(python), env_vars={"SOURCE": "/src"})
+    contract = check_policy(environment, "only_there:Policy", {"gain": 2.0})
+    assert contract is not None
+    assert contract.action.dim == 15
+    with pytest.raises(ConfigError, match=rf"in {python}: policy Policy: .*'gane'"):
+        check_policy(environment, "only_there:Policy", {"gane": 2.0})
+    with pytest.raises(ConfigError, match=rf"in {python}: policy only_there:Policy: KeyError: 'SOURCE'"):
+        check_policy(args(python=str(python)), "only_there:Policy", {})
+    with pytest.raises(ConfigError, match=rf"in {python}: .*no class 'Police'"):
+        check_policy(environment, "only_there:Police", {})
+    monkeypatch.chdir(tmp_path)
+    document = {
+        "name": "there",
+        "import_path": "vlagents_ray.serve.app:build",
+        "args": {
+            "policy": "only_there:Policy",
+            "environment": {"python": "env/bin/python", "env_vars": {"SOURCE": "/src"}},
+        },
+    }
+    Path("deployment.yaml").write_text(yaml.safe_dump({"applications": [document]}))
+    [app] = read_deployment("deployment.yaml").applications
+    assert app.args["environment"]["python"] == str(python), "Ray is to see no relative path"

@@ -1,0 +1,210 @@
+"""A batch waits for a group that is coming back: in simulated time, with the queue's own bookkeeping."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import random
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import pytest
+
+from vlagents_ray.protocol.messages import Op, Request
+from vlagents_ray.serve.queue.batch_window import BatchCost, BatchWindow
+from vlagents_ray.serve.queue.fair_queue import FairQueue, PendingRequest, Rank
+
+SIZE = 16
+Delay = Callable[[], float]
+
+
+def fixed(size: int) -> float:
+    """A policy for which a batch is mostly worth the wait, s."""
+    return 0.020 + 0.001 * size
+
+
+def ticket(
+    session: str, arrived: float, rank: Rank = Rank.SIMULATION, op: Op = "act", **fields: float
+) -> PendingRequest:
+    return PendingRequest(session, Request(op, **fields), lambda _: None, rank, arrived)  # type: ignore[arg-type]
+
+
+@dataclass
+class World:
+    """Clients that come back so long after each answer, a policy, and the queue between them."""
+
+    delays: list[Delay]
+    patience: float
+    cost: Callable[[int], float] = fixed
+    ranks: dict[int, Rank] = field(default_factory=dict)
+    sizes: list[int] = field(default_factory=list)
+    waits: list[tuple[float, float]] = field(default_factory=list)  # how long, and how long the batch before took
+    robots_waited: float = 0.0
+
+    def run(self, batches: int) -> World:
+        returning, waiting, now, took = BatchWindow(self.patience, SIZE, lambda _: True), FairQueue(), 0.0, 0.0
+        order = itertools.count()
+        coming = [(0.003 * i, next(order), i) for i in range(len(self.delays))]  # a cold start, one by one
+        heapq.heapify(coming)
+
+        def come() -> PendingRequest:
+            at, _, number = heapq.heappop(coming)
+            one = ticket(str(number), at, self.ranks.get(number, Rank.SIMULATION))
+            returning.record_arrival(one)
+            waiting.add(one)
+            return one
+
+        while len(self.sizes) < batches:
+            while coming and (coming[0][0] <= now or not waiting.size):
+                now = max(now, come().arrived)
+            wait = returning.wait_s(now, waiting)
+            if wait > 0:
+                until, begun = now + wait, now
+                now = until
+                while coming and coming[0][0] <= until:
+                    one = come()
+                    if returning.ends_wait(one, waiting):
+                        now = one.arrived
+                        break
+                self.waits.append((now - begun, took))
+            batch, _ = waiting.take(SIZE, now)
+            returning.record_start(batch)
+            took = self.cost(len(batch))
+            now += took
+            returning.record_end(now, took)
+            self.sizes.append(len(batch))
+            for one in batch:
+                heapq.heappush(coming, (now + self.delays[int(one.session_id)](), next(order), int(one.session_id)))
+        return self
+
+    def mean(self) -> float:
+        """Of the sizes of batches, when all has settled."""
+        half = self.sizes[len(self.sizes) // 2 :]
+        return sum(half) / len(half)
+
+
+def soon(seed: int) -> Delay:
+    """As a simulation that asks again at once: the way there and back, and its own frame."""
+    choose = random.Random(seed)
+    return lambda: 0.001 + choose.uniform(0, 0.001)
+
+
+@pytest.mark.parametrize("clients", [2, 3, 4, 8, 16])
+def test_a_group_comes_together_and_stays(clients: int) -> None:
+    delays = [soon(seed) for seed in range(clients)]
+    assert World(delays, patience=0.0).run(200).mean() < 0.7 * clients
+    assert World(delays, patience=0.15).run(200).mean() > 0.95 * clients
+
+
+def test_the_wait_is_bounded_by_the_batch_before() -> None:
+    world = World([soon(seed) for seed in range(8)], patience=0.1).run(300)
+    assert world.waits
+    assert all(wait <= 0.1 * took + 1e-9 for wait, took in world.waits)
+
+
+def test_a_lone_session_waits_for_nobody() -> None:
+    assert World([soon(0)], patience=1.0).run(50).waits == []
+
+
+def test_clients_that_are_usually_slow_are_not_waited_for() -> None:
+    choose = random.Random(0)
+    slow = [lambda: choose.uniform(0.05, 0.2) for _ in range(8)]
+    world = World(list(slow), patience=0.15).run(300)
+    assert sum(wait for wait, _ in world.waits) < 0.005 * sum(map(fixed, world.sizes))
+
+
+def test_a_client_that_stops_is_waited_for_once() -> None:
+    calls = itertools.count()
+    world = World([soon(0), soon(1), lambda: 0.0015 if next(calls) < 50 else 1e9], patience=0.15).run(150)
+    in_vain = [wait for wait, took in world.waits if wait > 0.15 * took - 1e-9]
+    assert len(in_vain) <= 2
+    assert world.sizes[-50:] == [2] * 50
+
+
+def test_nobody_waits_where_batches_save_nothing() -> None:
+    world = World([soon(seed) for seed in range(4)], patience=0.3, cost=lambda size: 0.01 * size).run(400)
+    waited = sum(wait for wait, _ in world.waits)
+    assert waited < 0.05 * sum(0.01 * size for size in world.sizes)
+
+
+def test_robots_neither_wait_nor_are_waited_for() -> None:
+    world = World([soon(0), soon(1)], patience=1.0, ranks=dict.fromkeys(range(2), Rank.ROBOT)).run(60)
+    assert world.waits == []
+
+
+def answered_together(*names: str, patience: float = 0.1) -> tuple[BatchWindow, FairQueue]:
+    """Three batches of 100 ms, the last over at 2.0; in between all were back after 2 ms."""
+    returning = BatchWindow(patience, SIZE, lambda name: name != "closed")
+    tickets = [ticket(name, 0.0) for name in names]
+    for end in (0.0, 1.0, 2.0):  # the first shows that the policy is slow
+        returning.record_start(tickets)
+        returning.record_end(end, 0.1)
+        tickets = [ticket(name, end + 0.002) for name in names]
+        if end < 2.0:
+            for one in tickets:
+                returning.record_arrival(one)
+    return returning, FairQueue()
+
+
+def arrive(returning: BatchWindow, waiting: FairQueue, one: PendingRequest) -> None:
+    returning.record_arrival(one)
+    waiting.add(one)
+
+
+def test_the_wait_ends_with_the_last_of_the_group() -> None:
+    returning, waiting = answered_together("a", "b", "c")
+    arrive(returning, waiting, ticket("a", 2.001))
+    assert returning.wait_s(2.001, waiting) == pytest.approx(0.01)
+    arrive(returning, waiting, b := ticket("b", 2.002))
+    assert not returning.ends_wait(b, waiting)
+    arrive(returning, waiting, c := ticket("c", 2.003))
+    assert returning.ends_wait(c, waiting)
+
+
+def test_a_robot_ends_the_wait_and_prevents_it() -> None:
+    returning, waiting = answered_together("a", "b")
+    arrive(returning, waiting, ticket("a", 2.001))
+    assert returning.wait_s(2.001, waiting) > 0
+    arrive(returning, waiting, robot := ticket("r", 2.002, Rank.ROBOT))
+    assert returning.ends_wait(robot, waiting)
+    assert returning.wait_s(2.002, waiting) == 0
+
+
+def test_a_deadline_that_the_wait_would_endanger_prevents_it() -> None:
+    for deadline_ms, waits in ((105.0, False), (500.0, True)):  # the batch takes 100 ms, the wait 10 ms
+        returning, waiting = answered_together("a", "b", "c")
+        arrive(returning, waiting, ticket("a", 2.001, deadline_ms=deadline_ms))
+        assert (returning.wait_s(2.001, waiting) > 0) is waits
+        returning, waiting = answered_together("a", "b", "c")
+        arrive(returning, waiting, ticket("a", 2.001))
+        assert returning.wait_s(2.001, waiting) > 0
+        arrive(returning, waiting, b := ticket("b", 2.002, deadline_ms=deadline_ms))
+        assert returning.ends_wait(b, waiting) is not waits
+
+
+def test_a_full_batch_does_not_wait() -> None:
+    names = [f"s{i}" for i in range(SIZE)]
+    returning, waiting = answered_together(*names)
+    for name in names[1:]:
+        arrive(returning, waiting, ticket(name, 2.001))
+    arrive(returning, waiting, ticket("another", 2.001))
+    assert returning.wait_s(2.001, waiting) == 0
+
+
+def test_sessions_that_are_closed_or_overdue_are_not_waited_for() -> None:
+    returning, waiting = answered_together("a", "closed")
+    arrive(returning, waiting, ticket("a", 2.001))
+    assert returning.wait_s(2.001, waiting) == 0
+    returning, waiting = answered_together("a", "b")
+    arrive(returning, waiting, ticket("a", 2.05))
+    assert returning.wait_s(2.05, waiting) == 0
+
+
+def test_the_fixed_part_of_a_batch_is_found() -> None:
+    cost = BatchCost()
+    for size in (4, 4, 4):
+        cost.add(size, fixed(size))
+    assert cost.fixed_s() == float("inf")
+    for size in (1, 8, 3, 16):
+        cost.add(size, fixed(size))
+    assert cost.fixed_s() == pytest.approx(0.020)

@@ -1,0 +1,278 @@
+"""A policy that does not return from a call makes its replica unhealthy, and whoever waits for it is answered."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import pytest
+from eval_fakes import wait_for
+from shm_client import call, client, request
+from starlette.testclient import TestClient
+
+from vlagents_ray.errors import DeadlineExceeded, PolicyFailed, PolicyUnavailable
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.protocol.messages import Limits, Reply, Request
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.config.deployment import LimitArgs
+from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.endpoints.local.shm import ShmServer
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.queue.call_limits import (
+    LOAD,
+    CallLimits,
+    PolicyCall,
+    PolicyCalls,
+)
+from vlagents_ray.serve.queue.checkpoint_choice import DEFAULT
+
+LIMITS = CallLimits(act_s=10.0, warm_up_s=100.0, load_s=1000.0)
+
+
+class Clock:
+    """Time that passes when it is told to."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+class Hanging(Agent):
+    """Does not return from what it is told to hang in, until `over`."""
+
+    shared = ("over",)
+
+    def __init__(self) -> None:
+        self.over = threading.Event()
+        self.hangs_at = ""
+
+    def _hang(self, op: str) -> None:
+        if self.hangs_at == op:
+            self.over.wait(20)
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self.hangs_at = kwargs.get("hangs_at", "")
+        self._hang("reset")
+        return {}
+
+    def observe(self, obs: Obs) -> None:
+        self._hang("observe")
+
+    def act(self, obs: Obs) -> Act:
+        self._hang("act")
+        return Act(np.zeros(1, np.float32))
+
+    def __getstate__(self) -> dict[str, Any]:
+        self._hang("export")
+        return self.__dict__
+
+
+@pytest.fixture
+def agent() -> Iterator[Hanging]:
+    agent = Hanging()
+    yield agent
+    agent.over.set()
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def engine(agent: Hanging, clock: Clock) -> Iterator[Engine]:
+    engine = Engine(agent, limits=LIMITS)
+    engine.calls.clock = clock
+    engine.start()
+    yield engine
+    agent.over.set()
+    engine.close()
+
+
+def put(engine: Engine, session: str, op: Any, **kwargs: Any) -> queue.SimpleQueue[Reply]:
+    replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
+    engine.submit(session, Request(op, Obs(), kwargs=kwargs), replies.put)
+    return replies
+
+
+def ask(engine: Engine, session: str, op: Any, **kwargs: Any) -> Reply:
+    reply = put(engine, session, op, **kwargs).get(timeout=10)
+    assert reply.error is None
+    return reply
+
+
+def hang(engine: Engine, op: str) -> queue.SimpleQueue[Reply]:
+    """Begin a call of that kind, past its warm-up, that does not return."""
+    ask(engine, "good", "reset")
+    for session in ("a", "b"):
+        ask(engine, session, "reset")
+        ask(engine, session, "observe")
+        ask(engine, session, "act")
+        ask(engine, session, "export")
+    if op == "reset":
+        replies = put(engine, "bad", "reset", hangs_at="reset")
+    else:
+        ask(engine, "bad", "reset", hangs_at=op)
+        replies = put(engine, "bad", op)
+    wait_for(lambda: engine.calls.under_way)
+    return replies
+
+
+OPS = ["reset", "act", "observe", "export"]
+
+
+@pytest.mark.parametrize("op", OPS)
+def test_a_call_over_its_limit_makes_the_engine_unhealthy(engine: Engine, clock: Clock, op: str) -> None:
+    hang(engine, op)
+    clock.now += 9.9
+    assert engine.ready
+    clock.now += 0.2
+    assert not engine.ready
+    with pytest.raises(PolicyUnavailable, match=rf"not returned from '{op}' for 10.1 s; its limit is 10 s"):
+        engine.check_health()
+
+
+@pytest.mark.parametrize("op", OPS)
+def test_those_who_wait_for_it_are_answered_and_no_others_are_let_in(
+    engine: Engine, agent: Hanging, clock: Clock, op: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    engine.stats.enable()
+    begun, behind = hang(engine, op), put(engine, "good", "act")
+    engine.notice_hung()
+    assert begun.empty()
+    assert behind.empty()
+    clock.now += 11.0
+    engine.notice_hung()
+    engine.notice_hung()
+    # Not to be repeated elsewhere, where it would hang as well; unlike what had not begun.
+    assert isinstance(begun.get(timeout=10).error, DeadlineExceeded)
+    assert isinstance(behind.get(timeout=10).error, PolicyUnavailable)
+    with pytest.raises(PolicyUnavailable, match="another replica"):
+        put(engine, "good", "act")
+    assert engine.stats.collect().hung == {op: 1}
+    assert caplog.text.count("not returned from") == 1
+    assert "self.over.wait" in caplog.text  # where it hangs
+    agent.over.set()
+    wait_for(lambda: not engine.calls.under_way)
+    engine.notice_hung()
+    assert engine.ready
+    assert "has returned" in caplog.text
+    ask(engine, "good", "act")
+    assert begun.empty()
+
+
+def test_a_first_call_may_compile(engine: Engine, clock: Clock) -> None:
+    ask(engine, "bad", "reset", hangs_at="act")
+    put(engine, "bad", "act")
+    wait_for(lambda: engine.calls.under_way)
+    clock.now += 99.0
+    assert engine.ready
+    clock.now += 2.0
+    assert not engine.ready
+
+
+def test_every_batch_size_may_compile_where_batches_have_fixed_sizes(agent: Hanging, clock: Clock) -> None:
+    engine = Engine(agent, limits=LIMITS, batch_sizes=[1, 2], max_batch_size=2)
+    engine.calls.clock = clock
+    engine.start()
+    hang(engine, "act")
+    [call] = engine.calls.under_way
+    model = engine.models.loaded(DEFAULT)
+    assert model is not None
+    assert call is model.call("act", 1)
+    assert (call.limit_s, model.call("act", 2).limit_s) == (10.0, 100.0)
+    agent.over.set()
+    engine.close()
+
+
+def test_a_slow_policy_has_ten_times_its_longest_call(clock: Clock) -> None:
+    call = PolicyCall(PolicyCalls(LIMITS, clock), "act")
+    limits = []
+    for took_s in (300.0, 40.0, 50.0, 0.0):  # the first one compiled
+        limits.append(call.limit_s)
+        with call:
+            clock.now += took_s
+    assert limits == [100.0, 100.0, 400.0, 500.0]
+
+
+def test_loading_has_its_own_limit(clock: Clock) -> None:
+    calls = PolicyCalls(LIMITS, clock)
+    with PolicyCall(calls, LOAD):
+        clock.now = 999.0
+        assert calls.overdue() is None
+        clock.now = 1001.0
+        overdue = calls.overdue()
+        assert overdue is not None
+        assert overdue.op == LOAD
+    assert calls.overdue() is None
+
+
+def test_a_policy_that_never_loads_has_failed() -> None:
+    class Loading(Hanging):
+        def initialize(self) -> None:
+            self.over.wait(60)
+
+    agent = Loading()
+    engine = Engine(agent, limits=CallLimits(load_s=0.05))
+    with pytest.raises(PolicyFailed, match=r"not loaded within 0.05 s"):
+        engine.start()
+    with pytest.raises(PolicyFailed, match="did not load"):
+        engine.check_health()
+    agent.over.set()
+
+
+def test_an_engine_whose_policy_hangs_ends_all_the_same(
+    agent: Hanging, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    engine = Engine(agent)
+    engine.start()
+    monkeypatch.setattr(engine.queue, "close", lambda **_: None)  # which waits for the batch, but not for ever
+    monkeypatch.setattr("vlagents_ray.serve.models.model_manager._CLOSE_S", 0.05)
+    ask(engine, "bad", "reset", hangs_at="act")
+    put(engine, "bad", "act")
+    wait_for(lambda: engine.calls.under_way)
+    engine.close()
+    assert "still busy" in caplog.text
+
+
+@pytest.mark.parametrize("hangs", [True, False])
+def test_health_answers_at_once_though_the_policys_own_check_hangs(
+    engine: Engine, agent: Hanging, monkeypatch: pytest.MonkeyPatch, hangs: bool
+) -> None:
+    monkeypatch.setattr("vlagents_ray.serve.endpoints.http._HEALTH_S", 0.05 if hangs else 30.0)
+    monkeypatch.setattr(Hanging, "check_health", lambda self: self.over.wait(60) if hangs else None)
+    with TestClient(build_http_app(engine, dict, Limits())) as client:
+        assert client.get("/healthz").status_code == (503 if hangs else 200)
+        agent.over.set()
+
+
+def test_a_local_client_is_refused_though_the_thread_that_reads_its_requests_hangs(
+    engine: Engine, clock: Clock
+) -> None:
+    endpoint = ShmServer(engine, Limits(), NoKey.OPEN)
+    endpoint.open()
+    waiting = client(endpoint)
+    assert call(waiting, request("reset"), 60).error is None
+    hang(engine, "act")
+    with ThreadPoolExecutor(1) as threads:
+        asked = threads.submit(call, waiting, request("act"), 60)
+        clock.now += 11.0
+        engine.notice_hung()
+        assert isinstance(asked.result().error, PolicyUnavailable)
+    assert isinstance(call(waiting, request("reset"), 60).error, PolicyUnavailable)
+    assert engine.calls.under_way
+    waiting.close()
+    endpoint.close()
+
+
+def test_a_deployment_sets_the_limits() -> None:
+    args = LimitArgs(act_s=1, warm_up_s=2, load_s=3)
+    assert args.call_limits() == CallLimits(1, 2, 3)
+    assert args.limits() == Limits()
+    assert LimitArgs().call_limits() == CallLimits()

@@ -1,0 +1,120 @@
+"""Whose turn it is."""
+
+from __future__ import annotations
+
+import random
+from collections import Counter, defaultdict
+
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from vlagents_ray.protocol.messages import Request
+from vlagents_ray.serve.queue.fair_queue import (
+    PATIENCE_S,
+    FairQueue,
+    PendingRequest,
+    Rank,
+)
+
+
+def ticket(session: str, *, owner: str = "", rank: Rank = Rank.SIMULATION, arrived: float = 0.0) -> PendingRequest:
+    return PendingRequest(session, Request("act"), lambda _: None, rank, arrived, connection=owner)
+
+
+def filled(*tickets: PendingRequest) -> FairQueue:
+    waiting = FairQueue()
+    for one in tickets:
+        waiting.add(one)
+    return waiting
+
+
+def bundle(owner: str, size: int) -> list[PendingRequest]:
+    return [ticket(f"{owner}{i}", owner=owner) for i in range(size)]
+
+
+def taken(waiting: FairQueue, size: int = 16, now: float = 0.0) -> list[str]:
+    return [one.session_id for one in waiting.take(size, now)[0]]
+
+
+def test_a_large_bundle_delays_others_by_no_more_than_a_batch() -> None:
+    waiting = filled(*bundle("learner", 512), *(ticket(f"env{i}") for i in range(10)))
+    first = taken(waiting)
+    assert {f"env{i}" for i in range(10)} <= set(first)
+    assert len(first) == 16
+
+
+def test_alone_a_bundle_fills_the_batch_in_its_order() -> None:
+    waiting = filled(*bundle("a", 20))
+    assert taken(waiting) == [f"a{i}" for i in range(16)]
+    assert taken(waiting) == [f"a{i}" for i in range(16, 20)]
+
+
+def test_bundles_share_batches_evenly() -> None:
+    waiting = filled(*bundle("a", 512), *bundle("b", 40), *bundle("c", 512))
+    for _ in range(5):
+        counts = Counter(name[0] for name in taken(waiting))
+        assert max(counts.values()) - min(counts.values()) <= 1
+
+
+def test_the_turn_goes_on_where_the_last_batch_ended() -> None:
+    waiting = filled(*(one for owner in "abc" for one in bundle(owner, 4)))
+    assert taken(waiting, 2) == ["a0", "b0"]
+    assert taken(waiting, 2) == ["c0", "a1"]
+
+
+def test_pipelined_requests_of_one_session_take_one_slot_of_a_batch() -> None:
+    waiting = filled(*(ticket("fast") for _ in range(100)), ticket("slow"))
+    assert taken(waiting) == ["fast", "slow"]
+    assert taken(waiting) == ["fast"]
+    assert waiting.size == 98
+
+
+def test_simulations_get_the_slots_that_robots_leave() -> None:
+    waiting = filled(*(ticket(f"s{i}") for i in range(4)), ticket("r", rank=Rank.ROBOT))
+    assert taken(waiting, 3) == ["r", "s0", "s1"]
+
+
+def test_robots_without_end_do_not_starve_simulations() -> None:
+    waiting, served, now = filled(ticket("s0"), ticket("s1")), [], 0.0
+    for _ in range(60):
+        waiting.add(ticket("r0", rank=Rank.ROBOT, arrived=now))
+        waiting.add(ticket("r1", rank=Rank.ROBOT, arrived=now))
+        now += 0.05
+        served.append(taken(waiting, 1, now))
+        if now <= PATIENCE_S:
+            assert served[-1][0].startswith("r")
+    order = [name for batch in served for name in batch]
+    assert {"s0", "s1"} <= set(order)
+    assert order.index("s1") - order.index("s0") == 2  # a robot in between, even where a batch has one slot
+
+
+@settings(max_examples=100)
+@given(st.integers(0, 2**32), st.integers(1, 9))
+def test_every_ticket_is_taken_once_and_in_its_sessions_order(seed: int, size: int) -> None:
+    choose = random.Random(seed)
+    waiting, put, got = FairQueue(), defaultdict(list), defaultdict(list)
+    for _ in range(200):
+        if choose.random() < 0.7:
+            name = f"s{choose.randrange(6)}"
+            one = ticket(name, owner=f"o{int(name[1]) % 3}", rank=Rank(choose.randrange(2)))
+            put[name].append(one)
+            waiting.add(one)
+        else:
+            batch, _ = waiting.take(size, 0.0)
+            assert len({one.session_id for one in batch}) == len(batch) <= size
+            for one in batch:
+                got[one.session_id].append(one)
+    while waiting.size:
+        for one in waiting.take(size, 0.0)[0]:
+            got[one.session_id].append(one)
+    assert {name: list(map(id, some)) for name, some in put.items()} == {
+        name: list(map(id, some)) for name, some in got.items()
+    }
+    assert waiting.depth == [0, 0]
+
+
+def test_nothing_is_left_after_clear() -> None:
+    waiting = filled(ticket("a"), ticket("a"), ticket("b", rank=Rank.ROBOT))
+    assert len(waiting.clear()) == 3
+    assert waiting.size == 0
+    assert waiting.take(4, 0.0) == ([], [])

@@ -1,0 +1,313 @@
+"""Which thread polls the local endpoints while the policy runs, and what happens between two batches."""
+
+from __future__ import annotations
+
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+
+import pytest
+from eval_fakes import wait_for
+from process_resources import descriptors, running_threads
+
+from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.serve.queue.batch_queue import BatchQueue, PendingRequest, Rank
+from vlagents_ray.serve.queue.poller import Poller
+
+SLOW_S = 0.02  # a batch at least, so that the queue takes the policy for a slow one
+
+
+class Slow:
+    """A queue whose policy takes at least `SLOW_S`, and then waits at a gate while that is closed."""
+
+    def __init__(self, size: int = 2, patience: float = 0.0) -> None:
+        self.events: list[str] = []
+        self.open = threading.Event()
+        self.open.set()
+        self.busy = threading.Event()
+        self.answered_by: dict[str, str] = {}  # the thread, by session
+        self.queue = BatchQueue(self._run, size, patience=patience)
+
+    def _run(self, batch: Sequence[PendingRequest]) -> None:
+        gate = self.open
+        self.events.append("batch " + " ".join(sorted(ticket.session_id for ticket in batch)))
+        self.busy.set()
+        time.sleep(SLOW_S)
+        assert gate.wait(10)
+        for ticket in batch:
+            reply = Reply(ticket.request.request_id)
+            if self.queue.full_batch_waits() and ticket.rank is Rank.SIMULATION:
+                self.queue.answer_later([(ticket, reply)])
+            else:
+                ticket.answer(reply)
+
+    def put(self, *sessions: str, rank: Rank = Rank.SIMULATION) -> None:
+        """A request of each session, together."""
+
+        def done(session: str) -> Callable[[Reply], None]:
+            def answered(reply: Reply) -> None:
+                self.answered_by[session] = threading.current_thread().name.partition("_")[0]
+                self.events.append(f"{'answer' if reply.error is None else 'error'} {session}")
+
+            return answered
+
+        self.queue.put(*(PendingRequest(s, Request("act", request_id=s), done(s), rank) for s in sessions))
+
+    def called(self, *events: str) -> bool:
+        """Have these happened?"""
+        return set(events) <= set(self.events)
+
+    def learn(self, *sessions: str) -> None:
+        """Let the queue see that the policy is slow, and that these come back together, at once."""
+        for _ in range(3):
+            self.events.clear()
+            self.put(*sessions)
+            wait_for(lambda: self.called(*(f"answer {s}" for s in sessions)))
+        self.events.clear()
+
+    def hold(self, *sessions: str) -> None:
+        """A batch of these is under way until `open` is set."""
+        self.open.clear()
+        self.busy.clear()
+        self.put(*sessions)
+        assert self.busy.wait(10)
+
+
+@pytest.fixture
+def slow() -> Iterator[Callable[..., Slow]]:
+    made: list[Slow] = []
+
+    def make(**options: float) -> Slow:
+        made.append(Slow(**options))  # type: ignore[arg-type]
+        return made[-1]
+
+    yield make
+    for one in made:
+        one.open.set()
+        one.queue.close(timeout_s=5)
+        assert not one.queue.alive()
+
+
+def test_messages_are_heard_beside_a_batch_and_never_on_two_threads_at_once(slow: Callable[..., Slow]) -> None:
+    one = slow()
+    ours, theirs = socket.socketpair()
+    threads: list[str] = []
+    inside = threading.Lock()
+
+    def ready() -> None:
+        assert inside.acquire(blocking=False)
+        ours.recv(1)
+        threads.append(threading.current_thread().name)
+        inside.release()
+
+    one.queue.watch(ours, ready)
+    one.queue.start()
+    one.learn("a", "b")
+    theirs.send(b"x")
+    wait_for(lambda: threads == ["policy"])
+    one.hold("a", "b")
+    theirs.send(b"x")
+    wait_for(lambda: threads == ["policy", "policy-reader"])
+    one.open.set()
+    for _ in range(20):
+        one.put("a", "b")
+        for _ in range(10):
+            theirs.send(b"x")
+            time.sleep(0.001)
+    wait_for(lambda: len(threads) == 202)
+    theirs.close()
+    one.queue.close(timeout_s=5)
+    ours.close()
+
+
+def test_nobody_listens_beside_a_lone_session(slow: Callable[..., Slow]) -> None:
+    one = slow()
+    one.queue.start()
+    one.learn("robot")
+    assert "policy-reader" not in {thread.name for thread in threading.enumerate()}
+
+
+def test_a_callback_may_end_its_watch_beside_a_batch(slow: Callable[..., Slow]) -> None:
+    one = slow()
+    ours, theirs = socket.socketpair()
+    ended = threading.Event()
+
+    def ready() -> None:
+        one.queue.unwatch(ours)
+        ours.close()
+        ended.set()
+
+    one.queue.watch(ours, ready)
+    one.queue.start()
+    one.learn("a", "b")
+    one.hold("a", "b")
+    theirs.close()
+    assert ended.wait(5)
+    one.open.set()
+    wait_for(lambda: one.called("answer a", "answer b"))
+
+
+def test_where_a_full_batch_waits_simulations_are_answered_from_another_thread(slow: Callable[..., Slow]) -> None:
+    one = slow()
+    one.queue.start()
+    one.learn("a", "b")
+    assert set(one.answered_by.values()) == {"policy"}
+    one.hold("a", "b")
+    one.put("c", "d")
+    one.open.set()
+    wait_for(lambda: one.called(*(f"answer {s}" for s in "abcd")))
+    assert [one.answered_by[s] for s in "abcd"] == ["policy-answers"] * 2 + ["policy"] * 2
+
+
+def test_answers_come_while_the_next_batch_runs_and_when_the_queue_closes(slow: Callable[..., Slow]) -> None:
+    one = slow()
+    one.queue.start()
+    one.learn("a", "b")
+    one.hold("a", "b")
+    one.put("c", "d")
+    one.busy.clear()
+    gate, one.open = one.open, threading.Event()
+    gate.set()
+    assert one.busy.wait(5)
+    wait_for(lambda: one.called("answer a", "answer b"))
+    assert not one.called("answer c")
+    one.put("e", "f")
+    closer = threading.Thread(target=one.queue.close)
+    closer.start()
+    one.open.set()
+    closer.join(5)
+    assert one.called("answer c", "answer d", "error e", "error f")
+
+
+def test_a_robot_is_answered_before_the_next_batch(slow: Callable[..., Slow]) -> None:
+    one = slow()
+    one.queue.start()
+    one.learn("a", "b")
+    one.open.clear()
+    one.busy.clear()
+    one.put("r", rank=Rank.ROBOT)
+    assert one.busy.wait(5)
+    one.put("c", "d")
+    one.open.set()
+    wait_for(lambda: one.called("answer r", "answer c"))
+    assert one.events.index("answer r") < one.events.index("batch c d")
+    assert one.answered_by["r"] == "policy"
+
+
+ENDLESS = 1e6  # times the batch before: what waits, waits until something ends it
+
+
+def test_a_batch_waits_for_the_rest_of_its_group(slow: Callable[..., Slow]) -> None:
+    one = slow(size=8, patience=ENDLESS)
+    one.queue.start()
+    one.learn("a", "b")
+    one.put("a")
+    wait_for(lambda: one.queue._gathering)
+    assert one.events == []
+    one.put("b")
+    wait_for(lambda: one.called("answer a", "answer b"))
+    assert one.events[0] == "batch a b"
+
+
+def test_a_robot_ends_the_wait(slow: Callable[..., Slow]) -> None:
+    one = slow(size=8, patience=ENDLESS)
+    one.queue.start()
+    one.learn("a", "b")
+    one.put("a")
+    wait_for(lambda: one.queue._gathering)
+    one.put("r", rank=Rank.ROBOT)
+    wait_for(lambda: one.called("answer a", "answer r"))
+    assert one.events[0] == "batch a r"
+
+
+def test_closing_ends_the_wait(slow: Callable[..., Slow]) -> None:
+    one = slow(size=8, patience=ENDLESS)
+    one.queue.start()
+    one.learn("a", "b")
+    one.put("a")
+    wait_for(lambda: one.queue._gathering)
+    one.queue.close(timeout_s=5)
+    assert one.events == ["error a"]
+
+
+def test_who_was_unwatched_a_moment_ago_is_not_called(caplog: pytest.LogCaptureFixture) -> None:
+    """By the call before, for whom both were ready."""
+    poller = Poller()
+    pairs = [socket.socketpair() for _ in range(2)]
+    called: list[int] = []
+
+    def ready(which: int) -> None:
+        called.append(which)
+        poller.unwatch(pairs[1 - which][0])
+
+    for which, (ours, theirs) in enumerate(pairs):
+        poller.watch(ours, lambda which=which: ready(which))  # type: ignore[misc]
+        theirs.send(b"x")
+    assert poller.poll(1)
+    assert len(called) == 1
+    poller.close()
+    for pair in pairs:
+        for one in pair:
+            one.close()
+    assert not caplog.records
+
+
+def test_a_file_whose_callback_failed_is_not_polled_again(caplog: pytest.LogCaptureFixture) -> None:
+    poller = Poller()
+    ours, theirs = socket.socketpair()
+
+    def fail() -> None:
+        raise OSError("broken")
+
+    poller.watch(ours, fail)
+    theirs.send(b"x")
+    assert poller.poll(1)
+    assert "the callback of a watched file failed" in caplog.text
+    assert not poller.poll(0)
+    poller.close()
+    ours.close()
+    theirs.close()
+
+
+def test_only_other_threads_wake_the_queue(slow: Callable[..., Slow], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A request that the queue's own thread has read finds it awake."""
+    one = slow()
+    ours, theirs = socket.socketpair()
+    woken: list[str] = []
+    wake = one.queue._poller.wake
+
+    def by_whom() -> None:
+        woken.append(threading.current_thread().name)
+        wake()
+
+    monkeypatch.setattr(one.queue._poller, "wake", by_whom)
+
+    def ready() -> None:
+        ours.recv(1)
+        one.put("heard")
+
+    one.queue.watch(ours, ready)
+    one.queue.start()
+    theirs.send(b"x")
+    wait_for(lambda: one.called("answer heard"))
+    assert woken == []
+    wait_for(lambda: one.queue._asleep)
+    one.put("other")
+    wait_for(lambda: one.called("answer other"))
+    assert woken == [threading.current_thread().name]
+    one.queue.close(timeout_s=5)
+    ours.close()
+    theirs.close()
+
+
+def test_no_descriptor_and_no_thread_is_left() -> None:
+    files, running = descriptors(), running_threads()
+    for lend in (False, True):
+        poller = Poller()
+        if lend:
+            poller.hand_to_reader()
+            poller.reclaim()
+        poller.close()
+    assert not descriptors() - files
+    assert not running_threads() - running

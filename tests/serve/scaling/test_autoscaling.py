@@ -1,0 +1,150 @@
+"""How many replicas measured load needs, on loads made up for it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from pydantic import ValidationError
+from ray.serve._private.common import DeploymentID, ReplicaID
+from ray.serve.config import AutoscalingConfig, AutoscalingContext
+
+from vlagents_ray.serve.config.deployment import AutoscalingArgs, ServerArgs
+from vlagents_ray.serve.scaling.autoscaling import (
+    SESSIONS,
+    UTILISATION,
+    WAITING,
+    MeasuredLoad,
+)
+
+POLICY = DeploymentID("Policy", "app")
+
+
+def wanted(
+    policy: MeasuredLoad,
+    utilisation: list[float],
+    *,
+    waiting: float = 0.0,
+    sessions: float = 0.0,
+    target: int | None = None,
+    running: int | None = None,
+    requests: float = 0.0,
+) -> int:
+    """The decision where each replica of those that report has this utilisation, queue and number of sessions."""
+    replicas = [ReplicaID(str(i), POLICY) for i in range(len(utilisation))]
+    context = AutoscalingContext(
+        deployment_id=POLICY,
+        deployment_name="Policy",
+        app_name="app",
+        current_num_replicas=len(replicas) if running is None else running,
+        target_num_replicas=len(replicas) if target is None else target,
+        running_replicas=replicas,
+        total_num_requests=requests,
+        total_queued_requests=0.0,
+        aggregated_metrics={
+            UTILISATION: dict(zip(replicas, utilisation, strict=True)),
+            WAITING: dict.fromkeys(replicas, waiting),
+            SESSIONS: dict.fromkeys(replicas, sessions),
+        }
+        if replicas
+        else {},
+        raw_metrics={},
+        capacity_adjusted_min_replicas=0,
+        capacity_adjusted_max_replicas=100,
+        policy_state={},
+        last_scale_up_time=None,
+        last_scale_down_time=None,
+        current_time=0.0,
+        config=None,
+    )
+    number, state = policy(context)
+    assert state == {}
+    return number
+
+
+def test_busy_replicas_get_help_and_idle_ones_leave() -> None:
+    policy = MeasuredLoad()
+    assert wanted(policy, [0.65]) == 1
+    assert wanted(policy, [0.95]) == 2
+    assert wanted(policy, [1.0, 1.0, 1.0]) == 5
+    assert wanted(policy, [0.1, 0.1, 0.1], sessions=1) == 1
+
+
+def test_a_long_queue_counts_where_the_policy_is_busy_anyway() -> None:
+    assert wanted(MeasuredLoad(), [1.0], waiting=3.0) == 3
+    assert wanted(MeasuredLoad(target_waiting=3.0), [1.0], waiting=3.0) == 2
+
+
+def test_sessions_count_only_if_a_target_is_set() -> None:
+    assert wanted(MeasuredLoad(), [0.1], sessions=100, target=1) == 1
+    assert wanted(MeasuredLoad(target_sessions=32), [0.1], sessions=100) == 4
+
+
+def test_around_a_target_the_number_stays() -> None:
+    """A load that hovers around what needs two replicas, as measured after each decision."""
+    policy, replicas, changes = MeasuredLoad(target_utilisation=0.7), 1, 0
+    for step in range(200):
+        load = 0.7 + (0.05 if step % 2 else -0.05)
+        number = wanted(policy, [load / replicas] * replicas, sessions=1)
+        changes += number != replicas
+        replicas = number
+    assert (replicas, changes) == (2, 1)
+
+
+@pytest.mark.parametrize("load", [0.05, 0.5, 0.71, 1.3, 2.4, 5.0])
+def test_any_steady_load_settles_at_once(load: float) -> None:
+    """With evenly spread load the first decision is the last one, whichever number it began with."""
+    for begun in range(1, 9):
+        first = wanted(MeasuredLoad(), [load / begun] * begun, sessions=1)
+        if load / begun <= 1.0:  # else it is hidden how much there is
+            assert wanted(MeasuredLoad(), [load / first] * first, sessions=1) == first
+
+
+def test_hidden_load_is_found_in_a_few_steps() -> None:
+    """A replica cannot be busier than always: four times too much needs more than one decision."""
+    replicas, steps = 1, []
+    for _ in range(10):
+        replicas = wanted(MeasuredLoad(), [min(1.0, 4.0 / replicas)] * replicas, sessions=1)
+        steps.append(replicas)
+    assert steps[-1] == 6
+    assert steps == sorted(steps)
+
+
+def test_nothing_is_taken_away_before_all_have_reported() -> None:
+    assert wanted(MeasuredLoad(), [0.3], running=2, target=2, sessions=1) == 2
+    assert wanted(MeasuredLoad(), [], running=1, target=1) == 1
+    assert wanted(MeasuredLoad(), [1.0], running=1, target=2) == 2  # the second one is still loading
+
+
+def test_only_an_unused_application_may_have_no_replica() -> None:
+    assert wanted(MeasuredLoad(), [0.0]) == 0
+    assert wanted(MeasuredLoad(), [8e-7]) == 0  # what an idle replica measures
+    assert wanted(MeasuredLoad(), [0.0], sessions=1) == 1
+    assert wanted(MeasuredLoad(), [0.0], requests=1.0) == 1
+
+
+def test_settings_reach_serve() -> None:
+    args = AutoscalingArgs(max_replicas=3, target_sessions=8, look_back_s=5, upscale_delay_s=2, downscale_delay_s=4)
+    config = AutoscalingConfig(**args.options())
+    assert (config.max_replicas, config.upscale_delay_s, config.downscale_delay_s) == (3, 2, 4)
+    assert (config.look_back_period_s, config.metrics_interval_s) == (5, 1)
+    policy: Any = config.policy.get_policy()(**config.policy.policy_kwargs)
+    assert wanted(policy, [0.1], sessions=16) == 2
+
+
+@pytest.mark.parametrize("args", [{"target_ongoing_requests": 8}, {"target_utilisation": 1.5}, {"look_back_s": 0}])
+def test_other_settings_are_refused(args: dict[str, Any]) -> None:
+    with pytest.raises(ValidationError):
+        AutoscalingArgs(**args)
+
+
+def test_the_deployment_of_the_page_about_it_is_accepted() -> None:
+    page = Path(__file__).parents[3] / "docs" / "cluster" / "autoscaling.md"
+    [block] = re.findall(r"```yaml\n(.*?)```", page.read_text(), re.DOTALL)
+    [application] = yaml.safe_load(block)["applications"]
+    args = ServerArgs(**application["args"])
+    assert args.autoscaling is not None
+    assert args.autoscaling.min_replicas == 0

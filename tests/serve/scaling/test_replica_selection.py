@@ -1,0 +1,212 @@
+"""Which replica a session goes to, and when it is sent to another one."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from in_process_replicas import Replicas
+
+from vlagents_ray import Act, Agent, Obs
+from vlagents_ray.serve.engine.connection_drain import DrainList
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.scaling import rebalancer as balancing
+from vlagents_ray.serve.scaling.rebalancer import Rebalancer
+from vlagents_ray.serve.scaling.replica_selection import (
+    ClientLocation,
+    ReplicaLoad,
+    choose_connections,
+    choose_replica,
+    excess_sessions,
+)
+
+
+def load(replica: str, sessions: int, node: str = "n1", *, accepts: bool = True) -> ReplicaLoad:
+    return ReplicaLoad(replica, sessions, accepts, node, f"boot of {node}", ("v", "f"))
+
+
+def chosen(loads: list[ReplicaLoad], place: ClientLocation = ClientLocation()) -> str | None:  # noqa: B008 - frozen
+    found = choose_replica(loads, place)
+    return None if found is None else found.replica
+
+
+def test_a_new_session_goes_to_the_least_loaded_replica_that_accepts_it() -> None:
+    loads = [load("a", 3), load("b", 2), load("c", 0, accepts=False)]
+    assert chosen(loads) == "b"
+    assert chosen(loads[2:]) is None
+
+
+@pytest.mark.parametrize("place", [ClientLocation("near"), ClientLocation(boot_id="boot of near")])
+def test_a_near_replica_is_preferred_until_it_is_clearly_more_loaded(place: ClientLocation) -> None:
+    assert chosen([load("far", 0, "far"), load("near", 1, "near")], place) == "near"
+    assert chosen([load("far", 0, "far"), load("near", 2, "near")], place) == "far"
+    assert chosen([load("far", 40, "far"), load("near", 50, "near")], place) == "near"
+    assert chosen([load("far", 40, "far"), load("near", 51, "near")], place) == "far"
+
+
+def test_a_client_that_reaches_one_machine_only_is_sent_nowhere_else() -> None:
+    place = ClientLocation("near", must_be_near=True)
+    assert chosen([load("far", 0, "far"), load("near", 90, "near")], place) == "near"
+    assert chosen([load("far", 0, "far")], place) is None
+
+
+def test_a_client_that_does_not_know_where_it_is_is_near_to_nobody() -> None:
+    assert chosen([replace(load("a", 0), node="", boot_id="")], ClientLocation(must_be_near=True)) is None
+
+
+@pytest.mark.parametrize(
+    ("mine", "others", "leaving", "expected"),
+    [
+        (12, [0], 0, 6),
+        (12, [0], 6, 0),  # they are on their way
+        (7, [5], 0, 0),
+        (8, [4], 0, 2),
+        (2, [0], 0, 0),  # one more than the mean is not worth a move
+        (3, [0], 0, 1),
+        (1, [0, 0, 0, 0], 0, 0),
+        (50, [40, 42], 0, 0),
+        (60, [40, 42], 0, 12),
+        (0, [12], 0, 0),
+        (5, [], 0, 0),
+    ],
+)
+def test_surplus(mine: int, others: list[int], leaving: int, expected: int) -> None:
+    assert excess_sessions(mine, others, leaving) == expected
+
+
+def test_moving_the_surplus_never_makes_another_one() -> None:
+    for mine in range(60):
+        for other in range(mine + 1):
+            moved = excess_sessions(mine, [other])
+            assert excess_sessions(mine - moved, [other + moved]) == 0
+            assert excess_sessions(other + moved, [mine - moved]) == 0
+
+
+def test_connections_move_whole() -> None:
+    assert choose_connections([1, 1, 1], 2) == [0, 1]
+    assert choose_connections([8, 1, 3], 4) == [2, 1]
+    assert choose_connections([8], 6) == []
+
+
+def test_a_connection_is_told_once_each_time_it_is_marked() -> None:
+    drain_list = DrainList()
+    assert not drain_list.ask("a")
+    drain_list.mark({"a"})
+    assert (drain_list.ask("b"), drain_list.ask("a"), drain_list.ask("a")) == (False, True, False)
+    assert drain_list.asked_within(60) == {"a"}
+    drain_list.forget_older(0)
+    assert drain_list.asked_within(60) == set()
+
+
+class Counting(Agent):
+    """Counts its acts."""
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
+        self.count = 0
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        self.count += 1
+        return Act(np.array([self.count], np.float32))
+
+
+class Beside:
+    """Neighbours that hold what they are told to hold; counts how often they were asked."""
+
+    def __init__(self, *loads: ReplicaLoad) -> None:
+        self.held, self.asked, self.slow_s = list(loads), 0, 0.0
+
+    def loads(self) -> list[ReplicaLoad]:
+        self.asked += 1
+        time.sleep(self.slow_s)
+        return [replace(one) for one in self.held]
+
+    def announce_client(self, replica: str) -> str:
+        return replica
+
+
+def balance(engine: Engine, *beside: ReplicaLoad) -> tuple[Rebalancer, Beside]:
+    neighbours = Beside(*beside)
+    return Rebalancer(engine, neighbours, lambda sessions: load("me", sessions)), neighbours
+
+
+def test_clients_that_come_at_once_are_spread_evenly() -> None:
+    engine = Engine(Counting())
+    mine, neighbours = balance(engine, load("b", 3), load("c", 0))
+    neighbours.slow_s = 0.2
+    waiting = [mine.place(ClientLocation()) for _ in range(15)]
+    places = [one.result(5) for one in waiting]
+    assert {name: places.count(name) for name in (None, "b", "c")} == {None: 6, "b": 3, "c": 6}
+    assert mine.load().sessions == 6
+    assert neighbours.asked == 1
+    mine.close()
+
+
+def test_a_client_that_no_replica_is_near_to_gets_the_least_loaded_of_the_next_place() -> None:
+    mine, _ = balance(Engine(Counting()), load("b", 0), replace(load("c", 2), boot_id="another machine"))
+    near = [
+        ClientLocation(boot_id=machine, must_be_near=True)
+        for machine in ("another machine", "none", load("b", 0).boot_id)
+    ]
+    assert mine.place(near[0], near[2]).result(5) == "c"
+    assert mine.place(near[1], near[2]).result(5) in ("b", None)
+    assert mine.place(near[1]).result(5) is None
+    mine.close()
+
+
+def test_a_client_is_expected_until_its_session_is_there(monkeypatch: pytest.MonkeyPatch) -> None:
+    engine = Engine(Counting())
+    mine, _ = balance(engine)
+    mine.expect_client()
+    mine.expect_client()
+    assert mine.load().sessions == 2
+    engine.sessions.open("one")
+    assert mine.load().sessions == 2
+    monkeypatch.setattr(balancing, "_EXPECTED_S", 0.0)
+    time.sleep(0.01)
+    assert mine.load().sessions == 1
+    mine.close()
+
+
+def test_surplus_connections_go_elsewhere_with_all_their_sessions() -> None:
+    served = Replicas([Counting(), Counting()])
+    first, second = served.engines
+    agents = [served.agent() for _ in range(4)]
+    groups = [[agent, *agent.sessions(1)] for agent in agents]
+    for agents_of_one in groups:
+        agents_of_one[0].reset_batch([Obs(), Obs()], [None, None], agents_of_one)
+    for engine in served.engines:  # the in-process transport says none of the real ones' names
+        for session_id in engine.sessions.ids():
+            engine.sessions.get(session_id).transport = "shm"
+    mine, _ = balance(first, load("b", 0))
+    mine.compare()
+    assert first.drain_list._marked == set(), "a surplus of one moment moves nobody"
+    mine.compare()
+    served.prefer = 1
+    for step in range(1, 5):
+        for agents_of_one in groups:
+            for act in agents_of_one[0].act_batch([Obs(), Obs()], agents_of_one):
+                assert isinstance(act, Act)
+                assert act.action[0] == step
+                assert "resumed" not in act.info
+    assert (len(first.sessions), len(second.sessions)) == (4, 4)
+    for agents_of_one in groups:
+        for agent in agents_of_one:
+            agent.close()
+    assert (len(first.sessions), len(second.sessions)) == (0, 0)
+    mine.close()
+    served.close()
+
+
+def test_a_session_closed_after_it_was_told_to_go_is_forgotten() -> None:
+    served = Replicas([Counting()])
+    agent = served.agent()
+    agent.reset(Obs())
+    [engine] = served.engines
+    engine.drain_list.mark(set(engine.sessions.by_connection(("in process",), 60)))
+    agent.act(Obs())
+    agent.close()
+    assert len(engine.sessions) == 0
+    served.close()

@@ -1,0 +1,443 @@
+"""Sessions that move: never two of one, nor none, and never an older state in place of a newer one. No Ray."""
+
+from __future__ import annotations
+
+import asyncio
+import queue
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from eval_fakes import wait_for
+from in_process_replicas import Replicas, export, version_of
+
+from vlagents_ray import Act, Agent, Obs
+from vlagents_ray.errors import DeadlineExceeded, OutcomeUnknown, UnknownSession
+from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.engine.dispatch import Dispatcher
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.scaling import held_sessions, session_migration
+from vlagents_ray.serve.scaling.held_sessions import PEER_METHODS, Peer
+
+
+class Counting(Agent):
+    """Says what it obeys and how often it has acted; waits at a gate where it is told to."""
+
+    gate = threading.Event()
+    entered: queue.SimpleQueue[str] = queue.SimpleQueue()
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self.instruction, self.acts = instruction, 0
+        self._wait(kwargs.get("wait"))
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        self.acts += 1
+        self._wait(obs.info.get("wait"))
+        return Act(np.array([self.acts], np.float32), info={"obeys": self.instruction})
+
+    def _wait(self, wait: Any) -> None:
+        if wait:
+            self.entered.put("")
+            assert self.gate.wait(20)
+
+
+@pytest.fixture
+def replicas() -> Iterator[Callable[[int], Replicas]]:
+    made: list[Replicas] = []
+    Counting.gate.clear()
+
+    def make(n: int) -> Replicas:
+        made.append(Replicas([Counting() for _ in range(n)]))
+        return made[-1]
+
+    yield make
+    Counting.gate.set()
+    for each in made:
+        each.close()
+
+
+def send(engine: Engine, op: Any, name: str = "robot-1", wait: bool = False, **fields: Any) -> queue.SimpleQueue[Reply]:
+    """As a plain HTTP client; where the answer will come."""
+    replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
+    obs = Obs(info={"wait": True} if wait and op == "act" else {})
+    if wait and op == "reset":
+        fields["kwargs"] = {"wait": True}
+    sender = Dispatcher(engine, "http", name, connected=False, caller=NoKey.OPEN)
+    sender.send([Request(op, obs, **fields)], lambda answers: replies.put(answers[0]))
+    return replies
+
+
+def ask(engine: Engine, op: Any, name: str = "robot-1", **fields: Any) -> Reply:
+    return send(engine, op, name, **fields).get(timeout=20)
+
+
+def obeys(engine: Engine, name: str = "robot-1") -> tuple[str, int]:
+    reply = ask(engine, "act", name)
+    if reply.error is not None:
+        raise reply.error
+    assert reply.act is not None
+    return reply.act.info["obeys"], int(reply.act.action[0])
+
+
+def serve(replicas: Replicas, number: int, method: str, *args: Any) -> Any:
+    """As another replica asks."""
+    work = PEER_METHODS[method](replicas.migrators[number].held, *args)
+    return asyncio.run_coroutine_threadsafe(work, replicas._loop).result(20)
+
+
+def cut_off(replicas: Replicas) -> None:
+    """No replica hears of the others."""
+
+    async def nobody() -> Sequence[Peer]:
+        return []
+
+    for number in range(len(replicas.engines)):
+        replicas.migrators[number]._peers = nobody
+
+
+def test_an_older_episode_never_takes_the_place_of_a_newer_one(replicas: Callable[[int], Replicas]) -> None:
+    served = replicas(2)
+    cut_off(served)
+    a, b = served.engines
+    ask(a, "reset", instruction="episode 1")
+    ask(a, "act")
+    ask(b, "reset", instruction="episode 2")
+    state = export(a, "robot-1")
+    assert state is not None
+    with pytest.raises(UnknownSession, match="newer"):
+        b.transfer.adopt("robot-1", state)
+    assert obeys(b) == ("episode 2", 1)
+
+
+def test_a_newer_episode_takes_the_place_of_one_that_was_left_behind(replicas: Callable[[int], Replicas]) -> None:
+    served = replicas(2)
+    cut_off(served)
+    a, b = served.engines
+    ask(a, "reset", instruction="episode 1")
+    ask(b, "reset", instruction="episode 2")
+    state = export(b, "robot-1")
+    assert state is not None
+    a.transfer.adopt("robot-1", state)
+    assert obeys(a) == ("episode 2", 1)
+
+
+def test_a_reset_under_way_is_not_overtaken_by_what_it_ends(replicas: Callable[[int], Replicas]) -> None:
+    served = replicas(2)
+    cut_off(served)
+    a, b = served.engines
+    ask(a, "reset", instruction="episode 1")
+    answers = send(b, "reset", instruction="episode 2", wait=True)
+    Counting.entered.get(timeout=20)
+    state = export(a, "robot-1")
+    assert state is not None
+    with pytest.raises(UnknownSession):
+        b.transfer.adopt("robot-1", state)
+    Counting.gate.set()
+    assert answers.get(timeout=20).error is None
+    assert obeys(b) == ("episode 2", 1)
+
+
+def test_a_reset_that_comes_late_ends_no_newer_episode(replicas: Callable[[int], Replicas]) -> None:
+    served = replicas(2)
+    cut_off(served)
+    a, b = served.engines
+    ask(b, "reset", "other")
+    busy = send(b, "act", "other", wait=True)
+    Counting.entered.get(timeout=20)
+    late = send(b, "reset", instruction="given up")
+    ask(a, "reset", instruction="episode 2")
+    state = export(a, "robot-1")
+    assert state is not None
+    b.transfer.adopt("robot-1", state)
+    Counting.gate.set()
+    assert busy.get(timeout=20).error is None
+    assert isinstance(late.get(timeout=20).error, UnknownSession)
+    assert obeys(b) == ("episode 2", 1)
+
+
+def test_a_session_that_was_closed_does_not_come_back(replicas: Callable[[int], Replicas]) -> None:
+    served = replicas(2)
+    cut_off(served)
+    a, b = served.engines
+    ask(a, "reset", instruction="episode 1")
+    state = export(a, "robot-1")
+    assert state is not None
+    b.transfer.adopt("robot-1", state)
+    ask(b, "act")
+    ask(b, "close")
+    for engine in (b, a):
+        if engine is b:
+            with pytest.raises(UnknownSession, match="newer"):
+                engine.transfer.adopt("robot-1", state)
+    assert len(b.sessions) == 0
+
+
+def test_where_a_session_is_reset_the_others_forget_it(replicas: Callable[[int], Replicas]) -> None:
+    served = replicas(3)
+    for engine in served.engines:
+        ask(engine, "reset", instruction="an episode")
+    wait_for(lambda: [len(engine.sessions) for engine in served.engines] == [0, 0, 1])
+    ask(served.engines[2], "reset", instruction="the next one")
+    assert obeys(served.engines[0]) == ("the next one", 1)
+
+
+def test_clocks_that_differ_do_not_make_an_episode_old_that_its_client_knows_to_be_new(
+    replicas: Callable[[int], Replicas],
+) -> None:
+    served = replicas(2)
+    cut_off(served)
+    a, b = served.engines
+    a.sessions._clock = lambda: 2 * 10**18
+    step = ask(a, "reset", instruction="episode 1").step
+    newer = ask(b, "reset", instruction="episode 2", step=step).step
+    assert step is not None
+    assert newer is not None
+    assert newer > step
+    assert isinstance(ask(a, "act", step=newer).error, UnknownSession)
+    assert ask(b, "act", step=newer).error is None
+
+
+def test_of_two_states_that_a_fault_left_the_newest_moves(replicas: Callable[[int], Replicas]) -> None:
+    served = replicas(3)
+    a, b, c = served.engines
+    peers = served.migrators[0]._peers, served.migrators[1]._peers
+    cut_off(served)
+    for engine, text in ((a, "old"), (b, "new")):
+        ask(engine, "reset", instruction=text)
+    served.migrators[0]._peers, served.migrators[1]._peers = peers
+    served.migrators[2]._peers = lambda: served._others(2)
+    assert obeys(c) == ("new", 1)
+    wait_for(lambda: len(a.sessions) == 0)
+    assert len(b.sessions) == 0
+
+
+def test_a_session_whose_export_takes_too_long_stays(
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = replicas(2)
+    a, b = served.engines
+    monkeypatch.setattr(held_sessions, "EXPORT_S", 0.1)
+    monkeypatch.setattr(session_migration, "EXPORT_S", 0.1)
+    ask(a, "reset", instruction="episode 1")
+    ask(a, "reset", "other")
+    busy = send(a, "act", "other", wait=True)
+    Counting.entered.get(timeout=20)
+    assert isinstance(ask(b, "act").error, UnknownSession)
+    version = a.sessions.held(["robot-1"])["robot-1"]
+    assert serve(served, 0, "release", "robot-1", version, "claim") is False
+    Counting.gate.set()
+    assert busy.get(timeout=20).error is None
+    assert obeys(a) == ("episode 1", 1)
+
+
+def test_a_session_that_goes_on_while_it_is_copied_is_not_released(replicas: Callable[[int], Replicas]) -> None:
+    served = replicas(2)
+    a, _ = served.engines
+    ask(a, "reset", instruction="episode 1")
+    state = serve(served, 0, "copy", "robot-1")
+    assert obeys(a) == ("episode 1", 1)
+    assert serve(served, 0, "release", "robot-1", version_of(state), "claim") is False
+    assert obeys(a) == ("episode 1", 2)
+
+
+def test_what_comes_twice_or_late_changes_nothing(replicas: Callable[[int], Replicas]) -> None:
+    served = replicas(3)
+    a, b, c = served.engines
+    ask(a, "reset", instruction="episode 1")
+    state = serve(served, 0, "copy", "robot-1")
+    assert serve(served, 0, "release", "robot-1", version_of(state), "one") is True
+    assert serve(served, 0, "release", "robot-1", version_of(state), "another") is False
+    assert serve(served, 0, "release", "robot-1", version_of(state), "one") is True
+    for _ in range(2):
+        assert serve(served, 1, "take_over", "robot-1", state) is True
+    assert obeys(c) == ("episode 1", 1)  # fetched from there
+    for number in (1, 2):
+        assert serve(served, number, "take_over", "robot-1", state) is True  # it need not be given to another one
+    assert [len(engine.sessions) for engine in (a, b, c)] == [0, 0, 1]
+    returned = serve(served, 2, "copy", "robot-1")
+    assert serve(served, 2, "release", "robot-1", version_of(returned), "two") is True
+    assert serve(served, 0, "take_over", "robot-1", returned) is True
+    serve(served, 0, "release", "robot-1", version_of(state), "one")
+    assert obeys(a) == ("episode 1", 2)
+
+
+def test_a_slow_replica_that_was_given_a_session_is_waited_for(
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = replicas(3)
+    a, b, c = served.engines
+    for number in range(20):
+        ask(a, "reset", f"robot-{number}", instruction=f"{number}")
+    under_way: list[int] = []
+    release = threading.Event()
+    adopt = b.transfer.adopt
+
+    def slow(*args: Any) -> None:
+        under_way.append(1)
+        assert release.wait(20)
+        adopt(*args)
+
+    monkeypatch.setattr(b.transfer, "adopt", slow)
+    given = threading.Thread(target=served.hand_over, args=[0])
+    given.start()
+    wait_for(lambda: len(c.sessions) == 10 and len(under_way) > 3)  # of several at a time
+    release.set()
+    given.join(20)
+    assert [len(engine.sessions) for engine in (a, b, c)] == [0, 10, 10]
+    for number in range(20):
+        engine = b if f"robot-{number}" in b.sessions else c
+        assert obeys(engine, f"robot-{number}") == (f"{number}", 1)
+
+
+def test_no_request_waits_for_a_replica_that_hangs_while_it_is_to_release_a_session(
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = replicas(2)
+    a, b = served.engines
+    ask(a, "reset", instruction="episode 1")
+    monkeypatch.setattr(session_migration, "_ANSWER_S", 1.0)
+    hangs, ends = threading.Event(), threading.Event()
+    old = served.migrators[0].held
+    release, held = old.release, old.held
+
+    async def hang() -> None:
+        while hangs.is_set() and not ends.is_set():
+            await asyncio.sleep(0.01)
+
+    async def released(*args: Any) -> bool:
+        hangs.set()
+        await hang()
+        return await release(*args)
+
+    async def answered(*args: Any) -> Any:
+        await hang()
+        return await held(*args)
+
+    monkeypatch.setattr(old, "release", released)
+    monkeypatch.setattr(old, "held", answered)
+    try:
+        assert isinstance(ask(b, "act").error, UnknownSession)  # upon which a client begins its episode again
+        assert [len(engine.sessions) for engine in (a, b)] == [1, 0], "the copy waits all the same"
+    finally:
+        ends.set()
+    wait_for(lambda: [len(engine.sessions) for engine in (a, b)] == [0, 1])
+    assert obeys(b) == ("episode 1", 1)
+
+
+def test_a_session_on_its_way_to_another_replica_is_waited_for(
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = replicas(3)
+    a, b, c = served.engines
+    ask(a, "reset", instruction="episode 1")
+    on_its_way, release = threading.Event(), threading.Event()
+    adopt = b.transfer.adopt
+
+    def slow(*args: Any) -> None:
+        on_its_way.set()
+        assert release.wait(20)
+        adopt(*args)
+
+    monkeypatch.setattr(b.transfer, "adopt", slow)
+    given = threading.Thread(target=served.hand_over, args=[0])
+    given.start()
+    assert on_its_way.wait(20)
+    answer = send(c, "act")
+    threading.Timer(0.5, release.set).start()
+    reply = answer.get(timeout=20)
+    assert reply.error is None
+    given.join(20)
+    assert [len(engine.sessions) for engine in (a, b, c)] == [0, 0, 1]
+
+
+def test_an_act_whose_deadline_passed_while_its_session_was_fetched_is_not_executed(
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = replicas(2)
+    a, b = served.engines
+    ask(a, "reset", instruction="episode 1")
+    release, adopting = threading.Event(), threading.Event()
+    prepare = b.transfer.prepare
+
+    def slow(*args: Any) -> Any:
+        adopting.set()
+        assert release.wait(20)
+        return prepare(*args)
+
+    monkeypatch.setattr(b.transfer, "prepare", slow)
+
+    async def late(timed: bool) -> list[Reply]:
+        request = Request("act", Obs(), deadline_ms=50)
+        sender = Dispatcher(b, "http", "robot-1", connected=False, caller=NoKey.OPEN)
+        if timed:  # as HTTP and the proxied WebSocket
+            return await sender.ask([request])
+        answers: queue.SimpleQueue[list[Reply]] = queue.SimpleQueue()  # as shared memory and the replica's own port
+        sender.send([request], answers.put)
+        await asyncio.sleep(0.1)
+        release.set()
+        return answers.get(timeout=20)
+
+    for timed in (True, False):
+        [reply] = asyncio.run(late(timed))
+        assert isinstance(reply.error, DeadlineExceeded)
+        assert not isinstance(reply.error, OutcomeUnknown)
+    wait_for(lambda: "robot-1" in b.sessions)
+    assert obeys(b) == ("episode 1", 1)
+
+
+def test_an_act_that_was_begun_before_its_deadline_is_said_to_be(replicas: Callable[[int], Replicas]) -> None:
+    engine = replicas(1).engines[0]
+    ask(engine, "reset", instruction="episode 1")
+
+    async def late(wait: bool) -> Reply:
+        request = Request("act", Obs(info={"wait": wait}), deadline_ms=50)
+        [reply] = await Dispatcher(engine, "http", "robot-1", connected=False, caller=NoKey.OPEN).ask([request])
+        return reply
+
+    assert isinstance(asyncio.run(late(True)).error, OutcomeUnknown)
+    assert type(asyncio.run(late(False)).error) is DeadlineExceeded
+    Counting.gate.set()
+    assert obeys(engine) == ("episode 1", 2)
+
+
+def test_made_up_sessions_keep_no_other_from_moving(
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = replicas(2)
+    a, b = served.engines
+    ask(a, "reset", instruction="episode 1")
+    questions: list[int] = []
+    held = a.sessions.held
+
+    def counted(names: Any) -> Any:
+        questions.append(len(names))
+        return held(names)
+
+    monkeypatch.setattr(a.sessions, "held", counted)
+    made_up = [Request("act", Obs(), session=f"none-{i}") for i in range(400)]
+    answers: queue.SimpleQueue[list[Reply]] = queue.SimpleQueue()
+    Dispatcher(b, "websocket", "x", connected=True, caller=NoKey.OPEN).send(
+        [Request("reset", Obs()), *made_up], answers.put
+    )  # its own session comes first, without which it may not act
+    assert obeys(b) == ("episode 1", 1)
+    replies = answers.get(timeout=20)
+    assert sum(isinstance(reply.error, UnknownSession) for reply in replies) == 400
+    assert len(questions) < 40, "each search asked by itself"
+
+
+def test_who_looks_for_too_many_sessions_is_refused_alone(
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = replicas(2)
+    monkeypatch.setattr(session_migration, "_PENDING", 3)
+    migrator, told = served.migrators[1], threading.Semaphore(0)
+    assert [migrator.fetch(f"none-{i}", told.release, "one") for i in range(5)] == [True] * 3 + [False] * 2
+    assert migrator.fetch("none-0", told.release, "another")
+    for _ in range(4):
+        assert told.acquire(timeout=20)
+    assert migrator.fetch("none-5", told.release, "one")
+    assert told.acquire(timeout=20)

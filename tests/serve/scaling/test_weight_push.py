@@ -1,0 +1,261 @@
+"""New weights for several replicas: all of them, or none; and replicas that die or start meanwhile."""
+
+from __future__ import annotations
+
+import asyncio
+import queue
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from vlagents_ray.errors import InvalidWeights, Overloaded, PolicyUnavailable, UnchangedWeights
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.scaling.held_sessions import PeerEnded, PeerUnreachable
+from vlagents_ray.serve.scaling.weight_push import OwnWeights, WeightPusher, WeightsReplica
+from vlagents_ray.serve.weights.updates import PushOptions, PushResult
+
+
+class Gain(Agent):
+    """Acts with its one parameter, whose length may differ between replicas."""
+
+    trainable: ClassVar[str | None] = "tree"
+
+    def __init__(self, length: int = 2) -> None:
+        self.length = length
+
+    def initialize(self) -> None:
+        self.tree = {"gain": np.zeros(self.length, np.float32)}
+
+    def act(self, obs: Obs) -> Act:
+        return Act(self.tree["gain"].copy())
+
+
+class Replica(OwnWeights):
+    """A replica in this process, of which the calls of other replicas fail on demand."""
+
+    def __init__(self, name: str, agent: Agent) -> None:
+        self.engine = Engine(agent)
+        self.engine.start()
+        super().__init__(name, self.engine.weights)
+        self.fails: dict[str, Exception] = {}
+        self.calls: list[str] = []
+
+    def seen_by_others(self) -> WeightsReplica:
+        """The replica as others call it."""
+        return _Seen(self)
+
+    def gain(self, session: str = "s", *, reset: bool = True) -> tuple[int, float]:
+        """The version and the gain with which a simulation acts."""
+        replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
+        if reset:
+            self.engine.submit(session, Request("reset", Obs(), rank="simulation"), replies.put)
+            assert replies.get(timeout=30).error is None
+        self.engine.submit(session, Request("act", Obs()), replies.put)
+        act = replies.get(timeout=30).act
+        assert act is not None
+        return act.info["policy"]["version"], float(act.action[0])
+
+
+class _Seen:
+    def __init__(self, replica: Replica) -> None:
+        self._replica = replica
+        self.name = replica.name
+
+    def __getattr__(self, method: str) -> Callable[..., Awaitable[Any]]:
+        async def call(*args: Any) -> Any:
+            self._replica.calls.append(method)
+            if method in self._replica.fails:
+                raise self._replica.fails[method]
+            return await getattr(self._replica, method)(*args)
+
+        return call
+
+
+class Application:
+    """Replicas that know each other."""
+
+    def __init__(self) -> None:
+        self.replicas: list[Replica] = []
+
+    def start(self, *agents: Agent) -> list[Replica]:
+        """More replicas."""
+        begun = [Replica(f"r{len(self.replicas) + i}", agent) for i, agent in enumerate(agents)]
+        self.replicas += begun
+        return begun
+
+    def pusher(self, own: Replica) -> WeightPusher:
+        """Pushes as that replica does."""
+
+        async def others() -> list[WeightsReplica]:
+            return [replica.seen_by_others() for replica in self.replicas if replica is not own]
+
+        return WeightPusher(own, others)
+
+    def push(self, gain: float, options: PushOptions = PushOptions(), at: int = 0) -> PushResult:  # noqa: B008 - frozen
+        """Push by way of the replica at that index."""
+        return asyncio.run(self.pusher(self.replicas[at]).push(_gains(gain), options))
+
+    def catch_up(self, own: Replica) -> int:
+        """As that replica does."""
+        return asyncio.run(self.pusher(own).catch_up())
+
+    def gains(self) -> list[tuple[int, float]]:
+        """What each replica acts with."""
+        return [replica.gain() for replica in self.replicas]
+
+
+def _gains(gain: float) -> Mapping[str, Any]:
+    return {"gain": np.full(2, gain, np.float32)}
+
+
+@pytest.fixture
+def app() -> Iterator[Application]:
+    found = Application()
+    yield found
+    for replica in found.replicas:
+        replica.engine.close()
+
+
+def test_the_replica_that_coordinates_a_push_notes_its_duration(app: Application) -> None:
+    first, other = app.start(Gain(), Gain())
+    app.push(5)
+    with pytest.raises(UnchangedWeights):
+        app.push(5)
+    assert [took_ms > 0 for took_ms in first.engine.weights.collect_pushes_ms()] == [True]
+    assert first.engine.weights.collect_pushes_ms() == other.engine.weights.collect_pushes_ms() == []
+
+
+def test_all_replicas_act_with_a_push_by_way_of_any(app: Application) -> None:
+    app.start(Gain(), Gain(), Gain())
+    first = app.push(5)
+    assert (first.version, first.replicas) == (1, ("r0", "r1", "r2"))
+    assert app.gains() == [(1, 5.0)] * 3
+    assert app.push(6, at=2).version == 2
+    assert app.gains() == [(2, 6.0)] * 3
+
+
+def test_if_one_replica_refuses_none_acts_with_it(app: Application) -> None:
+    app.start(Gain(), Gain(length=3), Gain())
+    with pytest.raises(InvalidWeights, match=r"'gain': got shape \(2,\), want \(3,\)"):
+        app.push(5)
+    assert app.gains() == [(0, 0.0)] * 3
+    app.replicas.pop(1).engine.close()
+    assert app.push(5).replicas == ("r0", "r2")  # nothing is left of the refused push
+
+
+def test_what_changes_nothing_is_refused_everywhere(app: Application) -> None:
+    app.start(Gain(), Gain())
+    app.push(5)
+    with pytest.raises(UnchangedWeights):
+        app.push(5)
+    assert app.push(5, PushOptions(allow_same=True)).version == 2
+
+
+def test_if_one_replica_cannot_be_reached_none_acts_with_it(app: Application) -> None:
+    _, far = app.start(Gain(), Gain())
+    far.fails["stage_weights"] = PeerUnreachable("no route")
+    with pytest.raises(PolicyUnavailable, match="replica r1 cannot be reached, so that nothing was changed"):
+        app.push(5)
+    far.fails.clear()
+    assert app.gains() == [(0, 0.0)] * 2
+    app.push(5)
+
+
+@pytest.mark.parametrize("phase", ["newest_weights", "stage_weights", "commit_weights"])
+def test_a_replica_that_ends_does_not_hold_up_the_others(app: Application, phase: str) -> None:
+    _, ending, _ = app.start(Gain(), Gain(), Gain())
+    ending.fails[phase] = PeerEnded("killed")
+    assert app.push(5).replicas == ("r0", "r2")
+    assert [app.replicas[0].gain(), app.replicas[2].gain()] == [(1, 5.0)] * 2
+
+
+def test_a_push_beside_another_is_refused_and_leaves_that_one_alone(app: Application) -> None:
+    app.start(Gain(), Gain())
+    app.replicas[1].engine.weights.stage(1, _gains(7), PushOptions())  # by another coordinator
+    with pytest.raises(Overloaded, match="another push is under way"):
+        app.push(5)
+    app.replicas[1].engine.weights.commit(1, PushOptions())
+    assert app.gains() == [(0, 0.0), (1, 7.0)]
+
+
+def test_a_replica_that_starts_later_takes_the_newest_and_the_pinned_version(app: Application) -> None:
+    app.start(Gain())
+    app.push(5, PushOptions(pin=True))
+    app.push(6)
+    app.push(7)
+    [late] = app.start(Gain())
+    assert app.catch_up(late) == 3
+    assert late.engine.weights.describe() == app.replicas[0].engine.weights.describe()
+    assert late.gain() == (3, 7.0)
+    assert app.catch_up(late) == 3  # nothing to do
+    assert app.push(8, at=1).version == 4
+
+
+def test_a_replica_that_loads_does_not_hold_up_the_others_and_one_that_is_lost_does(app: Application) -> None:
+    _, other = app.start(Gain(), Gain())
+    pusher = app.pusher(app.replicas[0])
+    for error in (PeerUnreachable("no answer"), PolicyUnavailable("the policy is loading")):
+        other.fails["newest_weights"] = error
+        pushed = asyncio.run(pusher.push(_gains(len(str(error))), PushOptions()))
+        assert pushed.replicas == ("r0",)
+    other.fails.clear()
+    assert app.catch_up(other) == 2
+    asyncio.run(pusher.push(_gains(5), PushOptions()))
+    other.fails["newest_weights"] = PeerUnreachable("no answer")
+    with pytest.raises(PolicyUnavailable, match="replica r1 cannot be reached"):
+        asyncio.run(pusher.push(_gains(6), PushOptions()))
+    assert app.gains() == [(3, 5.0)] * 2
+
+
+def test_a_replica_that_missed_a_commit_catches_up(app: Application) -> None:
+    _, far = app.start(Gain(), Gain())
+    far.fails["commit_weights"] = PeerUnreachable("no route")
+    result = app.push(5)
+    assert result.replicas == ("r0",)
+    assert far.calls.count("commit_weights") > 1
+    assert far.gain() == (0, 0.0)
+    far.engine.weights.drop(1)  # as after a minute
+    assert app.catch_up(far) == 1
+    assert far.gain() == (1, 5.0)
+
+
+def test_a_replica_without_others_to_ask_stays_as_it_is(app: Application) -> None:
+    mute, alone = app.start(Gain(), Gain())
+    mute.fails["newest_weights"] = PeerUnreachable("no route")
+    assert app.catch_up(alone) == 0
+
+
+def test_weights_of_another_checkpoint_are_neither_taken_nor_mixed(app: Application) -> None:
+    app.start(Gain())
+    app.push(5)
+    [other] = app.start(Gain())
+    other.engine.models.own_weights.model = ("its settings", "its digest")
+    assert app.catch_up(other) == 0
+    with pytest.raises(PolicyUnavailable, match="changing their checkpoint"):
+        app.push(6)
+    assert app.gains() == [(1, 5.0), (0, 0.0)]
+
+
+def test_values_may_be_a_reference_that_each_replica_resolves(app: Application) -> None:
+    app.start(Gain(), Gain())
+
+    class Reference:
+        def __await__(self) -> Any:
+            return asyncio.sleep(0, _gains(5)).__await__()
+
+    asyncio.run(app.pusher(app.replicas[0]).push([Reference()], PushOptions()))
+    assert app.gains() == [(1, 5.0)] * 2
+
+
+def test_running_episodes_end_with_their_weights_at_every_replica(app: Application) -> None:
+    app.start(Gain(), Gain())
+    for replica in app.replicas:
+        replica.gain("old")
+    app.push(5)
+    assert [replica.gain("old", reset=False) for replica in app.replicas] == [(0, 0.0)] * 2
+    app.push(6, PushOptions("keep"))
+    assert [replica.gain("old", reset=False) for replica in app.replicas] == [(2, 6.0)] * 2

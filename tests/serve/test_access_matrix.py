@@ -1,0 +1,80 @@
+"""docs/access.md is true: each cell of its table, tried on a replica with API keys and all its ways in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from api_key_replica import WAYS, KeyedReplica, keyed_replica
+
+from vlagents_ray.protocol.messages import OPS
+from vlagents_ray.registry import DIALECTS
+
+PAGE = Path(__file__).parents[2] / "docs" / "access.md"
+CREDENTIALS = 9
+
+
+@dataclass(frozen=True)
+class Cell:
+    way: str
+    when: str
+    credential: str
+    stated: str
+
+
+def _cells() -> list[Cell]:
+    rows = [
+        [cell.strip() for cell in line.strip("|\n ").split("|")]
+        for line in PAGE.read_text().splitlines()
+        if line.startswith("|")
+    ]
+    (_, _, *credentials), _, *lines = rows
+    return [
+        Cell(way, when, credential, stated)
+        for way, when, *all_stated in lines
+        for credential, stated in zip(credentials, all_stated, strict=True)
+    ]
+
+
+CELLS = _cells()
+
+
+@pytest.fixture(scope="module")
+def replica(tmp_path_factory: pytest.TempPathFactory) -> Iterator[KeyedReplica]:
+    with keyed_replica(tmp_path_factory.mktemp("plasma")) as one:
+        yield one
+
+
+@pytest.mark.parametrize("cell", CELLS, ids=lambda cell: f"{cell.way}, {cell.when}, {cell.credential}")
+def test_what_the_table_says_is_so(replica: KeyedReplica, cell: Cell) -> None:
+    visitor = replica.visitor(cell.credential)
+    said = WAYS[cell.way](visitor, cell.when)
+    done = visitor.mark in replica.policy.done
+    if cell.stated in ("acts", "as simulation"):
+        assert (said in ("done", "200"), done) == (True, True), said
+        assert replica.ranks[visitor.mark] == ("ROBOT" if cell.stated == "acts" else "SIMULATION")
+        return
+    assert not done, said
+    if cell.stated != "nothing":
+        # A connection may be cut off before the request was refused.
+        assert said == cell.stated or (said == "ended" and cell.when == "after" and visitor.ends)
+
+
+def test_the_table_names_every_way_in(replica: KeyedReplica) -> None:
+    assert {cell.way for cell in CELLS} == set(WAYS)
+    assert len(CELLS) % CREDENTIALS == 0
+    assert len({(cell.way, cell.when, cell.credential) for cell in CELLS}) == len(CELLS) >= 300
+    connected = {way for way in WAYS if way.startswith("`WS") or way in ("own port", "shared memory")}
+    for way in connected:
+        assert {cell.when for cell in CELLS if cell.way == way} == {"before", "with", "after"}
+    routes = {getattr(route, "path", "") for route in _routes(replica)}
+    named = {way.strip("`").partition(" ")[2] for way in WAYS if way.startswith("`")}
+    assert routes - {"/openapi.json"} <= named | {f"/v1/{op}" for op in OPS}
+    tried = {"openpi", "roboarena", "openvla", "vla_eval", "gr00t", "vlagents"}
+    assert set(DIALECTS) == tried, "`keyed_replica` serves a new one, WAYS tries it, docs/access.md has its rows"
+
+
+def _routes(replica: KeyedReplica) -> list[object]:
+    return list(replica.routes)

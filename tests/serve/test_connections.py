@@ -1,0 +1,437 @@
+"""Who is let in at a replica's own ports, before which nothing is read, and when a connection has to end."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import os
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from asgi_server import served
+from eval_fakes import wait_for
+from in_memory_keys import ChangingKeys
+from starlette.testclient import TestClient
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+from vlagents_ray.client.agent import RemoteAgent
+from vlagents_ray.client.credentials import Credentials
+from vlagents_ray.client.transports.direct_websocket import Stream
+from vlagents_ray.client.transports.local.shm import ShmTransport
+from vlagents_ray.client.transports.probe import bytes_probe
+from vlagents_ray.errors import PolicyUnavailable, TooManyRequests, Unauthorized
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.protocol.frames import decode_reply, encode_request
+from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Limits, Request
+from vlagents_ray.serve import periodic
+from vlagents_ray.serve.access import api_keys
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.endpoints import websocket_connection
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.endpoints.local import unix_messages as local
+from vlagents_ray.serve.endpoints.local.shm import ShmServer
+from vlagents_ray.serve.endpoints.websocket import WebSocketServer
+from vlagents_ray.serve.engine.dispatch import Dispatcher
+from vlagents_ray.serve.engine.engine import Engine
+
+BASE = urlsplit("http://127.0.0.1")
+SLOW_S, IDLE_S = 0.4, 1.5
+
+
+class Seen(list[str | None]):
+    """Of all sessions together."""
+
+
+class Witness(Agent):
+    """Knows what reached it, and takes its time if it is told to."""
+
+    def __init__(self) -> None:
+        self.seen, self.hold, self.acting = Seen(), threading.Event(), threading.Event()
+        self.hold.set()
+
+    def shared_objects(self) -> list[object]:
+        return [self.seen, self.hold, self.acting]
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict[str, object]:
+        self.seen.append(instruction)
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        self.acting.set()
+        self.hold.wait(10)
+        return Act(np.zeros(2, np.float32))
+
+
+@dataclass
+class Replica:
+    engine: Engine
+    policy: Witness
+    known: ChangingKeys
+    own: WebSocketServer
+    local: ShmServer
+    clients: contextlib.ExitStack
+
+    def stream(self, token: str | None = None) -> Stream:
+        client = Stream(BASE, self.own.address.port, self.own.address.path, 5, shown(token))
+        self.clients.callback(client.close)
+        return client
+
+    def shm(self, token: str) -> ShmTransport:
+        client = ShmTransport(asdict(self.local.address), Credentials(token))
+        client.connect(5)
+        self.clients.callback(client.close)
+        return client
+
+
+def shown(token: str | None) -> dict[str, str]:
+    return {} if token is None else {"Authorization": f"Bearer {token}"}
+
+
+@contextlib.contextmanager
+def replica(*, keyed: bool = True) -> Iterator[Replica]:
+    known, policy = ChangingKeys(), Witness()
+    engine = Engine(policy, session_limit=8)
+    admit = (lambda token: known.keys.check(token, "app")) if keyed else NoKey.OPEN
+    own = WebSocketServer(engine, Limits(), "127.0.0.1", None, admit, slow_s=SLOW_S, idle_s=IDLE_S)
+    near = ShmServer(engine, Limits(), admit)
+    own.open()
+    near.open()
+    engine.start()
+    clients = contextlib.ExitStack()
+    try:
+        yield Replica(engine, policy, known, own, near, clients)
+    finally:
+        clients.close()
+        policy.hold.set()
+        engine.close()
+        own.close()
+        near.close()
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(api_keys, "_CHECK_S", 0.0)
+    monkeypatch.setattr(periodic.each_half_second, "_period_s", 0.02)
+
+
+@pytest.fixture
+def keyed() -> Iterator[Replica]:
+    with replica() as one:
+        yield one
+
+
+def handshake(path: str, *headers: str) -> bytes:
+    lines = [f"GET {path} HTTP/1.1", "Host: 127.0.0.1", "Upgrade: websocket", "Connection: Upgrade"]
+    lines += [f"Sec-WebSocket-Key: {base64.b64encode(os.urandom(16)).decode()}", "Sec-WebSocket-Version: 13", *headers]
+    return "\r\n".join([*lines, "", ""]).encode()
+
+
+def frame(payload: bytes) -> bytes:
+    mask = os.urandom(4)
+    head = bytes([0x82, 0x80 | 126]) + struct.pack(">H", len(payload))
+    return head + mask + bytes(byte ^ mask[i % 4] for i, byte in enumerate(payload))
+
+
+RESET = frame(encode_request(Request("reset", Obs(), "move to the human", session="arm/robot-1")))
+
+
+def answer(port: int, *segments: bytes) -> bytes:
+    """All that the server says until it hangs up, or for a second."""
+    said = b""
+    with socket.create_connection(("127.0.0.1", port)) as attacker, contextlib.suppress(OSError):
+        attacker.settimeout(1.0)
+        for segment in segments:
+            attacker.sendall(segment)
+        while more := attacker.recv(65536):
+            said += more
+    return said
+
+
+@pytest.mark.parametrize("apart", [False, True])
+@pytest.mark.parametrize(
+    ("path", "headers", "status"),
+    [
+        ("/no/such/path", [], 404),
+        ("", [], 401),
+        ("", ["Authorization: Bearer wrong"], 401),
+        ("", ["Authorization: Bearer vlr_elsewhere"], 403),
+        ("", ["Authorization: Bearer vlr_leaver"], 401),
+    ],
+)
+def test_what_comes_with_a_refused_handshake_is_not_read(
+    keyed: Replica, path: str, headers: list[str], status: int, apart: bool
+) -> None:
+    keyed.known.add("arm")
+    keyed.known.add("elsewhere", apps=["other"])
+    keyed.known.add("leaver", revoked=True)
+    hello = handshake(path or keyed.own.path, *headers)
+    said = answer(keyed.own.address.port, *((hello, RESET) if apart else (hello + RESET + RESET,)))
+    assert said.startswith(f"HTTP/1.1 {status}".encode())
+    wait_for(lambda: not keyed.own._clients)
+    assert keyed.policy.seen == []
+    assert len(keyed.engine.sessions) == 0
+
+
+def test_a_page_of_another_site_has_nothing_read_either() -> None:
+    with replica(keyed=False) as opened:
+        said = answer(opened.own.address.port, handshake(opened.own.path, "Origin: https://evil.example") + RESET)
+        assert said.startswith(b"HTTP/1.1 403")
+        assert opened.policy.seen == []
+
+
+@pytest.mark.parametrize("first", [RESET, b"GET / HTTP/1.1\r\n" + RESET, b"\r\n\r\n" + RESET, b"\0" * 40_000])
+def test_what_comes_without_a_handshake_is_not_read(keyed: Replica, first: bytes, monkeypatch) -> None:
+    monkeypatch.setattr(websocket_connection, "_HANDSHAKE_S", 0.2)
+    assert not answer(keyed.own.address.port, first).startswith(b"HTTP/1.1 101")
+    wait_for(lambda: not keyed.own._clients)
+    assert keyed.policy.seen == []
+
+
+@pytest.mark.parametrize("cut", [0, 1, 20, -1])
+def test_what_comes_with_a_right_handshake_is_read(keyed: Replica, cut: int) -> None:
+    token = keyed.known.add("arm")
+    whole = handshake(keyed.own.path, f"Authorization: Bearer {token}") + RESET
+    with socket.create_connection(("127.0.0.1", keyed.own.address.port)) as client:
+        for part in (whole[:cut], whole[cut:]):
+            client.sendall(part)
+            time.sleep(0.02)
+        wait_for(lambda: keyed.policy.seen == ["move to the human"])
+
+
+def test_who_forgets_to_say_whose_requests_they_are_fails(keyed: Replica) -> None:
+    with pytest.raises(TypeError, match="caller"):
+        Dispatcher(keyed.engine, "http")  # type: ignore[call-arg]
+    with pytest.raises(TypeError, match="want a Caller"):
+        Dispatcher(keyed.engine, "http", caller=None)  # type: ignore[arg-type]
+    unguarded = TestClient(build_http_app(keyed.engine, dict, Limits()), raise_server_exceptions=False)
+    assert unguarded.post("/v1/reset", json={"obs": {}}, headers={"x-session-id": "a"}).status_code == 500
+    assert keyed.policy.seen == []
+
+
+def listen_to_the_end(client: Stream) -> None:
+    while True:
+        client.recv(5)
+
+
+def half(payload: int) -> bytes:
+    """A frame's header and a part of what it announces."""
+    return bytes([0x82, 0x80 | 127]) + struct.pack(">Q", payload) + b"\0\0\0\0" + b"\0" * (payload // 2)
+
+
+def test_half_a_message_is_not_waited_for(keyed: Replica) -> None:
+    token = keyed.known.add("arm")
+    good, bad = keyed.stream(token), keyed.stream(token)
+    bad._socket.sendall(half(2**20))
+    wait_for(lambda: len(keyed.own._clients) == 1)
+    assert sum(len(client._protocol.reader.buffer) for client in keyed.own._clients) == 0
+    good.send(bytes_probe(100), 5)
+    assert good.recv(5)
+
+
+@pytest.mark.parametrize("first", [b"", b"GET / HTTP/1.1\r\nHost: x\r\n"])
+def test_who_does_not_say_what_he_wants_is_cut_off(keyed: Replica, first: bytes, monkeypatch) -> None:
+    monkeypatch.setattr(websocket_connection, "_HANDSHAKE_S", 0.2)
+    silent = [socket.create_connection(("127.0.0.1", keyed.own.address.port)) for _ in range(20)]
+    for each in silent:
+        each.sendall(first)
+    wait_for(lambda: not keyed.own._clients)
+    for each in silent:
+        each.close()
+
+
+def test_a_silent_connection_ends_and_one_that_is_used_does_not(keyed: Replica) -> None:
+    token = keyed.known.add("arm")
+    silent, used = keyed.stream(token), keyed.stream(token)
+    begun = time.monotonic()
+    while len(keyed.own._clients) > 1 or time.monotonic() - begun < 1.5 * IDLE_S:
+        used.send(bytes_probe(100), 5)
+        assert used.recv(5)
+        time.sleep(0.02)
+        assert time.monotonic() - begun < 20
+    with pytest.raises((ConnectionClosed, OSError), match="silent"):
+        listen_to_the_end(silent)
+
+
+def test_nobody_is_cut_off_because_the_policy_takes_long(keyed: Replica) -> None:
+    """It is the server then that does not read."""
+    token = keyed.known.add("arm")
+    other, waiting = keyed.stream(token), keyed.stream(token)
+    for client in (other, waiting):
+        client.send(encode_request(Request("reset", Obs())), 5)
+        client.recv(5)
+    keyed.policy.hold.clear()
+    other.send(encode_request(Request("act", Obs())), 5)
+    assert keyed.policy.acting.wait(5)
+    message = frame(encode_request(Request("act", Obs(info={"much": bytes(20_000)}))))
+    waiting._socket.sendall(message)
+    time.sleep(1.5 * IDLE_S)
+    keyed.policy.hold.set()
+    for client in (other, waiting):
+        assert decode_reply(client.recv(5)).error is None
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [({"revoked": True}, "revoked"), ({"expires": 1.0}, "expired"), ({"apps": ["x"]}, "not for")],
+)
+def test_connections_end_with_their_key_and_no_others(keyed: Replica, change: dict[str, object], said: str) -> None:
+    token, other = keyed.known.add("arm"), keyed.known.add("lab")
+    own, near = keyed.stream(token), keyed.shm(token)
+    bystander, beside = keyed.stream(other), keyed.shm(other)
+    for transport in (near, beside):
+        assert transport.call([Request("reset", Obs())], 5)[0].error is None
+    keyed.known.change("arm", **change)
+    wait_for(lambda: len(keyed.own._clients) == len(keyed.local._clients) == 1)
+    assert [name.partition("/")[0] for name in keyed.engine.sessions.ids()] == ["lab"]
+    with pytest.raises((ConnectionClosed, OSError), match=said):
+        listen_to_the_end(own)
+    bystander.send(bytes_probe(10), 5)
+    assert bystander.recv(5)
+    assert beside.call([Request("act", Obs())], 5)[0].error is None
+
+
+def test_a_revoked_key_is_cut_off_while_the_policy_takes_long(keyed: Replica) -> None:
+    token, other = keyed.known.add("arm"), keyed.known.add("lab")
+    busy, leaver = keyed.stream(other), keyed.stream(token)
+    busy.send(encode_request(Request("reset", Obs())), 5)
+    busy.recv(5)
+    keyed.policy.hold.clear()
+    busy.send(encode_request(Request("act", Obs())), 5)
+    assert keyed.policy.acting.wait(5)
+    keyed.known.change("arm", revoked=True)
+    with pytest.raises((ConnectionClosed, OSError)):
+        listen_to_the_end(leaver)
+
+
+@pytest.mark.parametrize("way", ["own", "shm"])
+def test_a_key_has_no_more_connections_than_sessions(keyed: Replica, way: str) -> None:
+    token, other = keyed.known.add("arm", sessions=2), keyed.known.add("lab")
+    first, second = keyed.stream(token), keyed.shm(token)
+    for _ in range(3):
+        if way == "own":
+            with pytest.raises(InvalidStatus) as refused:
+                keyed.stream(token)
+            assert refused.value.response.status_code == 429
+        else:
+            third = keyed.shm(token)
+            for _ in range(3):
+                assert isinstance(third.call([Request("reset", Obs(), request_id="r")], 5)[0].error, TooManyRequests)
+            keyed.known.change("arm", sessions=3)
+            wait_for(lambda: third.call([Request("reset", Obs(), request_id="s")], 5)[0].error is None)  # noqa: B023
+            keyed.known.change("arm", sessions=2)
+            third.close()
+            wait_for(lambda: len(keyed.local._clients) == 1)
+    keyed.stream(other).close()
+    second.close()
+    wait_for(lambda: not keyed.local._clients)
+    again = keyed.stream(token) if way == "own" else keyed.shm(token)
+    again.close()
+    first.close()
+    wait_for(lambda: not keyed.own._clients and not keyed.local._clients)
+    assert not keyed.known.keys._held
+
+
+def test_a_local_client_shows_its_key_soon(keyed: Replica, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(local, "_KEY_S", 0.3)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as silent:
+        silent.connect(f"\0{keyed.local.address.socket}")
+        silent.settimeout(5)
+        assert silent.recv(100) == b""
+    wrong = keyed.shm("wrong")
+    assert isinstance(wrong.call([Request("reset", Obs())], 5)[0].error, Unauthorized)
+    wait_for(lambda: not keyed.local._clients)
+    assert keyed.policy.seen == []
+
+
+def test_the_proxied_port_counts_a_keys_connections_too(keyed: Replica, serving: Callable[..., str]) -> None:
+    token = keyed.known.add("arm", sessions=1)
+    url = serving(keyed.engine, keyed.known.keys)
+    with (
+        connect(url, additional_headers=shown(token)),
+        pytest.raises(InvalidStatus) as refused,
+        connect(url, additional_headers=shown(token)),
+    ):
+        pytest.fail("was let in")
+    assert refused.value.response.status_code == 429
+    wait_for(lambda: not keyed.known.keys._held)
+    with connect(url, additional_headers=shown(token)) as again:
+        again.ping().wait(5)
+
+
+@pytest.fixture
+def serving() -> Iterator[Callable[..., str]]:
+    with contextlib.ExitStack() as stack:
+
+        def start(engine: Engine, keys: api_keys.Keys) -> str:
+            port = stack.enter_context(served(AccessMiddleware(build_http_app(engine, dict, Limits()), keys, "app")))
+            return f"ws://127.0.0.1:{port}/v1/stream"
+
+        yield start
+
+
+def test_a_full_replica_turns_away_before_it_accepts_and_says_why(keyed: Replica) -> None:
+    token = keyed.known.add("arm")
+    held = [keyed.stream(token) for _ in range(8)]
+    with pytest.raises(InvalidStatus) as refused:
+        keyed.stream(token)
+    assert refused.value.response.status_code == 503
+    assert b"limit of sessions" in (refused.value.response.body or b"")
+    assert len(held) == 8
+
+
+def test_a_client_goes_through_the_proxy_where_the_replicas_own_port_is_full(keyed: Replica) -> None:
+    token = keyed.known.add("arm")
+    about = {"policy": "p", "version": "0", "protocol": PROTOCOL_VERSION, "stream": asdict(keyed.own.address)}
+    inside = build_http_app(keyed.engine, lambda: about, Limits())
+    with served(AccessMiddleware(inside, keyed.known.keys, "app")) as port:
+
+        def agent() -> RemoteAgent:
+            return RemoteAgent(f"http://127.0.0.1:{port}", transport="websocket", api_key=token)
+
+        with agent() as direct:
+            direct.reset(Obs(), "x")
+            assert len(keyed.own._clients) == 1
+        wait_for(lambda: not keyed.own._clients)
+        for _ in range(8):
+            keyed.stream(token)
+        with agent() as proxied:
+            proxied.reset(Obs(), "x")
+            proxied.act(Obs())
+            assert len(keyed.own._clients) == 8
+
+
+def test_a_full_replica_closes_a_proxied_websocket_with_its_reason(keyed: Replica, serving: Callable[..., str]) -> None:
+    token = keyed.known.add("arm")
+    for number in range(8):
+        keyed.engine.sessions.open(f"lab/{number}")
+    with connect(serving(keyed.engine, keyed.known.keys), additional_headers=shown(token)) as late:
+        assert isinstance(decode_reply(late.recv(5)).error, PolicyUnavailable)
+        with pytest.raises(ConnectionClosed) as closed:
+            late.recv(5)
+    assert closed.value.rcvd is not None
+    assert closed.value.rcvd.code == 1013
+    assert "its limit" in closed.value.rcvd.reason
+
+
+def test_a_look_that_fails_is_followed_by_the_next(caplog: pytest.LogCaptureFixture) -> None:
+    looks = periodic.Periodic(0.01)
+    done: list[int] = []
+
+    def fail() -> None:
+        done.append(1)
+        raise RuntimeError("once more")
+
+    looks.add(fail)
+    wait_for(lambda: len(done) > 2)
+    looks.remove(fail)
+    assert looks._thread is None
+    assert "once more" in caplog.text

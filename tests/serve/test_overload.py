@@ -1,0 +1,614 @@
+"""What a message may cost is asked before it is paid: by the key's rate, by memory, and on which thread."""
+
+from __future__ import annotations
+
+import asyncio
+import http.client
+import json
+import socket
+import struct
+import threading
+import time
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from api_key_replica import (
+    WAYS,
+    KeyedReplica,
+    Visitor,
+    _Channel,
+    _read_map,
+    _read_reply,
+    _read_vla_eval,
+    keyed_replica,
+    over_gr00t,
+    over_websocket,
+)
+from dialect_server import body, libero
+from eval_fakes import wait_for
+
+import vlagents_ray
+from vlagents_ray.client.credentials import Credentials
+from vlagents_ray.client.transports.direct_websocket import Stream
+from vlagents_ray.client.transports.local.shm import ShmTransport
+from vlagents_ray.errors import DeadlineExceeded, MessageTooLarge, Overloaded, TooManyRequests, VLAgentsError
+from vlagents_ray.images import codecs, jpeg_png
+from vlagents_ray.images.codecs import decode_files
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.protocol import frame_layout
+from vlagents_ray.protocol.budget import Budget
+from vlagents_ray.protocol.frames import (
+    CONTENT_TYPE,
+    decode_replies,
+    decode_reply,
+    decode_requests,
+    encode_reply,
+)
+from vlagents_ray.protocol.messages import (
+    DEFAULT_LIMITS,
+    Limits,
+    PlasmaAddress,
+    Reply,
+    Request,
+)
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.dialects.gr00t import codec as gr00t_codec
+from vlagents_ray.serve.dialects.openpi import codec as openpi_codec
+from vlagents_ray.serve.dialects.openvla import codec as openvla_codec
+from vlagents_ray.serve.dialects.vla_eval import codec as vla_eval_codec
+from vlagents_ray.serve.endpoints import weights
+from vlagents_ray.serve.endpoints.local.shm import ShmServer
+from vlagents_ray.serve.endpoints.websocket import WebSocketServer
+from vlagents_ray.serve.engine.admission import Admission, MessageAdmission, NeedsDecodingThread
+from vlagents_ray.serve.engine.dispatch import Dispatcher
+from vlagents_ray.serve.engine.engine import Engine
+
+JPEG = jpeg_png.encode_jpeg(np.full((32, 32, 3), 9, np.uint8))
+PNG = jpeg_png.encode_png(np.full((32, 32, 3), 9, np.uint8))
+LARGE = jpeg_png.encode_jpeg(np.zeros((1100, 1000, 3), np.uint8), 1, "420")  # over a megapixel
+DECODED = 32 * 32 * 3
+SEEN = {"cameras": {"front": {"$": ["img", 0]}}}
+
+
+def frame(*requests: dict[str, Any], files: list[bytes] | None = None) -> bytes:
+    return b"".join(frame_layout.pack({"requests": list(requests)}, [JPEG] if files is None else list(files)))
+
+
+def reset(**more: Any) -> dict[str, Any]:
+    return {"op": "reset", "obs": SEEN, **more}
+
+
+def message_admission(
+    most: int = 10**9, limits: Limits = DEFAULT_LIMITS, admit: Callable[[object], bool] = lambda _: True
+) -> MessageAdmission:
+    return MessageAdmission(Admission(most), limits, admit)
+
+
+# Before anything is decoded.
+
+
+@pytest.fixture(scope="module")
+def replica(tmp_path_factory: pytest.TempPathFactory) -> Iterator[KeyedReplica]:
+    with keyed_replica(tmp_path_factory.mktemp("plasma")) as one:
+        yield one
+
+
+@pytest.fixture
+def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """By whom a message was decoded: images anywhere, or all of it by the readers of dialects of raw pixels."""
+    by: list[str] = []
+    for module, name in (
+        (jpeg_png, "decode"),
+        (weights, "read_header"),
+        (openpi_codec, "decode"),
+        (openvla_codec, "decode"),
+        (gr00t_codec, "read_request"),
+    ):
+        original = getattr(module, name)
+
+        def noted(*args: Any, original: Any = original, name: str = name, **options: Any) -> Any:
+            by.append(name)
+            return original(*args, **options)
+
+        monkeypatch.setattr(module, name, noted)
+    return by
+
+
+def _post(path: str, kind: str, content: bytes) -> Callable[[Visitor, str], str]:
+    def attempt(visitor: Visitor, _when: str) -> str:
+        visitor.become()
+        connection = http.client.HTTPConnection("127.0.0.1", visitor.replica.port, timeout=10)
+        headers = {"authorization": f"Bearer {visitor.shown}", "content-type": kind, "x-session-id": "robot-1"}
+        connection.request("POST", path, content, headers)
+        answer = connection.getresponse()
+        if answer.status == 429:
+            assert int(answer.headers["retry-after"]) >= 1
+        answer.read()
+        connection.close()
+        return str(answer.status)
+
+    return attempt
+
+
+def _form() -> tuple[str, bytes]:
+    head = '--X\r\nContent-Disposition: form-data; name="obs"\r\n\r\n{}\r\n--X\r\nContent-Disposition: form-data; '
+    return "multipart/form-data; boundary=X", head.encode() + (
+        b'name="cameras.front"; filename="a"\r\n\r\n' + JPEG + b"\r\n--X--\r\n"
+    )
+
+
+def _over_shm(visitor: Visitor, _when: str) -> str:
+    transport = ShmTransport(asdict(visitor.replica.local.address), Credentials(visitor.token))
+    transport.connect(10)
+    visitor.become()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            "vlagents_ray.client.transports.local.shm.request_parts", lambda *_: frame_layout.pack(reset(), [JPEG])
+        )
+        [reply] = transport.call([Request("reset", Obs())], 10)
+    transport.close()
+    return "done" if reply.error is None else str(reply.error.status)
+
+
+def _over_plasma(visitor: Visitor, _when: str) -> str:
+    key = visitor.name.encode().ljust(28, b"\0")
+    _Channel.frames[key] = frame(reset())
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
+        connection.settimeout(10)
+        connection.connect(visitor.replica.plasma.plasma.socket)
+        connection.send(PlasmaAddress.REQUEST.pack(key, 0))
+        return _read_reply(connection.recv(65536)[12:])
+
+
+def _image_of_vla_eval(mark: str) -> bytes:
+    image = {"__image__": True, "format": "jpeg", "data": JPEG, "shape": [32, 32, 3]}
+    seen = {"images": {"front": image}, "task_description": mark, "state": np.ones(3)}
+    return vla_eval_codec.encode(vla_eval_codec.Message("observation", seen, 3))
+
+
+def _stream(path: str) -> list[Callable[[Visitor, str], str]]:
+    return [over_websocket(path, lambda _: frame(reset()), _read_reply)]
+
+
+def _arena(mark: str) -> bytes:
+    return libero(1, mark, endpoint="infer", session_id="a")
+
+
+PUSH = "`WS /v1/weights`, scope `weights`"
+# Each way in by which something to decode comes, for a key; docs/access.md has them all.
+CARRY: dict[str, list[Callable[[Visitor, str], str]]] = {
+    "`POST /v1/reset`": [_post("/v1/reset", *_form()), _post("/v1/reset", CONTENT_TYPE, frame(reset()))],
+    "`POST /v1/act`": [_post("/v1/act", *_form()), _post("/v1/act", CONTENT_TYPE, frame({"op": "act", "obs": SEEN}))],
+    "`POST /act`": [_post("/act", "application/json", json.dumps(body(1)).encode())],
+    "`WS /v1/stream`": _stream("/v1/stream"),
+    "own port": _stream("own"),
+    "`WS /`": [over_websocket("/", lambda mark: libero(1, mark), _read_map)],
+    "`WS /openpi`": [over_websocket("/openpi", lambda mark: libero(1, mark), _read_map)],
+    "`WS /roboarena`": [over_websocket("/roboarena", _arena, _read_map)],
+    "`WS /vla-eval`": [over_websocket("/vla-eval", _image_of_vla_eval, _read_vla_eval)],
+    PUSH: [WAYS[PUSH]],
+    "shared memory": [_over_shm],
+    "GR00T's gateway, replica on its host": [over_gr00t(True)],
+    "GR00T's gateway, replica on another": [over_gr00t(False)],
+}
+NOTHING_TO_DECODE = {
+    *(way for way in WAYS if way.startswith("`GET")),
+    "`POST /v1/close`",  # is free, and nothing that it brings is decoded
+    "`POST /v1/probe`",
+    "own port, another path",  # is refused
+    "`WS /v1/weights`",  # is refused without the scope
+}
+NO_KEY = {"vlagents' gateway, `without_key: true`", "Serve handle (`serve://`)", "plasma (`serve://`)"}
+
+
+def test_a_refused_body_that_is_long_is_not_read(replica: KeyedReplica) -> None:
+    visitor = replica.visitor("over its rate")
+    visitor.become()
+    with socket.create_connection(("127.0.0.1", replica.port), timeout=10) as connection:
+        head = f"POST /v1/act HTTP/1.1\r\nhost: localhost\r\nauthorization: Bearer {visitor.token}\r\n"
+        connection.sendall(f"{head}content-length: 60000000\r\n\r\n".encode())  # none of it is here yet
+        answer = b""
+        while more := connection.recv(65536):  # until it is closed
+            answer += more
+    assert b" 429 " in answer.splitlines()[0]
+    assert b"retry-after: " in answer.lower()
+    assert b"connection: close" in answer.lower()
+
+
+def test_every_way_in_is_tried() -> None:
+    assert CARRY.keys() | NOTHING_TO_DECODE | NO_KEY == WAYS.keys()
+
+
+@pytest.mark.parametrize(("way", "number"), [(way, n) for way, tries in CARRY.items() for n in range(len(tries))])
+def test_nothing_of_a_key_over_its_rate_is_decoded(
+    replica: KeyedReplica, decoded: list[str], way: str, number: int
+) -> None:
+    attempt, when = CARRY[way][number], "with" if "gateway" in way else "after"
+    assert attempt(replica.visitor("over its rate"), when) == "429"
+    assert decoded == []
+    assert attempt(replica.visitor("right"), when) in ("done", "200", "409", "404")  # an act before a reset
+    assert decoded != []
+
+
+@pytest.mark.parametrize("way", sorted(NO_KEY))
+def test_ways_without_a_key_count_what_they_hold(
+    replica: KeyedReplica, monkeypatch: pytest.MonkeyPatch, way: str
+) -> None:
+    asked: list[int] = []
+    begin = MessageAdmission.begin
+
+    def noted(message: MessageAdmission, *args: Any) -> None:
+        asked.append(1)
+        begin(message, *args)
+
+    monkeypatch.setattr(MessageAdmission, "begin", noted)
+    visitor = replica.visitor("right")
+    assert (_over_plasma if way.startswith("plasma") else WAYS[way])(visitor, "with") == "done"
+    assert asked
+
+
+def test_nothing_that_serves_decodes_without_an_admission() -> None:
+    """A dialect that made a budget of its own would ask neither the key nor the replica."""
+    package = Path(vlagents_ray.__file__).parent
+    served = list((package / "serve").rglob("*.py"))
+    assert package / "serve/engine/admission.py" in served
+    for file in served:
+        assert "Budget(" not in file.read_text().replace("class MessageAdmission(Budget):", ""), file
+    for file in (*served, *(package / "protocol").glob("*.py")):
+        assert "jpeg_png" not in file.read_text(), file
+
+
+def test_closing_is_free_and_decodes_nothing(decoded: list[str]) -> None:
+    [answer] = decode_requests(frame({"op": "close", "obs": SEEN, "history": [SEEN]}), Budget(DEFAULT_LIMITS))
+    assert isinstance(answer, Request)
+    assert answer.obs is None
+    assert answer.history == []
+    assert decoded == []
+
+
+# What a message may take.
+
+
+def test_each_image_is_decoded_once_however_often_it_is_named(decoded: list[str]) -> None:
+    both = {"cameras": {"a": {"$": ["img", 0]}, "b": {"$": ["img", 1]}}, "info": {"again": {"$": ["img", 0]}}}
+    answers = decode_requests(
+        frame(*[{"op": "reset", "obs": both, "history": [both] * 5}] * 3, files=[JPEG, PNG]), message_admission()
+    )
+    assert all(isinstance(answer, Request) for answer in answers)
+    assert decoded == ["decode"] * 2
+
+
+def test_what_a_request_names_is_counted_each_time_and_taken_once() -> None:
+    limits = Limits(decoded_bytes=4 * DECODED)
+    held = Admission(10**9)
+    message = MessageAdmission(held, limits, lambda _: True)
+    good, bad = {"op": "reset", "obs": SEEN, "history": [SEEN] * 3}, {"op": "reset", "obs": SEEN, "history": [SEEN] * 4}
+    first, second, third = decode_requests(frame(good, bad, good), message)
+    assert isinstance(first, Request)
+    assert isinstance(second, Reply)
+    assert isinstance(second.error, MessageTooLarge)
+    assert "limits.decoded_bytes" in str(second.error)
+    assert isinstance(third, Request)
+    assert held.held == DECODED
+    message.release()
+    assert held.held == 0
+
+
+def test_what_images_declare_is_refused_before_the_first_is_decoded(decoded: list[str]) -> None:
+    with pytest.raises(MessageTooLarge):
+        decode_files([JPEG, JPEG, JPEG], Budget(Limits(decoded_bytes=2 * DECODED)))
+    with pytest.raises(MessageTooLarge, match=r"limits\.pixels"):
+        decode_files([PNG], Budget(Limits(pixels=32 * 31)))
+    assert decoded == []
+
+
+def test_4k_cameras_pass_by_default() -> None:
+    limits = DEFAULT_LIMITS
+    assert max(3840 * 2160, 4096 * 2160) <= limits.pixels
+    assert limits.decoded_bytes >= 3 * 4 * 3840 * 2160  # four of them at once
+    assert 4 * limits.decoded_bytes <= limits.in_flight_bytes
+
+
+def test_a_png_that_changes_its_mind_about_its_size_is_refused() -> None:
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(data, zlib.crc32(kind)))
+
+    def header(side: int) -> bytes:
+        return chunk(b"IHDR", struct.pack(">2I5B", side, side, 8, 2, 0, 0, 0))
+
+    data = chunk(b"IDAT", zlib.compress(bytes(64 * (1 + 64 * 3))))
+    liar = PNG[:8] + header(8) + header(64) + data + chunk(b"IEND", b"")
+    assert jpeg_png.size(liar) == (8, 8)
+    with pytest.raises(VLAgentsError, match="PNG"):
+        jpeg_png.decode(liar)
+
+
+def test_robots_have_a_share_of_the_memory_for_themselves() -> None:
+    whole = Admission(8 * DECODED)
+
+    def message(rank: str) -> tuple[MessageAdmission, VLAgentsError | None]:
+        one = MessageAdmission(whole, DEFAULT_LIMITS, lambda _: True)
+        [answer] = decode_requests(frame(reset(rank=rank)), one)
+        return one, answer.error if isinstance(answer, Reply) else None
+
+    simulations = [message("simulation") for _ in range(6)]
+    assert [error for _, error in simulations] == [None] * 6
+    refused = message("simulation")[1]
+    assert isinstance(refused, Overloaded)
+    assert (refused.status, refused.retry_after_s) == (503, 1.0)
+    robots = [message("robot") for _ in range(2)]
+    assert [error for _, error in robots] == [None] * 2
+    assert isinstance(message("robot")[1], Overloaded)
+    del simulations[0]  # answered, or dropped
+    assert message("robot")[1] is None
+    assert isinstance(message("simulation")[1], Overloaded)  # what robots have taken is theirs
+
+
+def test_a_message_that_will_never_fit_is_not_told_to_wait() -> None:
+    small = Admission(DECODED)
+    [answer] = decode_requests(frame(reset(rank="simulation")), MessageAdmission(small, DEFAULT_LIMITS, lambda _: True))
+    assert isinstance(answer, Reply)
+    assert isinstance(answer.error, MessageTooLarge)
+    assert "limits.in_flight_bytes" in str(answer.error)
+
+
+def test_how_long_to_wait_travels_with_the_refusal() -> None:
+    for error in (TooManyRequests("x"), Overloaded("x")):
+        error.retry_after_s = 2.5
+        told = decode_reply(encode_reply(Reply(error=error))).error
+        assert type(told) is type(error)
+        assert told.retry_after_s == 2.5  # type: ignore[union-attr]
+
+
+# On which thread.
+
+
+class Sees(Agent):
+    """Answers how high the camera's image is."""
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        return Act(np.array([obs.cameras["front"].shape[0]], np.float32))
+
+
+@pytest.fixture
+def held_up(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[threading.Event, list[str]]]:
+    """Large images are decoded once the event is set; the names of the threads that decode them."""
+    go_on, threads, original = threading.Event(), [], jpeg_png.decode
+
+    def decode(data: Any, most: int = 0) -> np.ndarray:
+        image = original(data, most)
+        if image.shape[0] > 1000:
+            threads.append(threading.current_thread().name)
+            assert go_on.wait(30)
+        return image
+
+    monkeypatch.setattr(jpeg_png, "decode", decode)
+    yield go_on, threads
+    go_on.set()
+
+
+@pytest.fixture
+def endpoints() -> Iterator[tuple[WebSocketServer, ShmServer]]:
+    engine = Engine(Sees())
+    own = WebSocketServer(engine, Limits(), "127.0.0.1", None, NoKey.OPEN)
+    near = ShmServer(engine, Limits(), NoKey.OPEN)
+    own.open(), near.open()
+    engine.start()
+    yield own, near
+    engine.close()
+    own.close(), near.close()
+    assert engine.admission.held == 0
+
+
+def _connected(own: WebSocketServer) -> Stream:
+    return Stream(urlsplit("http://127.0.0.1"), own.address.port, own.address.path, 10)
+
+
+def act(file: bytes, name: str, **more: Any) -> bytes:
+    return b"".join(frame_layout.pack({"op": "act", "obs": SEEN, "request_id": name, **more}, [file]))
+
+
+@pytest.mark.parametrize(("rank", "threads"), [("simulation", "decode-others"), ("robot", "decode-robots")])
+def test_a_robot_is_answered_while_anothers_image_is_decoded_and_order_is_kept(
+    endpoints: tuple[WebSocketServer, ShmServer], held_up: tuple[threading.Event, list[str]], rank: str, threads: str
+) -> None:
+    go_on, decoders = held_up
+    own, near = endpoints
+    robot, other = _connected(own), _connected(own)
+    local = ShmTransport(asdict(near.address), Credentials(""))
+    local.connect(10)
+    for client in (robot, other):
+        client.send(frame(reset()), 10)
+        assert decode_replies(client.recv(10))[0].error is None
+    small = Obs({"front": np.zeros((8, 8, 3), np.uint8)})
+    assert local.call([Request("reset", small)], 10)[0].error is None
+    other.send(act(LARGE, "large", rank=rank), 10)
+    other.send(act(JPEG, "small", rank=rank), 10)
+    wait_for(lambda: decoders != [])
+    assert decoders[0].startswith(threads)
+    for _ in range(3):
+        robot.send(act(JPEG, "robot"), 10)
+        assert decode_replies(robot.recv(10))[0].act is not None
+        assert local.call([Request("act", small)], 10)[0].act is not None
+    go_on.set()
+    first, second = decode_replies(other.recv(10))[0], decode_replies(other.recv(10))[0]
+    assert [(one.request_id, one.act.action.tolist()) for one in (first, second) if one.act] == [
+        ("large", [1100.0]),
+        ("small", [32.0]),
+    ]
+    assert len(decoders) == 1
+    for client in (robot, other, local):
+        client.close()
+
+
+def test_a_frame_that_waits_for_another_to_be_decoded_spends_its_own_deadline(
+    endpoints: tuple[WebSocketServer, ShmServer], held_up: tuple[threading.Event, list[str]]
+) -> None:
+    go_on, decoders = held_up
+    client = _connected(endpoints[0])
+    client.send(frame(reset()), 10)
+    assert decode_replies(client.recv(10))[0].error is None
+    client._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_CORK, 1)  # both are read at once
+    client.send(act(LARGE, "large"), 10)
+    client.send(act(JPEG, "small", deadline_ms=200), 10)
+    client._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_CORK, 0)
+    wait_for(lambda: decoders != [])
+    time.sleep(0.3)  # the deadline
+    go_on.set()
+    assert decode_replies(client.recv(10))[0].act is not None
+    assert isinstance(decode_replies(client.recv(10))[0].error, DeadlineExceeded)
+    client.close()
+
+
+def test_a_frame_in_shared_memory_is_decoded_beside_the_policy_too(
+    endpoints: tuple[WebSocketServer, ShmServer],
+    held_up: tuple[threading.Event, list[str]],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    go_on, decoders = held_up
+    own, near = endpoints
+    robot = _connected(own)
+    robot.send(frame(reset()), 10)
+    assert decode_replies(robot.recv(10))[0].error is None
+    local = ShmTransport(asdict(near.address), Credentials(""))
+    local.connect(10)
+    large = frame_layout.pack(reset(), [LARGE])
+    monkeypatch.setattr("vlagents_ray.client.transports.local.shm.request_parts", lambda *_: large)
+    answers: list[Reply] = []
+    asking = threading.Thread(target=lambda: answers.extend(local.call([Request("reset", Obs())], 30)))
+    asking.start()
+    wait_for(lambda: decoders != [])
+    robot.send(act(JPEG, "robot"), 10)
+    assert decode_replies(robot.recv(10))[0].act is not None
+    go_on.set()
+    asking.join(30)
+    assert answers[0].error is None
+    robot.close(), local.close()
+
+
+def test_a_client_that_leaves_while_its_image_is_decoded_leaves_nothing(
+    endpoints: tuple[WebSocketServer, ShmServer], held_up: tuple[threading.Event, list[str]]
+) -> None:
+    go_on, decoders = held_up
+    own, _ = endpoints
+    other = _connected(own)
+    other.send(frame(reset(), files=[LARGE]), 10)
+    wait_for(lambda: decoders != [])
+    assert own._engine.admission.held > 0
+    other.close()
+    go_on.set()
+    wait_for(lambda: not own._clients)
+    wait_for(lambda: own._engine.admission.held == 0)
+    assert len(own._engine.sessions) == 0
+
+
+def test_an_event_loop_goes_on_while_a_message_is_decoded(held_up: tuple[threading.Event, list[str]]) -> None:
+    go_on, decoders = held_up
+
+    async def run() -> list[Request | Reply]:
+        message = message_admission()
+        reading = asyncio.ensure_future(
+            message.decoded(lambda budget: decode_requests(frame(reset(), files=[LARGE]), budget))
+        )
+        while not decoders:
+            await asyncio.sleep(0.001)
+        assert not reading.done()
+        go_on.set()
+        return await reading
+
+    [answer] = asyncio.run(run())
+    assert isinstance(answer, Request)
+
+
+def test_a_message_that_is_read_again_elsewhere_counts_once() -> None:
+    counted: list[object] = []
+    message = message_admission(admit=lambda op: bool(counted.append(op)) or True)
+    data = frame(reset(), reset(obs={"cameras": {"front": {"$": ["img", 1]}}}), files=[JPEG, LARGE])
+
+    def read(budget: Budget) -> list[Request | Reply]:
+        return decode_requests(data, budget)
+
+    with pytest.raises(NeedsDecodingThread):
+        read(message)
+    assert all(isinstance(answer, Request) for answer in message.decode_on_thread(read).result(30))
+    assert counted == ["reset", "reset"]
+
+
+def test_simulations_images_are_decoded_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> Any:
+        raise AssertionError("on several cores")
+
+    monkeypatch.setattr(codecs, "thread_map", refuse)
+    two = {"cameras": {"a": {"$": ["img", 0]}, "b": {"$": ["img", 1]}}}
+    message = message_admission(admit=lambda _: False)
+    data = frame(reset(obs=two), files=[LARGE, LARGE])
+    [answer] = message.decode_on_thread(lambda budget: decode_requests(data, budget)).result(30)
+    assert isinstance(answer, Request)
+
+
+# Over the rate.
+
+
+def test_a_connection_over_its_rate_is_not_read_meanwhile(replica: KeyedReplica) -> None:
+    """Its messages wait in its own socket, so that those that are refused cost the others nothing."""
+    visitor = replica.visitor("right")
+    own = replica.own
+    client = Stream(
+        urlsplit("http://127.0.0.1"),
+        own.address.port,
+        own.address.path,
+        10,
+        {"authorization": f"Bearer {visitor.token}"},
+    )
+    client.send(frame(reset()), 10)
+    assert decode_replies(client.recv(10))[0].error is None
+    replica.known.change(visitor.name, rate=1e-6)
+    replica.known.keys.check(visitor.token, "app").admit()
+    [held] = [one for one in list(own._clients) if getattr(one.caller, "name", "") == visitor.name]
+    client.send(frame(reset()), 10)
+    assert isinstance(decode_replies(client.recv(10))[0].error, TooManyRequests)
+    wait_for(lambda: not held._polled)
+    client.send(frame(reset()), 10)
+    assert isinstance(decode_replies(client.recv(10))[0].error, TooManyRequests)  # after a second, at most
+    client.close()
+
+
+def test_a_local_client_over_its_rate_is_not_read_meanwhile(replica: KeyedReplica) -> None:
+    visitor = replica.visitor("right")
+    transport = ShmTransport(asdict(replica.local.address), Credentials(visitor.token))
+    transport.connect(10)
+    seen = Obs({"front": np.zeros((8, 8, 3), np.uint8)})
+    assert transport.call([Request("reset", seen)], 10)[0].error is None
+    [held] = [one for one in list(replica.local._clients) if getattr(one.caller, "name", "") == visitor.name]
+    replica.known.change(visitor.name, rate=1e-6)
+    replica.known.keys.check(visitor.token, "app").admit()
+    for op in ("act", "reset"):  # in compact form, and in a frame
+        assert isinstance(transport.call([Request(op, seen)], 10)[0].error, TooManyRequests)  # type: ignore[arg-type]
+        wait_for(lambda: held._pauses == 1)
+    transport.close()
+
+
+@pytest.mark.parametrize("path", ["own", "/v1/stream", "/vla-eval"])
+def test_what_cannot_be_read_counts_too(replica: KeyedReplica, path: str) -> None:
+    """Or garbage would cost its sender nothing."""
+    visitor = replica.visitor("right")
+    replica.known.change(visitor.name, rate=1e-6)
+    wanted = {"own": _read_reply, "/v1/stream": _read_reply, "/vla-eval": _read_vla_eval}[path]
+    assert over_websocket(path, lambda _: b"\xc1" * 1000, wanted)(visitor, "with") == "400"
+    with pytest.raises(TooManyRequests):
+        replica.known.keys.check(visitor.token, "app").admit()
+
+
+def test_a_sender_that_is_not_over_its_rate_is_read_at_once() -> None:
+    engine: Any = SimpleNamespace()
+    assert Dispatcher(engine, "shm", caller=NoKey.OPEN).throttled_s() == 0.0

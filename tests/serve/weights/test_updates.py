@@ -1,0 +1,346 @@
+"""New weights in one replica: two phases, when sessions change, and nothing changed by what is refused."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from vlagents_ray.errors import (
+    InvalidInput,
+    InvalidWeights,
+    NotTrainable,
+    Overloaded,
+    PolicyFailed,
+    UnchangedWeights,
+    UnknownSession,
+    WeightsNotStaged,
+)
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.weights import versions
+from vlagents_ray.serve.weights.updates import PushOptions
+from vlagents_ray.weights.check import fingerprint
+
+
+class Gain(Agent):
+    """Acts with its one parameter, and what a session has drawn."""
+
+    trainable: ClassVar[str | None] = "tree"
+
+    def initialize(self) -> None:
+        self.tree = {"layer": {"gain": np.zeros(2, np.float32)}}
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self.rng = np.random.default_rng(kwargs.get("seed", 0))
+        return {"gain": float(self.tree["layer"]["gain"][0])}
+
+    def act(self, obs: Obs) -> Act:
+        return Act(np.append(self.tree["layer"]["gain"], self.rng.random()))
+
+
+class Doubled(Gain):
+    """Computes its actions from twice its parameter, which it computes once for each version, in place."""
+
+    def initialize(self) -> None:
+        super().initialize()
+        self.twice = np.zeros(2, np.float32)
+
+    def shared_objects(self) -> list[Any]:
+        return [*super().shared_objects(), self.twice]
+
+    def load_parameters(self, named: Mapping[str, Any]) -> None:
+        np.copyto(self.tree["layer"]["gain"], named["layer/gain"])
+        np.copyto(self.twice, 2 * named["layer/gain"])
+
+    def act(self, obs: Obs) -> Act:
+        return Act(np.append(self.twice / 2, self.rng.random()))
+
+
+class Served:
+    """An engine in this process, with a learner."""
+
+    def __init__(self, engine: Engine) -> None:
+        self.engine = engine
+        self.learn = engine.weights
+
+    def reset(self, session: str, rank: Any = "simulation", **options: Any) -> Reply:
+        return self.ask(session, Request("reset", Obs(), kwargs=options, rank=rank))
+
+    def act(self, session: str) -> tuple[int, float]:
+        """The version that acted, and the gain in its action."""
+        act = self.ask(session, Request("act", Obs())).act
+        assert act is not None
+        return act.info["policy"]["version"], float(act.action[0])
+
+    def ask(self, session: str, request: Request) -> Reply:
+        replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
+        self.engine.submit(session, request, replies.put)
+        reply = replies.get(timeout=30)
+        if reply.error is not None:
+            raise reply.error
+        return reply
+
+    def push(self, number: int, mode: versions.PushMode = "next_episode") -> str:
+        """A version whose gain is its number."""
+        digest = self.learn.stage(number, gains(number), PushOptions(mode))
+        self.learn.commit(number, PushOptions(mode))
+        return digest
+
+
+def gains(gain: float) -> dict[str, Any]:
+    return {"layer/gain": np.full(2, gain, np.float32)}
+
+
+@pytest.fixture
+def serving() -> Iterator[Callable[..., Served]]:
+    engines: list[Engine] = []
+
+    def serve(agent: Agent, **options: Any) -> Served:
+        engines.append(Engine(agent, **options))
+        engines[-1].start()
+        return Served(engines[-1])
+
+    yield serve
+    for engine in engines:
+        engine.close()
+
+
+AGENTS = pytest.mark.parametrize("agent", [Gain, Doubled], ids=["by reference", "in place"])
+
+
+@AGENTS
+def test_an_episode_ends_with_the_weights_that_it_began_with(serving: Callable[..., Served], agent: type[Gain]) -> None:
+    served = serving(agent())
+    alone = serving(agent())
+    for one in (served, alone):
+        one.reset("old", seed=3)
+    served.push(1)
+    served.reset("new")
+    for number in range(2, 5):
+        served.push(number)
+        assert served.act("new") == (1, 1.0)
+        mine, apart = (one.ask("old", Request("act", Obs())).act for one in (served, alone))
+        assert mine is not None
+        assert apart is not None
+        assert mine.info == apart.info
+        np.testing.assert_array_equal(mine.action, apart.action, strict=True)
+    assert served.reset("old").info == {"gain": 4.0}
+    assert served.act("old") == (4, 4.0)
+    assert served.act("new") == (1, 1.0)
+
+
+@AGENTS
+def test_with_keep_running_episodes_change_at_once(serving: Callable[..., Served], agent: type[Gain]) -> None:
+    served = serving(agent())
+    served.reset("a")
+    assert served.act("a") == (0, 0.0)
+    served.push(1, "keep")
+    assert served.act("a") == (1, 1.0)
+
+
+def test_with_wait_no_episode_begins_until_all_have_ended_and_robots_are_not_held_up(
+    serving: Callable[..., Served],
+) -> None:
+    served = serving(Gain())
+    for session in "ab":
+        served.reset(session)
+    served.reset("robot", "robot")
+    served.push(1, "wait")
+    served.learn.commit(1, PushOptions("wait"))  # as when its reply was lost
+    assert served.learn.number == 0
+    waiting: queue.SimpleQueue[Reply] = queue.SimpleQueue()
+    for session in ("a", "new"):
+        served.engine.submit(session, Request("reset", Obs(), rank="simulation"), waiting.put)
+    assert served.act("b") == (0, 0.0)
+    served.reset("robot", "robot")
+    assert served.act("robot") == (0, 0.0)
+    assert waiting.empty()
+    with pytest.raises(Overloaded, match="or waits for the end of episodes"):
+        served.learn.stage(2, gains(2), PushOptions())
+    served.ask("b", Request("close"))
+    for _ in range(2):
+        assert waiting.get(timeout=30).info == {"gain": 1.0}
+    assert [served.act(session) for session in ("a", "new", "robot")] == [(1, 1.0), (1, 1.0), (0, 0.0)]
+    served.push(2, "wait")
+    served.ask("new", Request("close"))
+    served.ask("a", Request("close"))
+    assert served.learn.number == 2  # without a reset
+
+
+@AGENTS
+def test_the_fingerprint_is_that_of_what_the_agent_holds(serving: Callable[..., Served], agent: type[Gain]) -> None:
+    served = serving(agent())
+    digest = served.push(1)
+    served.reset("a")
+    act = served.ask("a", Request("act", Obs())).act
+    assert act is not None
+    assert act.info["policy"] == {"version": 1, "fingerprint": digest}
+    assert digest == fingerprint(gains(1))
+
+
+def test_robots_keep_the_pinned_weights_unless_they_follow(serving: Callable[..., Served]) -> None:
+    served = serving(Gain())
+    for session, options in {"pinned": {}, "follows": {"weights": "follow"}}.items():
+        served.reset(session, "robot", **options)
+    served.reset("baseline", weights="pinned")
+    served.push(1, "keep")
+    assert {name: served.act(name)[0] for name in ("pinned", "follows", "baseline")} == {
+        "pinned": 0,
+        "follows": 1,
+        "baseline": 0,
+    }
+    served.reset("pinned", "robot")
+    assert served.act("pinned") == (0, 0.0)
+    served.learn.stage(2, gains(2), PushOptions())
+    served.learn.commit(2, PushOptions(pin=True))
+    served.reset("pinned", "robot")
+    assert served.act("pinned") == (2, 2.0)
+    with pytest.raises(InvalidInput, match="weights: got 7, want 'follow'"):
+        served.reset("pinned", weights=7)
+
+
+@pytest.mark.parametrize(
+    ("pushed", "error"),
+    [({}, InvalidWeights), ({"layer/gain": np.full(2, np.nan)}, InvalidWeights), (gains(1), UnchangedWeights)],
+)
+def test_what_is_refused_changes_nothing(
+    serving: Callable[..., Served], pushed: dict[str, Any], error: type[Exception]
+) -> None:
+    served = serving(Gain())
+    served.push(1)
+    before = served.learn.describe()
+    with pytest.raises(error):
+        served.learn.stage(2, pushed, PushOptions())
+    with pytest.raises(WeightsNotStaged, match="version 2 is not staged here"):
+        served.learn.commit(2, PushOptions("keep"))
+    assert served.learn.describe() == before
+    served.reset("a")
+    assert served.act("a") == (1, 1.0)
+    served.push(2)
+
+
+def test_a_staged_version_does_not_act_and_a_second_one_has_to_wait(serving: Callable[..., Served]) -> None:
+    served = serving(Gain())
+    served.learn.stage(1, gains(1), PushOptions())
+    served.reset("a")
+    assert served.act("a") == (0, 0.0)
+    with pytest.raises(Overloaded, match="another push"):
+        served.learn.stage(2, gains(2), PushOptions())
+    with pytest.raises(InvalidInput, match="mode: got 'now'"):
+        PushOptions("now")  # type: ignore[arg-type]
+    served.learn.drop(1)
+    served.push(1)
+    served.learn.commit(1, PushOptions("keep"))  # as when its reply was lost
+    with pytest.raises(Overloaded, match="got version 1, want one above 1, the newest here: another push was faster"):
+        served.learn.stage(1, gains(3), PushOptions())
+
+
+def test_a_learner_that_dies_between_the_phases_leaves_the_last_version(
+    serving: Callable[..., Served], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = serving(Gain())
+    monkeypatch.setattr(versions, "STAGED_S", 0.0)
+    dropped = threading.Event()
+    own = served.engine.models.own_weights
+    drop = own.drop
+    monkeypatch.setattr(own, "drop", lambda number: (drop(number), dropped.set()))
+    served.learn.stage(1, gains(1), PushOptions())
+    assert dropped.wait(30)
+    with pytest.raises(WeightsNotStaged):
+        served.learn.commit(1, PushOptions("keep"))
+    served.reset("a")
+    assert served.act("a") == (0, 0.0)
+
+
+def test_versions_never_go_back_and_no_act_fails_while_weights_are_pushed(serving: Callable[..., Served]) -> None:
+    served = serving(Gain())
+    over = threading.Event()
+    seen: dict[str, list[tuple[int, float]]] = {name: [] for name in "abc"}
+    failed: list[BaseException] = []
+
+    def play(session: str) -> None:
+        try:
+            while not over.is_set():
+                served.reset(session)
+                seen[session] += [served.act(session) for _ in range(5)]
+        except BaseException as error:  # noqa: BLE001 - reported below
+            failed.append(error)
+
+    threads = [threading.Thread(target=play, args=(session,)) for session in seen]
+    for thread in threads:
+        thread.start()
+    for number in range(1, 40):
+        served.push(number, "keep" if number % 2 else "next_episode")
+    over.set()
+    for thread in threads:
+        thread.join(30)
+    assert failed == []
+    for acts in seen.values():
+        numbers = [number for number, _ in acts]
+        assert numbers == sorted(numbers)
+        assert all(gain == number for number, gain in acts)
+
+
+def test_a_moved_session_goes_on_with_its_version_and_not_where_that_is_missing(serving: Callable[..., Served]) -> None:
+    here, there, without = serving(Gain()), serving(Gain()), serving(Gain())
+    here.push(1)
+    here.reset("a")
+    there.push(1)
+    for one in (here, there):
+        one.push(2)
+    state = here.ask("a", Request("export")).info
+    assert state is not None
+    with pytest.raises(UnknownSession, match="version 1 of the weights"):
+        there.engine.transfer.adopt("a", state)  # nobody acts with it there
+    for one in (here, there):
+        one.push(3)
+    here.reset("a")
+    state = here.ask("a", Request("export")).info
+    assert state is not None
+    there.engine.transfer.adopt("a", state)
+    assert there.act("a") == (3, 3.0)
+    with pytest.raises(UnknownSession, match="version 3 of the weights"):
+        without.engine.transfer.adopt("a", state)
+
+
+def test_versions_that_nobody_acts_with_are_freed(serving: Callable[..., Served]) -> None:
+    served = serving(Gain())
+    served.reset("a")
+    for number in range(1, 4):
+        served.push(number)
+    assert sorted(served.engine.models.own_weights._alive) == [0, 3]
+
+
+def test_weights_that_cannot_be_loaded_fail_the_act_and_others_act_again(serving: Callable[..., Served]) -> None:
+    class Fragile(Gain):
+        def load_parameters(self, named: Mapping[str, Any]) -> None:
+            if named["layer/gain"][0] == 1:
+                raise MemoryError
+            super().load_parameters(named)
+
+    served = serving(Fragile())
+    served.reset("a")
+    served.push(1)
+    with pytest.raises(PolicyFailed):
+        served.reset("b")
+    assert served.act("a") == (0, 0.0)
+    served.push(2)
+    served.reset("b")
+    assert served.act("b") == (2, 2.0)
+
+
+def test_a_policy_that_names_no_parameters_is_not_trainable(serving: Callable[..., Served]) -> None:
+    class Fixed(Agent):
+        def act(self, obs: Obs) -> Act:
+            return Act(np.zeros(1))
+
+    served = serving(Fixed())
+    with pytest.raises(NotTrainable, match="Fixed: names no parameters"):
+        served.learn.stage(1, {}, PushOptions())
+    assert served.learn.describe() == {key: {"version": 0, "fingerprint": ""} for key in ("newest", "pinned")}

@@ -1,0 +1,142 @@
+"""Robots of the simulation: what each asked, what it was told, and whether that can be true."""
+
+from __future__ import annotations
+
+import asyncio
+
+from tests.simulation.world import LENGTH_S, World, code
+from vlagents_ray import Obs
+from vlagents_ray.protocol.messages import Reply
+
+_UNCERTAIN = ("silence", "outcome_unknown", "connection_lost")
+_NOT_DONE = ("deadline_exceeded", "unavailable")
+
+
+class Violation(AssertionError):
+    """What must not happen."""
+
+
+class Robot:
+    """One session, for a few episodes. With `steps` it sends back the step of the last answer."""
+
+    def __init__(self, world: World, number: int) -> None:
+        self.world = world
+        self.name = f"robot{number}"
+        draw = world.draw
+        self.steps = draw.random() < 0.6
+        self.timed = draw.random() < 0.5  # over HTTP; else over a connection
+        self.history: list[str] = []
+        self.refused: list[str] = []  # acts whose answer says that they were not executed, and never will be
+        self.done: list[str] = []  # acts that were answered with an action
+        self.over = False
+        self.uncertain: set[str] = set()  # acts and resets of which it does not know what became
+        self._step: int | None = None
+        self._asked = 0
+
+    async def run(self) -> None:
+        """Until its episodes are over, or the world is."""
+        draw = self.world.draw
+        for episode in range(draw.randint(1, 3)):
+            await asyncio.sleep(draw.random() * 0.5)
+            await self._episode(f"{self.name}/{episode}")
+        self.over = True
+
+    async def _episode(self, instruction: str) -> None:
+        draw = self.world.draw
+        while True:
+            self._asked += 1
+            instruction = f"{instruction}.{self._asked}"
+            reply = await self._ask("reset", instruction, None)
+            if code(reply) == "ok":
+                break
+            if code(reply) in _UNCERTAIN:
+                self.uncertain.add(instruction)
+            await asyncio.sleep(0.1)
+        acted: list[str] = []  # that it was told of
+        for _ in range(draw.randint(2, 6)):
+            await asyncio.sleep(draw.random() * 0.4)
+            self._asked += 1
+            name = f"{self.name}.{self._asked}"
+            reply = await self._ask("act", instruction, name)
+            outcome = code(reply)
+            if outcome == "ok" and reply is not None:
+                self.done.append(name)
+                self._check(reply, instruction, [*acted, name])
+                acted.append(name)
+            elif outcome in _NOT_DONE:
+                self.refused.append(name)
+            elif outcome in _UNCERTAIN:
+                self.uncertain.add(name)
+                if self.steps:
+                    return  # where it is now is not known: another episode
+            else:
+                if not self.world.plan.rough and not self.uncertain:
+                    raise Violation(
+                        f"{name}: {outcome} ({reply and reply.error}), though nothing was lost: a session was"
+                    )
+                return
+
+    def _check(self, reply: Reply, instruction: str, expected: list[str]) -> None:
+        assert reply.act is not None
+        obeyed, ids = reply.act.info["obeys"], reply.act.info["ids"]
+        if not obeyed.startswith(self.name + "/"):
+            raise Violation(f"{expected[-1]}: crossed with another session, it obeys {obeyed}")
+        if not self.steps and (self.uncertain or self.world.plan.rough):
+            return  # what it gave up may come late, and what a fault left behind may be met: steps are for that
+        if obeyed != instruction:
+            raise Violation(f"{expected[-1]}: of an older episode, it obeys {obeyed}, not {instruction}")
+        if [one for one in ids if one not in self.uncertain] != expected:
+            raise Violation(
+                f"{expected[-1]}: acts were lost or doubled: {ids}, want {expected} and some of {self.uncertain}"
+            )
+
+    async def _ask(self, op: str, instruction: str, name: str | None) -> Reply | None:
+        """The answer, if it comes in time."""
+        draw = self.world.draw
+        deadline_s = draw.choice([0.05, 0.5, 3.0, None])
+        answer = self.world.send(
+            op,  # type: ignore[arg-type]
+            self.name,
+            Obs(info={"id": name}),
+            steady=not self.steps,
+            timed=self.timed,
+            instruction=instruction if op == "reset" else None,
+            step=self._step if self.steps else None,
+            deadline_ms=None if deadline_s is None else deadline_s * 1e3,
+            request_id=name or instruction,
+        )
+        patience_s = 20.0 if deadline_s is None else deadline_s + draw.choice([0.0, 12.0])
+        await asyncio.wait([answer], timeout=patience_s)
+        reply = answer.result() if answer.done() else None
+        if reply is not None and reply.step is not None and reply.error is None:
+            self._step = reply.step
+        self.history.append(f"{self.world.clock.now:8.3f} {op} {name or instruction}: {code(reply)}")
+        return reply
+
+
+def play(world: World) -> list[Robot]:
+    """Run a world with its robots to the end; `Violation` if a history cannot be."""
+    robots = [Robot(world, number) for number in range(world.draw.randint(2, 3))]
+    tasks = [world.outside.create_task(robot.run()) for robot in robots]
+    try:
+        world.clock.run(LENGTH_S, lambda: all(task.done() for task in tasks))
+        for task in tasks:
+            if task.done():
+                task.result()
+        if world.clock.errors:
+            raise world.clock.errors[0]
+        names = [name for name, _ in world.log.acts]
+        executed = set(names)
+        if len(executed) < len(names):
+            raise Violation(f"executed twice: {sorted(name for name in executed if names.count(name) > 1)}")
+        for robot in robots:
+            if late := executed.intersection(robot.refused):
+                raise Violation(f"executed, though answered with that they never would be: {sorted(late)}")
+            if unheard := set(robot.done) - executed:
+                raise Violation(f"answered, but never executed: {sorted(unheard)}")
+        for name, obeyed in world.log.acts:
+            if name.partition(".")[0] != obeyed.partition("/")[0]:
+                raise Violation(f"{name}: crossed with another session, it obeyed {obeyed}")
+    finally:
+        world.close()
+    return robots

@@ -1,0 +1,148 @@
+"""Histories of sessions under faults, each drawn from a seed, and played in a few milliseconds.
+
+VLAGENTS_SIMULATION_SEED=1234 pytest tests/simulation -s     replays a seed that failed, and prints its history
+VLAGENTS_SIMULATION_SEEDS=100000 pytest tests/simulation     more of them than 10,000
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections import Counter
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from tests.simulation.clients import Robot, Violation, play
+from tests.simulation.world import Replica, World
+from vlagents_ray.errors import UnknownSession, VLAgentsError
+from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.serve.engine.dispatch import Dispatcher, ReplyCollector
+from vlagents_ray.serve.scaling import held_sessions, session_migration
+from vlagents_ray.serve.sessions import Session
+
+SEEDS = int(os.environ.get("VLAGENTS_SIMULATION_SEEDS", "10000"))
+SEED = os.environ.get("VLAGENTS_SIMULATION_SEED")
+
+
+@pytest.fixture(autouse=True)
+def _quiet() -> Iterator[None]:
+    """What replicas say of a fault is no news here, and takes longer than all the rest."""
+    logging.disable(logging.CRITICAL)
+    yield
+    logging.disable(logging.NOTSET)
+
+
+def run(seed: int, **world: Any) -> list[Robot]:
+    """Play a seed; what is wrong with it is raised with what it takes to play it again."""
+    try:
+        return play(World(seed, **world))
+    except Exception as error:
+        raise Violation(
+            f"seed {seed}: {error}\nagain: VLAGENTS_SIMULATION_SEED={seed} pytest tests/simulation"
+        ) from error
+
+
+def run_all(seeds: int, **world: Any) -> None:
+    """The first so many."""
+    for seed in range(seeds):
+        run(seed, **world)
+
+
+@pytest.mark.timeout(900)
+@pytest.mark.slow
+def test_no_history_is_impossible() -> None:
+    if SEED is not None:
+        show(int(SEED))
+        return
+    seen: Counter[str] = Counter()
+    for seed in range(SEEDS):
+        for robot in run(seed):
+            seen.update(line.split()[1] + " " + line.split()[-1] for line in robot.history)
+    print(seen)
+    assert seen["act ok"] > SEEDS, "the faults left too little to be judged"
+
+
+def show(seed: int) -> None:
+    """Play a seed and print all of it."""
+    world = World(seed)
+    print(world.plan.__dict__)
+    try:
+        robots = play(world)
+    finally:
+        print(*world.log.acts, sep="\n")
+    for robot in robots:
+        print(robot.name, *robot.history, sep="\n")
+
+
+def test_a_seed_is_one_history() -> None:
+    for seed in range(20):
+        assert [robot.history for robot in run(seed)] == [robot.history for robot in run(seed)]
+
+
+def overwrite(replica: Replica) -> None:
+    """A session that arrives takes the place of whatever is here, and no reset is announced."""
+    table = replica.engine.sessions
+
+    def enter(arriving: Session) -> None:
+        if (here := table._sessions.get(arriving.id)) is not None:
+            table.ended(here)
+        table._sessions[arriving.id] = arriving
+
+    table.enter = enter  # type: ignore[method-assign]
+    replica.migrator.announce = lambda *_: None  # type: ignore[method-assign]
+
+
+def export_at_once(replica: Replica) -> None:
+    """To copy a session is to give it up, whether or not the one who asked still waits."""
+    held = replica.migrator.held
+
+    async def copy(session_id: str) -> dict[str, Any] | None:
+        state = await held._ask(session_id, "export", None)
+        if state is not None:
+            replica.engine.sessions.close(session_id)
+            replica.engine.sessions._left.clear()
+        return state
+
+    async def release(*_: Any) -> bool:
+        return True
+
+    held.copy = copy  # type: ignore[method-assign]
+    held.release = release  # type: ignore[method-assign]
+
+
+class LateSender(Dispatcher):
+    """Counts the deadline anew once the session was fetched, and asks nobody whether it was answered."""
+
+    def _refuse(
+        self, collector: ReplyCollector, index: int, request: Request, error: VLAgentsError, arrived: float | None
+    ) -> None:
+        def retry() -> None:
+            try:
+                self._put([self._ticket(collector, index, request, None, again=True)])
+            except VLAgentsError as again:
+                collector.put(index, Reply(request.request_id, error=again))
+
+        finder = self._engine.finder
+        if not (isinstance(error, UnknownSession) and finder and finder.fetch(self._session(request), retry)):
+            collector.put(index, Reply(request.request_id, error=error))
+
+
+@pytest.mark.parametrize(
+    ("world", "sign"),
+    [
+        ({"spoil": overwrite}, "of an older episode|a session was|lost or doubled"),
+        ({"spoil": export_at_once}, "a session was"),
+        ({"sender": LateSender}, "never would be|lost or doubled"),
+    ],
+    ids=["older episodes overwrite", "a slow export destroys", "deadlines begin anew"],
+)
+def test_the_simulation_finds_what_was_wrong_before(
+    world: dict[str, Callable[..., Any]], sign: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session_migration, "EXPORT_S", 3.0)
+    monkeypatch.setattr(held_sessions, "EXPORT_S", 3.0)
+    with pytest.raises(Violation, match=sign) as found:
+        run_all(2000, **world)
+    print(found.value)

@@ -1,0 +1,577 @@
+"""A replica with API keys in this process, and the outcome of a request to each of its endpoints, as one word."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import http.client
+import itertools
+import json
+import re
+import socket
+import struct
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from asgi_server import served
+from dialect_server import ALL, METADATA, body, libero, seen
+from eval_fakes import wait_for
+from gr00t_client import PolicyClient
+from in_memory_keys import ChangingKeys
+from in_process_replicas import InProcess
+from rpyc_client import Client, document
+from websockets.client import ClientProtocol
+from websockets.exceptions import InvalidStatus
+from websockets.frames import Close, Frame, Opcode
+from websockets.protocol import State
+from websockets.uri import parse_uri
+
+from vlagents_ray.client.agent import RemoteAgent
+from vlagents_ray.client.connection import Connection
+from vlagents_ray.client.credentials import Credentials
+from vlagents_ray.client.transports.codec_selection import CodecChoice
+from vlagents_ray.client.transports.local.shm import ShmTransport
+from vlagents_ray.client.transports.probe import bytes_probe
+from vlagents_ray.errors import BY_CODE, VLAgentsError
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.protocol.frames import decode_replies, decode_reply, encode_request
+from vlagents_ray.protocol.messages import (
+    PROTOCOL_VERSION,
+    Limits,
+    LocalAddress,
+    PlasmaAddress,
+    RankName,
+    Request,
+)
+from vlagents_ray.registry import dialect_class
+from vlagents_ray.serve import periodic
+from vlagents_ray.serve.access import api_keys
+from vlagents_ray.serve.config.dialects import DialectArgs
+from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext
+from vlagents_ray.serve.dialects.routes import dialect_routes
+from vlagents_ray.serve.dialects.vla_eval import codec as vla_eval_codec
+from vlagents_ray.serve.endpoints import access_middleware, websocket_connection
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.endpoints.local.shm import ShmServer
+from vlagents_ray.serve.endpoints.websocket import WebSocketServer
+from vlagents_ray.serve.endpoints.weights import weights_routes
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.ports import free_port, reserve
+from vlagents_ray.serve.weights.updates import PushResult
+from vlagents_ray.weights.safetensors import header_of
+
+ANSWER_S = 10.0
+LIMITS = Limits(body_bytes=2**20)
+_NUMBERS = itertools.count()
+_WORDS = {  # of refusals, where a protocol has no code
+    "401": r"revoked|expired|not known|wants an API key",
+    "403": r"is for \[",
+    "429": r"requests a second|may hold \d+ sessions|sessions here",
+}
+
+
+class Done(list[str]):
+    """What the policy was asked for, of all sessions."""
+
+
+class Recorder(Agent):
+    """Notes by which marks it was reached."""
+
+    def __init__(self) -> None:
+        self.done = Done()
+
+    def shared_objects(self) -> list[object]:
+        return [self.done]
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self.instruction = str(instruction)
+        self.done.append(self.instruction)
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        self.done.append(str(obs.info.get("mark", self.instruction)))
+        return Act(np.zeros(8, np.float32))
+
+
+@dataclass
+class Visitor:
+    """Who comes with one of the credentials, and a mark by which its request is known."""
+
+    replica: KeyedReplica
+    credential: str
+    name: str = field(default_factory=lambda: f"key-{next(_NUMBERS)}")
+
+    def __post_init__(self) -> None:
+        self.token = self.replica.known.add(self.name)
+        self.mark = f"mark of {self.name}"
+
+    @property
+    def shown(self) -> str | None:
+        """What it shows once it has become what it is."""
+        return {"none": None, "wrong": "vlr_wrong"}.get(self.credential, self.token)
+
+    @property
+    def ends(self) -> bool:
+        """Does its connection end?"""
+        return self.credential in ("expired", "revoked", "another application's")
+
+    def become(self) -> None:
+        """Make the key, which was a right one so far, what the credential says."""
+        changes: dict[str, dict[str, Any]] = {
+            "expired": {"expires": 1.0},
+            "revoked": {"revoked": True},
+            "another application's": {"apps": ["another"]},
+            "simulation": {"rank": "simulation"},
+            "over its rate": {"rate": 1e-6},
+            "over its sessions": {"sessions": 1},
+        }
+        if self.credential not in changes:
+            return
+        self.replica.known.change(self.name, **changes[self.credential])
+        for keys in (self.replica.known.keys, self.replica.at_gateway):
+            if self.credential == "over its rate":
+                keys.check(self.token, "app").admit()
+            if self.credential == "over its sessions":
+                keys.hold(self.name, 1, None)
+        if self.credential == "over its sessions":
+            self.replica.engine.sessions.open(f"{self.name}/held")
+
+
+class KeyedReplica:
+    """An engine, and everything that stands before it."""
+
+    def __init__(self, stack: contextlib.ExitStack, patch: pytest.MonkeyPatch, folder: Path) -> None:
+        patch.setattr(api_keys, "_CHECK_S", 0.0)
+        patch.setattr(access_middleware, "_TICK_S", 0.02)
+        patch.setattr(periodic.each_half_second, "_period_s", 0.02)
+        patch.setattr("vlagents_ray.serve.dialects.gr00t.handler._TICK_MS", 20)
+        self.known = ChangingKeys()
+        self.at_gateway = self.known.another()  # of another process
+        self.policy = Recorder()
+        self.engine = Engine(self.policy, session_limit=5000)
+        self.ranks: dict[str, str] = {}
+        self._watch_ranks()
+        admit = partial(self.known.keys.check, app="app")
+        self.own = WebSocketServer(self.engine, LIMITS, "127.0.0.1", None, admit)
+        self.local = ShmServer(self.engine, LIMITS, admit)
+        self.plasma = _plasma_server(self.engine, patch, folder)
+        for each in (self.own, self.local, self.plasma):
+            each.open()
+        self.engine.start()
+        routes = dialect_routes(DialectArgs(**ALL), ReplicaContext(self.engine, lambda: METADATA, LIMITS))
+        weights = weights_routes(_Receiving(self), 30.0, open_to_network=False)
+        inside = build_http_app(self.engine, lambda: METADATA, LIMITS, dialects=routes, weights=weights)
+        self.routes = inside.routes
+        self.port = stack.enter_context(served(AccessMiddleware(inside, self.known.keys, "app")))
+        check = partial(self.at_gateway.check, app="app")
+        self.gr00t = {near: self._on_own_port(stack, "gr00t", near, check) for near in (True, False)}
+        self.vlagents = self._on_own_port(stack, "vlagents", False, check, without_key=True)
+        stack.callback(self._close)
+
+    def visitor(self, credential: str) -> Visitor:
+        """Somebody new."""
+        return Visitor(self, credential)
+
+    def _close(self) -> None:
+        self.engine.close()
+        for each in (self.own, self.local, self.plasma):
+            each.close()
+
+    def _watch_ranks(self) -> None:
+        put = self.engine.queue.put
+
+        def watched(*tickets: Any) -> None:
+            for ticket in tickets:
+                obs = ticket.request.obs
+                mark = ticket.request.instruction or (obs is not None and obs.info.get("mark")) or ticket.session_id
+                self.ranks[str(mark)] = ticket.rank.name
+            put(*tickets)
+
+        self.engine.queue.put = watched  # type: ignore[method-assign]
+
+    def _agent(self, near: bool, key: str | None, rank: RankName | None) -> RemoteAgent:
+        agent = RemoteAgent("http://127.0.0.1:9", rank=rank or "robot")
+        engines = SimpleNamespace(
+            engines=[self.engine], dead=set(), frozen=set(), prefer=0, lose_reply=False, stopping=False, frames=[]
+        )
+        way = _Near(asdict(self.local.address), Credentials(key or "")) if near else InProcess(engines)  # type: ignore[arg-type]
+        agent._connection = Connection(agent.url, way, CodecChoice("raw"), 5.0, 5.0)  # type: ignore[arg-type]
+        return agent
+
+    def _on_own_port(self, stack: contextlib.ExitStack, name: str, near: bool, check: Any, **settings: Any) -> int:
+        """Serve a dialect of the gateway; returns its port."""
+        cls, port = dialect_class(name), free_port()
+        context = GatewayContext("app", partial(self._agent, near), LIMITS, 100, 2.0, None, check)
+        dialect = cls(name, cls.Config(port=port, **settings), context)
+        dialect.serve(reserve(name, "127.0.0.1", port))
+        stack.callback(dialect.close)
+        return port
+
+
+class _Near(ShmTransport):
+    def connect(self, timeout_s: float) -> dict[str, Any]:  # type: ignore[override]
+        super().connect(timeout_s)
+        return {"protocol": PROTOCOL_VERSION, "contract": None}
+
+
+def _plasma_server(engine: Engine, patch: pytest.MonkeyPatch, folder: Path) -> Any:
+    """The plasma endpoint, with channels that hold a frame as it is."""
+    import ray
+
+    from vlagents_ray.serve.endpoints.local.plasma import PlasmaServer
+
+    node = SimpleNamespace(plasma_store_socket_name=str(folder / "plasma_store"))
+    with pytest.MonkeyPatch.context() as for_now:
+        for_now.setattr(ray._private.worker.global_worker, "node", node, raising=False)
+        for_now.setattr(ray, "get_runtime_context", lambda: SimpleNamespace(get_node_id=lambda: "node"))
+        server = PlasmaServer(engine, LIMITS)
+    patch.setattr(server.pool, "claim", lambda key: _Channel(server, key))
+    patch.setattr(server.pool, "release", lambda _channel: None)
+    return server
+
+
+class _Channel:
+    frames: ClassVar[dict[bytes, bytes]] = {}
+
+    def __init__(self, _server: Any, key: bytes) -> None:
+        self.ref = SimpleNamespace(binary=lambda: key)
+        self._key = key
+
+    def read(self) -> bytes:
+        return self.frames[self._key]
+
+
+@contextlib.contextmanager
+def keyed_replica(folder: Path) -> Iterator[KeyedReplica]:
+    """One, for as many visitors as want."""
+    with pytest.MonkeyPatch.context() as patch, contextlib.ExitStack() as stack:
+        yield KeyedReplica(stack, patch, folder)
+
+
+Way = Callable[[Visitor, str], str]
+"""Tries a request before, with or after the credential; returns what was answered: a status, "done" or "ended"."""
+
+
+def over_http(method: str, path: str, **options: Any) -> Way:
+    """A request of HTTP. `session`: a session has been reset with the key while it was right."""
+
+    def attempt(visitor: Visitor, _when: str) -> str:
+        def ask(method: str, path: str, document: dict[str, Any] | None, token: str | None) -> int:
+            connection = http.client.HTTPConnection("127.0.0.1", visitor.replica.port, timeout=ANSWER_S)
+            headers = {"x-session-id": "robot-1", "content-type": "application/json"} if path != "/act" else {}
+            headers |= {} if token is None else {"authorization": f"Bearer {token}"}
+            with contextlib.closing(connection):
+                content = bytes_probe(10) if path == "/v1/probe" else json.dumps(document).encode()
+                connection.request(method, path, None if document is None else content, headers)
+                return connection.getresponse().status
+
+        if options.get("session"):
+            assert ask("POST", "/v1/reset", {"instruction": "before"}, visitor.token) == 200
+        visitor.become()
+        document = options.get("document", lambda _mark: None)(visitor.mark)
+        status = ask(method, path, document, visitor.shown)
+        gone = f"{visitor.name}/robot-1" not in visitor.replica.engine.sessions
+        if path == "/v1/close" and gone:
+            visitor.replica.policy.done.append(visitor.mark)
+            visitor.replica.ranks[visitor.mark] = visitor.replica.ranks[f"{visitor.name}/robot-1"]
+        return str(status)
+
+    return attempt
+
+
+def over_websocket(path: str, message: Callable[[str], bytes], read: Callable[[bytes | str], str | None]) -> Way:
+    """A WebSocket: `message` asks for what the mark says, `read` gives what a message says of it, if anything."""
+
+    def attempt(visitor: Visitor, when: str) -> str:
+        replica = visitor.replica
+        port, place = replica.port, path
+        if path.startswith("own"):
+            port, place = replica.own.address.port, replica.own.path + path.removeprefix("own")
+        protocol = ClientProtocol(parse_uri(f"ws://127.0.0.1:{port}{place}"))
+        with socket.create_connection(("127.0.0.1", port), timeout=ANSWER_S) as connection:
+            if when == "before":
+                visitor.become()
+                with pytest.MonkeyPatch.context() as impatient:
+                    impatient.setattr(websocket_connection, "_HANDSHAKE_S", 0.1)
+                    connection.sendall(_frame(message(visitor.mark)) * 3)
+                    return _until_closed(connection)
+            refused = visitor.credential in ("none", "wrong")
+            if when == "with" or refused:
+                visitor.become()
+            request = protocol.connect()
+            shown = visitor.token if when == "after" and not refused else visitor.shown
+            if shown is not None:
+                request.headers["authorization"] = f"Bearer {shown}"
+            protocol.send_request(request)
+            handshake, asked = b"".join(protocol.data_to_send()), _frame(message(visitor.mark))
+            connection.sendall(handshake + (asked if when == "with" else b""))
+            while protocol.state is State.CONNECTING and protocol.handshake_exc is None:
+                protocol.receive_data(_some(connection))
+            if when == "with":
+                if protocol.state is State.OPEN and not path.startswith("own"):
+                    connection.sendall(asked)  # uvicorn drops what comes in one segment with a handshake
+                return _answer(protocol, connection, read)
+            said = "" if protocol.handshake_exc is None else _answer(protocol, connection, read)
+            if not refused:
+                visitor.become()
+            with contextlib.suppress(OSError):  # it may be cut off already
+                connection.sendall(asked)
+                said = said or _answer(protocol, connection, read)
+            if visitor.ends:
+                _until_ended(protocol, connection)
+            return said or "ended"
+
+    return attempt
+
+
+def _frame(payload: bytes) -> bytes:
+    return bytes([0x82, 0x80 | 127]) + struct.pack(">Q", len(payload)) + bytes(4) + payload
+
+
+def _until_closed(connection: socket.socket) -> str:
+    """All that comes; fails if the server does not hang up."""
+    with contextlib.suppress(ConnectionError):
+        while connection.recv(65536):
+            pass
+    return "ended"
+
+
+def _some(connection: socket.socket) -> bytes:
+    data = connection.recv(65536)
+    if not data:
+        raise ConnectionError("the server hung up without a word")
+    return data
+
+
+def _until_ended(protocol: ClientProtocol, connection: socket.socket) -> None:
+    """The server's goodbye, which is answered; fails if it does not come."""
+    with contextlib.suppress(ConnectionError):
+        while protocol.state is State.OPEN and (data := connection.recv(65536)):
+            protocol.receive_data(data)
+        connection.sendall(b"".join(protocol.data_to_send()))
+
+
+def _answer(protocol: ClientProtocol, connection: socket.socket, read: Callable[[bytes | str], str | None]) -> str:
+    while True:
+        for event in protocol.events_received():
+            if isinstance(event, Frame) and event.opcode in (Opcode.BINARY, Opcode.TEXT):
+                data = bytes(event.data)
+                if (said := read(data.decode() if event.opcode is Opcode.TEXT else data)) is not None:
+                    return said
+            elif isinstance(event, Frame) and event.opcode is Opcode.CLOSE:
+                return status_of(Close.parse(bytes(event.data)).reason)
+        if isinstance(protocol.handshake_exc, InvalidStatus):
+            return str(protocol.handshake_exc.response.status_code)
+        data = connection.recv(65536)
+        if not data:
+            protocol.receive_eof()
+            if isinstance(protocol.handshake_exc, InvalidStatus):
+                return str(protocol.handshake_exc.response.status_code)
+            return "ended"
+        protocol.receive_data(data)
+
+
+def status_of(text: str) -> str:
+    """Of a refusal: `code: what it says`, or what it says alone."""
+    code = text.partition(":")[0].removeprefix("Server error: ")
+    if code in BY_CODE:
+        return str(BY_CODE[code].status)
+    return next((status for status, words in _WORDS.items() if re.search(words, text)), text)
+
+
+def _read_reply(data: bytes | str) -> str:
+    assert isinstance(data, bytes)
+    error = decode_reply(data).error
+    return "done" if error is None else str(error.status)
+
+
+def _read_map(data: bytes | str) -> str | None:
+    if isinstance(data, str):
+        return status_of(data)
+    return "done" if b"actions" in data else None  # what it says first
+
+
+def _read_vla_eval(data: bytes | str) -> str:
+    assert isinstance(data, bytes)
+    payload = vla_eval_codec.decode(data).payload
+    return str(BY_CODE[payload["code"]].status) if "code" in payload else "done"
+
+
+def over_shm(visitor: Visitor, when: str) -> str:
+    """Shared memory."""
+    address = visitor.replica.local.address
+    if when != "after":
+        visitor.become()
+    refused = visitor.credential in ("none", "wrong")
+    token = visitor.token if when == "after" and not refused else visitor.shown
+    transport = ShmTransport(asdict(replace(address, keyed=when != "before")), Credentials(token or ""))
+    with contextlib.closing(transport):
+        transport.connect(ANSWER_S)
+        if when == "after":
+            if not refused:
+                local = visitor.replica.local
+                wait_for(lambda: any(getattr(c.caller, "name", "") == visitor.name for c in list(local._clients)))
+            visitor.become()
+        try:
+            [reply] = transport.call([Request("reset", Obs(), visitor.mark)], ANSWER_S)
+        except VLAgentsError:  # cut off
+            return "ended"
+        if when == "after" and visitor.ends:
+            with pytest.raises(VLAgentsError, match=r"closed|reset|pipe"):
+                wait_for(lambda: not transport.call([Request("close")], ANSWER_S))
+        return "done" if reply.error is None else str(reply.error.status)
+
+
+def over_plasma(visitor: Visitor, _when: str) -> str:
+    """A plasma channel."""
+    visitor.become()
+    key = visitor.name.encode().ljust(28, b"\0")
+    _Channel.frames[key] = encode_request(Request("reset", Obs(), visitor.mark))
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
+        connection.settimeout(ANSWER_S)
+        connection.connect(visitor.replica.plasma.plasma.socket)
+        connection.send(PlasmaAddress.REQUEST.pack(key, 0))
+        reply = connection.recv(65536)
+    return _read_reply(reply[LocalAddress.REPLY.size :])
+
+
+def over_handle(visitor: Visitor, _when: str) -> str:
+    """The actor's own entry point, as a Serve handle calls it."""
+    from vlagents_ray.serve.replica.replica import PolicyReplica
+
+    visitor.become()
+    replica: Any = SimpleNamespace(_engine=visitor.replica.engine, _limits=LIMITS)
+    frame = encode_request(Request("reset", Obs(), visitor.mark))
+    [reply] = decode_replies(asyncio.run(PolicyReplica.call(replica, visitor.name, frame)))
+    return "done" if reply.error is None else str(reply.error.status)
+
+
+def over_gr00t(near: bool) -> Way:
+    """GR00T's gateway, to a replica on its own host, or on another."""
+
+    def attempt(visitor: Visitor, when: str) -> str:
+        observation = {
+            "video": {"ego": np.zeros((1, 1, 8, 8, 3), np.uint8)},
+            "state": {"arm": np.zeros((1, 1, 3), np.float32)},
+            "language": {"task": [[visitor.mark]]},
+        }
+        refused = visitor.credential in ("none", "wrong")
+        if when == "with":
+            visitor.become()
+        token = visitor.token if when == "after" and not refused else visitor.shown
+        with PolicyClient(visitor.replica.gr00t[near], token) as client:
+            if when == "after":
+                with contextlib.suppress(RuntimeError) if refused else contextlib.nullcontext():
+                    client.ping()
+                visitor.become()
+            try:
+                client.get_action(observation)
+            except RuntimeError as error:
+                return status_of(str(error).removeprefix("Server error: "))
+        return "done"
+
+    return attempt
+
+
+def over_vlagents(visitor: Visitor, _when: str) -> str:
+    """vlagents' gateway, which asks for no key."""
+    visitor.become()
+    with Client(visitor.replica.vlagents) as client:
+        client.act(document(1, visitor.mark))
+    return "done"
+
+
+class _Receiving:
+    """Notes the names of weights that are pushed, as the policy notes marks."""
+
+    def __init__(self, replica: KeyedReplica) -> None:
+        self._replica = replica
+
+    def require_fit(self, announced: Any, options: Any) -> None:
+        """All fit."""
+
+    async def push_received(self, named: Any, options: Any) -> PushResult:
+        for mark in named:
+            self._replica.policy.done.append(mark)
+            self._replica.ranks[mark] = "ROBOT"
+        return PushResult(1, "", ("replica",))
+
+    async def versions_of_weights(self) -> list[int]:
+        return [1]
+
+
+def _with_scope(way: Way) -> Way:
+    """The same, with keys that may push weights."""
+
+    def attempt(visitor: Visitor, when: str) -> str:
+        visitor.replica.known.change(visitor.name, scopes=["weights"])
+        return way(visitor, when)
+
+    return attempt
+
+
+def _weights(mark: str) -> bytes:
+    return header_of({mark: np.zeros(0, np.float32)})
+
+
+def _read_pushed(data: bytes | str) -> str:
+    answer = json.loads(data)
+    return str(BY_CODE[answer["code"]].status) if "code" in answer else "done"
+
+
+def _stream_message(mark: str) -> bytes:
+    return encode_request(Request("reset", Obs(), mark))
+
+
+def _reset(mark: str) -> dict[str, Any]:
+    return {"instruction": mark}
+
+
+def _act(mark: str) -> dict[str, Any]:
+    return {"info": {"mark": mark}}
+
+
+def _see(mark: str) -> bytes:
+    return vla_eval_codec.encode(vla_eval_codec.Message("observation", seen(1, mark), 3))
+
+
+def _arena(mark: str) -> bytes:
+    return libero(1, mark, endpoint="infer", session_id="a")
+
+
+WAYS: dict[str, Way] = {
+    "`GET /healthz`": over_http("GET", "/healthz"),
+    "`GET /v1/metadata`": over_http("GET", "/v1/metadata"),
+    "`GET /docs`": over_http("GET", "/docs"),
+    "`GET /health`": over_http("GET", "/health"),
+    "`GET /no/such/path`": over_http("GET", "/no/such/path"),
+    "`POST /v1/probe`": over_http("POST", "/v1/probe", document=lambda _: {}),
+    "`POST /v1/reset`": over_http("POST", "/v1/reset", document=_reset),
+    "`POST /v1/act`": over_http("POST", "/v1/act", document=_act, session=True),
+    "`POST /v1/close`": over_http("POST", "/v1/close", document=lambda _: {}, session=True),
+    "`POST /act`": over_http("POST", "/act", document=lambda mark: body(1, mark)),
+    "`WS /v1/stream`": over_websocket("/v1/stream", _stream_message, _read_reply),
+    "`WS /`": over_websocket("/", partial(libero, 1), _read_map),
+    "`WS /openpi`": over_websocket("/openpi", partial(libero, 1), _read_map),
+    "`WS /roboarena`": over_websocket("/roboarena", _arena, _read_map),
+    "`WS /vla-eval`": over_websocket("/vla-eval", _see, _read_vla_eval),
+    "`GET /v1/weights`": over_http("GET", "/v1/weights"),
+    "`GET /v1/weights`, scope `weights`": _with_scope(over_http("GET", "/v1/weights")),
+    "`WS /v1/weights`": over_websocket("/v1/weights", _weights, _read_pushed),
+    "`WS /v1/weights`, scope `weights`": _with_scope(over_websocket("/v1/weights", _weights, _read_pushed)),
+    "own port": over_websocket("own", _stream_message, _read_reply),
+    "own port, another path": over_websocket("own/x", _stream_message, _read_reply),
+    "shared memory": over_shm,
+    "GR00T's gateway, replica on its host": over_gr00t(True),
+    "GR00T's gateway, replica on another": over_gr00t(False),
+    "vlagents' gateway, `without_key: true`": over_vlagents,
+    "Serve handle (`serve://`)": over_handle,
+    "plasma (`serve://`)": over_plasma,
+}

@@ -1,0 +1,74 @@
+"""Dialects over an engine in this process, without Ray, and what their clients send."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+from starlette.testclient import TestClient
+
+from vlagents_ray.interface import Agent
+from vlagents_ray.protocol.messages import Limits
+from vlagents_ray.serve.config.dialects import DialectArgs
+from vlagents_ray.serve.dialects.base import ReplicaContext
+from vlagents_ray.serve.dialects.openpi import codec as openpi_codec
+from vlagents_ray.serve.dialects.openvla import codec as openvla_codec
+from vlagents_ray.serve.dialects.routes import dialect_routes
+from vlagents_ray.serve.dialects.vla_eval import codec as vla_eval_codec
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.engine.engine import Engine
+
+LIMITS = Limits(body_bytes=300_000, pixels=64 * 64)
+METADATA = {"policy": "mirror", "version": "0", "protocol": 1, "checkpoint": None}
+ALL: dict[str, Any] = {
+    "openpi": {"mapping": "openpi-libero", "metadata": {"reset_pose": [0.5]}},
+    "roboarena": {"mapping": "openpi-libero"},
+    "openvla": {},
+    "vla_eval": {"observation_params": {"send_state": True}},
+}
+
+
+@contextmanager
+def serving(agent: Agent, dialects: dict[str, Any], **options: Any) -> Iterator[tuple[TestClient, Engine]]:
+    engine = Engine(agent, **options)
+    engine.start()
+    routes = dialect_routes(DialectArgs(**dialects), ReplicaContext(engine, lambda: METADATA, LIMITS))
+    inside = build_http_app(engine, lambda: METADATA, LIMITS, dialects=routes)
+    with TestClient(AccessMiddleware(inside, None, "app")) as client:
+        yield client, engine
+    engine.close()
+
+
+def image(pixel: int) -> np.ndarray:
+    return np.full((8, 8, 3), pixel, np.uint8)
+
+
+def libero(pixel: int, prompt: str | None = "task 1", **more: Any) -> bytes:
+    state = np.array([0, 0, 0, 0, 0, 1, 0.04, -0.04])
+    both = {"observation/image": image(pixel), "observation/wrist_image": image(0)}
+    return openpi_codec.encode({**both, "observation/state": state, "prompt": prompt, **more})
+
+
+def call(socket: Any, data: bytes) -> Any:
+    socket.send_bytes(data)
+    return openpi_codec.decode(socket.receive_bytes())
+
+
+def body(pixel: int, instruction: str = "task 1", **more: Any) -> dict[str, Any]:
+    return {"image": json.loads(openvla_codec.encode(image(pixel), twice=False)), "instruction": instruction, **more}
+
+
+def send(socket: Any, kind: Any, payload: dict[str, Any], seq: int) -> None:
+    socket.send_bytes(vla_eval_codec.encode(vla_eval_codec.Message(kind, payload, seq)))
+
+
+def receive(socket: Any) -> vla_eval_codec.Message:
+    return vla_eval_codec.decode(socket.receive_bytes())
+
+
+def seen(pixel: int, task: str = "task 1") -> dict[str, Any]:
+    return {"images": {"front": image(pixel)}, "task_description": task, "state": np.ones(3)}

@@ -1,0 +1,223 @@
+"""A keyed replica in a process of its own, and one that floods it: `flood.py serve`, `flood.py attack WAY WHERE S`."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import json
+import os
+import socket
+import struct
+import sys
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import asdict
+from functools import partial
+from typing import Any
+
+import numpy as np
+from asgi_server import served
+from dialect_server import ALL, METADATA
+from websockets.client import ClientProtocol
+from websockets.protocol import State
+from websockets.uri import parse_uri
+
+from vlagents_ray.images import jpeg_png
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.protocol import frame_layout
+from vlagents_ray.protocol.frames import CONTENT_TYPE
+from vlagents_ray.protocol.messages import Limits, LocalAddress
+from vlagents_ray.serve.access.api_keys import Keys
+from vlagents_ray.serve.config.dialects import DialectArgs
+from vlagents_ray.serve.dialects import json_numpy
+from vlagents_ray.serve.dialects.base import ReplicaContext
+from vlagents_ray.serve.dialects.openpi import codec as openpi_codec
+from vlagents_ray.serve.dialects.routes import dialect_routes
+from vlagents_ray.serve.dialects.vla_eval import codec as vla_eval_codec
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.endpoints.local.shm import ShmServer
+from vlagents_ray.serve.endpoints.websocket import WebSocketServer
+from vlagents_ray.serve.engine.engine import Engine
+
+HEIGHT, WIDTH = 2304, 4096  # of the largest image
+IMAGES = 4  # of these in the largest request
+
+
+class _Policy(Agent):
+    def act(self, obs: Obs) -> Act:
+        return Act(np.zeros(8, np.float32))
+
+
+def _key(name: str, **limits: Any) -> dict[str, Any]:
+    return {"name": name, "sha256": hashlib.sha256(name.encode()).hexdigest(), **limits}
+
+
+def key_of(way: str) -> str:
+    """The key of whoever floods that way, which is its name, too."""
+    return f"way-{list(WAYS).index(way)}"
+
+
+def serve() -> None:
+    """Say where it is, as JSON, and serve until the standard input ends."""
+    rated = [_key(key_of(way), rate=1, rank="simulation") for way in WAYS]
+    keys = Keys.from_text(json.dumps({"keys": [_key("robot"), *rated]}))
+    admit, limits = partial(keys.check, app="app"), Limits()
+    engine = Engine(_Policy())
+    own, near = WebSocketServer(engine, limits, "127.0.0.1", None, admit), ShmServer(engine, limits, admit)
+    own.open(), near.open()
+    engine.start()
+    routes = dialect_routes(DialectArgs(**ALL), ReplicaContext(engine, lambda: METADATA, limits))
+    with served(
+        AccessMiddleware(build_http_app(engine, lambda: METADATA, limits, dialects=routes), keys, "app")
+    ) as port:
+        found = {"port": port, "own": [own.address.port, own.path], "local": asdict(near.address)}
+        print(json.dumps(found), flush=True)
+        sys.stdin.read()
+    engine.close()
+    own.close(), near.close()
+
+
+def _jpeg() -> bytes:
+    """Of the largest image, so that the largest request fits into a WebSocket's message."""
+    pixels = np.random.default_rng(0).integers(0, 255, (HEIGHT // 8, WIDTH // 8, 3), np.uint8)
+    return jpeg_png.encode_jpeg(np.repeat(np.repeat(pixels, 8, 0), 8, 1), 60, "420")
+
+
+def _frame(op: str = "reset") -> bytes:
+    seen = [{"cameras": {"front": {"$": ["img", i]}}} for i in range(IMAGES)]
+    return b"".join(frame_layout.pack({"op": op, "obs": seen[0], "history": seen[1:]}, [_jpeg()] * IMAGES))
+
+
+def _raw_frame() -> bytes:
+    size = 2304 * 2400 * 3
+    node = {"cameras": {"front": {"$": ["nd", 0, "|u1", [2304, 2400, 3]]}}}
+    return b"".join(frame_layout.pack({"op": "reset", "obs": node}, [bytes(size)]))
+
+
+def _probe() -> bytes:
+    return b"VLA?\1\0\0\0" + _frame()  # as clients of earlier versions measured codecs
+
+
+def _map(**more: Any) -> bytes:
+    both = {
+        "observation/image": np.zeros((2304, 2300, 3), np.uint8),
+        "observation/wrist_image": np.zeros((8, 8, 3), np.uint8),
+    }
+    return openpi_codec.encode({**both, "observation/state": np.zeros(8), "prompt": "x", **more})
+
+
+def _of_vla_eval() -> bytes:
+    image = {"__image__": True, "format": "jpeg", "data": _jpeg(), "shape": [HEIGHT, WIDTH, 3]}
+    seen = {"images": {f"camera{i}": image for i in range(IMAGES)}, "task_description": "x"}
+    return vla_eval_codec.encode(vla_eval_codec.Message("observation", seen, 1))
+
+
+def _form() -> bytes:
+    parts = [b'--X\r\nContent-Disposition: form-data; name="obs"\r\n\r\n{}\r\n']
+    for i in range(IMAGES):
+        head = f'--X\r\nContent-Disposition: form-data; name="cameras.{i}"; filename="a"\r\n\r\n'
+        parts += [head.encode(), _jpeg(), b"\r\n"]
+    return b"".join(parts) + b"--X--\r\n"
+
+
+def _of_openvla() -> bytes:
+    return json_numpy.dumps({"image": np.zeros((HEIGHT, WIDTH, 3), np.uint8), "instruction": "x"}).encode()
+
+
+Where = dict[str, Any]
+Attack = Callable[[bytes, Where, str, float], None]
+
+
+def _drain(connection: socket.socket) -> None:
+    with contextlib.suppress(OSError):
+        while connection.recv(65536):
+            pass
+
+
+def _websocket(path: str) -> Attack:
+    def attack(message: bytes, where: Where, key: str, end: float) -> None:
+        port, place = (where["own"][0], where["own"][1]) if path == "own" else (where["port"], path)
+        head = bytes([0x82, 0x80 | 127]) + struct.pack(">Q", len(message)) + bytes(4)
+        with socket.create_connection(("127.0.0.1", port), timeout=5) as connection:
+            protocol = ClientProtocol(parse_uri(f"ws://127.0.0.1:{port}{place}"))
+            request = protocol.connect()
+            request.headers["authorization"] = f"Bearer {key}"
+            protocol.send_request(request)
+            connection.sendall(b"".join(protocol.data_to_send()))
+            while protocol.state is State.CONNECTING:
+                protocol.receive_data(connection.recv(65536))
+            threading.Thread(target=_drain, args=(connection,), daemon=True).start()
+            while (left_s := end - time.monotonic()) > 0:
+                connection.settimeout(left_s)
+                connection.sendall(head + message)
+
+    return attack
+
+
+def _post(path: str, kind: str) -> Attack:
+    def attack(content: bytes, where: Where, key: str, end: float) -> None:
+        head = (
+            f"POST {path} HTTP/1.1\r\nhost: localhost\r\nauthorization: Bearer {key}\r\nx-session-id: s\r\n"
+            f"content-type: {kind}\r\ncontent-length: {len(content)}\r\n\r\n"
+        ).encode()
+        with socket.create_connection(("127.0.0.1", where["port"]), timeout=5) as connection:
+            while time.monotonic() < end:
+                connection.sendall(head + content)
+                if not connection.recv(65536):
+                    return
+
+    return attack
+
+
+def _shared_memory(message: bytes, where: Where, key: str, end: float) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as connection:
+        connection.connect("\0" + where["local"]["socket"])
+        connection.send(key.encode())
+        descriptor = os.memfd_create("flood", os.MFD_ALLOW_SEALING)
+        os.ftruncate(descriptor, len(message))
+        os.pwrite(descriptor, message, 0)
+        fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, fcntl.F_SEAL_SHRINK)
+        threading.Thread(target=_drain, args=(connection,), daemon=True).start()
+        head = LocalAddress.REQUEST.pack(0, 0, len(message))
+        socket.send_fds(connection, [head], [descriptor])
+        while (left_s := end - time.monotonic()) > 0:
+            connection.settimeout(left_s)
+            connection.send(head)
+
+
+WAYS: dict[str, tuple[Callable[[], bytes], Attack]] = {
+    "own port": (_frame, _websocket("own")),
+    "own port, raw": (_raw_frame, _websocket("own")),
+    "own port, probes": (_probe, _websocket("own")),
+    "WS /v1/stream": (_frame, _websocket("/v1/stream")),
+    "WS /v1/stream, probes": (_probe, _websocket("/v1/stream")),
+    "WS /openpi": (_map, _websocket("/openpi")),
+    "WS /roboarena": (partial(_map, endpoint="infer", session_id="a"), _websocket("/roboarena")),
+    "WS /vla-eval": (_of_vla_eval, _websocket("/vla-eval")),
+    "POST /v1/reset, form": (_form, _post("/v1/reset", "multipart/form-data; boundary=X")),
+    "POST /v1/reset, frame": (_frame, _post("/v1/reset", CONTENT_TYPE)),
+    "POST /v1/probe": (_probe, _post("/v1/probe", "application/octet-stream")),
+    "POST /act": (_of_openvla, _post("/act", "application/json")),
+    "shared memory": (_frame, _shared_memory),
+}
+
+
+def attack(way: str, where: Where, seconds: float) -> None:
+    """Send the largest messages for so long, as fast as they are taken, whatever is answered."""
+    make, send = WAYS[way]
+    message, end = make(), time.monotonic() + seconds
+    print("begun", flush=True)
+    while time.monotonic() < end:
+        with contextlib.suppress(OSError):  # cut off: once more
+            send(message, where, key_of(way), end)
+        time.sleep(0.001)
+
+
+if __name__ == "__main__":
+    if sys.argv[1] == "serve":
+        serve()
+    else:
+        attack(sys.argv[2], json.loads(sys.argv[3]), float(sys.argv[4]))

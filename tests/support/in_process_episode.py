@@ -1,0 +1,30 @@
+"""One episode of an env with an agent in the test's process."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.envs import EvalEnv
+from vlagents_ray.evaluate.episode.episode import run_episode
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.policies.scripted import Scripted
+
+
+class Always(Agent):
+    """The same action in every step."""
+
+    def __init__(self, *action: float) -> None:
+        self.action = np.array(action, np.float32)
+
+    def act(self, obs: Obs) -> Act:
+        return Act(self.action.copy())
+
+
+def play(env: EvalEnv, name: str, agent: Agent | None = None, *, seed: int = 0, **options: Any) -> EpisodeResult:
+    """The episode of `seed` and the reset's `options`; without an agent the env's scripted expert plays it."""
+    key = EpisodeKey(name, episode=0, seed=seed, settings="")
+    return run_episode(env, agent or Scripted(), key, reset_options=options)

@@ -1,0 +1,172 @@
+"""Replicas in this process, and a transport to them that fails on demand."""
+
+from __future__ import annotations
+
+import asyncio
+import queue
+import threading
+import time
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+from vlagents_ray.client.agent import RemoteAgent
+from vlagents_ray.client.connection import Connection
+from vlagents_ray.client.transports.codec_selection import CodecChoice
+from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, PolicyUnavailable, UnknownApp
+from vlagents_ray.interface import Agent
+from vlagents_ray.protocol.budget import Budget
+from vlagents_ray.protocol.frames import (
+    decode_replies,
+    decode_requests,
+    encode_replies,
+    encode_requests,
+)
+from vlagents_ray.protocol.messages import (
+    DEFAULT_LIMITS,
+    PROTOCOL_VERSION,
+    Reply,
+    Request,
+)
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.engine.dispatch import Dispatcher
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.models.checkpoints import Checkpoints
+from vlagents_ray.serve.scaling.held_sessions import Peer, PeerEnded
+from vlagents_ray.serve.scaling.session_migration import SessionMigrator
+
+
+class Replicas:
+    """Engines of one policy that know each other; requests go to the first that lives and does not stop."""
+
+    def __init__(self, agents: Sequence[Agent | Checkpoints]) -> None:
+        self.dead: set[int] = set()
+        self.frozen: set[int] = set()
+        self.prefer = 0  # where new connections go, if that one lives and does not stop
+        self.lose_reply = False  # of the next frame, after it was acted on
+        self.stopping = False  # the server has no application any more, or none yet
+        self.frames: list[int] = []  # requests in each frame that was sent
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever)
+        self._thread.start()
+        self.migrators = [SessionMigrator(partial(self._others, number), self._loop) for number in range(len(agents))]
+        self.engines = [Engine(agent, finder=finder) for agent, finder in zip(agents, self.migrators, strict=True)]
+        for migrator, engine in zip(self.migrators, self.engines, strict=True):
+            migrator.start(engine)
+            engine.start()
+
+    def agent(self, **options: Any) -> RemoteAgent:
+        """A client of them."""
+        agent = RemoteAgent("http://127.0.0.1:9", **options)
+        another = partial(InProcess, self) if options.get("resume", True) else None
+        agent._connection = Connection(agent.url, InProcess(self), CodecChoice("raw"), 5.0, 5.0, another)
+        return agent
+
+    def close(self) -> None:
+        """End all engines."""
+        for migrator in self.migrators:
+            asyncio.run_coroutine_threadsafe(migrator.close(), self._loop).result(30)
+        self._loop.call_soon_threadsafe(self._loop.stop)
+        self._thread.join()
+        self._loop.close()
+        for engine in self.engines:
+            engine.close()
+
+    def hand_over(self, number: int) -> int:
+        """As when that one stops: how many sessions the others took."""
+        return asyncio.run_coroutine_threadsafe(self.migrators[number].hand_over(), self._loop).result(30)
+
+    async def _others(self, me: int) -> list[Peer]:
+        return [_Peer(self, number) for number in range(len(self.engines)) if number != me]
+
+
+class InProcess:
+    """Frames to an engine and back."""
+
+    name = "in process"
+    holds_sessions = True
+
+    def __init__(self, replicas: Replicas) -> None:
+        self._replicas = replicas
+        self._sender: Dispatcher | None = None
+        self._number = -1
+
+    def connect(self, timeout_s: float) -> dict[str, Any]:
+        """To the preferred replica, or the first that is there."""
+        if self._replicas.stopping:
+            raise UnknownApp("no application at this path")
+        numbered = sorted(enumerate(self._replicas.engines), key=lambda one: one[0] != self._replicas.prefer)
+        for number, engine in numbered:
+            if number not in self._replicas.dead | self._replicas.frozen and not engine.draining:
+                self._number, self._sender = number, Dispatcher(engine, "in process", caller=NoKey.OPEN)
+                contract = engine.contract
+                return {"protocol": PROTOCOL_VERSION, "contract": contract.to_json() if contract else None}
+        raise PolicyUnavailable("no replica lives")
+
+    def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
+        """As a transport does."""
+        if self._sender is None:
+            raise PolicyUnavailable("not connected")
+        self._replicas.frames.append(len(requests))
+        if self._number in self._replicas.dead:
+            self.close()
+            raise ConnectionLost("the replica is dead")
+        if self._number in self._replicas.frozen:
+            time.sleep(timeout_s)
+            raise DeadlineExceeded("no answer")
+        answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+        frame = encode_requests(requests)
+        self._sender.send(
+            decode_requests(frame, Budget(DEFAULT_LIMITS)), lambda replies: answers.put(encode_replies(replies))
+        )
+        try:
+            answer = answers.get(timeout=timeout_s)
+        except queue.Empty:
+            raise DeadlineExceeded("no answer") from None
+        if self._replicas.lose_reply:
+            self._replicas.lose_reply = False
+            self.close()
+            raise ConnectionLost("the reply was lost")
+        return decode_replies(answer)
+
+    def close(self) -> None:
+        """As when a connection ends."""
+        if self._sender is not None:
+            self._sender.release()
+            self._sender = None
+
+
+class _Peer(Peer):
+    def __init__(self, replicas: Replicas, number: int) -> None:
+        self.name = str(number)
+        self._replicas = replicas
+        self._number = number
+
+    async def ask(self, method: Any, *args: Any, **kwargs: Any) -> Any:
+        """By a call in this process."""
+        if self._number in self._replicas.dead:
+            raise PeerEnded(self.name)
+        if self._number in self._replicas.frozen:
+            await asyncio.sleep(60)
+        return await getattr(self._replicas.migrators[self._number].held, method.__name__)(*args)
+
+
+def export(engine: Engine, session_id: str) -> dict[str, Any] | None:
+    """Take a session out of a replica, as another one does that adopts it; None if it stays."""
+    copied = _ask(engine, session_id, Request("export"))
+    if copied.info is None:
+        return None
+    released = _ask(engine, session_id, Request("release", kwargs={"version": version_of(copied.info)}))
+    assert released.info == {"released": True}
+    return copied.info
+
+
+def version_of(state: dict[str, Any]) -> tuple[int, int]:
+    """The version of what was exported."""
+    return state["steps"], state["moves"]
+
+
+def _ask(engine: Engine, session_id: str, request: Request) -> Reply:
+    replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
+    engine.submit(session_id, request, replies.put)
+    return replies.get(timeout=30)

@@ -1,0 +1,99 @@
+"""What a test needs, by its markers: what this machine cannot give is skipped, what no marker names is refused.
+
+So `make check`, which leaves out whatever is marked, is sure to start no Ray and to load no simulator.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from importlib.abc import Loader
+from importlib.machinery import ModuleSpec, PathFinder
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from assets import assets
+from browser import CHROMIUM
+from cluster_hosts import no_hosts
+
+# Ray makes a session's folder in this one: in no process of the test does one start that finds a file in its place.
+_NO_RAY = "/dev/null/not-marked-ray"  # short: a longer name would be replaced, as sockets in it could not be named
+_RAY = ("ray", "server", "hosts")
+_SIMULATORS = {"gym_pusht", "gymnasium_robotics", "libero", "mani_skill", "metaworld", "mujoco", "rcs", "sapien"}
+
+
+def left_out(file: Path, markexpr: str) -> bool:
+    """Does `-m 'not (a or b)'` leave out all of a file? Then it is not imported: torch and simulators take seconds."""
+    names = re.fullmatch(r"not \((\w+(?: or \w+)*)\)", markexpr)
+    if names is None or file.suffix != ".py":
+        return False
+    marked = " ".join(re.findall(r"^pytestmark = .*", file.read_text(), re.MULTILINE))
+    return not set(re.findall(r"pytest\.mark\.(\w+)", marked)).isdisjoint(names[1].split(" or "))
+
+
+def skip_what_is_missing(item: pytest.Item) -> None:
+    """Skip what this machine cannot run; the Vulkan device is looked for when the first test wants it."""
+    if item.get_closest_marker("gpu") and not any(Path("/dev").glob("nvidia[0-9]*")):
+        pytest.skip("no NVIDIA GPU")
+    for marker in item.iter_markers("source"):
+        [variable] = marker.args
+        if not os.environ.get(variable):
+            pytest.skip(f"{variable} names no checkout of this family's source")
+    for marker in item.iter_markers("assets"):
+        [simulator] = marker.args
+        if assets(simulator) is None:
+            pytest.skip(f"no assets of {simulator}: VLAGENTS_RAY_ASSETS names their folder")
+    if item.get_closest_marker("hosts") and (reason := no_hosts()):
+        pytest.skip(reason)
+    if item.get_closest_marker("browser") and CHROMIUM is None:
+        pytest.skip("no Chromium")
+    if item.get_closest_marker("vulkan"):
+        from vlagents_ray.envs.maniskill import ManiSkill
+
+        missing = ManiSkill.missing()
+        if missing:
+            pytest.skip(missing)
+
+
+@contextmanager
+def nothing_else(item: pytest.Item) -> Iterator[None]:
+    """Refuse Ray, torch and simulators for the length of a test, unless its markers name them."""
+    marked = {marker.name for marker in item.iter_markers()}
+    modules = set()
+    if not marked & {"sim", "vulkan"}:
+        modules |= _SIMULATORS
+    if not marked & {"sim", "vulkan", "torch"}:
+        modules |= {"torch"}
+    refusal = _Refusal(modules)
+    environment = dict(os.environ)
+    if not marked & set(_RAY):
+        os.environ["RAY_TMPDIR"] = _NO_RAY
+    sys.meta_path.insert(0, refusal)
+    try:
+        yield
+    finally:
+        sys.meta_path.remove(refusal)
+        if not marked & set(_RAY):
+            os.environ.pop("RAY_TMPDIR", None)
+            if "RAY_TMPDIR" in environment:
+                os.environ["RAY_TMPDIR"] = environment["RAY_TMPDIR"]
+
+
+class _Refusal(Loader):
+    """Loads none of some modules, as if they were not installed; those that are loaded already are not asked for."""
+
+    def __init__(self, modules: set[str]) -> None:
+        self._modules = modules
+
+    def find_spec(self, name: str, path: Sequence[str] | None, target: ModuleType | None = None) -> ModuleSpec | None:
+        spec = PathFinder.find_spec(name, path) if name in self._modules else None
+        if spec is not None:
+            spec.loader = self
+        return spec
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType:
+        raise ModuleNotFoundError(f"{spec.name}: the test is not marked `sim` or `torch`", name=spec.name)

@@ -1,0 +1,36 @@
+"""A Python environment with other systems' clients from PyPI, some of whose requirements conflict with ours.
+
+The environment is `.venv-peers` of this checkout, the one that the benchmark uses; it is created at first use.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from pathlib import Path
+from typing import Any
+
+from vlagents_ray.bench.peers import REQUIREMENTS, set_up
+from vlagents_ray.serve.python_env.create import python_in
+
+FOLDER = Path(os.environ.get("VLAGENTS_PEERS", Path(__file__).parents[2] / ".venv-peers"))
+CLIENTS = Path(__file__).with_name("peer_clients.py")
+
+
+def peers_python() -> Path:
+    """Their Python, with the pinned packages in it."""
+    stamp = FOLDER / "installed.txt"
+    wanted = REQUIREMENTS.read_text()
+    if not stamp.is_file() or stamp.read_text() != wanted:
+        set_up(FOLDER)
+        stamp.write_text(wanted)
+    return python_in(FOLDER)
+
+
+def drive(python: Path, client: str, *words: object, timeout_s: float = 120) -> Any:
+    """What a client of `peer_clients.py` has to say at its end; its error is this process's."""
+    command = [str(python), str(CLIENTS), client, *map(str, words)]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=timeout_s)
+    assert done.returncode == 0, f"{client} ended with {done.returncode}:\n{done.stdout[-2000:]}\n{done.stderr[-4000:]}"
+    return json.loads(done.stdout.splitlines()[-1])

@@ -1,0 +1,35 @@
+"""Whether a loaded policy acts with weights that are pushed, and as before with those that it had."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.interface import Agent
+from vlagents_ray.serve.weights.versions import ModelWeights
+from vlagents_ray.weights.trainable import own_copy
+
+
+def check_pushed_weights(agent: Agent, act: Callable[[], np.ndarray]) -> None:
+    """Push weights twice.
+
+    Args:
+        agent: Initialized.
+        act: Returns the first action of an episode, always of the same one.
+    """
+    weights = ModelWeights(agent, threading.Lock())
+    before, loaded = act(), {name: own_copy(value) for name, value in agent.parameters().items()}
+
+    def push(number: int, named: Mapping[str, Any]) -> np.ndarray:
+        weights.stage(number, named)
+        weights.commit(number, "keep", list)
+        weights.use(weights.newest)
+        return act()
+
+    other = push(1, {name: 0.8 * value if value.is_floating_point() else value for name, value in loaded.items()})
+    assert other.shape == before.shape
+    assert not np.allclose(other, before)
+    np.testing.assert_array_equal(push(2, loaded), before)

@@ -1,0 +1,103 @@
+"""Policies for separate Python environments; before they are loaded they need only numpy and this package."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import json
+import os
+import platform
+import sys
+import weakref
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray import Act, ActionSpec, Agent, Contract, Obs
+
+ALIVE: weakref.WeakSet[Telling] = weakref.WeakSet()  # sessions that this process holds
+
+
+class Telling(Agent):
+    """Brings `eval_fakes.Line` to zero, and says in every `info` what it runs on and how many acts it has behind it.
+
+    `needs` is imported when it is loaded; what it says at each reset is also a line of the file `notes`.
+    """
+
+    contract = Contract(action=ActionSpec(dim=1))
+
+    def __init__(self, needs: str = "numpy", notes: str | None = None) -> None:
+        self.needs = needs
+        self.notes = notes
+
+    def initialize(self) -> None:
+        print("a policy is loading", file=sys.stderr)
+        self.version = importlib.import_module(self.needs).__version__
+        self.weights_id = {"digest": self.version, "revision": None}
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        if instruction == "fail":
+            raise RuntimeError("/no/path/of/ours")
+        ALIVE.add(self)
+        self.instruction, self.acts, self.seen = instruction, 0, [float(obs.info.get("value", 0))]
+        if self.notes is not None:
+            with Path(self.notes).open("a") as file:
+                file.write(json.dumps(self.told()) + "\n")
+        return self.told()
+
+    def observe(self, obs: Obs) -> None:
+        self.seen.append(float(obs.info["value"]))
+
+    def act(self, obs: Obs) -> Act:
+        if obs.info.get("exit"):
+            os._exit(7)
+        self.acts += 1
+        self.observe(Obs(info={"value": obs.info.get("value", 0)}))
+        position = obs.state["position"][:1] if obs.state else np.zeros(1)
+        return Act(-np.asarray(position, np.float32), info=self.told() | {"batch": 1})
+
+    def act_batch(self, obs: Any, sessions: Any) -> list[Act | Exception]:
+        acts: list[Act | Exception] = []
+        for act in super().act_batch(obs, sessions):
+            if isinstance(act, Act):
+                act.info["batch"] = len(obs)
+            acts.append(act)
+        return acts
+
+    def told(self) -> dict[str, Any]:
+        """What this process is, and this session."""
+        try:
+            ray = importlib.metadata.version("ray")
+        except importlib.metadata.PackageNotFoundError:
+            ray = None
+        return {
+            "python": platform.python_version(), "numpy": np.__version__, "ray": ray, self.needs: self.version,
+            "prefix": sys.prefix, "pid": os.getpid(), "parent": os.getppid(), "variable": os.environ.get("VARIABLE"),
+            "gpus": os.environ.get("CUDA_VISIBLE_DEVICES"), "instruction": self.instruction, "acts": self.acts,
+            "seen": list(self.seen), "alive": len(ALIVE),
+        }  # fmt: skip
+
+
+class Unpicklable(Telling):
+    """Its sessions cannot move."""
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        told = super().reset(obs, instruction, **kwargs)
+        self.lock = open(os.devnull)  # noqa: SIM115
+        return told
+
+
+class Broken(Telling):
+    """Cannot load."""
+
+    def initialize(self) -> None:
+        raise FileNotFoundError("no checkpoint here")
+
+
+class Dying(Telling):
+    """Ends its process while it loads."""
+
+    def initialize(self) -> None:
+        print("the driver is too old", file=sys.stderr, flush=True)
+        os._exit(3)

@@ -1,0 +1,93 @@
+"""The layout that ARCHITECTURE.md describes, as far as import-linter does not hold it."""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import vlagents_ray
+from vlagents_ray.registry import ENVS, POLICIES
+
+PACKAGE = Path(vlagents_ray.__file__).parent
+FILES = {
+    ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"): path
+    for path in PACKAGE.rglob("*.py")
+}
+_LINES, _MODULES = 350, 9
+# As `ray._raylet`, `ray.serve._private.api`, or a name with an underscore that is imported from Ray.
+_PRIVATE = re.compile(r"\bray(\.\w+)*\._\w|^\s*from ray\S* import .*\b_\w", re.MULTILINE)
+
+
+@cache
+def tree(module: str) -> ast.Module:
+    return ast.parse(FILES[module].read_text())
+
+
+def imports(module: str) -> Iterator[str]:
+    """The modules that one imports, those included that only a type checker, or a function, does."""
+    for node in ast.walk(tree(module)):
+        if isinstance(node, ast.ImportFrom) and node.module is not None:
+            for alias in node.names:
+                name = f"{node.module}.{alias.name}"
+                yield name if name in FILES else node.module
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+
+
+def circles(edges: dict[str, set[str]]) -> list[set[str]]:
+    """The groups in which each is reached from each."""
+    reached = {start: _reached(start, edges) for start in edges}
+    groups = {frozenset(other for other in reached[one] if one in reached.get(other, ())) for one in edges}
+    return [set(group) for group in groups if len(group) > 1]
+
+
+def _reached(start: str, edges: dict[str, set[str]]) -> set[str]:
+    found: set[str] = set()
+    left = [start]
+    while left:
+        new = edges.get(left.pop(), set()) - found
+        found |= new
+        left += new
+    return found
+
+
+def test_no_module_imports_itself_by_way_of_others() -> None:
+    edges = {module: {name for name in imports(module) if name in FILES and name != module} for module in FILES}
+    assert circles(edges) == []
+
+
+def test_a_circle_would_be_found() -> None:
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == [{"a", "b", "c"}]
+
+
+def test_a_class_name_stands_once() -> None:
+    places = defaultdict(list)
+    for module in FILES:
+        for node in ast.walk(tree(module)):
+            if isinstance(node, ast.ClassDef):
+                places[node.name].append(module)
+    assert {name: found for name, found in places.items() if len(found) > 1} == {}
+
+
+def test_no_file_grows_long() -> None:
+    long = {module for module, path in FILES.items() if len(path.read_text().splitlines()) > _LINES}
+    assert not long, "cut them"
+
+
+def test_no_folder_has_more_modules_than_a_reader_takes_in() -> None:
+    one_of_many = {place.partition(":")[0] for place in (*ENVS.values(), *POLICIES.values())}  # found by its name
+    folders = Counter(
+        path.parent for module, path in FILES.items() if path.stem != "__init__" and module not in one_of_many
+    )
+    full = {folder for folder, modules in folders.items() if modules > _MODULES}
+    assert not full, "make folders of subjects in them"
+
+
+def test_private_names_of_ray_are_in_one_module() -> None:
+    users = {module for module, path in FILES.items() if _PRIVATE.search(path.read_text())}
+    by_value = "vlagents_ray.serve.scaling.router"  # may import nothing of this package
+    assert users == {"vlagents_ray.ray_tools.private", by_value}

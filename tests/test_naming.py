@@ -1,0 +1,27 @@
+"""Names of files and features: one for each."""
+
+from __future__ import annotations
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from vlagents_ray.naming import distinct, plain
+
+
+def test_a_name_is_numbered_only_where_it_would_be_anothers() -> None:
+    assert distinct(["front", "left/wrist"]) == {"front": "front", "left/wrist": "left_wrist"}
+    assert distinct(["left/wrist", "left wrist", "left_wrist", "left_wrist_2"]) == {
+        "left_wrist": "left_wrist",
+        "left_wrist_2": "left_wrist_2",
+        "left wrist": "left_wrist_3",
+        "left/wrist": "left_wrist_4",
+    }
+
+
+@given(st.lists(st.text("ab_/ 2", min_size=1, max_size=6), unique=True))
+def test_no_two_names_become_the_same_in_whatever_order_they_come(names: list[str]) -> None:
+    found = distinct(names)
+    assert len(set(found.values())) == len(names)
+    assert distinct(reversed(names)) == found
+    assert all(found[name] == name for name in names if plain(name) == name)
+    assert all(plain(own) == own for own in found.values())

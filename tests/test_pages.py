@@ -1,0 +1,120 @@
+"""What README and the pages under docs/ show works: every Python and shell block is run as typed, or says why not.
+
+Each runs in a fresh folder, in which there is what a checkout has and what earlier evaluations left. Those that want a
+served policy, and tutorials, are run by test_served_pages.py.
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+from flat_config import flat_config
+from in_process_evaluation import play
+from page_commands import PAGES, TUTORIALS, commands, read_as_typed
+from readme_blocks import PYTHON, SHELL, Block, blocks, check_commands, checkout, run
+from recorded_results import record, runs
+
+from vlagents_ray.policies.scripted import Scripted
+
+README = next(page for page in PAGES if page.name == "README.md")
+BLOCKS = [(page, block) for page in PAGES for block in blocks(page.read_text())]
+RUN_HERE = [(page, block) for page, block in BLOCKS if page not in TUTORIALS and not (block.not_run or block.server)]
+SEEDS = {"first": 0, "a": 0, "b": 10, "machine-a": 20, "machine-b": 30} | {f"array/{n}": 100 * n for n in range(4)}
+
+# What a sentence names can mostly not be typed as it stands ("vlagents-ray serve POLICY"); of the rest, these are run,
+RUN = {"vlagents-ray doctor", "vlagents-ray policies"}
+# and these are not.
+NOT_RUN = {
+    "vlagents-ray envs": "a block of docs/evaluation/index.md runs it",
+    "vlagents-ray slurm eval": "the name of a command",
+    "vlagents-ray serve my_policies:Reach --set gain=0.3": "test_served_pages.py serves it",
+    "vlagents-ray bench report": "minutes of measuring",
+    "vlagents-ray env make requirements/hf.txt --into .venv-hf": "it downloads packages",
+    "vlagents-ray env make requirements/libero.txt": "it downloads packages",
+}
+
+
+@pytest.fixture(scope="module")
+def earlier(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folders of results by the names that pages give them: an expert's at the tabletop, and a sweep of a learner's."""
+    folder = tmp_path_factory.mktemp("earlier") / "runs"
+    for name, seed in SEEDS.items():
+        first = name == "first"
+        settings = {"policy": "other" if name == "b" else "scripted", "envs": ["tabletop"], "seed": seed}
+        settings |= {"episodes": 4 if first else 1}
+        kept = "all" if first else "none"
+        play(flat_config(**settings, out=folder / name, video=kept, record=kept), Scripted)
+    record(runs(folder / "sweep"))
+    return folder
+
+
+@pytest.fixture
+def reader(earlier: Path, tmp_path: Path) -> Path:
+    """A folder of a reader's."""
+    checkout(tmp_path)
+    shutil.copytree(earlier, tmp_path / "runs")
+    return tmp_path
+
+
+def named(page: Path, block: Block) -> object:
+    """Each command of a shell block starts an interpreter; what quick tests say of them is in test_docs.py."""
+    marks = [pytest.mark.server] * block.ray + [pytest.mark.slow] * (block.ray or block.language in SHELL)
+    return pytest.param(page, block, id=f"{page.stem}-{block}", marks=marks)
+
+
+@pytest.mark.parametrize(("page", "block"), [named(page, block) for page, block in RUN_HERE])
+def test_a_block_works(page: Path, block: Block, reader: Path) -> None:
+    run(block, reader, page=page.stem)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("line", sorted(RUN))
+def test_a_command_in_a_sentence_works(line: str, tmp_path: Path) -> None:
+    run(Block("bash", 1, line), tmp_path)
+
+
+def test_python_that_is_not_run_is_python() -> None:
+    for page, block in BLOCKS:
+        if block.not_run and block.language in PYTHON:
+            compile(block.source, page.name, "exec")
+
+
+def test_commands_of_the_readme_that_are_not_run_exist() -> None:
+    for page, block in BLOCKS:
+        if page == README and block.not_run and block.language in SHELL:
+            check_commands(block)
+
+
+def test_the_readme_is_one_that_is_read() -> None:
+    assert len(README.read_text().splitlines()) <= 200
+    assert {block.language for page, block in BLOCKS if page == README} == {"python", "bash"}
+
+
+def as_it_stands(line: str) -> bool:
+    """Whether a command in a sentence can be typed, with no word of it standing for another."""
+    try:
+        read_as_typed(line, whole=True)
+    except ValueError:
+        return False
+    return not re.search(r"[\[\]…]|\.\.\.|\b[A-Z]{3,}\b", line)
+
+
+def test_a_command_in_a_sentence_is_run_or_said_not_to_be() -> None:
+    said = {line for page in PAGES for line, in_block in commands(page.read_text()) if not in_block}
+    assert {line for line in said if as_it_stands(line)} == RUN | set(NOT_RUN)
+
+
+def test_no_command_stands_in_a_block_that_nobody_runs() -> None:
+    for page in PAGES:
+        fences = re.findall(r"^ *```(\w*)\n(.*?)```", page.read_text(), re.DOTALL | re.MULTILINE)
+        others = "".join(code for language, code in fences if language not in SHELL)
+        assert not re.search(r"^ *(\$ )?(\w+=\S+ )*(vlagents-ray|python -m vlagents_ray\S*) ", others, re.MULTILINE), (
+            page
+        )
+
+
+def test_there_are_such_blocks() -> None:
+    assert len(RUN_HERE) > 10

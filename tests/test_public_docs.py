@@ -1,0 +1,144 @@
+"""Docstrings of the public names: whole sentences, and every argument by its name."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import inspect
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+
+from vlagents_ray import registry
+
+MODULES = (
+    "vlagents_ray",
+    "vlagents_ray.robot",
+    "vlagents_ray.testing",
+    "vlagents_ray.envs",
+    "vlagents_ray.evaluate",
+    "vlagents_ray.learn",
+)
+UNFINISHED: tuple[str, ...] = ()
+# A summary that begins with one of these is a fragment, which is understood with the name beside it alone.
+FRAGMENTS = {"as", "how", "it", "likewise", "of", "that", "these", "they", "this", "those", "what", "which", "who"}
+
+
+@dataclass(frozen=True)
+class Documented:
+    """A public class, function, method or property."""
+
+    name: str
+    doc: str
+    parameters: tuple[str, ...] = ()
+    returns: bool = False
+
+    def faults(self) -> Iterator[str]:
+        """What is wrong with the docstring, in words."""
+        summary = " ".join(self.doc.partition("\n\n")[0].split())
+        words = re.findall(r"[\w'.`]+", summary)
+        if len(words) < 3 or not re.match(r"[A-Z0-9`(]", summary) or not re.search(r"[.:]$", summary):
+            yield f"{self.name}: got the summary {summary!r}, want a whole sentence"
+        elif words[0].lower() in FRAGMENTS:
+            yield f"{self.name}: got the summary {summary!r}, want a sentence that does not begin with {words[0]!r}"
+        if len(self.parameters) > 1:
+            named = set(re.findall(r"(?m)^    \*{0,2}(\w+)(?: \([^)]*\))?: \S", section(self.doc, "Args")))
+            if lacking := [name for name in self.parameters if name not in named]:
+                yield f"{self.name}: no line in Args for {', '.join(lacking)}"
+            if self.returns and not section(self.doc, "Returns"):
+                yield f"{self.name}: no Returns"
+
+
+def section(doc: str, title: str) -> str:
+    """The indented lines below `title:`; "" if there are none."""
+    found = re.search(rf"(?ms)^{title}:\n((?:    .*?(?:\n|\Z)|\n)+)", doc)
+    return found[1] if found else ""
+
+
+def public_names() -> Iterator[tuple[str, Any]]:
+    """Every name that users import, with its full name."""
+    for module in MODULES:
+        loaded = importlib.import_module(module)
+        yield from ((f"{module}.{name}", getattr(loaded, name)) for name in loaded.__all__)
+    for target in (*registry.POLICIES.values(), *registry.WRAPPERS.values()):
+        module, _, name = target.partition(":")
+        yield f"{module}.{name}", getattr(importlib.import_module(module), name)
+
+
+def documented(name: str, value: Any) -> Iterator[Documented]:
+    """The docstrings of a public name; of a class, those of its methods and properties as well.
+
+    A method that overrides another one inherits its docstring, or the description of its arguments alone.
+    """
+    if inspect.isfunction(value):
+        yield of_function(name, value)
+    elif inspect.isclass(value):
+        yield of_class(name, value)
+        for key, member in vars(value).items():
+            function = member.__func__ if isinstance(member, (classmethod, staticmethod)) else member
+            if key.startswith("_") and key != "__call__":
+                continue
+            if isinstance(member, property):
+                yield Documented(f"{name}.{key}", inspect.getdoc(getattr(value, key)) or "")
+            elif inspect.isfunction(function):
+                inherited = any(hasattr(base, key) for base in value.__mro__[1:])
+                if not (inherited and function.__doc__ is None):
+                    found = of_function(f"{name}.{key}", function, method=not isinstance(member, staticmethod))
+                    yield dataclasses.replace(found, parameters=()) if inherited else found
+
+
+def of_function(name: str, function: Callable[..., Any], *, method: bool = False) -> Documented:
+    parameters = tuple(inspect.signature(function).parameters)[method:]
+    returned = str(inspect.get_annotations(function).get("return"))
+    returns = returned not in ("None", "NoReturn") and not returned.startswith(("Iterator", "Generator"))
+    return Documented(name, inspect.getdoc(function) or "", parameters, returns)
+
+
+def of_class(name: str, cls: type[Any]) -> Documented:
+    """Its docstring with its constructor's; a dataclass says at each field what it is."""
+    own = vars(cls).get("__init__")
+    doc = inspect.cleandoc(cls.__doc__ or "")
+    # Python itself gives a protocol a constructor, and a class that inherits from one when it is first called.
+    inherited = not inspect.isfunction(own) or own.__module__ == "typing"
+    if inherited or (dataclasses.is_dataclass(cls) and own.__doc__ is None):
+        return Documented(name, doc)
+    constructor = inspect.cleandoc(own.__doc__ or "")
+    return Documented(name, f"{doc}\n\n{constructor}".strip(), tuple(inspect.signature(own).parameters)[1:])
+
+
+def names_to_check() -> list[tuple[str, Any]]:
+    return [
+        (name, value) for name, value in public_names() if not getattr(value, "__module__", name).startswith(UNFINISHED)
+    ]
+
+
+def test_public_docstrings_are_whole_sentences_and_name_their_arguments() -> None:
+    faults = [fault for found in names_to_check() for one in documented(*found) for fault in one.faults()]
+    assert faults == [], "\n" + "\n".join(faults)
+
+
+def test_most_public_names_are_checked() -> None:
+    assert len(names_to_check()) > len(list(public_names())) / 2
+
+
+@pytest.mark.parametrize(
+    ("doc", "fault"),
+    [
+        ("", "whole sentence"),
+        ("Likewise.", "whole sentence"),
+        ("Of one camera in one episode.", "does not begin with"),
+        ("Add two numbers.", "no line in Args for a, b"),
+        ("Add two numbers.\n\nArgs:\n    a: The first.\n", "no line in Args for b"),
+        ("Add two numbers.\n\nArgs:\n    a: The first.\n    b: The second.\n", "no Returns"),
+    ],
+)
+def test_a_bad_docstring_is_found(doc: str, fault: str) -> None:
+    assert fault in "".join(Documented("add", doc, ("a", "b"), returns=True).faults())
+
+
+def test_a_good_docstring_has_no_fault() -> None:
+    doc = "Add two numbers.\n\nArgs:\n    a: The first.\n    b: The second.\n\nReturns:\n    Their sum.\n"
+    assert list(Documented("add", doc, ("a", "b"), returns=True).faults()) == []

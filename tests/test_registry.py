@@ -1,0 +1,108 @@
+"""Names of policies, wrappers and environments, and the cure for an optional package that is not installed."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import tomllib
+
+import vlagents_ray
+from vlagents_ray import registry
+from vlagents_ray.errors import MissingDependency, UnknownEnv, UnknownPolicy, UnknownWrapper
+
+ROOT = Path(vlagents_ray.__file__).parents[1]
+FAMILIES = ["diffusion_policy", "hf", "lerobot", "octo", "openpi", "openvla"]
+
+
+@pytest.fixture
+def nothing_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let every optional import fail."""
+
+    def missing(name: str) -> None:
+        raise ModuleNotFoundError(f"No module named {name!r}", name=name.partition(".")[0])
+
+    monkeypatch.setattr(importlib, "import_module", missing)
+
+
+def cure(module: str) -> str:
+    with pytest.raises(MissingDependency) as caught:
+        registry.require(module)
+    return str(caught.value).partition("; ")[2]
+
+
+@pytest.mark.usefixtures("nothing_installed")
+@pytest.mark.parametrize(
+    ("module", "files"),
+    [
+        ("torch", ["diffusion_policy", "hf", "lerobot", "openpi", "openvla"]),
+        ("transformers", ["hf", "lerobot", "octo", "openpi", "openvla"]),
+        ("jax", ["octo", "openpi"]),
+        ("diffusers", ["diffusion_policy"]),
+        ("openpi.models.model", ["openpi"]),
+        ("lerobot.processor", ["lerobot"]),
+        ("rcs.envs.base", ["rcs"]),
+    ],
+)
+def test_a_missing_model_package_is_cured_by_its_requirements_file(module: str, files: list[str]) -> None:
+    text = cure(module)
+    assert "pip install" not in text, "an extra of this package would not bring it"
+    assert "vlagents-ray env make requirements/" in text
+    assert re.findall(r"(\w+)\.txt", text) == files
+
+
+@pytest.mark.usefixtures("nothing_installed")
+def test_a_simulators_environment_is_for_the_workers_and_a_policys_for_its_deployment() -> None:
+    assert "py_executable" in cure("rcs")
+    assert "deployment's `environment`" in cure("octo.model.octo_model")
+
+
+@pytest.mark.usefixtures("nothing_installed")
+def test_a_missing_simulator_is_cured_by_its_extra() -> None:
+    assert cure("mani_skill.envs") == "pip install 'vlagents-ray[maniskill]'"
+
+
+def required() -> Iterator[str]:
+    """The top-level packages that the code imports through `require`."""
+    for path in (ROOT / "vlagents_ray").rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            match node:
+                case ast.Call(func=ast.Name("require"), args=[ast.Constant(str(module))]):
+                    yield module.partition(".")[0]
+
+
+@pytest.mark.usefixtures("nothing_installed")
+def test_every_optional_package_has_a_cure() -> None:
+    assert [name for name in sorted(set(required())) if cure(name).startswith("install the package")] == []
+
+
+def test_the_extras_and_files_that_cures_name_exist() -> None:
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    assert set(registry._EXTRAS.values()) <= extras.keys()
+    files = {file for named in registry._POLICY_REQUIREMENTS.values() for file in named}
+    assert files == set(FAMILIES)
+    for file in files | set(registry._SIMULATOR_REQUIREMENTS.values()):
+        assert (ROOT / f"requirements/{file}.txt").exists()
+
+
+@pytest.mark.parametrize("package", ["torch", "transformers", "jax", "flax", "timm"])
+def test_a_cure_names_each_file_that_lists_the_package(package: str) -> None:
+    listed = [
+        name
+        for name in FAMILIES
+        if re.search(rf"(?m)^{package}\b(?!-)", (ROOT / f"requirements/{name}.txt").read_text())
+    ]
+    assert set(listed) <= set(registry._POLICY_REQUIREMENTS[package])
+
+
+def test_an_unknown_name_raises_the_error_of_its_kind() -> None:
+    with pytest.raises(UnknownPolicy, match=r"'scriptd' is not registered.*did you mean 'scripted'"):
+        registry.policy_class("scriptd")
+    with pytest.raises(UnknownWrapper, match=r"'aro' is not registered.*did you mean 'arro'"):
+        registry.wrapper_class("aro")
+    with pytest.raises(UnknownEnv, match=r"'tabletopp' is not registered.*did you mean 'tabletop'"):
+        registry.env_class("tabletopp/reach")

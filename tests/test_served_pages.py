@@ -1,0 +1,97 @@
+"""What README and docs show of a served policy works, and each tutorial from its first block to its last."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+from page_commands import DOCS, PAGES, TUTORIALS
+from readme_blocks import DOCUMENTED_HOST, Block, blocks, checkout, run
+from serve_command import serving
+
+pytestmark = [pytest.mark.server, pytest.mark.slow]
+
+_SERVED = [
+    (page, block) for page in PAGES if page not in TUTORIALS for block in blocks(page.read_text()) if block.server
+]
+# One server after the other, and first the one that is still there from the tutorials.
+SERVED = sorted(_SERVED, key=lambda one: (one[1].server != "noop", str(one[1].server)))
+
+
+@pytest.fixture(scope="module")
+def host_of(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str | None], str]]:
+    """A policy's "host:port"; its server is started when first asked for. One runs at a time."""
+    with contextlib.ExitStack() as running:
+        current: dict[str, str] = {}
+
+        def host(policy: str | None) -> str:
+            if policy is None:
+                return DOCUMENTED_HOST
+            if policy not in current:
+                running.close()
+                current.clear()
+                log = tmp_path_factory.mktemp("serve") / "log"
+                current[policy] = running.enter_context(serving(policy, log))
+            return current[policy]
+
+        yield host
+
+
+ENV_OF_ONES_OWN = """
+from vlagents_ray.envs.tabletop import Tabletop
+
+
+class MyEnv(Tabletop):
+    pass
+"""
+
+
+def test_modules_of_ones_own_are_served_and_evaluated_from_their_folder(tmp_path: Path) -> None:
+    [policy] = [block for block in blocks((DOCS / "own_policy.md").read_text()) if block.not_run is None]
+    (tmp_path / "my_policies.py").write_text(policy.source.replace("ActionSpec(dim=3)", "ActionSpec(dim=4)"))
+    (tmp_path / "my_policies.py").write_text(
+        (tmp_path / "my_policies.py").read_text().replace("Act(action", "Act(np.append(action, 1)")
+    )
+    (tmp_path / "my_envs.py").write_text(ENV_OF_ONES_OWN)
+    log = tmp_path / "log"
+    with serving("my_policies:Reach", log, None, "--set", "gain=0.3", cwd=tmp_path) as host:
+        said = log.read_text()
+        url = f"http://{host}"
+        wanted = f"vlagents-ray eval my_envs:MyEnv --policy {url} --episodes 2 --workers 2 --out runs/own"
+        run(Block("bash", 1, wanted), tmp_path, host)
+        deadline = time.monotonic() + 60
+        while "Ctrl-C stops" not in said and time.monotonic() < deadline:
+            time.sleep(0.2)
+            said = log.read_text()
+    assert [line for line in said.splitlines() if not line.startswith("log of Ray, ")] == [
+        f"serving Reach at {url}",
+        "  policy: my_policies:Reach (gain=0.3)",
+        f"  how to talk to it: {url}/docs",
+        f"Ray programs of yours on this machine: vlagents_ray.join('{url}')",
+        "Ctrl-C stops",
+    ]
+    [kept] = re.findall(r"^log of Ray, Serve and HAProxy: (.*)$", said, re.MULTILINE)
+    assert "Adding 1 replica to Deployment(name='Policy', app='Reach')" in Path(kept).read_text()
+    Path(kept).unlink()
+
+
+@pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
+def test_a_tutorial_works_from_top_to_bottom(page: Path, host_of: Callable[[str | None], str], tmp_path: Path) -> None:
+    for block in blocks(page.read_text()):
+        if block.not_run is None:
+            run(block, tmp_path, host_of(block.server), page=f"page_{page.stem}")
+
+
+@pytest.mark.parametrize(("page", "block"), [pytest.param(*one, id=f"{one[0].stem}-{one[1]}") for one in SERVED])
+def test_a_block_works(page: Path, block: Block, host_of: Callable[[str | None], str], tmp_path: Path) -> None:
+    checkout(tmp_path)
+    run(block, tmp_path, host_of(block.server), page=page.stem)
+
+
+def test_there_are_such_blocks() -> None:
+    assert {block.server for _, block in SERVED} >= {"noop", "random", "scripted", "deployments/openpi.yaml"}
+    assert len(TUTORIALS) == 3

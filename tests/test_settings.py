@@ -1,0 +1,64 @@
+"""Values of settings that have no model: compared with annotations and defaults where these are plain."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.settings import require_arguments
+
+
+class Annotated:
+    def __init__(
+        self,
+        gain: float = 0.5,
+        steps: int = 3,
+        name: str | None = None,
+        fast: bool = False,
+        where: Path = Path(),
+        **more: Any,
+    ) -> None: ...
+
+
+class Bare:
+    def __init__(self, gain=1, mode="auto", fast=False, rows=(1, 2), seed=None): ...  # type: ignore[no-untyped-def]
+
+
+class Broken:
+    def __init__(self, gain: NoSuchType = 1.0) -> None: ...  # type: ignore[name-defined]  # noqa: F821
+
+
+@pytest.mark.parametrize(
+    ("cls", "given"),
+    [
+        (Annotated, {"gain": 1, "steps": np.int64(2), "name": "x", "fast": True, "where": "/tmp", "other": object()}),
+        (Annotated, {"gain": np.float32(1), "name": None}),
+        (Bare, {"gain": 0.5, "mode": "slow", "fast": np.True_, "rows": [3], "seed": "any"}),
+        (Broken, {"gain": 2}),
+    ],
+)
+def test_what_fits_is_taken(cls: type, given: dict[str, Any]) -> None:
+    require_arguments("policy P", cls, given)
+
+
+@pytest.mark.parametrize(
+    ("cls", "given", "said"),
+    [
+        (Annotated, {"gain": "high"}, "policy P: gain: got 'high', want float"),
+        (Annotated, {"steps": 2.5}, "steps: got 2.5, want int"),
+        (Annotated, {"steps": True}, "steps: got True, want int"),
+        (Annotated, {"name": 7}, "name: got 7, want str or None"),
+        (Annotated, {"fast": "maybe"}, "fast: got 'maybe', want bool"),
+        (Bare, {"gain": "high"}, "gain: got 'high', want float"),
+        (Bare, {"mode": 3}, "mode: got 3, want str"),
+        (Bare, {"fast": 1}, "fast: got 1, want bool"),
+        (Broken, {"gain": "high"}, "gain: got 'high', want float"),
+    ],
+)
+def test_what_does_not_is_told_before_it_is_used(cls: type, given: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        require_arguments("policy P", cls, given)

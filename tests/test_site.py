@@ -1,0 +1,56 @@
+"""The site that `make docs` builds, as a browser shows it from the file system."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from browser import Page, browser
+from eval_fakes import wait_for
+
+SITE = Path(__file__).parents[1] / "build" / "docs"
+PAGES = [
+    "index.html",
+    "tutorials/robot.html",
+    "reference/vlagents_ray.html",
+    "troubleshooting.html",
+    "measured.html",
+    "ARCHITECTURE.html",
+]
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(not (SITE / "index.html").is_file(), reason="the site is not built: make docs"),
+]
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with browser(tmp_path_factory.mktemp("profile")) as found:
+        yield found
+
+
+@pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (1280, "dark"), (360, "light")])
+def test_pages_fit_and_ask_for_nothing_outside_of_the_site(page: Page, width: int, scheme: str) -> None:
+    page.asked.clear()
+    page.said.clear()
+    for name in PAGES:
+        page.open(SITE / name, width=width, scheme=scheme)
+        assert page.value("document.body.dataset.mdColorScheme") == ("slate" if scheme == "dark" else "default")
+        assert page.value("document.documentElement.scrollWidth") <= width, name
+        assert page.value("[...document.images].filter(one => !one.naturalWidth).map(one => one.src)") == []
+    assert [url for url in page.asked if not url.startswith((SITE.as_uri(), "data:", "blob:", "about:"))] == []
+    assert page.said == []
+
+
+def test_the_search_finds_pages_without_a_server(page: Page) -> None:
+    page.open(SITE / "index.html", width=1280, scheme="light")
+    page.value('document.querySelector(".md-search__input").focus()')
+    for letter in "watchdog":
+        for event in ("keyDown", "keyUp"):
+            page.call(
+                "Input.dispatchKeyEvent", type=event, key=letter, **({"text": letter} if event == "keyDown" else {})
+            )
+    found = '[...document.querySelectorAll(".md-search-result__link")].map(link => link.href)'
+    wait_for(lambda: page.value(found), 60)
+    assert any(link.startswith((SITE / "control_loop.html").as_uri()) for link in page.value(found))

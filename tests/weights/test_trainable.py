@@ -1,0 +1,148 @@
+"""The named values of numpy trees and torch modules."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from vlagents_ray.errors import NotTrainable
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.weights.trainable import converted, dtype_name, named_values, portable, set_values
+
+
+class Linear(Agent):
+    """Acts by a tree of numpy arrays."""
+
+    trainable: ClassVar[str | None] = "tree"
+
+    def initialize(self) -> None:
+        self.tree = {"layers": [{"w": np.eye(2, dtype=np.float32)}], "bias": np.zeros(2, np.float32)}
+
+    def act(self, obs: Obs) -> Act:
+        return Act(self.tree["layers"][0]["w"] @ np.ones(2, np.float32) + self.tree["bias"])  # type: ignore[index,call-overload]
+
+
+def test_values_of_a_tree_are_named_by_their_keys_and_replaced_in_the_same_dicts() -> None:
+    agent = Linear()
+    agent.initialize()
+    tree = agent.tree
+    assert list(agent.parameters()) == ["layers/0/w", "bias"]
+    agent.load_parameters({"bias": np.full(2, 3, np.float32)})
+    assert agent.tree is tree
+    np.testing.assert_array_equal(agent.act(Obs()).action, [4, 4])
+
+
+def test_sessions_share_what_is_trainable() -> None:
+    agent = Linear()
+    agent.initialize()
+    assert agent.shared_objects() == [agent.tree]
+
+
+def test_what_is_trainable_may_be_inside_of_what_sessions_share() -> None:
+    class Deep(Linear):
+        shared = ("model",)
+        trainable = "model.tree"
+
+        def initialize(self) -> None:
+            super().initialize()
+            self.model = SimpleNamespace(tree=self.tree)
+
+    agent = Deep()
+    agent.initialize()
+    assert agent.shared_objects() == [agent.model]
+    agent.load_parameters({"bias": np.full(2, 3, np.float32)})
+    np.testing.assert_array_equal(agent.act(Obs()).action, [4, 4])
+
+
+def test_an_agent_that_names_nothing_to_train_says_how_to() -> None:
+    with pytest.raises(NotTrainable, match="set `trainable`"):
+        Agent().parameters()
+    with pytest.raises(NotTrainable, match="got tuple, want"):
+        named_values({"layers": (np.zeros(1),)})
+
+
+def test_what_the_learner_writes_later_does_not_reach_the_policy() -> None:
+    mine = np.ones(3, np.float32)
+    for pushed in (mine, mine[:], np.broadcast_to(mine, (3,))):
+        theirs = converted(pushed, np.zeros(3, np.float32))
+        mine += 1
+        assert theirs[0] == mine[0] - 1
+
+
+def test_read_only_memory_is_taken_without_a_copy() -> None:
+    pushed = np.frombuffer(np.ones(3, np.float32).tobytes(), np.float32)
+    assert np.shares_memory(converted(pushed, np.zeros(3, np.float32)), pushed)
+
+
+def test_other_precisions_are_converted() -> None:
+    assert converted(np.ones(2, np.float64), np.zeros(2, np.float32)).dtype == np.float32
+
+
+@pytest.mark.torch
+class TestTorch:
+    """Modules of torch."""
+
+    @pytest.fixture
+    def module(self) -> Any:
+        torch = pytest.importorskip("torch")
+        module = torch.nn.Sequential(torch.nn.Linear(3, 2), torch.nn.BatchNorm1d(2))
+        module.tied = module[0].weight
+        return module.eval()
+
+    def test_values_are_those_of_the_state_dict_buffers_and_tied_ones_included(self, module: Any) -> None:
+        import torch
+
+        parameter, held = module[0].weight, named_values(module)
+        assert list(held) == list(module.state_dict())
+        assert {"tied", "1.running_mean"} <= held.keys()
+        new = {name: value + 1 for name, value in held.items()}
+        set_values(module, new)
+        assert module[0].weight is parameter
+        assert module[0].weight.data_ptr() == new["0.weight"].data_ptr()
+        torch.testing.assert_close(module.state_dict(), new, rtol=0, atol=0)
+
+    def test_extra_state_of_a_module_is_not_trained(self, module: Any) -> None:
+        import torch
+
+        class WithState(torch.nn.Linear):
+            def get_extra_state(self) -> Any:
+                return {"version": 1}
+
+            def set_extra_state(self, state: Any) -> None:
+                """Nothing."""
+
+        assert set(named_values(WithState(2, 2))) == {"weight", "bias"}
+
+    def test_tensors_and_arrays_become_the_policys_type(self, module: Any) -> None:
+        import torch
+
+        held = torch.zeros(2, dtype=torch.bfloat16)
+        mine = torch.ones(2, dtype=torch.bfloat16)
+        theirs = converted(mine, held)
+        mine += 1
+        for value in (theirs, converted(np.ones(2), held), converted(torch.ones(2), held)):
+            assert value.dtype == torch.bfloat16
+            assert value.tolist() == [1, 1]
+        assert converted(mine, np.zeros(2, np.float32)).tolist() == [2, 2]
+
+    def test_read_only_arrays_are_taken_without_a_copy(self, module: Any) -> None:
+        import torch
+
+        pushed = np.frombuffer(np.ones(3, np.float32).tobytes(), np.float32)
+        assert converted(pushed, torch.zeros(3)).data_ptr() == pushed.ctypes.data
+
+    def test_bfloat16_travels_as_bytes(self, module: Any) -> None:
+        import torch
+
+        mine = torch.tensor([1.5, -2.0, 3.0], dtype=torch.bfloat16)
+        sent = np.frombuffer(portable(mine).tobytes(), portable(mine).dtype)
+        assert dtype_name(sent) == "bfloat16"
+        theirs = converted(sent, torch.zeros(3, dtype=torch.bfloat16))
+        assert torch.equal(theirs, mine)
+        assert theirs.data_ptr() == sent.ctypes.data
+        for held in (np.zeros(3, np.float32), torch.zeros(3)):
+            assert converted(sent, held).tolist() == [1.5, -2.0, 3.0]
+        assert portable(torch.ones(2)).dtype == np.float32

@@ -1,0 +1,242 @@
+"""Clients of ours, each in a process of its own or a Ray actor: `python -m vlagents_ray.bench.clients JSON`.
+
+The peers' clients run in such processes too; and one inside another network namespace must. A process holds one
+client, which makes calls when it is its turn (`BenchCaller`), or several, which make load (`LoadGenerator`).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import inspect
+import json
+import random
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from vlagents_ray.bench.line_process import CALL_S, START_S, Driver, LineProcess, ProcessDriver, our_environment
+from vlagents_ray.bench.peers.peer import WARM_UP, die_with_parent, obey, own_stdout, timed
+from vlagents_ray.client.agent import RemoteAgent
+from vlagents_ray.client.transports.select import TransportName
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.images.codecs import ImageCodec
+from vlagents_ray.interface import Obs
+
+Call = tuple[float, float, float, int]  # ended, s of time.monotonic; round trip, ms; inference, ms; size of its batch
+ROBOT, SIMULATION = "robot", "simulation"
+_THINK_S = 0.05  # a robot asks at most so long after its last answer: it finds batches at any stage
+
+
+@functools.cache
+def observation(size: int = 224, cameras: int = 2) -> Obs:
+    """Return what every server in a benchmark gets, ours or a peer's, byte for byte.
+
+    Cameras with smooth structure and some noise, as photographs have; seven joints; a gripper. It is the same object
+    each time and must not be changed.
+    """
+    rng = np.random.default_rng(0)
+    y, x = np.mgrid[0:size, 0:size] / size
+    images = {}
+    for number in range(cameras):
+        waves = [np.sin(2 * np.pi * (a * x + b * y) + number) for a, b in rng.uniform(-4, 4, (6, 2))]
+        base = np.stack([sum(waves[i : i + 2]) for i in (0, 2, 4)], axis=-1)
+        images[f"camera_{number}"] = np.clip(128 + 50 * base + rng.normal(0, 6, base.shape), 0, 255).astype(np.uint8)
+    return Obs(images, 0.5, {"joints": np.zeros(7, np.float32)})
+
+
+def save_observation(obs: Obs, path: Path) -> None:
+    """Save an .npz that a peer's client loads: every camera by its name, `joints`, `gripper`."""
+    if obs.gripper is None:
+        raise ValueError("the observation of a benchmark has a gripper")
+    np.savez(path, gripper=np.float64(obs.gripper), joints=obs.state["joints"], **obs.cameras)  # type: ignore[arg-type]
+
+
+@dataclass(frozen=True, slots=True)
+class OwnClient:
+    """A client of ours, by its transport. `codec` is as in `connect`."""
+
+    transport: str
+    codec: str = "raw"
+    actor: bool = False  # from inside a Ray actor, by serve://
+
+    @property
+    def name(self) -> str:
+        """The name in the table."""
+        if self.transport in ("shm", "handle", "plasma"):
+            return f"{self.transport}, Ray actor" if self.actor else self.transport
+        return f"{self.transport}, {'default' if self.codec == 'auto' else self.codec}"
+
+
+OWN_CLIENTS = (
+    OwnClient("plasma", actor=True),
+    OwnClient("handle", actor=True),
+    OwnClient("shm", actor=True),
+    OwnClient("shm"),
+    OwnClient("websocket", "raw"),
+    OwnClient("websocket", "jpeg"),
+    OwnClient("websocket", "auto"),
+    OwnClient("http", "raw"),
+    OwnClient("http", "jpeg"),
+)
+
+
+def own_clients(only: Sequence[str] = ()) -> tuple[list[OwnClient], dict[str, str]]:
+    """Return the clients that this version has, or those whose transport is in `only`, and why others are skipped."""
+    known = get_args(TransportName)
+    wanted = [one for one in OWN_CLIENTS if not only or one.transport in only]
+    if unknown := set(only) - {one.transport for one in OWN_CLIENTS}:
+        known_here = sorted({one.transport for one in OWN_CLIENTS})
+        raise ConfigError(f"transports: got {sorted(unknown)}, want some of {known_here}")
+    skipped = {w.name: f"no transport {w.transport!r} in this version" for w in wanted if w.transport not in known}
+    return [one for one in wanted if one.transport in known], skipped
+
+
+def connect(url: str, transport: str, codec: str, rank: str | None = None) -> RemoteAgent:
+    """Make an agent that has not connected yet.
+
+    `codec` is "auto", "raw", "jpeg", or "jpeg QUALITY SUBSAMPLING". `rank` is "robot" or "simulation", and
+    has no effect where `RemoteAgent` knows no ranks.
+    """
+    name, *details = codec.split()
+    chosen = ImageCodec(name, int(details[0]), details[1]) if details else codec
+    ranked = {"rank": rank} if rank and "rank" in inspect.signature(RemoteAgent).parameters else {}
+    return RemoteAgent(url, transport=transport, codec=chosen, **ranked)  # type: ignore[arg-type]
+
+
+class BenchCaller:
+    """One session that measures its own calls. A Ray actor holds it as well as a process does."""
+
+    def __init__(self, url: str, transport: str, codec: str) -> None:
+        self._agent = connect(url, transport, codec)
+        self._obs = observation()
+        info = self._agent.reset(self._obs, "measure")
+        self.description: dict[str, Any] = {"transport": self._agent.transport, "psnr_db": info.get("psnr_db")}
+
+    def measure(self, calls: int) -> list[float]:
+        """Make calls; returns the milliseconds of each."""
+        return timed(lambda: self._obs, self._agent.act, calls)
+
+    def ready(self) -> dict[str, Any]:
+        """Warm up; returns what a client says of itself when it is ready."""
+        self.measure(WARM_UP)
+        return self.description
+
+    def close(self) -> None:
+        """End the session."""
+        self._agent.close()
+
+
+class LoadGenerator:
+    """Clients of one process that act as fast as they are answered, one thread each."""
+
+    def __init__(self, url: str, transport: str, codec: str, ranks: Sequence[str]) -> None:
+        self._obs = observation()
+        self._ranks = list(ranks)
+        self._agents = [connect(url, transport, codec, rank) for rank in ranks]
+        self._pool = ThreadPoolExecutor(max(1, len(ranks)))
+        for ready in [self._pool.submit(agent.reset, self._obs, "measure") for agent in self._agents]:
+            ready.result()
+
+    def ready(self) -> bool:
+        """Answer an actor's caller once `__init__` is done."""
+        return True
+
+    def run(self, active: int, begin: float, end: float) -> list[list[Call]]:
+        """Let the first `active` clients act until `end`, s of `time.monotonic`.
+
+        All begin at the same moment of the machine's monotonic clock, in whatever process or actor they live.
+
+        Returns:
+            For each client its calls that ended after `begin`.
+        """
+        acting = list(zip(self._agents, self._ranks, strict=True))[:active]
+        return [one.result() for one in [self._pool.submit(self._act, *each, begin, end) for each in acting]]
+
+    def close(self) -> None:
+        """End all sessions."""
+        for agent in self._agents:
+            agent.close()
+        self._pool.shutdown()
+
+    def _act(self, agent: RemoteAgent, rank: str, begin: float, end: float) -> list[Call]:
+        calls = []
+        think = random.Random(0)
+        while time.monotonic() < end:
+            if rank == ROBOT:
+                time.sleep(think.uniform(0, _THINK_S))
+            timing = agent.act(self._obs).info["timing"]
+            ended = time.monotonic()
+            if begin <= ended < end:
+                calls.append((ended, timing["round_trip_ms"], timing["inference_ms"], int(timing["batch_size"])))
+        return calls
+
+
+@dataclass(frozen=True, slots=True)
+class ActorDriver:
+    """A client in a Ray actor, as rollouts are."""
+
+    actor: Any
+
+    def ready(self) -> dict[str, Any]:
+        """Wait until it has connected."""
+        import ray
+
+        said: dict[str, Any] = ray.get(self.actor.ready.remote(), timeout=START_S)
+        return said
+
+    def measure(self, calls: int) -> list[float]:
+        """Make the calls in one call of the actor."""
+        import ray
+
+        taken: list[float] = ray.get(self.actor.measure.remote(calls), timeout=CALL_S + calls)
+        return taken
+
+
+@contextlib.contextmanager
+def connected(client: OwnClient, url: str, app: str, prefix: Sequence[str] = ()) -> Iterator[Driver]:
+    """Start a client of ours to the server at `url`; its command begins with `prefix`."""
+    if client.actor:
+        import ray
+
+        actor = ray.remote(num_cpus=0)(BenchCaller).remote(f"serve://{app}", client.transport, client.codec)
+        try:
+            yield ActorDriver(actor)
+        finally:
+            with contextlib.suppress(ray.exceptions.RayError):  # `ready` has raised why it never connected
+                ray.get(actor.close.remote(), timeout=CALL_S)
+            ray.kill(actor)
+        return
+    settings = json.dumps({"url": url, "transport": client.transport, "codec": client.codec})
+    command = [*prefix, sys.executable, "-m", "vlagents_ray.bench.clients", settings]
+    with LineProcess(client.name, command, our_environment()) as child:
+        yield ProcessDriver(child)
+
+
+def main() -> None:
+    """Run the process: its settings are JSON; with "ranks" it makes load."""
+    die_with_parent()
+    out = own_stdout()
+    settings = json.loads(sys.argv[1])
+    if "ranks" not in settings:
+        caller = BenchCaller(**settings)
+        try:
+            obey(sys.stdin, out, caller.measure, caller.description)
+        finally:
+            caller.close()
+        return
+    load = LoadGenerator(**settings)
+    print(json.dumps(load.ready()), file=out, flush=True)
+    for line in sys.stdin:
+        print(json.dumps(load.run(**json.loads(line))), file=out, flush=True)
+    load.close()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,154 @@
+"""Processes of a benchmark: each obeys the line protocol of `peers/peer.py`, and never outlives this process."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import subprocess
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import vlagents_ray
+from vlagents_ray.errors import VLAgentsError
+
+START_S = 90.0
+CALL_S = 30.0
+_END_S = 10.0
+_KEPT = 2000  # characters of its standard error that are shown when it fails
+
+
+class ProcessFailed(VLAgentsError):
+    """A process of a benchmark, ours or a peer's, ended or did not answer; the message has the end of its errors."""
+
+
+class LineProcess:
+    """A process that answers lines with lines of JSON. What it writes on standard error is shown if it fails."""
+
+    def __init__(
+        self,
+        name: str,
+        command: Sequence[str],
+        environment: Mapping[str, str] | None = None,
+        *,
+        end_s: float = _END_S,
+    ) -> None:
+        self.name = name
+        self._end_s = end_s  # how long it may take to end once its input has ended
+        self._received = b""  # what came after the last whole line
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
+        self._process = subprocess.Popen(  # noqa: S603 - the bench's own scripts
+            list(command),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._errors,
+            env={**os.environ, **(environment or {})},
+            start_new_session=True,  # Ctrl-C is for the bench, which ends its children in order
+        )
+
+    @property
+    def pid(self) -> int:
+        """Return the id of the process."""
+        return self._process.pid
+
+    def read(self, timeout_s: float) -> Any:
+        """Read the next line that it writes, decoded. Raises `ProcessFailed` if it ends or writes none in time."""
+        stream = self._process.stdout
+        if stream is None:
+            raise ProcessFailed(f"{self.name}: has no standard output")
+        deadline = time.monotonic() + timeout_s
+        while b"\n" not in self._received:
+            ready, _, _ = select.select([stream], [], [], max(0.0, deadline - time.monotonic()))
+            if not ready:
+                raise ProcessFailed(f"{self.name}: no answer within {timeout_s:g} s\n{self._last_errors()}".rstrip())
+            more = os.read(stream.fileno(), 2**16)
+            if not more:
+                with contextlib.suppress(subprocess.TimeoutExpired):
+                    self._process.wait(_END_S)
+                status = self._process.returncode
+                raise ProcessFailed(f"{self.name}: ended with exit status {status}\n{self._last_errors()}".rstrip())
+            self._received += more
+        line, _, self._received = self._received.partition(b"\n")
+        try:
+            return json.loads(line)
+        except ValueError as error:
+            raise ProcessFailed(f"{self.name}: wrote {line[:80]!r}, want a line of JSON") from error
+
+    def send(self, line: str) -> None:
+        """Send a line, without waiting for the answer."""
+        if self._process.stdin is None:
+            raise ProcessFailed(f"{self.name}: has no standard input")
+        with contextlib.suppress(BrokenPipeError):  # `read` will say why
+            self._process.stdin.write(line.encode() + b"\n")
+            self._process.stdin.flush()
+
+    def request(self, line: str, timeout_s: float) -> Any:
+        """Send a line and return the answer."""
+        self.send(line)
+        return self.read(timeout_s)
+
+    def close(self) -> None:
+        """End its standard input, which ends it; kill it if that does not."""
+        if self._process.stdin is not None:
+            with contextlib.suppress(OSError):
+                self._process.stdin.close()
+        try:
+            self._process.wait(self._end_s)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        if self._process.stdout is not None:
+            self._process.stdout.close()
+        self._errors.close()
+
+    def __enter__(self) -> LineProcess:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def _last_errors(self) -> str:
+        self._errors.seek(0, os.SEEK_END)
+        self._errors.seek(max(0, self._errors.tell() - _KEPT))
+        return self._errors.read().decode(errors="replace").strip()
+
+
+class Driver(Protocol):
+    """A client that is connected and makes calls when it is its turn."""
+
+    def ready(self) -> dict[str, Any]:
+        """Wait until it is connected and warm; returns what it says of itself."""
+        ...
+
+    def measure(self, calls: int) -> list[float]:
+        """Make calls; returns the milliseconds of each."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class ProcessDriver:
+    """A client in a process of its own."""
+
+    child: LineProcess
+
+    def ready(self) -> dict[str, Any]:
+        """Read its first line."""
+        said: dict[str, Any] = self.child.read(START_S)
+        return said
+
+    def measure(self, calls: int) -> list[float]:
+        """Send a line, read a line."""
+        taken: list[float] = self.child.request(str(calls), CALL_S + calls)
+        return taken
+
+
+def our_environment() -> dict[str, str]:
+    """Return the variables with which a process of ours finds this package, installed or not."""
+    package = str(Path(vlagents_ray.__file__).parent.parent)
+    others = [one for one in os.environ.get("PYTHONPATH", "").split(os.pathsep) if one and one != package]
+    return {"PYTHONPATH": os.pathsep.join([package, *others])}

@@ -1,0 +1,87 @@
+"""Calls to a policy from a background thread, one request at a time."""
+
+from __future__ import annotations
+
+import threading
+import time
+from dataclasses import dataclass
+
+from vlagents_ray.interface import Act, Agent, Obs
+
+_CLOSE_S = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class AsyncAnswer:
+    """The policy's answer to a request, or its error."""
+
+    tick: int  # the tick of its observation
+    result: Act | Exception
+    came_at: float  # s, of `time.monotonic`
+
+
+class AsyncCaller:
+    """A thread that calls `agent.act`, so that the caller's own thread never waits for it.
+
+    Nothing else may use the agent during a request; `settle` waits for its end.
+    """
+
+    def __init__(self, agent: Agent) -> None:
+        self._agent = agent
+        self._changed = threading.Condition()
+        self._job: tuple[int, Obs] | None = None
+        self._answer: AsyncAnswer | None = None
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, name="vlagents-ray-caller", daemon=True)
+        self._thread.start()
+
+    @property
+    def idle(self) -> bool:
+        """Whether there is neither a request in progress nor an answer to be taken."""
+        return self._job is None and self._answer is None
+
+    def ask(self, tick: int, obs: Obs) -> None:
+        """Begin a request, only while `idle`. The caller must not change `obs` afterwards."""
+        with self._changed:
+            self._job = tick, obs
+            self._changed.notify_all()
+
+    def take(self, wait_s: float = 0.0) -> AsyncAnswer | None:
+        """Return the answer if one comes within `wait_s` seconds, else None."""
+        if self._answer is None and wait_s > 0:
+            with self._changed:
+                self._changed.wait_for(lambda: self._answer is not None, wait_s)
+        with self._changed:
+            answer, self._answer = self._answer, None
+        return answer
+
+    def settle(self) -> None:
+        """Wait for the end of the request in progress, however long that takes, and drop its answer."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._job is None)
+            self._answer = None
+
+    def close(self) -> None:
+        """Close the agent as soon as its request is over; wait for that for two seconds at most."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        self._thread.join(_CLOSE_S)
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._job is not None or self._closing)
+                job = self._job
+            if job is None:
+                break
+            tick, obs = job
+            try:
+                result: Act | Exception = self._agent.act(obs)
+            except Exception as error:  # noqa: BLE001 - raised or reported where the answer is taken
+                result = error
+            with self._changed:
+                self._answer = AsyncAnswer(tick, result, time.monotonic())
+                self._job = None  # last: `idle` takes no lock
+                self._changed.notify_all()
+        self._agent.close()

@@ -1,0 +1,170 @@
+"""The buffer of action chunks, which decides which row of which chunk is executed next.
+
+The chunk player, episodes of an evaluation (`vlagents_ray.evaluate.episode.latency`), policies that return the rows of
+their chunks one by one (`vlagents_ray.policies.base.policy`), and vla-eval's sessions all use this buffer.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vlagents_ray.errors import ConfigError, PolicyFailed
+from vlagents_ray.interface import DELAY, LEFTOVER
+
+Merge = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""(D,) of the older chunks and (D,) of a newer one -> (D,), for one tick."""
+
+# The names and weights of LeRobot 0.4.4, `lerobot/async_inference/configs.py`, AGGREGATE_FUNCTIONS; its "latest_only"
+# is "newest" here.
+MERGES: Mapping[str, Merge] = {
+    "newest": lambda _, new: new,
+    "average": lambda old, new: 0.5 * old + 0.5 * new,
+    "weighted_average": lambda old, new: 0.3 * old + 0.7 * new,
+    "conservative": lambda old, new: 0.7 * old + 0.3 * new,
+}
+DELAYS = 10  # the longest delay of so many answers counts: a single slow answer, often the first, drops out
+ENSEMBLE = "ensemble"
+ENSEMBLE_M = 0.01
+"""Of the weights exp(-m * i), i = 0 for the oldest: Zhao et al. 2023 (ACT, https://arxiv.org/abs/2304.13705), and
+`temporal_agg` in their code."""
+
+
+class Chunk(NamedTuple):
+    """A chunk of actions that the policy answered with."""
+
+    number: int  # 0 for an episode's first
+    step: int  # `ChunkBuffer.executed` at its observation: the position of its first row
+    rows: np.ndarray  # (H, D) float32
+    done: bool = False
+    info: Mapping[str, Any] = MappingProxyType({})  # the info of the policy's Act
+    tick: int = 0  # the tick of the observation
+    seen_at: float = 0.0  # s, of `time.monotonic`: when the observation was captured
+
+    @property
+    def end(self) -> int:
+        """The step after the last row."""
+        return self.step + len(self.rows)
+
+
+class Step(NamedTuple):
+    """The action of one step of the plan."""
+
+    action: np.ndarray  # (D,) float32
+    chunk: Chunk  # the newest chunk that the action comes from
+    row: int  # the row of that chunk
+
+
+class ChunkBuffer:
+    """The chunks of a plan, positioned by the number of actions that the robot had executed at their observation.
+
+    Row r of a chunk is for r executed actions after its observation. So the rows in place of which rows of earlier
+    chunks were executed are left out, however late the answer came. While the robot holds still, the plan stands still
+    with it, and no row is left out for those ticks. If ticks were counted instead, the rows after a stall would begin
+    ahead of the robot's position: absolute targets would make it jump, and relative ones would leave out a part of the
+    path. (LeRobot's real-time chunking has the same rule since huggingface/lerobot#4454.)
+    """
+
+    def __init__(self, merge: str | Merge = "newest", ensemble_m: float = ENSEMBLE_M) -> None:
+        """Begin a plan without chunks.
+
+        Args:
+            merge: How the rows that several chunks have for one step are combined: a name of `MERGES`, "ensemble", or a
+                function that is folded over them from the oldest to the newest.
+            ensemble_m: The m of the ensemble's weights exp(-m * i), oldest first.
+
+        Raises:
+            ConfigError: `merge` is an unknown name.
+        """
+        if isinstance(merge, str) and merge not in MERGES and merge != ENSEMBLE:
+            raise ConfigError(f"merge: got {merge!r}, want one of {sorted([*MERGES, ENSEMBLE])} or a function")
+        self.executed = 0  # executed actions of this plan
+        self._merge = MERGES.get(merge) if isinstance(merge, str) else merge  # None: the ensemble
+        self._newest = merge == "newest"
+        self._m = ensemble_m
+        self._chunks: deque[Chunk] = deque()
+
+    def add(self, chunk: Chunk) -> bool:
+        """Add a chunk; return False if it has no row left to execute.
+
+        If there is nothing else, the last row may be executed one step late: an answer with a single action has no
+        other row, and comes when the action before it has been executed.
+        """
+        while self._chunks and self._chunks[0].end <= self.executed:
+            self._chunks.popleft()
+        if chunk.end == self.executed and self.next is None:
+            chunk = chunk._replace(step=chunk.step + 1)
+        if chunk.end <= self.executed:
+            return False
+        self._chunks.append(chunk)
+        return True
+
+    @property
+    def next(self) -> Step | None:
+        """The action to execute now; None if no chunk reaches that far."""
+        return self._at(self.executed)
+
+    def advance(self) -> None:
+        """Count `next`, or the action in place of it, as executed."""
+        self.executed += 1
+
+    def take(self) -> Step:
+        """Return `next` and count it as executed; raises `PolicyFailed` if no chunk reaches that far."""
+        step = self.next
+        if step is None:
+            raise PolicyFailed(f"chunk: no row is left for step {self.executed} of the plan")
+        self.advance()
+        return step
+
+    def replace(self, rows: np.ndarray, step: int | None = None) -> None:
+        """Replace all chunks by one of `rows`, (H, D), the first of which is for `step`; None: for the next step."""
+        self._chunks.clear()
+        self.add(Chunk(0, self.executed if step is None else step, rows))
+
+    def leftover(self) -> np.ndarray | None:
+        """Return the actions to execute from now on, (H', D); None if there are none."""
+        rows: list[np.ndarray] = []
+        while (step := self._at(self.executed + len(rows))) is not None:
+            rows.append(step.action)
+        return np.stack(rows) if rows else None
+
+    def continuation(self, delays: Iterable[int]) -> dict[str, Any]:
+        """Return the `Obs.info` of a request to a policy with real-time chunking; {} if no planned action is left.
+
+        `delays` are the ticks that recent answers took.
+        """
+        rest = self.leftover()
+        return {} if rest is None else {LEFTOVER: rest, DELAY: min(max(delays, default=0), len(rest))}
+
+    def drop(self, before: float = math.inf) -> bool:
+        """Drop the chunks of observations from before a time, s of `time.monotonic`; return True if there were any."""
+        kept = [chunk for chunk in self._chunks if chunk.seen_at >= before]
+        dropped = len(kept) < len(self._chunks)
+        if dropped:
+            self._chunks = deque(kept)
+        return dropped
+
+    def _at(self, place: int) -> Step | None:
+        for newest in reversed(self._chunks):
+            if newest.step <= place < newest.end:
+                break
+        else:
+            return None
+        row = place - newest.step
+        if self._newest:
+            return Step(newest.rows[row], newest, row)
+        rows = [chunk.rows[place - chunk.step] for chunk in self._chunks if chunk.step <= place < chunk.end]
+        if len(rows) == 1:
+            action = rows[0]
+        elif self._merge is None:
+            weights = np.array([math.exp(-self._m * i) for i in range(len(rows))])
+            action = np.asarray((weights / weights.sum()) @ np.stack(rows), np.float32)
+        else:
+            action = np.asarray(functools.reduce(self._merge, rows), np.float32)
+        return Step(action, newest, row)

@@ -1,0 +1,107 @@
+"""The safe action, which a robot executes when the policy's action does not come in time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Literal, get_args
+
+import numpy as np
+
+from vlagents_ray.contract import ActionSpec
+from vlagents_ray.errors import ConfigError, InvalidAction
+from vlagents_ray.interface import Obs
+
+SafeName = Literal["auto", "hold", "zero"]
+Safe = SafeName | np.ndarray | Callable[[Obs], np.ndarray]
+
+
+class SafeAction:
+    """Computes the action that keeps a robot still, which depends on what its actions mean.
+
+    "hold" commands the last action again, which is right for absolute targets. "zero" commands no motion, which is
+    right for deltas and velocities; the columns in `grippers` keep the last action's value, as 0 would half open a
+    gripper whose command is a position. "auto" chooses by the contract's `ActionSpec`. An array (D,), or a function of
+    the observation that returns one (for instance of the measured joints), is used unchanged.
+
+    Raises `ConfigError` where the choice would be a guess or would move the robot: a repeated delta continues the
+    motion, and zeros as joint targets move the arm to its zero position. Only "hold" may be chosen where the contract
+    does not say what the actions are.
+    """
+
+    def __init__(self, safe: Safe, spec: ActionSpec, grippers: Sequence[int] | None = None) -> None:
+        """Choose the safe action.
+
+        Args:
+            safe: The name, array or function of the safe action.
+            spec: The actions of the contract.
+            grippers: The columns of the grippers; by default the last one, if the contract says how the gripper is
+                opened.
+
+        Raises:
+            ConfigError: The choice does not fit `spec`.
+        """
+        if isinstance(safe, str):
+            if safe not in get_args(SafeName):
+                raise ConfigError(f"safe: got {safe!r}, want one of {list(get_args(SafeName))}, an array or a function")
+            self._make: SafeName | np.ndarray | Callable[[Obs], np.ndarray] = _fitting(safe, spec)
+        else:
+            self._make = safe if callable(safe) else np.asarray(safe, np.float32)
+        self._grippers = list(grippers) if grippers is not None else [-1] if spec.gripper_open is not None else []
+        self._dim = spec.dim
+        self.holds = spec.relative is False or (isinstance(safe, str) and safe == "hold")
+        """Does the last action, commanded again, keep the robot where it is?"""
+
+    def __call__(self, obs: Obs, last: np.ndarray | None) -> np.ndarray:
+        """Return the safe action, (D,) float32; `last` is the last commanded action, None if there was none.
+
+        Raises:
+            InvalidAction: There is no last action, and the safe one depends on it.
+        """
+        if callable(self._make):
+            return np.asarray(self._make(obs), np.float32)
+        if isinstance(self._make, np.ndarray):
+            return self._make.copy()
+        if last is None and self._make == "zero" and self._dim is not None and not self._grippers:
+            return np.zeros(self._dim, np.float32)
+        if last is None:
+            raise InvalidAction(
+                f"safe: got {self._make!r} before the first action, which there is nothing to make from"
+            )
+        if self._make == "hold":
+            return last.copy()
+        action = np.zeros_like(last)
+        action[self._grippers] = last[self._grippers]
+        return action
+
+
+def stopping(spec: ActionSpec) -> SafeName:
+    """Return the action that keeps a robot still: "zero" if its actions are known to be relative, else "hold"."""
+    return "zero" if spec.relative else "hold"
+
+
+def neutral(spec: ActionSpec, dim: int | None = None) -> np.ndarray:
+    """Return no motion, (D,) float32, with the gripper open where `spec` says how one is opened.
+
+    For relative actions.
+    """
+    dim = spec.dim if dim is None else dim
+    if dim is None:
+        raise InvalidAction("neutral action: got a contract without action.dim; want one that states it")
+    action = np.zeros(dim, np.float32)
+    if spec.gripper_open is not None:
+        action[-1] = spec.gripper_open
+    return action
+
+
+def _fitting(safe: SafeName, spec: ActionSpec) -> SafeName:
+    if spec.relative is None and safe != "hold":
+        raise ConfigError(
+            f"safe: got {safe!r}, and the policy's contract does not say whether its actions are relative or absolute; "
+            "state it (ActionSpec.delta), or give safe='hold', which is right for absolute ones alone, "
+            "or an action of your own"
+        )
+    fitting = stopping(spec)
+    if safe not in ("auto", fitting):
+        moves = "relative actions go on moving with" if fitting == "zero" else "absolute ones take for a pose to go to"
+        raise ConfigError(f"safe: got {safe!r}, which {moves}; give safe={fitting!r}, or 'auto'")
+    return fitting

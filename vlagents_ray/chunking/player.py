@@ -1,0 +1,350 @@
+"""The chunk player: one action a tick from a policy's chunks, without blocking a control loop."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from vlagents_ray.chunking.background import AsyncAnswer, AsyncCaller
+from vlagents_ray.chunking.buffer import DELAYS, ENSEMBLE, ENSEMBLE_M, Chunk, ChunkBuffer, Merge, Step
+from vlagents_ray.chunking.capture_clock import CaptureClock
+from vlagents_ray.chunking.fallback import Safe, SafeAction
+from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.errors import ConfigError, InvalidAction, InvalidInput, NotReset, VLAgentsError
+from vlagents_ray.interface import AGE, CAPTURED, DEADLINE, SAFE, SILENT, Act, Agent, Obs, copied
+from vlagents_ray.validation import check_action
+
+Mode = Literal["open_loop", "ensemble", "async"]
+Check = Callable[[np.ndarray, "np.ndarray | None"], np.ndarray]
+"""The action and the one before it, (D,) each -> the action to be taken, or `InvalidAction`."""
+
+_WAITING = "waiting for an answer: the last one's rows are executed"
+_LATE = "the answer came so late that others had been executed in place of all its rows"
+_OLD = "what was planned is older than max_age_s"
+_STALE = (
+    "the observation is older than max_age_s, or of a clock that is ahead: look for a camera that hangs, for robot and "
+    "sensors with different clocks, or for an info['captured_at'] that is not time.time()"
+)
+_STOPPED = "the robot was stopped since the observation that was answered last"
+_Motion = Literal["stopped", "moving", "held"]
+
+
+class ChunkPlayer(Agent):
+    """An `Agent` around another, local or remote, whose `act` returns single actions, (D,), one a control tick.
+
+    Ticks are counted by the calls of `act`. Row r of a chunk is for r executed actions after the observation that the
+    chunk answers, whenever it comes: rows in place of which others were executed meanwhile are left out, and while the
+    robot holds still none is (see `vlagents_ray.chunking.buffer.ChunkBuffer`). `reset` may block: it begins the episode
+    and, with a deadline, waits for the first chunk.
+
+    In mode "async", and in the others with `deadline_s`, `act` returns within `deadline_s`: the policy's action, or the
+    `safe` one where there is none, with the reason in `act.info["safe"]`. `info` also tells `age_ticks`, `chunk`,
+    `row`, and `silent_s`, for how long an answer has been waited for. Errors that asking again will not cure
+    (`InvalidInput`, and any that is not this package's) are raised by the next `act`; the others are the reason of safe
+    actions until the policy answers. Without a deadline, errors are raised.
+    """
+
+    def __init__(
+        self,
+        agent: Agent,
+        *,
+        mode: Mode = "open_loop",
+        execute: int | None = None,
+        merge: str | Merge = "newest",
+        ensemble_m: float = ENSEMBLE_M,
+        real_time_chunking: bool = False,
+        deadline_s: float | None = None,
+        timeout_s: float | None = None,
+        horizon: int | None = None,
+        max_age_s: float | None = None,
+        safe: Safe = "auto",
+        grippers: Sequence[int] | None = None,
+        check: Check | None = None,
+    ) -> None:
+        """Play the chunks of a policy.
+
+        Args:
+            agent: The policy, in this process or a `RemoteAgent`.
+            mode: "open_loop" executes `execute` rows, then asks again and waits for the answer. "ensemble" asks at each
+                tick and averages what all chunks say of it, with the weights exp(-m * i), oldest first (ACT's temporal
+                ensembling). "async" asks in the background, one request at a time, with the newest observation.
+            execute: Rows between two requests: of a chunk (default: all), or in "async" ticks (default: 1).
+            merge: What becomes of a tick that several chunks have a row for, in "async": "newest", "average",
+                "weighted_average", "conservative", "ensemble", or a function (see `vlagents_ray.chunking.buffer`).
+            ensemble_m: The m of the weights.
+            real_time_chunking: Whether each request carries what is left of the plan and the measured delay
+                (`LEFTOVER`, `DELAY` in `vlagents_ray.interface`), for policies that use them; in "async" only.
+            deadline_s: The time within which `act` returns; 0 by default in "async", else none.
+            timeout_s: The time after which a request is given up; by default the agent's.
+            horizon: The number of rows of a chunk that may be executed at all.
+            max_age_s: How old the observation of an executed action may be. Its age counts from `info["captured_at"]`,
+                that of the sensor which was read first; without it, from the call of `act` (see `CaptureClock`).
+            safe: The action in place of a missing one (see `SafeAction`).
+            grippers: The dimensions of the action that are grippers (see `SafeAction`).
+            check: Sees every action before it is returned, such as a `vlagents_ray.robot.Guard`. In place of one of the
+                policy's that it refuses the safe one is taken, and the plan is dropped; in place of a safe one the last
+                action, if that keeps the robot still; else `act` raises `InvalidAction`. It gets the last action, too;
+                a `Guard` with `measure` takes the measured pose where there is none, and after safe actions.
+
+        Raises:
+            ConfigError: Settings do not go together.
+        """
+        if mode not in get_args(Mode):
+            raise ConfigError(f"mode: got {mode!r}, want one of {list(get_args(Mode))}")
+        for name, value in (("execute", execute), ("horizon", horizon)):
+            if value is not None and value < 1:
+                raise ConfigError(f"{name}: got {value}, want at least 1, or None")
+        if max_age_s is not None and not max_age_s > 0:
+            raise ConfigError(f"max_age_s: got {max_age_s}, want above 0, or None")
+        if mode != "async" and (merge != "newest" or real_time_chunking):
+            raise ConfigError(f"merge and real_time_chunking: got them with mode {mode!r}, want mode='async'")
+        self._agent = agent
+        self._mode: Mode = mode
+        self._execute = execute
+        self._deadline_s = 0.0 if deadline_s is None and mode == "async" else deadline_s
+        self._timeout_s = timeout_s
+        self._horizon, self._max_age_s = horizon, max_age_s
+        self._safe_choice, self._grippers = safe, grippers
+        self.check = check
+        self._real_time = real_time_chunking
+        self._plan = ChunkBuffer(ENSEMBLE if mode == "ensemble" else merge, ensemble_m)
+        self._asker: AsyncCaller | None = None
+        self._contract: Contract | None = None
+        self._begin()
+
+    def _begin(self) -> None:
+        self._plan.drop()
+        self._tick: int | None = None  # tick of the next `act`; None outside an episode
+        self._chunks = 0
+        # The last request: its tick, step of the plan, and capture time of its observation (s, of `time.monotonic`).
+        self._asked, self._asked_step, self._seen_at = -1, 0, 0.0
+        self._waiting_since: float | None = None
+        self._trouble = _WAITING
+        self._captured = CaptureClock()
+        self._since = 0  # tick; answers to earlier observations are not executed
+        self._delays: deque[int] = deque(maxlen=DELAYS)
+        self._last: np.ndarray | None = None  # the last commanded action
+        self._before: np.ndarray | None = None  # the action before it
+        self._motion: _Motion = "stopped"
+        self._safe: SafeAction | None = None
+
+    @property
+    def contract(self) -> Contract | None:
+        """The policy's contract, with single actions."""
+        if self._tick is None:  # during an episode the policy is busy, and a call to a remote one might block
+            self._contract = self._agent.contract
+        return None if self._contract is None else replace(self._contract, chunk=1)
+
+    def initialize(self) -> None:
+        """Initialize the policy; waits for a request in progress, if the policy was used before."""
+        if self._asker is not None:
+            self._asker.settle()
+        self._agent.initialize()
+        self._choose_safe()
+
+    def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:
+        """Begin an episode, however long that takes; the plan and pending requests are dropped."""
+        if self._asker is not None:
+            self._asker.settle()
+        self._begin()
+        obs = _stamped(obs, {})
+        self._captured(obs)  # before the reset of the policy, which may take long
+        info = self._agent.reset(obs, instruction, **kwargs)
+        self._choose_safe()
+        if self._deadline_s is not None:
+            self._note_asked(0, obs)
+            self._take(0, self._agent.act(obs), 0)
+            if self._asker is None:
+                self._asker = AsyncCaller(self._agent)
+        self._tick = 0
+        return info
+
+    def interrupt(self) -> None:
+        """Drop the plan: the robot was stopped or moved, and did not execute the last action of `act`.
+
+        Earlier observations are not acted on any more, so the policy is asked again. `run_loop` calls this at each tick
+        at which the watchdog has the robot stopped; call it in your own loop when you stop or take over the robot.
+        """
+        self._plan.drop()
+        self._since = self._tick or 0
+        self._trouble = _STOPPED
+        self._last = self._before
+        self._motion = "stopped"
+
+    def observe(self, obs: Obs) -> None:
+        """Show the policy an observation for which no action is needed."""
+        if self._asker is not None:
+            self._asker.settle()
+        self._agent.observe(obs)
+
+    def act(self, obs: Obs) -> Act:
+        """Return the action of this tick, (D,) float32."""
+        tick = self._tick
+        if tick is None:
+            raise NotReset("act before reset; reset first")
+        begun = time.monotonic()
+        if self._asker is None or self._deadline_s is None:
+            if self._wants(tick, obs):
+                self._note_asked(tick, obs)
+                self._take(tick, self._agent.act(_stamped(obs, self._extras())), tick)
+        else:
+            self._ask_in_time(self._asker, obs, tick, begun + self._deadline_s)
+        self._tick = tick + 1
+        return self._chosen(obs, tick)
+
+    def close(self) -> None:
+        """Close the policy, at once or as soon as the request in progress is over."""
+        if self._asker is not None:
+            self._asker.close()
+            self._asker = None
+        else:
+            self._agent.close()
+        self._begin()
+
+    def _choose_safe(self) -> None:
+        """Choose the safe action; raises `ConfigError` if it does not fit the policy's actions."""
+        self._contract = self._agent.contract
+        if self._deadline_s is not None:
+            spec = ActionSpec() if self._contract is None else self._contract.action
+            self._safe = SafeAction(self._safe_choice, spec, self._grippers)
+
+    def _note_asked(self, tick: int, obs: Obs) -> None:
+        self._asked, self._asked_step, self._seen_at = tick, self._plan.executed, self._captured(obs)
+
+    def _is_old(self, seen_at: float) -> bool:
+        return self._max_age_s is not None and seen_at < time.monotonic() - self._max_age_s
+
+    def _next(self) -> Step | None:
+        """Return the action for now from chunks that are young enough."""
+        if self._max_age_s is not None and self._plan.drop(time.monotonic() - self._max_age_s):
+            self._trouble = _OLD
+        return self._plan.next
+
+    def _wants(self, tick: int, obs: Obs) -> bool:
+        """Whether a request with this tick's observation is due."""
+        if self._is_old(self._captured(obs)):
+            return False
+        step = self._next()
+        if step is None:
+            return True
+        if step.chunk.done:
+            return False
+        if self._mode == "open_loop":
+            return self._execute is not None and step.row >= self._execute
+        last = step.chunk.end == self._plan.executed + 1  # also true for each answer of a single action
+        return last or tick - self._asked >= (self._execute or 1)
+
+    def _ask_in_time(self, asker: AsyncCaller, obs: Obs, tick: int, deadline: float) -> None:
+        """Take an answer, send a request if one is due, and wait for its answer as long as allowed and needed."""
+        self._receive(asker.take(), tick)
+        if asker.idle and self._wants(tick, obs):
+            self._note_asked(tick, obs)
+            if self._waiting_since is None:
+                self._waiting_since = time.monotonic()
+            asker.ask(tick, _stamped(copied(obs), self._extras()))
+        while not asker.idle and (left_s := deadline - time.monotonic()) > 0:
+            fresh = self._mode != "async" and self._asked == tick
+            if not fresh and self._next() is not None:
+                break
+            self._receive(asker.take(left_s), tick)
+
+    def _receive(self, answer: AsyncAnswer | None, tick: int) -> None:
+        if answer is None:
+            return
+        if isinstance(answer.result, Act):
+            try:
+                if answer.tick >= self._since:
+                    self._take(answer.tick, answer.result, tick)
+                self._waiting_since = None
+            except InvalidAction as error:
+                self._trouble = str(error)
+            return
+        if isinstance(answer.result, InvalidInput) or not isinstance(answer.result, VLAgentsError):
+            raise answer.result
+        self._trouble = f"{answer.result.code}: {answer.result}"
+
+    def _take(self, asked: int, act: Act, now: int) -> None:
+        rows = Act(check_action(act.action, self._contract)).rows()[: self._horizon]
+        if self._mode == "open_loop" and act.done and self._execute is not None:
+            rows = rows[: self._execute]
+        chunk = Chunk(self._chunks, self._asked_step, rows, act.done, act.info, asked, self._seen_at)
+        self._trouble = _WAITING if self._plan.add(chunk) else _LATE
+        self._chunks += 1
+        self._delays.append(now - asked)
+
+    def _extras(self) -> dict[str, Any]:
+        extras: dict[str, Any] = {}
+        if self._timeout_s is not None:
+            extras[DEADLINE] = self._timeout_s * 1e3
+        if self._real_time:
+            extras |= self._plan.continuation(self._delays)
+        return extras
+
+    def _chosen(self, obs: Obs, tick: int) -> Act:
+        step = self._next()
+        silent_s = 0.0 if self._waiting_since is None else time.monotonic() - self._waiting_since
+        reason = _STALE if self._is_old(self._captured(obs)) else self._trouble
+        self._before = self._last
+        if step is not None:
+            try:
+                self._last = self._passed(step.action, obs)
+                self._motion = "moving"
+                self._plan.advance()
+                return _played(self._last, step, tick, silent_s)
+            except InvalidAction as error:
+                self._plan.drop()  # the rest was planned from where this action would have led
+                reason = str(error)
+                if self._safe is None:
+                    raise
+        if self._safe is None:
+            raise InvalidAction(f"no action for this tick: {reason}")
+        last = self._standing(obs) if self._motion == "stopped" else self._last
+        try:
+            self._last = self._checked(self._safe(obs, last), last)
+        except InvalidAction as refused:
+            reason = f"{reason}; the safe action is refused, too: {refused}"
+            if last is None or not self._safe.holds:
+                raise InvalidAction(
+                    f"no action for this tick: {reason}; let the guard pass it, or give another one (safe=)"
+                ) from refused
+            self._last = self._checked(last, last)
+        self._motion = "held" if self._motion == "moving" else self._motion
+        return Act(self._last.copy(), info={SAFE: reason, SILENT: silent_s})
+
+    def _passed(self, action: np.ndarray, obs: Obs) -> np.ndarray:
+        """Return the policy's action, (D,) float32, if it is close enough to the robot's position or last target."""
+        if self._motion == "moving":
+            return self._checked(action, self._last)
+        if self._motion == "held":  # the last target; the robot may have been moved since, or never have arrived
+            with contextlib.suppress(InvalidAction):
+                return self._checked(action, self._last)
+        return self._checked(action, self._standing(obs))
+
+    def _standing(self, obs: Obs) -> np.ndarray | None:
+        """Return the robot's position, (D,), as far as it is known."""
+        reference = getattr(self.check, "reference", None)
+        return self._last if reference is None else reference(obs, self._last)
+
+    def _checked(self, action: np.ndarray, last: np.ndarray | None) -> np.ndarray:
+        """Return a row, (D,) float32, that may be sent to the robot; raises `InvalidAction` for any other."""
+        action = check_action(action, self._contract)
+        if action.ndim != 1:
+            raise InvalidAction(f"action: got {action.shape}, want (D,), a single row")
+        return action if self.check is None else self.check(action, last)
+
+
+def _played(action: np.ndarray, step: Step, tick: int, silent_s: float) -> Act:
+    chunk = step.chunk
+    about = {AGE: tick - chunk.tick, "chunk": chunk.number, "row": step.row, SILENT: silent_s}
+    return Act(action.copy(), chunk.done and step.row == len(chunk.rows) - 1, {**chunk.info, **about})
+
+
+def _stamped(obs: Obs, extras: dict[str, Any]) -> Obs:
+    """Return a copy of the observation with its capture time and the `extras` of the request."""
+    return replace(obs, info={CAPTURED: time.time(), **obs.info, **extras})

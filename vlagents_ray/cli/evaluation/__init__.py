@@ -1,0 +1,1 @@
+"""`vlagents-ray eval`, and the commands that read its results."""

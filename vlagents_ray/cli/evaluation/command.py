@@ -1,0 +1,204 @@
+"""`vlagents-ray eval`: from a file or from options, serving what is to be served."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+import yaml
+
+from vlagents_ray.cli.console import errors
+from vlagents_ray.cli.options import YAML_SUFFIXES, Address, Set, parse_list, parse_settings, parse_time
+from vlagents_ray.cli.ray_session import RESUME, exit_if_ray_is_lost
+from vlagents_ray.errors import ConfigError
+
+if TYPE_CHECKING:
+    from pydantic import BaseModel
+
+    from vlagents_ray.evaluate import EvalConfig, WorkerConfig
+
+
+# An option that is a field of `EvalConfig`, or of its policy, suite or worker, has the field's name here.
+def evaluate_command(
+    what: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="FILE | ENV...",
+            help="A file of runs (.yaml); or environments: maniskill/PushCube-v1, 'libero/*', …",
+        ),
+    ],
+    source: Annotated[
+        str | None,
+        typer.Option("--policy", help="A registered name, a deployment file, or the URL of a running server."),
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder of the results.")] = None,
+    episodes: Annotated[int | None, typer.Option(min=1, help="Episodes of each environment; default: 10.")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Environments rolled out in parallel; default: 1.")] = None,
+    cpus: Annotated[
+        float | None,
+        typer.Option("--worker-cpus", min=0, help="CPUs of each worker, unless the file says how many; default: 0.5."),
+    ] = None,
+    gpus: Annotated[
+        float | None,
+        typer.Option(
+            "--worker-gpus",
+            min=0,
+            help="GPUs likewise, to render on: 0.25 is a quarter of one; default: 0, in software.",
+        ),
+    ] = None,
+    seeds: Annotated[int | None, typer.Option("--seed", min=0, help="Episode i uses seed + i; default: 0.")] = None,
+    video: Annotated[str | None, typer.Option(help="none, failures (default) or all.")] = None,
+    record: Annotated[
+        str | None, typer.Option(help="Trajectories, to export and to replay: none (default), failures or all.")
+    ] = None,
+    track: Annotated[str, typer.Option(help="wandb, trackio, tensorboard, with commas between them.")] = "",
+    resume: Annotated[bool, typer.Option(help="Go on with the results in --out.")] = False,
+    execute: Annotated[int | None, typer.Option(min=1, help="Rows executed of each chunk; default: all.")] = None,
+    retries: Annotated[
+        int | None, typer.Option(min=0, help="Further attempts after an infrastructure failure; default: 3.")
+    ] = None,
+    config: Set = [],  # noqa: B006 - typer reads it
+    env_options: Annotated[
+        list[str], typer.Option("--env-set", metavar="KEY=VALUE", help="An option of the environments: width=256.")
+    ] = [],  # noqa: B006
+    options: Annotated[
+        list[str],
+        typer.Option("--reset-set", metavar="KEY=VALUE", help="An option of the policy's reset: checkpoint_step=9."),
+    ] = [],  # noqa: B006
+    watch: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Evaluate each checkpoint that a training run writes there, until Ctrl-C."),
+    ] = None,
+    until: Annotated[int | None, typer.Option(min=0, metavar="STEP", help="End --watch with this step.")] = None,
+    settle: Annotated[
+        float | None, typer.Option(min=0, help="With --watch: s that a checkpoint must not have changed; default: 10.")
+    ] = None,
+    marker: Annotated[
+        str | None, typer.Option(metavar="NAME", help="With --watch: the file that the trainer writes in it when done.")
+    ] = None,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Print plan, count and estimated time; play nothing.")
+    ] = False,
+    end_at: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TIME",
+            help="Begin no episode that would not end by then: 2027-01-31T18:30, local time, or s since 1970.",
+        ),
+    ] = None,
+    replica_per_gpu: Annotated[
+        bool,
+        typer.Option(
+            "--replica-per-gpu",
+            help="With --address: a policy has a replica on each GPU of the cluster, unless its deployment says more.",
+        ),
+    ] = False,
+    address: Address = None,
+) -> None:
+    """Evaluate policies: episodes in parallel, success rates with confidence intervals, videos.
+
+    A file holds policies, their checkpoints, suites of environments, seeds; --out, --workers, --video, --record,
+    --track, --retries and --resume win over it.
+
+    Exit status: 0 when every episode has its result, 75 when --end-at left some over (--resume goes on), 130 after
+    Ctrl-C or SIGTERM (likewise), 2 for wrong settings, 1 for what else failed, and when infrastructure lost an episode
+    for good (--resume tries it again).
+    """
+    given = locals()  # every option by its name
+    with errors(), exit_if_ray_is_lost(RESUME):
+        evaluation = config_from_options(given)
+        watching: dict[str, Any] = {"until": until, "settle_s": settle, "marker": marker}
+        watching = {name: value for name, value in watching.items() if value is not None}
+        if watching and watch is None:
+            raise ConfigError(f"got {sorted(watching)} without --watch")
+        if dry_run and watch is not None:
+            raise ConfigError("--dry-run and --watch exclude each other: nobody knows yet which steps there will be")
+        if end_at is not None and watch is not None:
+            raise ConfigError("--end-at and --watch exclude each other: watching ends with --until, or by Ctrl-C")
+        if replica_per_gpu and address is None:
+            raise ConfigError("--replica-per-gpu: want --address, a cluster whose GPUs can be counted")
+        if dry_run:
+            from vlagents_ray.cli.evaluation.dry_run import print_plan
+
+            print_plan(evaluation)
+        elif watch is not None:
+            from vlagents_ray.cli.evaluation.watch import watch_training
+
+            watch_training(evaluation, watch, address, **watching)
+        else:
+            from vlagents_ray.cli.evaluation.run import run_evaluation
+
+            end = None if end_at is None else parse_time(end_at, "--end-at")
+            run_evaluation(evaluation, address, end_at=end, replica_per_gpu=replica_per_gpu)
+
+
+def config_from_options(options: Mapping[str, Any]) -> EvalConfig:
+    """Build the configuration of an evaluation from the options of `vlagents-ray eval`.
+
+    Args:
+        options: The parameters of `evaluate_command`, by their names.
+
+    Raises:
+        ConfigError: The options do not go together, or one cannot be parsed.
+    """
+    from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig
+
+    what = options["what"]
+    parsed = {
+        **options,
+        "track": parse_list(options["track"]),
+        "config": parse_settings(options["config"], "--set"),
+        "options": parse_settings(options["options"], "--reset-set"),
+        "env_options": parse_settings(options["env_options"], "--env-set"),
+        "seeds": None if options["seeds"] is None else [options["seeds"]],
+    }
+    run, policy, suite, worker = (
+        _given(parsed, model) for model in (EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig)
+    )
+    if what[0].endswith(YAML_SUFFIXES):
+        if beside := [*what[1:], *policy, *suite]:
+            raise ConfigError(f"{what[0]} says what is evaluated; got {beside} beside it: write that there")
+        fields = read_run(Path(what[0])) | run
+    else:
+        if "source" not in policy or "out" not in run:
+            raise ConfigError("want --policy and --out, or a file of runs (.yaml)")
+        fields = {"policies": [policy], "suites": [{"envs": list(what)} | suite], **run}
+    return _with_resources(EvalConfig.model_validate(fields), worker)
+
+
+def _given(options: Mapping[str, Any], model: type[BaseModel]) -> dict[str, Any]:
+    """Select the options that are fields of `model` and were given."""
+    found = {name: options[name] for name in model.model_fields if name in options}
+    # 0 was given, though it equals False.
+    return {name: value for name, value in found.items() if value not in (None, {}, []) and value is not False}
+
+
+def _with_resources(config: EvalConfig, resources: dict[str, float]) -> EvalConfig:
+    """Give each worker these resources where the configuration does not say what it takes."""
+    if not resources:
+        return config
+
+    def filled(worker: WorkerConfig) -> WorkerConfig:
+        unset = {name: value for name, value in resources.items() if name not in worker.model_fields_set}
+        return worker.model_copy(update=unset)
+
+    suites = [
+        suite if suite.worker is None else suite.model_copy(update={"worker": filled(suite.worker)})
+        for suite in config.suites
+    ]
+    return config.model_copy(update={"worker": filled(config.worker), "suites": suites})
+
+
+def read_run(file: Path) -> dict[str, Any]:
+    """Read a file of runs; results go to runs/NAME unless it names a folder."""
+    if not file.is_file():
+        raise ConfigError(f"file of runs {str(file)!r} does not exist")
+    try:
+        document = yaml.safe_load(file.read_text())
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{file}: not YAML ({error})") from error
+    if not isinstance(document, dict):
+        raise ConfigError(f"{file}: got {type(document).__name__}, want a mapping with `policies` and `suites`")
+    return {"out": Path("runs") / file.stem} | document

@@ -1,0 +1,125 @@
+"""The commands that read a folder of results: `vlagents-ray report`, `export`, `merge` and `replay`."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from vlagents_ray.cli.console import errors, fresh, out
+from vlagents_ray.cli.options import Address, parse_list
+from vlagents_ray.errors import ConfigError
+
+
+class Videos(str, Enum):
+    """Where the videos of the page are."""
+
+    INLINE = "inline"
+    LINK = "link"
+    NONE = "none"
+
+
+def report_command(
+    folders: Annotated[list[Path], typer.Argument(metavar="OUT...", help="Folders that evaluations wrote to.")],
+    html: Annotated[
+        Path | None, typer.Option(help="The file to write; default: report.html in OUT, with several here.")
+    ] = None,
+    videos: Annotated[
+        Videos, typer.Option(help="In the page as far as they fit, beside it, or stills alone.")
+    ] = Videos.LINK,
+) -> None:
+    """Write a page of what came out: success with intervals, comparisons, latency, failures, and all that made it."""
+    from vlagents_ray.evaluate import Results
+    from vlagents_ray.evaluate.report.html import FILE, write_report
+    from vlagents_ray.evaluate.results.combine import combined
+
+    with errors():
+        results = combined([Results.load(folder) for folder in folders])
+        path = html or (folders[0] / FILE if len(folders) == 1 else Path(FILE))
+        written = write_report(results, path, videos=videos.value)
+        out.print(f"report: {written}")
+
+
+def export_command(
+    folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the results.")],
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="File to write; of lerobot, a new folder.")],
+    to: Annotated[str, typer.Option(help="json, csv, parquet: a row an episode; lerobot: a dataset of what was seen.")],
+    policy: Annotated[str | None, typer.Option(help="Only this one: NAME, or NAME@STEP in a sweep.")] = None,
+    env: Annotated[str | None, typer.Option(help="Only this one.")] = None,
+    cameras: Annotated[str | None, typer.Option(help="lerobot: only these, as base,wrist. Default: all.")] = None,
+    state: Annotated[
+        str | None,
+        typer.Option(help="lerobot: only these parts of the state, in this order, as joints,gripper. Default: all."),
+    ] = None,
+    successes: Annotated[bool, typer.Option("--successes", help="lerobot: only episodes that were solved.")] = False,
+    cut_idle: Annotated[
+        bool, typer.Option("--cut-idle", help="lerobot: end each episode where nothing moves after it was solved.")
+    ] = False,
+) -> None:
+    """Write the episodes of an evaluation as JSON, CSV, Parquet or a LeRobotDataset v3.0."""
+    from vlagents_ray.evaluate import Results
+    from vlagents_ray.evaluate.artifacts.storage import storing
+    from vlagents_ray.evaluate.exports import EXPORTS
+
+    with errors():
+        if to not in EXPORTS:
+            raise ConfigError(f"--to: got {to!r}, want one of {', '.join(EXPORTS)}")
+        named = {"cameras": cameras, "state": state}
+        chosen: dict[str, Any] = {name: parse_list(value) for name, value in named.items() if value is not None}
+        chosen |= {name: True for name, on in (("successes", successes), ("cut_idle", cut_idle)) if on}
+        if chosen and to != "lerobot":
+            given = ", ".join(f"--{name.replace('_', '-')}" for name in chosen)
+            raise ConfigError(f"{given}: got --to {to}, want --to lerobot, whose frames they choose")
+        results = Results.load(folder).only(policy, env)
+        with storing(path.parent):
+            number = EXPORTS[to](results, path, **chosen)
+    out.print(f"wrote {number} episodes to {path}")
+
+
+def merge_command(
+    into: Annotated[Path, typer.Argument(metavar="OUT", help="New folder.")],
+    folders: Annotated[list[Path], typer.Argument(metavar="FOLDER...", help="Folders of results, which stay.")],
+    keep_first: Annotated[
+        bool,
+        typer.Option("--keep-first", help="Of different outcomes of an episode keep that of the folder named first."),
+    ] = False,
+) -> None:
+    """Put results together: each episode once, by its key; videos and trajectories go along."""
+    from vlagents_ray.evaluate import print_summary
+    from vlagents_ray.evaluate.merge import merge
+
+    with errors():
+        print_summary(out, merge(into, folders, keep_first=keep_first))
+
+
+def replay_command(
+    folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the results.")],
+    episode: Annotated[str, typer.Argument(help="Its key, or ENV#NUMBER: 'tabletop#3'.")],
+    policy: Annotated[
+        str | None, typer.Option(help="A registered name, a deployment file, or a URL, in place of the run's own.")
+    ] = None,
+    out_dir: Annotated[
+        Path | None, typer.Option("--out", help="Folder of the replay, with its video; default: a new one below OUT.")
+    ] = None,
+    address: Address = None,
+) -> None:
+    """Play an episode of an evaluation again, and compare: exit code 0 if every action and its outcome is the same."""
+    from vlagents_ray.cli.evaluation.run import play_one
+    from vlagents_ray.evaluate import Results
+    from vlagents_ray.evaluate.replay import compare, find
+
+    with errors():
+        recorded = find(Results.load(folder), episode)
+        other: dict[str, Any] | None = None
+        if policy is not None:
+            other = {"source": policy, "url": None, "config": {}, "checkpoint": None}
+        into = out_dir or fresh(folder / "replays" / "replay")
+        summary = play_one(recorded.config(into, policy=other), address, recorded.number_and_seed)
+        found = compare(recorded, summary.results)
+    steps = recorded.episode.result.steps
+    lines = found or [f"the same: {steps} actions byte for byte, and what came of them"]
+    for line in [*lines, f"replay: {into}"]:
+        out.print(line)
+    raise typer.Exit(bool(found))

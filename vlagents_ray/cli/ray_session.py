@@ -1,0 +1,192 @@
+"""Ray under a command: what it logs goes to a file, and the command ends if Ray is lost."""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import logging
+import os
+import re
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterator
+from logging.handlers import RotatingFileHandler
+from pathlib import Path
+from typing import Any
+
+from vlagents_ray.cli.console import say_error
+from vlagents_ray.errors import ClusterLost
+from vlagents_ray.ray_tools.private import LOGGERS, node_of_this_process, output_printer, set_output_printer
+
+log = logging.getLogger(__name__)
+
+_LEAVE_S = 10.0  # for a command to end in order
+_EXIT_S = 3.0  # for its process to end then: Ray's own farewell may wait for what is not there any more
+_END_S = 90.0  # from Ctrl-C to the end: Serve has a third of it to end in order, and Ray's farewell the rest
+RESTART = "start it again"
+RESUME = "what was played is kept: go on with --resume when there is a cluster again"
+
+_FILE_BYTES = 10_000_000  # Serve logs each request; twice as much is kept
+_SERVES_INFO = re.compile(r"(INFO|DEBUG) \d{4}-\d\d-\d\d \d\d:")  # as each line of Serve's processes begins
+# Warnings of what is meant to be so: of `own_ray`, which is on loopback, has a token and leaves signals alone.
+_MEANT = (
+    "won't accept connections from HAProxy on other nodes",
+    "Token authentication is enabled",
+    "SIGTERM handler is not set",
+)
+
+
+@contextlib.contextmanager
+def quiet_ray(name: str | None) -> Iterator[Path | None]:
+    """Keep what Ray, Serve and HAProxy log off the terminal, unless it is a problem.
+
+    The context begins before Ray is started.
+
+    Args:
+        name: What the name of the log file begins with; None keeps no log.
+
+    Yields:
+        The log file, which stays and which this user alone can read; None without one.
+    """
+    file, kept = _file(name) if name is not None else (None, None)
+
+    def no_problem(text: str, level: int) -> bool:
+        return level < logging.WARNING or any(one in text for one in _MEANT)
+
+    def note(text: str) -> None:
+        if kept is not None:
+            kept.emit(logging.LogRecord("ray", logging.INFO, "", 0, text, None, None))
+
+    def is_shown(record: logging.LogRecord) -> bool:
+        text = record.getMessage()
+        if shown := not no_problem(text, record.levelno):
+            return shown
+        note(text)
+        return False
+
+    printed = output_printer()
+
+    def print_to_stdstream(data: dict[str, Any], *args: Any, **kwargs: Any) -> None:
+        """Print lines of other processes, as Ray's own function does."""
+        shown = []
+        for line in data["lines"]:
+            if no_problem(line, logging.INFO if _SERVES_INFO.match(line) else logging.WARNING):
+                note(f"({data.get('actor_name') or data.get('task_name') or 'ray'} pid={data.get('pid')}) {line}")
+            else:
+                shown.append(line)
+        if shown:
+            printed({**data, "lines": shown}, *args, **kwargs)
+
+    set_output_printer(print_to_stdstream)
+    loggers = [logging.getLogger(one) for one in LOGGERS]
+    for logger in loggers:
+        logger.addFilter(is_shown)
+    try:
+        yield file
+    finally:
+        for logger in loggers:
+            logger.removeFilter(is_shown)
+        set_output_printer(printed)
+        if kept is not None:
+            kept.close()
+
+
+def _file(name: str) -> tuple[Path, logging.Handler]:
+    descriptor, path = tempfile.mkstemp(prefix=f"{name}-", suffix=".log")
+    os.close(descriptor)
+    return Path(path), RotatingFileHandler(path, maxBytes=_FILE_BYTES, backupCount=1)
+
+
+@contextlib.contextmanager
+def exit_if_ray_is_lost(cure: str) -> Iterator[RayLoss]:
+    """End the process with status 1 if its Ray is lost within the context, in order if that takes no longer than 10 s.
+
+    Args:
+        cure: What the user can do about it, for the message.
+    """
+    import ray  # noqa: F401 - before the thread does: one that two threads import at once is seen half made
+
+    loss = RayLoss(cure)
+    threading.Thread(target=loss.watch, name="ray-lost", daemon=True).start()
+    try:
+        yield loss
+    except ClusterLost as error:
+        loss.error = error
+        raise
+    except KeyboardInterrupt:  # or SIGTERM, which may have ended Ray as well
+        loss.interrupted = True
+        raise
+    except Exception as error:
+        if loss.error is not None:  # what Ray says of it is its consequence
+            raise loss.error from error
+        raise
+    finally:
+        loss.left.set()
+
+
+class RayLoss:
+    """Watches the Ray that this process has joined, and knows whether it is lost."""
+
+    def __init__(self, cure: str) -> None:
+        """`cure` is what the user can do about it."""
+        self.error: ClusterLost | None = None
+        self.interrupted = False
+        self.left = threading.Event()  # the command has ended, or is about to say why it does
+        self._cure = cure
+        self._known = threading.Event()
+
+    def wait(self) -> None:
+        """Block until Ray is lost and raise `ClusterLost`; an interrupt has the command end within `_END_S`."""
+        try:
+            self._known.wait()
+        except KeyboardInterrupt:
+            self.left.set()
+            faulthandler.dump_traceback_later(_END_S, exit=True)  # and says where, whatever hangs in whatever thread
+            raise
+        if self.error is not None:
+            raise self.error
+
+    def watch(self) -> None:
+        """Watch Ray until the command ends, and end the process if Ray is lost. Runs on a thread of its own."""
+        while self.error is None and not self.left.is_set():
+            self._watch_ray()
+        if self.error is None:
+            return
+        self._known.set()
+        said = f"{type(self.error).__name__}: {self.error}"
+        if self.left.wait(_LEAVE_S):
+            if self.interrupted:
+                return
+            time.sleep(_EXIT_S)
+        else:
+            say_error(said)
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(1)  # whatever else runs is ended by the reaper
+
+    def _watch_ray(self) -> None:
+        """Watch the Ray that this process is in, until it leaves it or that Ray is lost."""
+        from vlagents_ray.ray_tools.head_monitor import (
+            PERIOD_S,
+            HeadMonitor,
+            keep_from_printing_last_words,
+        )
+
+        head: HeadMonitor | None = None
+        while not self.left.wait(PERIOD_S):
+            node = node_of_this_process()
+            if node is None or (head is not None and head.node is not node):
+                return
+            try:
+                if head is None:
+                    head = HeadMonitor(self._cure)
+                    keep_from_printing_last_words()
+                head.answers()
+            except ClusterLost as error:
+                if node_of_this_process() is node:  # it is not being left just now
+                    self.error = error
+                return
+            except Exception as error:  # noqa: BLE001 - whatever Ray raises while it is being joined or left
+                log.debug("Ray was not watched: %s", error)

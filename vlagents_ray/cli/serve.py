@@ -1,0 +1,160 @@
+"""`vlagents-ray serve`: serve a policy, and say how clients and a browser reach it."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+from urllib.parse import urlsplit
+
+import typer
+
+from vlagents_ray.cli.console import errors, out
+from vlagents_ray.cli.doctor.listing import require_packages
+from vlagents_ray.cli.options import Address, Set, parse_settings
+from vlagents_ray.cli.ray_session import RESTART, exit_if_ray_is_lost, quiet_ray
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK
+
+if TYPE_CHECKING:
+    from ray.serve.schema import ServeDeploySchema
+
+    from vlagents_ray.serve.access.tls import Tls
+    from vlagents_ray.serve.config.deployment import ServerArgs
+
+
+def serve_command(
+    source: Annotated[str, typer.Argument(help="A registered policy, 'module:Class', or a deployment file (.yaml).")],
+    host: Annotated[
+        str | None,
+        typer.Option(help="0.0.0.0, or one address of this machine, lets others in; default: the file's, 127.0.0.1."),
+    ] = None,
+    port: Annotated[int | None, typer.Option(min=1, max=65535, help="Default: the file's, or 8000.")] = None,
+    settings: Set = [],  # noqa: B006 - typer reads it
+    serve_set: Annotated[
+        list[str], typer.Option("--serve-set", metavar="KEY=VALUE", help="A setting of the server: batch.max_size=8.")
+    ] = [],  # noqa: B006
+    vlagents_port: Annotated[
+        int | None, typer.Option(min=1, max=65535, help="Let clients of the package vlagents in at this port, too.")
+    ] = None,
+    address: Address = None,
+    keys: Annotated[
+        Path | None,
+        typer.Option(help="File of the API keys (`vlagents-ray keys new`); default: VLAGENTS_RAY_KEYS_FILE or _KEYS."),
+    ] = None,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Let in whoever reaches the port, without keys.")
+    ] = False,
+    plain_http: Annotated[
+        bool, typer.Option("--plain-http", help="Keys may cross the network unencrypted: no warning.")
+    ] = False,
+    tls_cert: Annotated[Path | None, typer.Option(help="Certificate in PEM: serve https:// and wss://.")] = None,
+    tls_key: Annotated[Path | None, typer.Option(help="Its key, in PEM.")] = None,
+    tls_client_ca: Annotated[
+        Path | None, typer.Option(help="Who signs the certificates that clients must show, in PEM.")
+    ] = None,
+) -> None:
+    """Serve a policy until Ctrl-C."""
+    from vlagents_ray.serve.launch.deployment_file import listens_at, read_deployment, with_dialect, with_gateways_at
+    from vlagents_ray.serve.launch.server import running_server
+
+    with errors():
+        config = read_deployment(source, _server_args(settings, serve_set))
+        if vlagents_port is not None:
+            config = with_dialect(config, "vlagents", {"port": vlagents_port})
+        if address is None:
+            require_packages(config)
+        stated_host, stated_port = listens_at(config)
+        host, port = host or stated_host, port or stated_port
+        access: dict[str, Any] = {
+            "keys_file": keys,
+            "insecure": insecure,
+            "plain_http": plain_http,
+            "tls": _tls(tls_cert, tls_key, tls_client_ca),
+        }
+        with (
+            quiet_ray(f"vlagents-ray-serve-{port}") as log,
+            exit_if_ray_is_lost(RESTART) as loss,
+            running_server(config, host=host, port=port, address=address, show_logs=True, **access) as server,
+        ):
+            for line in connection_lines(with_gateways_at(config, host), server.apps, host, keys, insecure=insecure):
+                out.print(line)
+            if address is None:
+                out.print(f"Ray programs of yours on this machine: vlagents_ray.join({server.url!r})")
+            out.print(f"log of Ray, Serve and HAProxy: {log}")
+            out.print("Ctrl-C stops")
+            with contextlib.suppress(KeyboardInterrupt):
+                loss.wait()
+
+
+def connection_lines(
+    config: ServeDeploySchema, urls: Mapping[str, str], host: str, keys: Path | None = None, *, insecure: bool = False
+) -> Iterator[str]:
+    """Say of each application its URL, its policy, its page, and where clients of other systems connect.
+
+    Args:
+        config: The deployment, in which gateways have their hosts.
+        urls: Application -> its URL, as this machine reaches it.
+        host: Where the server listens.
+        keys: The file of keys that was named to the server, beside those of the deployment.
+        insecure: Whether it lets everybody in, whatever the deployment says.
+    """
+    from vlagents_ray.serve.config.deployment import ServerArgs
+    from vlagents_ray.serve.dialects.routes import describe
+    from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH, own_settings
+
+    for app in config.applications:
+        url = urls[app.name]
+        yield f"serving {app.name} at {url}"
+        if host == EVERYWHERE:
+            yield f"  from other machines: {url.replace(LOOPBACK, socket.gethostname(), 1)}"
+        if app.import_path != IMPORT_PATH:
+            continue
+        args = ServerArgs(**app.args)
+        settings = ", ".join(f"{name}={value!r}" for name, value in own_settings(app).items())
+        yield f"  policy: {args.policy}" + (f" ({settings})" if settings else "")
+        keyed = not insecure and (keys is not None or _wants_key(args))
+        yield f"  how to talk to it: {_page(url) if keyed else f'{url}/docs'}"
+        for name, one in describe(args.dialects).items():
+            places = [one["address"]] if "address" in one else [_address(url, path) for path in one["paths"]]
+            yield f"  {name}: {', '.join(places)}"
+
+
+def _wants_key(args: ServerArgs) -> bool:
+    try:
+        return args.access.keys() is not None
+    except ConfigError:  # they are on the cluster's machines, not on this one
+        return True
+
+
+def _page(url: str) -> str:
+    return f'curl -H "Authorization: Bearer $VLAGENTS_RAY_API_KEY" {url}/docs'
+
+
+def _address(url: str, path: str) -> str:
+    """Turn "WS /openpi" into a URL."""
+    method, _, place = path.partition(" ")
+    if method != "WS":
+        return f"{method} {url}{place}"
+    parts = urlsplit(url)
+    return f"{'wss' if parts.scheme == 'https' else 'ws'}://{parts.netloc}{parts.path}{place}"
+
+
+def _tls(certificate: Path | None, key: Path | None, client_ca: Path | None) -> Tls | None:
+    from vlagents_ray.serve.access.tls import Tls
+
+    if certificate is None and key is None and client_ca is None:
+        return None
+    if certificate is None or key is None:
+        raise ConfigError("TLS: give both --tls-cert and --tls-key")
+    return Tls(certificate, key, client_ca)
+
+
+def _server_args(settings: list[str], serve_set: list[str]) -> dict[str, Any]:
+    args = parse_settings(serve_set, "--serve-set")
+    if "config" in args:
+        raise ConfigError("--serve-set config: the policy's own settings go into --set")
+    config = parse_settings(settings, "--set")
+    return {**args, **({"config": config} if config else {})}

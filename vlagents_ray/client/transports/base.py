@@ -1,0 +1,87 @@
+"""The interface between `RemoteAgent` and the transports that carry its requests."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+from vlagents_ray.protocol.messages import Reply, Request
+
+logger = logging.getLogger(__name__)
+
+_ANSWER_S = 2.0  # most s that the first replica asked may take to send anything
+_SILENT_S = 2.0  # s after which an attempt to connect that goes on is reported
+
+
+class RequestChannel(Protocol):
+    """Carries the requests of one frame at a time to one replica of a server.
+
+    A request names its session. A session ends with its `close` request, or with the connection.
+
+    Raises `PolicyUnavailable` when the server cannot be reached or is not ready, `ConnectionLost` when the connection
+    broke after the request was sent, and `DeadlineExceeded` when no answer came in time. An error that the server
+    replied with is in `Reply.error`.
+    """
+
+    @property
+    def holds_sessions(self) -> bool:
+        """Whether sessions end with the connection."""
+        ...
+
+    @property
+    def name(self) -> str:
+        """The name of the transport for users: "shm", "plasma", "websocket", "http" or "handle"."""
+        ...
+
+    def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
+        """Send requests as one frame and wait for their replies, in order. Nothing is ever sent twice."""
+        ...
+
+    def close(self) -> None:
+        """End the connection."""
+        ...
+
+
+class Transport(RequestChannel, Protocol):
+    """A channel that finds its replica itself; after `close`, `connect` may begin a connection to another replica."""
+
+    def connect(self, timeout_s: float) -> dict[str, Any]:
+        """Try once to reach the server; return its metadata."""
+        ...
+
+
+class ConnectReport:
+    """Logs once that a server is not ready and is tried again, when an attempt to connect has lasted for 2 s."""
+
+    def __init__(self, url: str, timeout_s: float) -> None:
+        """Begin; the attempts to connect last for `timeout_s` in all."""
+        self._url = url
+        self._begun, self._timeout_s = time.monotonic(), timeout_s
+        self._logged = False
+
+    def failed(self, error: Exception) -> None:
+        """Note that an attempt failed, and that there will be another one."""
+        waited_s = time.monotonic() - self._begun
+        if not self._logged and waited_s >= _SILENT_S:
+            self._logged = True
+            left_s = self._timeout_s - waited_s
+            logger.warning("%s: not ready; trying again for up to %.0f s (%s)", self._url, left_s, error)
+
+
+def first_timeout_s(timeout_s: float) -> float:
+    """Return how long, s, the first replica may take to send anything, of `timeout_s` in all; the next gets twice that.
+
+    The first replica may hang while another one works. With this limit, every attempt to connect, however short, asks
+    at least two replicas.
+    """
+    return min(_ANSWER_S, timeout_s / 3)
+
+
+def is_answer(replies: Sequence[Reply], requests: Sequence[Request]) -> bool:
+    """Whether these replies belong to these requests, not to earlier ones that timed out.
+
+    An unreadable frame has no id.
+    """
+    return replies[0].request_id in ("", requests[0].request_id)

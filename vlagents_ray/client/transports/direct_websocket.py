@@ -1,0 +1,116 @@
+"""A WebSocket to a replica's own port, which the thread that waits for the answer reads and writes itself."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import time
+from collections.abc import Mapping
+from urllib.parse import SplitResult
+
+from websockets.client import ClientProtocol
+from websockets.frames import Frame, Opcode
+from websockets.protocol import State
+from websockets.uri import parse_uri
+
+from vlagents_ray.client.credentials import WEBSOCKET_LOG
+
+_READ_BYTES = 256 * 1024
+
+
+class Stream:
+    """An open connection. No thread answers pings: the server must rely on the kernel's keep-alive instead."""
+
+    def __init__(
+        self, base: SplitResult, port: int, path: str, timeout_s: float, headers: Mapping[str, str] | None = None
+    ) -> None:
+        """Connect to `port` on the host of `base`; raises `OSError` or `InvalidHandshake` if no such server answers."""
+        host = base.hostname or ""
+        deadline = time.monotonic() + timeout_s
+        self._protocol = ClientProtocol(
+            parse_uri(f"ws://{f'[{host}]' if ':' in host else host}:{port}{path}"), max_size=None, logger=WEBSOCKET_LOG
+        )
+        self._messages: list[bytes] = []
+        self._socket = socket.create_connection((host, port), timeout_s)
+        try:
+            self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            request = self._protocol.connect()
+            request.headers.update(headers or {})
+            self._protocol.send_request(request)
+            self._flush(deadline)
+            while self._protocol.state is State.CONNECTING:
+                self._read(deadline)
+                if self._protocol.handshake_exc is not None:
+                    raise self._protocol.handshake_exc
+        except BaseException:
+            self._socket.close()
+            raise
+
+    def send(self, message: bytes, timeout_s: float) -> None:
+        """Send a binary message.
+
+        Raises what `recv` raises, and `OSError` if the server does not take all of it in time.
+        """
+        self._check_open()
+        self._protocol.send_binary(message)
+        try:
+            self._flush(time.monotonic() + timeout_s)
+        except TimeoutError as error:
+            raise ConnectionAbortedError(f"the server took no message within {timeout_s:g} s") from error
+
+    def recv(self, timeout_s: float) -> bytes:
+        """Return the next binary message.
+
+        Raises:
+            ConnectionClosed: The connection is closed; `OSError` if it broke.
+            TimeoutError: No message came within `timeout_s`.
+        """
+        deadline = time.monotonic() + timeout_s
+        while not self._messages:
+            self._check_open()
+            self._read(deadline)
+        return self._messages.pop(0)
+
+    def close(self) -> None:
+        """Close the connection, so that the server notices."""
+        with contextlib.suppress(OSError):
+            if self._protocol.state is State.OPEN:
+                self._protocol.send_close()
+                self._flush(time.monotonic() + 1.0)
+        self._socket.close()
+
+    def _check_open(self) -> None:
+        """Raise `ConnectionClosed` or `OSError` unless the connection is open.
+
+        Also if the server has sent its close frame.
+        """
+        if self._protocol.state is State.CLOSED:
+            raise self._protocol.close_exc
+        if self._protocol.state is not State.OPEN:
+            raise ConnectionResetError(f"the server closes the connection ({self._protocol.close_rcvd})")
+
+    def _read(self, deadline: float) -> None:
+        self._socket.settimeout(_left(deadline))
+        data = self._socket.recv(_READ_BYTES)
+        if data:
+            self._protocol.receive_data(data)
+        else:
+            self._protocol.receive_eof()
+        for event in self._protocol.events_received():
+            if isinstance(event, Frame) and event.opcode is Opcode.BINARY:
+                self._messages.append(bytes(event.data))
+        self._flush(deadline)
+
+    def _flush(self, deadline: float) -> None:
+        for piece in self._protocol.data_to_send():
+            if piece:
+                self._socket.settimeout(_left(deadline))
+                self._socket.sendall(piece)
+
+
+def _left(deadline: float) -> float:
+    left_s = deadline - time.monotonic()
+    if left_s <= 0:
+        raise TimeoutError
+    return left_s

@@ -1,0 +1,224 @@
+"""The HTTP transport: `POST /v1/<op>` with binary frames on a persistent connection."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import select
+import socket
+import ssl
+import time
+import uuid
+from collections.abc import Sequence
+from typing import Any
+from urllib.parse import SplitResult, urlsplit
+
+from vlagents_ray.client.credentials import ANONYMOUS, KEY_VARIABLE, Credentials, tls_failure
+from vlagents_ray.client.transports.base import ConnectReport, first_timeout_s
+from vlagents_ray.client.transports.codec_selection import CodecChoice
+from vlagents_ray.errors import (
+    ConfigError,
+    ConnectionLost,
+    DeadlineExceeded,
+    Forbidden,
+    MessageTooLarge,
+    NoReplica,
+    PolicyUnavailable,
+    Unauthorized,
+    UnknownApp,
+    VLAgentsError,
+)
+from vlagents_ray.protocol.frames import (
+    CONTENT_TYPE,
+    decode_replies,
+    encode_requests,
+    read_error,
+)
+from vlagents_ray.protocol.messages import (
+    MACHINE_HEADER,
+    REQUEST_ID_HEADER,
+    SESSION_HEADER,
+    Reply,
+    Request,
+)
+
+_UNKNOWN_APP_S = 10.0  # a starting server knows no path until its first replica exists
+
+
+class HttpTransport:
+    """HTTP/1.1; a header names the session, by which all requests of this object reach one replica."""
+
+    name = "http"
+    holds_sessions = False
+
+    def __init__(self, url: str, codec: CodecChoice, credentials: Credentials = ANONYMOUS, machine: str = "") -> None:
+        """Set the server.
+
+        With `machine` (see `MACHINE_HEADER`), ask for the least loaded replica on that machine, if any.
+        """
+        self._machine = machine
+        self._credentials = credentials
+        self._url = http_url(url)
+        self._codec = codec
+        self._session = uuid.uuid4().hex
+        self._connection: http.client.HTTPConnection | None = None
+
+    def connect(self, timeout_s: float) -> dict[str, Any]:
+        """Return the server's metadata as soon as it answers; retries while it is not ready."""
+        begun, report = time.monotonic(), ConnectReport(self._url.geturl(), timeout_s)
+        unknown_since: float | None = None
+        pause_s, attempt_s = 0.05, first_timeout_s(timeout_s)
+        while True:
+            left_s = begun + timeout_s - time.monotonic()
+            try:
+                return self._metadata(max(0.1, min(left_s, attempt_s)))
+            except (PolicyUnavailable, DeadlineExceeded) as error:
+                if isinstance(error, DeadlineExceeded):  # a hung replica: another session id selects another one
+                    self._session, attempt_s = uuid.uuid4().hex, 2 * attempt_s
+                if pause_s > left_s:
+                    raise PolicyUnavailable(
+                        f"{self._url.geturl()}: not ready within {timeout_s:g} s ({error})"
+                    ) from error
+                unknown_since = None
+                report.failed(error)
+            except UnknownApp as error:
+                unknown_since = unknown_since or time.monotonic()
+                if time.monotonic() - unknown_since > _UNKNOWN_APP_S or pause_s > left_s:
+                    raise
+                report.failed(error)
+            time.sleep(pause_s)
+            pause_s = min(1.0, pause_s * 1.5)
+
+    def _metadata(self, timeout_s: float) -> dict[str, Any]:
+        # The session id selects the replica by its hash: the load balancer's round robin is left to WebSockets, which
+        # spread by it.
+        headers = {SESSION_HEADER: self._session} | ({MACHINE_HEADER: self._machine} if self._machine else {})
+        metadata = self.get("/v1/metadata", timeout_s, headers)
+        if "protocol" not in metadata:
+            raise ConfigError(f"{self._url.geturl()}: answers, but is no vlagents_ray server ({str(metadata)[:80]})")
+        return metadata
+
+    def get(self, path: str, timeout_s: float, headers: dict[str, str] | None = None) -> dict[str, Any]:
+        """Return the JSON document at a path of the server."""
+        status, kind, body = self._exchange("GET", path, None, headers or {}, timeout_s)
+        if status != 200:
+            raise refusal(status, kind, body)
+        document = _json(body)
+        if not isinstance(document, dict):
+            raise ConfigError(f"{self._url.geturl()}: answers, but is no vlagents_ray server ({body[:80]!r})")
+        return document
+
+    def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
+        """Send one POST; a response that is not a frame of replies becomes the error of the server or the proxy."""
+        headers = {
+            SESSION_HEADER: self._session,
+            REQUEST_ID_HEADER: requests[0].request_id,
+            "content-type": CONTENT_TYPE,
+            "accept": CONTENT_TYPE,
+        }
+        codec = self._codec.codec_for(requests[0].obs, lambda probe: self._probe(probe, timeout_s))
+        frame = encode_requests(requests, codec)
+        status, kind, body = self._exchange("POST", f"/v1/{requests[0].op}", frame, headers, timeout_s)
+        if status == 200:
+            return decode_replies(body)
+        refused = refusal(status, kind, body)
+        return [Reply(request.request_id, error=refused) for request in requests]
+
+    def _probe(self, probe: bytes, timeout_s: float) -> None:
+        headers = {SESSION_HEADER: self._session, "content-type": "application/octet-stream"}
+        status, kind, body = self._exchange("POST", "/v1/probe", probe, headers, timeout_s)
+        if status != 200:
+            raise refusal(status, kind, body)
+
+    def close(self) -> None:
+        """Close the connection; the next one may reach another replica over another link."""
+        self._codec.forget()
+        self._close_connection()
+
+    def _close_connection(self) -> None:
+        if self._connection is not None:
+            self._connection.close()
+            self._connection = None
+
+    def _exchange(
+        self, method: str, path: str, body: bytes | None, headers: dict[str, str], timeout_s: float
+    ) -> tuple[int, str, bytes]:
+        connection = self._open(timeout_s)
+        try:
+            connection.request(method, self._url.path.rstrip("/") + path, body, headers | self._credentials.headers)
+            answer = connection.getresponse()
+            return answer.status, answer.headers.get("content-type", ""), answer.read()
+        except TimeoutError as error:
+            self._close_connection()
+            raise DeadlineExceeded(f"{self._url.geturl()}: no answer within {timeout_s:g} s") from error
+        except ssl.SSLError as error:  # with TLS 1.3, the server checks the client's certificate only now
+            self._close_connection()
+            raise tls_failure(self._url.geturl(), error) from error
+        except (OSError, http.client.HTTPException) as error:
+            self._close_connection()
+            raise ConnectionLost(f"{self._url.geturl()}: {type(error).__name__}: {error}") from error
+
+    def _open(self, timeout_s: float) -> http.client.HTTPConnection:
+        if self._connection is not None and _closed_by_peer(self._connection.sock):
+            self._close_connection()
+        if self._connection is None:
+            host, port = self._url.hostname or "", self._url.port
+            context = self._credentials.context(self._url.geturl())
+            connection = (
+                http.client.HTTPConnection(host, port, timeout=timeout_s)
+                if context is None
+                else http.client.HTTPSConnection(host, port, timeout=timeout_s, context=context)
+            )
+            try:
+                connection.connect()
+            except ssl.SSLError as error:
+                raise tls_failure(self._url.geturl(), error) from error
+            except OSError as error:
+                raise PolicyUnavailable(f"{self._url.geturl()}: cannot connect ({error}); is it running?") from error
+            connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            self._connection = connection
+        self._connection.sock.settimeout(timeout_s)
+        return self._connection
+
+
+def http_url(url: str) -> SplitResult:
+    """Return the http(s) form of a server's URL; raises `ConfigError` if it is not a server's URL."""
+    parts = urlsplit(url)
+    scheme = {"http": "http", "https": "https", "ws": "http", "wss": "https"}.get(parts.scheme)
+    if scheme is None or not parts.hostname:
+        raise ConfigError(f"url: got {url!r}, want http(s)://HOST:PORT, ws(s)://HOST:PORT or serve://APP")
+    return parts._replace(scheme=scheme)
+
+
+def _closed_by_peer(sock: socket.socket | None) -> bool:
+    """Whether the server closed an idle connection: only then is there anything to read."""
+    if sock is None:
+        return True
+    poller = select.poll()
+    poller.register(sock, select.POLLIN)
+    return bool(poller.poll(0))
+
+
+def refusal(status: int, kind: str, body: bytes) -> VLAgentsError:
+    """Return the error for an HTTP response of the server, or of a proxy before it, that is not a frame."""
+    if "json" in kind and isinstance(document := _json(body), dict):
+        return read_error(document)
+    text = body[:200].decode(errors="replace").strip()
+    if status == 413:
+        return MessageTooLarge(f"a proxy takes no body as large ({text}); raise its limit, or send JPEG")
+    if status in (401, 403):  # without a JSON document, as when a WebSocket is refused
+        return (Unauthorized if status == 401 else Forbidden)(
+            f"the server refuses this API key, or that there is none (HTTP {status}); set api_key or {KEY_VARIABLE}"
+        )
+    if status == 404:
+        return UnknownApp(f"no application at this path ({text}); check the URL")
+    if status == 500 or status in (502, 503, 504):  # from the proxy: no replica is ready
+        return NoReplica(f"no replica answers (HTTP {status}: {text})")
+    return VLAgentsError(f"HTTP {status}: {text}")
+
+
+def _json(body: bytes) -> Any:
+    try:
+        return json.loads(body)
+    except ValueError:
+        return None

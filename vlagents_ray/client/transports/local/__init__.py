@@ -1,0 +1,1 @@
+"""Transports to a server on the same machine: Unix sockets, with shared memory or plasma for the observations."""

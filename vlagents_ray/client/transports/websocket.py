@@ -1,0 +1,225 @@
+"""The WebSocket transport: binary frames to a replica's own port, or through the proxy.
+
+Sessions end with the connection. The metadata says where the replica listens. Where that port cannot be reached
+(because of a firewall, a tunnel of one port, or TLS, which ends at the proxy), `WS /v1/stream` on the server's port
+does the same, a little slower.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import socket
+import ssl
+import struct
+import time
+from collections.abc import Sequence
+from typing import Any, Protocol
+
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
+from websockets.sync.client import connect
+
+from vlagents_ray.client.credentials import ANONYMOUS, WEBSOCKET_LOG, Credentials, tls_failure
+from vlagents_ray.client.transports.base import first_timeout_s, is_answer
+from vlagents_ray.client.transports.codec_selection import CodecChoice
+from vlagents_ray.client.transports.direct_websocket import Stream
+from vlagents_ray.client.transports.http import HttpTransport, http_url, refusal
+from vlagents_ray.client.transports.probe import is_answer as is_probe_answer
+from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, MalformedMessage, MessageTooLarge, PolicyUnavailable
+from vlagents_ray.protocol.frames import decode_replies, decode_reply, encode_requests
+from vlagents_ray.protocol.messages import (
+    SERVERS_MACHINE,
+    STREAM_BYTES,
+    Reply,
+    Request,
+    StreamAddress,
+)
+
+logger = logging.getLogger(__name__)
+
+# statuses of a proxy that are worth a retry; HAProxy says 500 for its own 502 to 504
+_TRANSIENT = (408, 500, 502, 503, 504)
+_PAUSE_S = 0.2
+_DIRECT_S = 1.0  # s for a replica's own port to answer: a firewall may drop the packets
+
+
+class _Socket(Protocol):
+    def send(self, message: bytes, timeout_s: float) -> None: ...
+
+    def recv(self, timeout_s: float) -> bytes: ...
+
+    def close(self) -> None: ...
+
+
+class ProxiedSocket:
+    """A connection through the proxy; a thread answers its pings."""
+
+    def __init__(self, url: str, credentials: Credentials, timeout_s: float) -> None:
+        """Connect; raises the errors of `websockets`."""
+        self._open = contextlib.ExitStack()
+        self._connection = self._open.enter_context(
+            connect(
+                url,
+                open_timeout=timeout_s,
+                close_timeout=1,
+                compression=None,
+                max_size=None,
+                ssl=credentials.context(url),
+                additional_headers=credentials.headers,
+                logger=WEBSOCKET_LOG,
+            )
+        )
+        self.close = self._open.close
+
+    def send(self, message: bytes, timeout_s: float) -> None:
+        """Send a message within a time limit."""
+        # The kernel enforces the limit, since websockets sends without one: a hung proxy would block a robot for
+        # minutes.
+        limit = struct.pack("@ll", int(timeout_s), int(timeout_s % 1 * 1e6))
+        self._connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
+        self._connection.send(message)
+
+    def recv(self, timeout_s: float) -> bytes:
+        """Return the next message, also if it is a text."""
+        return self._connection.recv(timeout=timeout_s, decode=False)
+
+
+def open_websocket(url: str, credentials: Credentials, timeout_s: float) -> ProxiedSocket:
+    """Connect to a path of a server's own port.
+
+    Raises:
+        PolicyUnavailable: The server cannot be reached, or refuses the connection.
+        VLAgentsError: It refuses the API key.
+    """
+    try:
+        return ProxiedSocket(url, credentials, timeout_s)
+    except ssl.SSLError as error:
+        raise tls_failure(url, error) from error
+    except InvalidStatus as error:
+        if error.response.status_code in (401, 403, 429):
+            kind = error.response.headers.get("content-type", "")
+            raise refusal(error.response.status_code, kind, bytes(error.response.body or b"")) from error
+        raise PolicyUnavailable(f"{url}: refused with HTTP {error.response.status_code}") from error
+    except (OSError, InvalidHandshake, TimeoutError) as error:
+        raise PolicyUnavailable(f"{url}: cannot connect ({error}); is it running?") from error
+
+
+class WebSocketTransport:
+    """Frames over a WebSocket; sessions end with the connection."""
+
+    name = "websocket"
+    holds_sessions = True
+
+    def __init__(self, url: str, codec: CodecChoice, credentials: Credentials = ANONYMOUS) -> None:
+        self._credentials = credentials
+        base = http_url(url)
+        scheme = "wss" if base.scheme == "https" else "ws"
+        self._base = base
+        self._url = base._replace(scheme=scheme, path=base.path.rstrip("/") + "/v1/stream").geturl()
+        self._codec = codec
+        self._socket: _Socket | None = None
+        self._address: StreamAddress | None = None  # the address of the replica that answered
+        self._unreachable = False  # whether replicas' own ports cannot be reached from this client
+
+    def connect(self, timeout_s: float) -> dict[str, Any]:
+        """Return the server's metadata, once it answers and has accepted the stream."""
+        deadline = time.monotonic() + timeout_s
+        http = HttpTransport(self._base.geturl(), self._codec, self._credentials, SERVERS_MACHINE)
+        try:
+            metadata = http.connect(timeout_s)
+        finally:
+            http.close()
+        self.connect_to(metadata, max(1.0, deadline - time.monotonic()))
+        return metadata
+
+    def connect_to(self, metadata: dict[str, Any], timeout_s: float) -> None:
+        """Connect like `connect`, to the replica with this metadata."""
+        stream = metadata.get("stream")
+        self._address = StreamAddress(**stream) if stream and self._base.scheme == "http" else None
+        self._stream(timeout_s)
+
+    def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
+        """Send one frame and return its replies; replies to earlier requests that timed out are discarded."""
+        deadline = time.monotonic() + timeout_s
+        codec = self._codec.codec_for(requests[0].obs, lambda probe: self._probe(probe, timeout_s), STREAM_BYTES)
+        frame = encode_requests(requests, codec)
+        if len(frame) > STREAM_BYTES:  # the server would only close the connection
+            raise MessageTooLarge(
+                f"{self._url}: got {len(frame)} bytes, the limit of a WebSocket message is {STREAM_BYTES}; "
+                f"send JPEG, or use transport='http'"
+            )
+        connection = self._stream(timeout_s)
+        try:
+            connection.send(frame, timeout_s)
+            while True:
+                data = connection.recv(max(0.0, deadline - time.monotonic()))
+                replies = decode_replies(data)
+                if is_answer(replies, requests):
+                    return replies
+        except TimeoutError as error:
+            raise DeadlineExceeded(f"{self._url}: no answer within {timeout_s:g} s") from error
+        except (ConnectionClosed, OSError) as error:
+            self.close()
+            raise ConnectionLost(f"{self._url}: {error}; reset before the next act") from error
+
+    def _probe(self, probe: bytes, timeout_s: float) -> None:
+        connection = self._stream(timeout_s)
+        try:
+            connection.send(probe, timeout_s)
+            data = connection.recv(timeout_s)
+        except TimeoutError as error:
+            self.close()  # its reply may come later, and would be taken for that of another request
+            raise DeadlineExceeded(
+                f"{self._url}: no answer to a probe of {len(probe)} bytes within {timeout_s:g} s"
+            ) from error
+        except (ConnectionClosed, OSError) as error:
+            self.close()
+            raise ConnectionLost(f"{self._url}: {error}; reset before the next act") from error
+        if not is_probe_answer(data):
+            raise decode_reply(data).error or MalformedMessage(f"{self._url}: got another answer to a probe")
+
+    def close(self) -> None:
+        """Close the connection, and with it its sessions."""
+        self._codec.forget()
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+    def _stream(self, timeout_s: float) -> _Socket:
+        if self._socket is None:
+            self._socket = self._direct(timeout_s) or self._proxied(timeout_s)
+        return self._socket
+
+    def _direct(self, timeout_s: float) -> Stream | None:
+        if self._address is None or self._unreachable:
+            return None
+        try:
+            limit_s = min(timeout_s, _DIRECT_S)
+            return Stream(self._base, self._address.port, self._address.path, limit_s, self._credentials.headers)
+        except TimeoutError:  # a firewall drops the packets: do not try again
+            self._unreachable = True
+        except (OSError, InvalidHandshake) as error:
+            logger.debug("%s: port %d: %s", self._url, self._address.port, error)
+        return None
+
+    def _proxied(self, timeout_s: float) -> ProxiedSocket:
+        """Connect through the proxy; retries while the proxy says that a replica is starting or stopping.
+
+        Also retries without an answer: the replica that the proxy chose may hang while the next one works.
+        """
+        deadline = time.monotonic() + timeout_s
+        attempt_s = first_timeout_s(timeout_s)
+        while True:
+            try:
+                return open_websocket(
+                    self._url, self._credentials, max(0.1, min(attempt_s, deadline - time.monotonic()))
+                )
+            except PolicyUnavailable as error:
+                cause = error.__cause__
+                transient = isinstance(cause, InvalidStatus) and cause.response.status_code in _TRANSIENT
+                silent = isinstance(cause, TimeoutError)
+                if not (transient or silent) or time.monotonic() + _PAUSE_S > deadline:
+                    raise
+                if silent:
+                    attempt_s *= 2
+            time.sleep(_PAUSE_S)

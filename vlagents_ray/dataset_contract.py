@@ -1,0 +1,217 @@
+"""The contract of a dataset of demonstrations, and its way into the checkpoints that are trained on it.
+
+LeRobot copies nothing of a dataset's `info.json` into a checkpoint, but all of its `stats.json`, by which a policy
+normalises. So the contract is written to `info.json` for readers and also to `stats.json`, as a feature whose values
+are the bytes of the contract's JSON. It reaches the checkpoint with every version of LeRobot.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.contract import Contract
+from vlagents_ray.errors import ConfigError, MalformedMessage
+
+INFO = "vlagents_ray"  # key in `info.json`
+STATISTICS, BYTES = "vlagents_ray_contract", "mean"  # keys in `stats.json`
+GRIPPER = "gripper"  # as a part of the state: `Obs.gripper`
+Centre = float | tuple[float, float, float]  # of an angle, or of a rotation vector, rad
+_TURN = 2 * math.pi
+_USUAL = {"joints": "rad", "xyzrpy": "m+rad"}
+_SLACK = 1e-3  # rad: float32 angles may be a little more than pi
+
+
+@dataclass(frozen=True, slots=True)
+class DatasetContract:
+    """The meaning of the numbers and images of a dataset."""
+
+    contract: Contract  # of a policy that is trained on the dataset
+    state: tuple[str, ...] = ()  # parts side by side in `observation.state`; "gripper" is `Obs.gripper`
+    cameras: Mapping[str, str] = field(default_factory=dict)  # feature -> camera
+    angles: Mapping[int, Centre] = field(default_factory=dict)  # (first) place in `observation.state` -> centre, rad
+
+    @property
+    def width(self) -> int:
+        """The number of values in `observation.state`; parts of unknown width count as zero."""
+        specs = self.contract.state or {}
+        return sum((specs[part].dim or 0) if part in specs else 1 for part in self.state)
+
+    def wrapped(self, state: np.ndarray) -> np.ndarray:
+        """Return `observation.state`, (..., D) float32, with each of `angles` within pi of its centre.
+
+        A robot's angle jumps by a full turn between -pi and pi, and so does the angle of a rotation vector; wrapped, it
+        jumps where the demonstrations have no values.
+        """
+        if not self.angles:
+            return state
+        changed = state.copy()
+        for place, centre in self.angles.items():
+            if isinstance(centre, tuple):
+                vector = slice(place, place + 3)
+                changed[..., vector] = _near_vector(state[..., vector].astype(np.float64), np.array(centre))
+            else:
+                changed[..., place] = _near(state[..., place].astype(np.float64), centre)
+        return changed
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the contract as plain JSON values."""
+        return {
+            "state": list(self.state),
+            "cameras": dict(self.cameras),
+            "angles": {str(at): list(one) if isinstance(one, tuple) else one for at, one in self.angles.items()},
+            "contract": self.contract.to_json(),
+        }
+
+    @classmethod
+    def from_json(cls, data: Any) -> DatasetContract:
+        """Read a contract from the values of `to_json`; raises `ConfigError` if this version cannot read them."""
+        try:
+            found = cls(
+                Contract.from_json(data["contract"]),
+                tuple(map(str, data["state"])),
+                {str(key): str(name) for key, name in data["cameras"].items()},
+                {int(place): _centre(centre) for place, centre in data["angles"].items()},
+            )
+            if unknown := set(found.state) - {*(found.contract.state or {}), GRIPPER}:
+                raise ValueError(f"its contract has no state {sorted(unknown)}")
+            numbers = {at: np.atleast_1d(centre) for at, centre in found.angles.items()}
+            if odd := [
+                at for at, one in numbers.items() if not 0 <= at <= found.width - len(one) or np.isnan(one).any()
+            ]:
+                raise ValueError(f"its state has no angles at {odd}")
+        except (MalformedMessage, AttributeError, KeyError, TypeError, ValueError) as error:
+            raise ConfigError(
+                f"the contract of the dataset in the checkpoint cannot be read "
+                f"({type(error).__name__}: {error}); was the dataset written by a newer vlagents-ray, or merged of "
+                f"datasets with different contracts? Update this one, or export the results of `vlagents-ray merge`"
+            ) from error
+        return found
+
+    def to_statistics(self, frames: int) -> dict[str, dict[str, list[int]]]:
+        """Return the entry of `stats.json` that holds the contract, for a dataset with so many frames.
+
+        It has all statistics of a feature, as LeRobot's tools average them when they merge datasets.
+        """
+        text = list(json.dumps(self.to_json(), separators=(",", ":"), ensure_ascii=False).encode())
+        same = dict.fromkeys(("min", "max", BYTES, "q01", "q10", "q50", "q90", "q99"), text)
+        return {STATISTICS: same | {"std": [0] * len(text), "count": [frames]}}
+
+    @classmethod
+    def from_statistics(cls, numbers: Iterable[float]) -> DatasetContract:
+        """Read a contract from the numbers of `to_statistics` as LeRobot stores them; raises `ConfigError`."""
+        try:
+            data = json.loads(bytes(round(number) for number in numbers))
+        except ValueError as error:
+            data = str(error)
+        return cls.from_json(data)
+
+
+def angles_in(part: str, unit: str | None, dim: int) -> range:
+    """Return the indices of the angles in a part of the state that wrap at -pi and pi, by the part's unit.
+
+    The numbers of a rotation vector (`rotation_vector_in`) and of a quaternion are not such angles.
+    """
+    if rotation_vector_in(part, unit, dim) is not None:
+        return range(0)
+    if unit == "rad":
+        return range(dim)
+    if unit == "m+rad" and dim == 6:  # x, y, z, roll, pitch, yaw
+        return range(3, 6)
+    return range(0)
+
+
+def rotation_vector_in(part: str, unit: str | None, dim: int) -> int | None:
+    """Return the index of the first number of a rotation vector (axis times angle) in a part of the state, or None.
+
+    Its part has "axis" in its name, as `xyz_axis_angle`, and no other numbers than a position before it.
+    """
+    return {("rad", 3): 0, ("m+rad", 6): 3}.get((unit or "", dim)) if "axis" in part else None
+
+
+def usual_unit(part: str) -> str | None:
+    """Return the usual unit of a part of this name, for a dataset without a contract."""
+    return next((unit for end, unit in _USUAL.items() if part.endswith(end)), None)
+
+
+def centre_between(lowest: float, highest: float) -> float | None:
+    """Return the centre of an angle of which only the range in the dataset is known; None if it is within [-pi, pi].
+
+    Values within the range are not changed by wrapping them around this centre.
+    """
+    outside = max(-lowest, highest) > math.pi + _SLACK
+    return (lowest + highest) / 2 if outside and highest - lowest < _TURN else None
+
+
+def centre_of(episodes: Sequence[np.ndarray]) -> float | None:
+    """Return the centre around which an angle is to be wrapped, rad, opposite to the widest arc without a value.
+
+    Args:
+        episodes: The angle in each episode, (N,) rad.
+
+    Returns:
+        The centre; None if the angle never jumps, within an episode or from one to the next, or if it counts full
+        turns.
+    """
+    values = np.concatenate(episodes).astype(np.float64)
+    if not len(values) or np.abs(values).max() > math.pi + _SLACK or np.abs(np.diff(values)).max(initial=0) <= math.pi:
+        return None
+    circle = np.sort(values)
+    arcs = np.diff(circle, append=circle[0] + _TURN)
+    widest = int(arcs.argmax())
+    opposite = circle[widest] + arcs[widest] / 2 + math.pi
+    return round(float(_near(np.array(opposite), 0.0)), 6)
+
+
+def rotation_centre_of(episodes: Sequence[np.ndarray]) -> tuple[float, float, float] | None:
+    """Return the centre around which a rotation vector is to be wrapped, rad: the mean of its rotations.
+
+    Args:
+        episodes: The rotation vector in each episode, (N, 3) rad.
+
+    Returns:
+        The centre, at most pi long; None if the vector never jumps, within an episode or from one to the next, or if
+        its length counts full turns.
+    """
+    vectors = np.concatenate(episodes).astype(np.float64)
+    angles = np.linalg.norm(vectors, axis=1, keepdims=True)
+    before, after = vectors[:-1], vectors[1:]
+    if angles.max(initial=0) > _TURN + _SLACK or np.array_equal(_near_vector(after, before), after):
+        return None
+    # The mean of unit quaternions of either sign (Markley et al., Averaging Quaternions, 2007).
+    quaternions = np.hstack([np.cos(angles / 2), np.sinc(angles / _TURN) * vectors / 2])  # w first
+    mean = np.linalg.eigh(quaternions.T @ quaternions)[1][:, -1]
+    mean *= np.copysign(1, mean[0])
+    half = np.arctan2(np.linalg.norm(mean[1:]), mean[0])
+    x, y, z = (round(float(number), 6) for number in mean[1:] * 2 / np.sinc(half / np.pi))
+    return x, y, z
+
+
+def _centre(value: Any) -> Centre:
+    if not isinstance(value, list):
+        return float(value)
+    x, y, z = map(float, value)
+    return x, y, z
+
+
+def _near_vector(vectors: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """Replace rotation vectors by those of the same rotations that are nearest to `centre`, (..., 3) each.
+
+    A vector of the same axis and an angle with further full turns is the same rotation. Those that are nearest already
+    stay the same to the bit, and a vector of zeros, which has no axis, stays zero.
+    """
+    angles = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    axes = np.divide(vectors, angles, out=np.zeros_like(vectors), where=angles > 0)
+    nearest = _near(angles, (axes * centre).sum(axis=-1, keepdims=True))
+    return np.where(nearest == angles, vectors, nearest * axes)
+
+
+def _near(angles: np.ndarray, centre: float | np.ndarray) -> np.ndarray:
+    """Shift angles by full turns to within pi of `centre`; angles that are within stay the same to the bit."""
+    off = angles - centre
+    return np.where(np.abs(off) > math.pi, centre + (off + math.pi) % _TURN - math.pi, angles)

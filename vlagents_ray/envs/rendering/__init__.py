@@ -1,0 +1,1 @@
+"""Drawing on a machine: which GPU and which library draws, and what is missing."""

@@ -1,0 +1,103 @@
+"""The choice of the device that renders an env's images, and a check that it is used.
+
+Ray sets CUDA_VISIBLE_DEVICES to the GPU of a worker, but neither EGL nor Vulkan reads it: each would take its
+first device, which may be the GPU that a policy uses. So the device is chosen here. Nothing is
+chosen in a process without CUDA_VISIBLE_DEVICES.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from vlagents_ray.envs.rendering import egl
+from vlagents_ray.errors import ConfigError
+
+GPUS = "CUDA_VISIBLE_DEVICES"
+EGL_DEVICE = "MUJOCO_EGL_DEVICE_ID"
+VULKAN_DRIVERS = ("VK_ICD_FILENAMES", "VK_DRIVER_FILES")  # the first is also read by the old loader that SAPIEN brings
+_ICD_FOLDERS = ("/usr/local/share/vulkan/icd.d", "/usr/share/vulkan/icd.d", "/etc/vulkan/icd.d")
+_SAPIENS_OWN = "sapien/vulkan_library/"  # of NVIDIA's driver, which it names where it finds no other
+_SOFTWARE_VULKAN = "llvmpipe"  # how lavapipe names its device
+
+SHARE = "worker: {gpus: 0.25}, or --worker-gpus 0.25, gives each worker a part of a GPU"
+_CURE_HIDDEN = (
+    f"{SHARE}; to render in software install Mesa's drivers (libegl1 libgl1-mesa-dri mesa-vulkan-drivers) on that node"
+)
+_CURE_OWN = (
+    "install the NVIDIA driver's graphics part on that node (libnvidia-gl; in a container "
+    "NVIDIA_DRIVER_CAPABILITIES=all), or leave worker.gpus at 0 to render in software; if it is intended, set "
+    f"render_backend in env_options (ManiSkill) or {EGL_DEVICE} in worker.runtime_env.env_vars"
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Renderer:
+    """The device that renders an env's images."""
+
+    name: str  # the driver's name of it: "llvmpipe (LLVM 15.0.6, 256 bits)", "NVIDIA H200/PCIe/SSE2"
+    software: bool
+    cuda: int | None  # its number among the CUDA devices that this process may use; None if CUDA does not know it
+    asked_for: bool = False  # the environment names this very device
+
+
+def has_gpu() -> bool | None:
+    """Whether this process was given a GPU; None if that is not stated."""
+    visible = os.environ.get(GPUS)
+    return None if visible is None else visible.strip() not in ("", "-1")
+
+
+def fitting(devices: Sequence[egl.EglDevice], *, gpu: bool) -> egl.EglDevice | None:
+    """Return the device to render on: CUDA's first one, or the software device without `gpu`; None if there is none."""
+    if gpu:
+        return min((one for one in devices if one.cuda is not None), key=lambda one: one.cuda or 0, default=None)
+    return next((one for one in devices if one.software), None)
+
+
+def choose_devices() -> None:
+    """Set the variables that select the devices, before libraries are loaded; variables set by the user are kept."""
+    gpu = has_gpu()
+    if gpu is None:
+        return
+    if EGL_DEVICE not in os.environ and (device := fitting(egl.devices(), gpu=gpu)) is not None:
+        os.environ[EGL_DEVICE] = str(device.number)
+    if not gpu and not any(os.environ.get(name) for name in VULKAN_DRIVERS) and (driver := _lavapipe()) is not None:
+        os.environ[VULKAN_DRIVERS[0]] = str(driver)
+
+
+def opengl_renderer() -> Renderer | None:
+    """Return the renderer of this thread's OpenGL context; None if there is none, or it is not EGL's."""
+    found = egl.drawing()
+    if found is None:
+        return None
+    named = os.environ.get(EGL_DEVICE) == str(found.device.number)
+    return Renderer(found.renderer, found.device.software, found.device.cuda, named)
+
+
+def vulkan_renderer(name: str, cuda: int | None, *, asked_for: bool = False) -> Renderer:
+    """Return the renderer for the device that SAPIEN uses; `asked_for` says that the env's options named it."""
+    files = filter(None, map(os.environ.get, VULKAN_DRIVERS))
+    named = has_gpu() is False and any(_SAPIENS_OWN not in file for file in files)
+    return Renderer(name, name.startswith(_SOFTWARE_VULKAN), cuda, asked_for or named)
+
+
+def require_own(renderer: Renderer) -> None:
+    """Raise `ConfigError` if it is not the GPU that this process was given, or a GPU although it was given none."""
+    gpu = has_gpu()
+    if gpu is None or renderer.asked_for or (renderer.cuda is not None if gpu else renderer.software):
+        return
+    if gpu:
+        raise ConfigError(
+            f"the worker was given the GPU {os.environ[GPUS]}, but its env renders on {renderer.name!r}; {_CURE_OWN}"
+        )
+    raise ConfigError(
+        f"the worker was given no GPU (worker.gpus: 0), but its env renders on {renderer.name!r}, which a policy may "
+        f"be using; {_CURE_HIDDEN}"
+    )
+
+
+def _lavapipe() -> Path | None:
+    """Return the file that describes Mesa's software driver to Vulkan."""
+    return next((path for folder in _ICD_FOLDERS for path in sorted(Path(folder).glob("lvp_icd*.json"))), None)

@@ -1,0 +1,111 @@
+"""Records the artifacts of an episode: videos for people, a trajectory for programs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vlagents_ray.evaluate.artifacts.trajectory import TrajectoryRecorder, save_trajectory
+from vlagents_ray.evaluate.artifacts.video import Footage, VideoRecorder, save_videos
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.cases import EvalCase
+from vlagents_ray.evaluate.plan.config import EpisodeChoice, EvalConfig
+from vlagents_ray.interface import Act, Obs
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+@dataclass(frozen=True, slots=True)
+class Artifacts:
+    """The recorded files of an episode, as the worker sends them to the driver with its result."""
+
+    footage: Footage = field(default_factory=Footage)
+    trajectory: bytes | None = None  # a `Trajectory` as .npz
+    transitions: Any = None  # a pyarrow.RecordBatch, for a learner
+
+
+class EpisodeRecorder:
+    """Records one episode. Use as a context manager, which frees what it holds. This one keeps nothing."""
+
+    request_info: Mapping[str, Any] = {}
+    """Added to the `Obs.info` of every request to the policy."""
+
+    @property
+    def wants_images(self) -> bool:
+        """Whether the images of every step are needed; an episode's outcome may discard them in the end."""
+        return False
+
+    def add_observation(self, obs: Obs) -> None:
+        """Add an observation, beginning with that of the reset."""
+
+    def add_act(self, act: Act) -> None:
+        """Add an answer of the policy; some or all rows of its action are executed next."""
+
+    def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
+        """Add an executed action, (D,), with its reward and success; its next observation was added before."""
+
+    def finish(self, result: EpisodeResult) -> Artifacts:
+        """Return what is kept of an episode with this result."""
+        return Artifacts()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        pass
+
+
+RecorderFactory = Callable[[EvalConfig, float | None], EpisodeRecorder]  # called with the env's control_hz
+
+
+class Recording(EpisodeRecorder):
+    """Records one episode as `config` says, for people and for files."""
+
+    def __init__(self, config: EvalConfig, fps: float | None) -> None:
+        self._wants_video, self._wants_trajectory = config.video, config.record
+        self._video = VideoRecorder(fps, seen=config.record != "none")
+        self._trajectory = TrajectoryRecorder()
+
+    @property
+    def wants_images(self) -> bool:
+        return {self._wants_video, self._wants_trajectory} != {"none"}
+
+    def add_observation(self, obs: Obs) -> None:
+        if self._wants_video != "none":
+            self._video.add(obs)
+        elif self._wants_trajectory != "none":
+            self._video.add(replace(obs, info={}))  # without the views for people
+        if self._wants_trajectory != "none":
+            self._trajectory.add_observation(obs)
+
+    def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
+        if self._wants_trajectory != "none":
+            self._trajectory.add_action(action, reward, success)
+
+    def finish(self, result: EpisodeResult) -> Artifacts:
+        video, trajectory = _wanted(self._wants_video, result), _wanted(self._wants_trajectory, result)
+        if not video and not trajectory:
+            return Artifacts()
+        footage = self._video.finish()
+        return Artifacts(
+            Footage(footage.shown if video else {}, footage.seen if trajectory else {}),
+            self._trajectory.finish().to_bytes() if trajectory else None,
+        )
+
+    def __exit__(self, *exc: object) -> None:
+        self._video.close()
+
+
+def save(out: Path, cell: EvalCase, result: EpisodeResult, kept: Artifacts) -> tuple[list[str], str | None]:
+    """Write the files of an episode below `out`; returns the paths of its videos and its trajectory, relative to it."""
+    videos = save_videos(out, cell, result, kept.footage.shown)
+    return videos, save_trajectory(out, cell, result, kept.trajectory, kept.footage, videos)
+
+
+def _wanted(which: EpisodeChoice, result: EpisodeResult) -> bool:
+    return which == "all" or (which == "failures" and not result.success_once)

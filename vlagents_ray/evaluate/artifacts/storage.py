@@ -1,0 +1,190 @@
+"""The files of an episode: where they are, how they are written whole, and what is raised if the disk is full."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import sqlite3
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path, PurePosixPath
+
+from vlagents_ray.errors import ConfigError, StorageFailed
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.cases import EvalCase
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey
+from vlagents_ray.naming import plain
+
+VIDEOS, TRAJECTORIES, PROVENANCE = "videos", "trajectories", "provenance"
+
+
+def episode_folder(out: Path, kind: str, cell: EvalCase) -> Path:
+    """`out/KIND/POLICY/SUITE/ENV`; a suite without a name has no folder."""
+    return out.joinpath(kind, *(plain(part) for part in cell.name if part))
+
+
+def stem(key: EpisodeKey) -> str:
+    """The beginning of the names of an episode's files, before "_" or "."."""
+    return f"ep{key.episode:04d}_seed{key.seed}"
+
+
+def require_below(path: str) -> str:
+    """Return `path`, of an episode's file in results.db, or raise `ConfigError` if it leads out of the folder.
+
+    The folder may come from somebody else.
+    """
+    parts = PurePosixPath(path).parts
+    if not parts or path.startswith("/") or ".." in parts or "\0" in path:
+        raise ConfigError(
+            f"got {path!r} as a file of an episode, want a path below the folder of results; "
+            f"no evaluation writes another: do not trust whoever made this results.db"
+        )
+    return path
+
+
+def inside(home: Path, path: str) -> Path:
+    """The absolute path of the file `path` in the folder of results `home`, whether it exists or not.
+
+    Raises `ConfigError` if it leads out of that folder, also by a symbolic link: its target is neither read, copied nor
+    published.
+    """
+    found = (home / require_below(path)).resolve()
+    if not found.is_relative_to(home.resolve()):
+        raise ConfigError(
+            f"{home / path}: is a symbolic link out of the folder of results; if you trust it, copy what it leads to "
+            f"into the folder in its place"
+        )
+    return found
+
+
+def require_there(path: Path) -> Path:
+    """Return `path`, of an episode's file, or raise `ConfigError` if it is missing, as in a folder copied in part."""
+    if not path.is_file():
+        raise ConfigError(
+            f"{path}: got no file, want the one that results.db names there; copy the folder again from where it was "
+            f"evaluated, with its {VIDEOS}/ and {TRAJECTORIES}/"
+        )
+    return path
+
+
+def remove_old(folder: Path, key: EpisodeKey) -> None:
+    """Remove the files of an earlier attempt at the episode."""
+    for old in folder.glob(f"{stem(key)}[_.]*"):
+        old.unlink()
+
+
+def outcome(result: EpisodeResult) -> str:
+    """The outcome of an episode: "success", "failure", "policy_error" or "infra_failed"."""
+    if result.status != "done":
+        return result.status
+    return "success" if result.success_once else "failure"
+
+
+@contextmanager
+def whole(path: Path) -> Iterator[Path]:
+    """A path to write a file to, which is renamed to `path` when it is whole; missing folders are made.
+
+    If writing fails, the file is removed: others need the room on a full disk.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    part = path.with_name(path.name + ".part")
+    part.unlink(missing_ok=True)
+    try:
+        yield part
+        os.replace(part, path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+
+
+@contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """A folder to write into, which becomes `path`, an empty folder or none so far, when all of it is written.
+
+    It is beside `path` until then, and removed if writing fails.
+    """
+    path = path.resolve()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix=f"{path.name}.part-", dir=path.parent) as temporary:
+        part = Path(temporary) / path.name
+        part.mkdir()
+        yield part
+        os.replace(part, path)
+
+
+def link_or_copy(source: Path, target: Path) -> None:
+    """Make `target` a hard link to `source`, or a copy where the file system has no hard links."""
+    with whole(target) as part:
+        try:
+            os.link(source, part)
+        except OSError:  # another file system, or one without hard links
+            shutil.copyfile(source, part)
+
+
+_RESUME = "what was recorded is kept: go on with --resume"
+_FULL = f"make room; {_RESUME}"
+_REFUSED = "make it writable, or choose another folder"
+_BROKEN = f"see the system's log (dmesg), and mend the disk; {_RESUME}"
+_CURES = {
+    errno.ENOSPC: ("the disk is full", _FULL),
+    errno.EDQUOT: ("your quota on this disk is used up", _FULL),
+    errno.EFBIG: ("a file would be larger than is allowed here (ulimit -f)", f"allow more; {_RESUME}"),
+    errno.EROFS: ("is on a read-only file system", _REFUSED),
+    errno.EACCES: ("you may not write there", _REFUSED),
+    errno.EPERM: ("you may not write there", _REFUSED),
+    errno.ENOTDIR: ("something on the way there is no folder", "choose another folder"),
+    errno.EEXIST: ("is there, and no folder", "choose another folder"),
+    errno.EIO: ("the disk reports an error", _BROKEN),
+    errno.ESTALE: ("the file server has lost the folder", f"mount it again; {_RESUME}"),
+}
+# SQLite reports these texts in place of the system's errno.
+_SQLITE = {
+    "database or disk is full": errno.ENOSPC,
+    "attempt to write a readonly database": errno.EROFS,
+    "unable to open database file": errno.EACCES,
+    "disk I/O error": errno.EIO,
+}
+_NOTHING_LEFT = 2**16  # bytes: SQLite has no word for a full disk where it extends a memory-mapped file
+
+
+@contextmanager
+def storing(folder: Path) -> Iterator[None]:
+    """Raise `StorageFailed` in place of an error of the disk that `folder` is on, with its cause and its cure.
+
+    Use it around code in which only the disk raises `OSError`. Other errors pass.
+    """
+    try:
+        yield
+    except (OSError, sqlite3.OperationalError) as error:
+        found = error.errno if isinstance(error, OSError) else _number(error, folder)
+        if found not in _CURES:
+            raise
+        what, cure = _CURES[found]
+        raise StorageFailed(f"{folder}: {what} ({error}); {cure}") from error
+
+
+def _number(error: sqlite3.OperationalError, folder: Path) -> int | None:
+    """The errno of an error of SQLite; None if it is not about the disk."""
+    number = _SQLITE.get(str(error))
+    if number == errno.EIO and _is_full(folder):
+        return errno.ENOSPC
+    if number == errno.EACCES and _is_read_only(folder):
+        return errno.EROFS
+    return number
+
+
+def _is_full(folder: Path) -> bool:
+    found = _disk(folder)
+    return found.f_bavail * found.f_frsize < _NOTHING_LEFT
+
+
+def _is_read_only(folder: Path) -> bool:
+    return bool(_disk(folder).f_flag & os.ST_RDONLY)
+
+
+def _disk(folder: Path) -> os.statvfs_result:
+    """The file system that `folder` is on, or would be."""
+    there = next(one for one in (folder, *folder.absolute().parents) if one.exists())
+    return os.statvfs(there)

@@ -1,0 +1,1 @@
+"""An episode: its loop, its clock, and the attribution of its errors."""

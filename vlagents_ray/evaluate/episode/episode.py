@@ -1,0 +1,334 @@
+"""The loop of episodes: environments and an agent play against each other. Plain Python, no Ray.
+
+The episodes of a batch are played in lockstep: at each step, one request to the policy serves all that need an answer.
+A single environment is a batch of one. Each episode has the same result as if it were played alone, except for the
+times.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from time import perf_counter
+from typing import Any, Literal
+
+import numpy as np
+
+from vlagents_ray.client.agent import RemoteAgent
+from vlagents_ray.contract import Contract
+from vlagents_ray.envs.base import BatchEnv, Environment, EvalEnv
+from vlagents_ray.envs.batch import SequentialBatch
+from vlagents_ray.errors import CheckpointFailed, ConfigError, InvalidAction, PolicyFailed, VLAgentsError
+from vlagents_ray.evaluate.episode.env_outputs import EnvStep, checked_instruction, checked_obs, checked_step
+from vlagents_ray.evaluate.episode.failures import env_side, policy_side
+from vlagents_ray.evaluate.episode.latency import ChunkExecutor, Tick
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.episode.stats import EpisodeStats
+from vlagents_ray.evaluate.plan.config import ClockConfig
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey
+from vlagents_ray.interface import HIGH_RES, Act, Agent, Obs
+from vlagents_ray.validation import check_action
+
+Phase = Literal["idle", "connect", "make", "env reset", "policy reset", "policy act", "env step"]
+Outcome = EpisodeResult | VLAgentsError
+Watch = Callable[[Phase, int], None]  # called with the phase that begins and the number of steps so far
+Record = Callable[[int, Obs], None]  # called with the number of the episode and each of its observations
+Acted = Callable[[int, Act], None]  # the same, and each answer of the policy
+Executed = Callable[[int, np.ndarray, float, bool], None]  # the same, each action, (D,), its reward, and success
+
+_ACTING, _STEPPING = policy_side("act"), env_side("step")  # entered at each step
+
+
+def run_episode(
+    env: EvalEnv,
+    agent: Agent,
+    key: EpisodeKey,
+    *,
+    execute: int | None = None,
+    clock: ClockConfig | None = None,
+    reset_options: Mapping[str, Any] | None = None,
+    policy_options: Mapping[str, Any] | None = None,
+    watch: Watch = lambda _phase, _steps: None,
+    record: Callable[[Obs], None] = lambda _obs: None,
+    images: bool = True,
+    executed: Callable[[np.ndarray, float, bool], None] = lambda _action, _reward, _success: None,
+) -> EpisodeResult:
+    """Play the episode `key` in a single environment, which stays open: `run_episodes` with a batch of one.
+
+    `agent` is the policy and its only session; the other arguments are those of `run_episodes`.
+
+    Returns:
+        The result. A policy that raises or returns an unusable action ends its episode with status "policy_error".
+
+    Raises:
+        VLAgentsError: An error that is not the policy's: `EnvFailed` for the simulator, `PolicyUnavailable`,
+            `DeadlineExceeded` and similar errors for the connection to the policy, and `CheckpointFailed`, as a
+            checkpoint that did not load has played no episode.
+    """
+    [outcome] = run_episodes(
+        SequentialBatch([env]),
+        agent,
+        [agent],
+        [key],
+        execute=execute,
+        clock=clock,
+        reset_options=reset_options,
+        policy_options=policy_options,
+        watch=watch,
+        record=lambda _i, obs: record(obs),
+        images=images,
+        executed=lambda _i, *done: executed(*done),
+    )
+    if isinstance(outcome, VLAgentsError):
+        raise outcome
+    return outcome
+
+
+def run_episodes(
+    env: BatchEnv,
+    agent: Agent,
+    sessions: Sequence[Agent],
+    keys: Sequence[EpisodeKey],
+    *,
+    execute: int | None = None,
+    clock: ClockConfig | None = None,
+    reset_options: Mapping[str, Any] | None = None,
+    policy_options: Mapping[str, Any] | None = None,
+    watch: Watch = lambda _phase, _steps: None,
+    record: Record = lambda _i, _obs: None,
+    images: bool = True,
+    request_info: Mapping[str, Any] | None = None,
+    acted: Acted = lambda _i, _act: None,
+    executed: Executed = lambda _i, _action, _reward, _success: None,
+) -> list[Outcome]:
+    """Play the episodes `keys` together, at most `env.num_envs`, each with its own session.
+    `agent.act_batch` is called for all sessions that have no rows of a chunk left. Either `agent` is a `RemoteAgent`
+    and `sessions` come from its `sessions(n)`, or it is an initialized policy in this process and they are copies of
+    it. A single session may be `agent` itself, whose `act` is then called. A finished episode is idle until all are.
+
+    Args:
+        env: The environments.
+        agent: The policy.
+        sessions: The session of each episode.
+        keys: Environment, number and seed of each episode.
+        execute: Rows of each action chunk that are executed, open loop; None: all.
+        clock: Real-time mode, in which time passes while the policy computes, for each episode by itself (see
+            `vlagents_ray.evaluate.episode.latency`); None: the environments wait for the policy.
+        reset_options: Options for each reset of an environment.
+        policy_options: Options for each reset of the policy.
+        watch: Called before each phase that may take long.
+        record: Called with every observation, the first one included.
+        images: Whether `record` needs the images of every step. If not, the environments may leave out those between
+            two requests to the policy.
+        request_info: Added to the `Obs.info` of every request to the policy.
+        acted: Called with every answer of the policy, before its rows are executed.
+        executed: Called with every action that was executed.
+
+    Returns:
+        An outcome for each key. A policy error ends only its own episode, with status "policy_error". Where an episode
+        failed by another error, such as `PolicyUnavailable`, the error stands in place of the result.
+
+    Raises:
+        ConfigError: The numbers of episodes and sessions differ, or there are fewer environments.
+        EnvFailed: The simulator broke, which ends all episodes.
+    """
+    if not len(keys) == len(sessions) <= env.num_envs or not keys:
+        raise ConfigError(
+            f"got {len(keys)} episodes and {len(sessions)} sessions for {env.num_envs} environments; "
+            f"want one session an episode, and an environment for each"
+        )
+    watch("env reset", 0)
+    begun = perf_counter()
+    with env_side("reset"):
+        contract = env.contract
+        seen = env.reset(
+            seeds=[key.seed for key in keys],
+            options=[options_of_reset(env, key.episode, reset_options) for key in keys],
+        )
+        first = [
+            (checked_obs(obs, contract, "reset"), checked_instruction(text))
+            for obs, text in zip(seen, env.instructions, strict=True)
+        ]
+    reset_ms = 1e3 * (perf_counter() - begun)
+    episodes = []
+    for i, (key, session, (obs, instruction)) in enumerate(zip(keys, sessions, first, strict=True)):
+        record(i, obs)
+        stats = EpisodeStats(key, begun, instruction=instruction, reset_ms=reset_ms)
+        episodes.append(_Episode(i, session, stats, ChunkExecutor(execute, clock, contract), obs))
+    watch("policy reset", 0)
+    _reset_policy(agent, episodes, contract, policy_options or {})
+    steps, playing = 0, _unfinished(episodes)
+    while playing:
+        if requesting := [episode for episode in playing if not episode.ticks]:
+            watch("policy act", steps)
+            _request_actions(agent, requesting, contract, request_info or {}, acted)
+            playing = _unfinished(playing)
+        if playing:
+            watch("env step", steps)
+            env.looked_at = images or any(len(episode.ticks) == 1 for episode in playing)
+            _step(env, episodes, playing, contract, record, executed)
+            steps, playing = steps + 1, _unfinished(playing)
+    return [episode.outcome for episode in episodes if episode.outcome is not None]
+
+
+def _unfinished(episodes: Sequence[_Episode]) -> list[_Episode]:
+    return [episode for episode in episodes if episode.outcome is None]
+
+
+class _Episode:
+    """One of the episodes in lockstep."""
+
+    def __init__(self, number: int, session: Agent, stats: EpisodeStats, executor: ChunkExecutor, obs: Obs) -> None:
+        self.number = number
+        self.session = session
+        self.stats = stats
+        self.obs = obs
+        self.ticks: deque[Tick] = deque()  # the ticks before the next request
+        self.outcome: Outcome | None = None  # set once the episode is over
+        self._executor = executor
+        self._done = False  # the policy ends the episode with these ticks
+
+    def began(self, answer: dict[str, Any] | Exception) -> None:
+        """Begin with the policy's answer to the reset of the session."""
+        try:
+            with policy_side("reset"):
+                if isinstance(answer, Exception):
+                    raise answer
+                self.stats.began(answer)
+        except VLAgentsError as error:
+            self.failed(error)
+
+    def request(self, info: Mapping[str, Any]) -> Obs:
+        """Return the observation for the next request to the policy, with `info`."""
+        continuation = self._executor.request_info()
+        return _for_policy(self.obs, {**info, **continuation} if info else continuation)
+
+    def answered(self, answer: Act | Exception, contract: Contract, seconds: float, acted: Acted) -> None:
+        """Plan the next ticks from the policy's answer, which took `seconds`."""
+        try:
+            with _ACTING:
+                if isinstance(answer, Exception):
+                    raise answer
+                latency_s = self._executor.latency_s(seconds)
+                self.stats.acted(answer, seconds, latency_s)
+            rows = Act(check_action(answer.action, contract)).rows()
+            acted(self.number, answer)
+            self.ticks.extend(self._executor.ticks(rows, latency_s or 0.0))
+            self._done = answer.done
+        except VLAgentsError as error:
+            self.failed(error)
+
+    def stepped(self, step: EnvStep, limit: int) -> Tick:
+        """Record the outputs of the next of `ticks`, which is returned."""
+        self.obs, tick = step.obs, self.ticks.popleft()
+        over = self.stats.stepped(tick, step, limit)
+        if not over and self._done and not self.ticks:
+            self.stats.ending, over = "policy_done", True
+        if over:
+            self.outcome = self.stats.result(transport_of(self.session))
+        return tick
+
+    def failed(self, error: VLAgentsError) -> None:
+        """End the episode with `error`."""
+        if isinstance(error, PolicyFailed) and not isinstance(error, CheckpointFailed):
+            self.outcome = self.stats.result(transport_of(self.session), error)
+        else:
+            self.outcome = error
+
+
+def _reset_policy(agent: Agent, episodes: Sequence[_Episode], contract: Contract, options: Mapping[str, Any]) -> None:
+    """Reset the session of each episode with its first observation; a server gets all of them in one message."""
+    keys, sessions = [one.stats.key for one in episodes], [one.session for one in episodes]
+    first, texts = [_for_policy(one.obs, {}) for one in episodes], [one.stats.instruction for one in episodes]
+    seeds = [key.seed if key.policy_seed is None else key.policy_seed for key in keys]
+    given = {**options, "env": keys[0].env}
+    if hasattr(agent, "metadata"):  # a server compares the contract, too, and answers 409
+        given["contract"] = contract.to_json()
+    answers: Iterable[dict[str, Any] | Exception]
+    if isinstance(agent, RemoteAgent):
+        try:
+            answers = agent.reset_batch(first, texts, sessions, seeds=seeds, **given)  # type: ignore[arg-type]
+        except VLAgentsError as error:
+            answers = [error] * len(episodes)
+    else:
+        answers = map(partial(_reset_session, given), sessions, first, texts, seeds)
+    for episode, answer in zip(episodes, answers, strict=True):
+        episode.began(answer)
+
+
+def _reset_session(
+    given: Mapping[str, Any], session: Agent, obs: Obs, text: str, seed: int
+) -> dict[str, Any] | Exception:
+    try:
+        return session.reset(obs, text, **{**given, "seed": seed})
+    except Exception as error:  # noqa: BLE001 - becomes the outcome of the episode
+        return error
+
+
+def _request_actions(
+    agent: Agent, episodes: Sequence[_Episode], contract: Contract, info: Mapping[str, Any], acted: Acted
+) -> None:
+    begun = perf_counter()
+    try:
+        with _ACTING:
+            requests = [episode.request(info) for episode in episodes]
+            if len(episodes) == 1 and episodes[0].session is agent:
+                answers: list[Act | Exception] = [agent.act(requests[0])]
+            else:
+                answers = agent.act_batch(requests, [episode.session for episode in episodes])
+            if len(answers) != len(episodes):
+                raise PolicyFailed(f"act_batch: got {len(episodes)} observations, returned {len(answers)} actions")
+    except VLAgentsError as error:
+        answers = [error] * len(episodes)
+    seconds = perf_counter() - begun
+    for episode, answer in zip(episodes, answers, strict=True):
+        episode.answered(answer, contract, seconds, acted)
+
+
+def _step(
+    env: BatchEnv,
+    episodes: Sequence[_Episode],
+    playing: Sequence[_Episode],
+    contract: Contract,
+    record: Record,
+    executed: Executed,
+) -> None:
+    acts = [Act(episode.ticks[0].action) if episode.outcome is None else None for episode in episodes]
+    begun = perf_counter()
+    try:
+        with _STEPPING:
+            seen, rewards, terminated, truncated, infos = env.step(acts)
+            answers = list(zip(episodes, seen, rewards, terminated, truncated, infos, strict=True))
+    except InvalidAction as error:
+        if len(playing) > 1:  # the error does not name the episode
+            raise
+        playing[0].failed(error)
+        return
+    took_ms = 1e3 * (perf_counter() - begun)
+    for episode, obs, reward, terminated, truncated, info in answers:
+        if episode.outcome is None:
+            step = checked_step(obs, reward, terminated, truncated, info, contract, images=env.looked_at)
+            episode.stats.step_ms.append(took_ms)
+            record(episode.number, step.obs)
+            tick = episode.stepped(step, env.max_steps)
+            executed(episode.number, tick.action, step.reward, step.success)
+
+
+def transport_of(agent: Agent) -> str:
+    """Return the transport of an agent's observations: "local" for one in this process."""
+    return str(getattr(agent, "transport", "local"))
+
+
+def options_of_reset(env: Environment, episode: int, options: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """Return the options for the environment's reset: the user's `options` override the benchmark's."""
+    begin = {} if env.init_states is None else {"init_state": episode % env.init_states}
+    return begin | dict(options or {}) or None
+
+
+def _for_policy(obs: Obs, info: Mapping[str, Any]) -> Obs:
+    """Return the observation with `info`, and without the views that are for the record only."""
+    if HIGH_RES not in obs.info and not info:
+        return obs
+    return replace(obs, info={name: value for name, value in obs.info.items() if name != HIGH_RES} | dict(info))

@@ -1,0 +1,132 @@
+"""Real-time evaluation: the environment's clock runs while the policy computes.
+
+The clock is simulated, so no machine has to keep up. An answer that took L seconds comes ceil(L * hz) ticks after its
+observation. The environment is stepped through these ticks with the actions that `ClockConfig.meanwhile` selects, and
+then with the answer's rows, beginning with the row that the chunk player would begin with
+(`vlagents_ray.chunking.buffer.ChunkBuffer`). A synchronous evaluation is the case L = 0.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from vlagents_ray.chunking.buffer import DELAYS, ChunkBuffer
+from vlagents_ray.chunking.fallback import SafeAction, neutral, stopping
+from vlagents_ray.contract import Contract
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate.plan.config import ClockConfig
+from vlagents_ray.interface import Obs
+
+_SYNCHRONOUS = ClockConfig(latency=0)
+_EXACTLY = 1e-9  # ticks: 1.1 s at 10 Hz are 11 ticks, though 1.1 * 10 > 11 in floating point
+
+
+class Tick(NamedTuple):
+    """One step of the environment."""
+
+    action: np.ndarray  # (D,) float32
+    waited: bool = False  # executed while waiting for an answer
+    held: bool = False  # no row of any chunk is left for it
+
+
+class ChunkExecutor:
+    """Decides which actions are executed from one request to the next, during one episode."""
+
+    def __init__(self, execute: int | None, clock: ClockConfig | None, env: Contract) -> None:
+        """Begin an episode.
+
+        Args:
+            execute: Rows of a chunk before the policy is asked again; None: all.
+            clock: Real-time mode; None: the environment waits for the policy.
+            env: The contract of the environment.
+
+        Raises:
+            ConfigError: The rate of the clock is unknown, or the action that keeps the robot still before the first
+                answer.
+        """
+        self._execute = execute
+        self._real_time = clock is not None
+        self._clock = _SYNCHRONOUS if clock is None else clock
+        self._hz = 0.0 if clock is None else _rate(clock, env)
+        self._spec = env.action
+        self._still = stopping(env.action) if self._clock.meanwhile == "chunk" else self._clock.meanwhile
+        if self._clock.latency != 0 and self._clock.neutral is None and stopping(env.action) != "zero":
+            raise ConfigError(
+                "clock: the env's contract does not say that its actions are relative, so that zeros may be a pose to "
+                "go to; give clock.neutral, the action that is executed before the first answer comes"
+            )
+        self._plan = ChunkBuffer()
+        self._last: np.ndarray | None = None  # (D,) action
+        self._delays: deque[int] = deque(maxlen=DELAYS)  # ticks that answers took
+
+    def latency_s(self, measured_s: float) -> float | None:
+        """Return the latency that an answer counts as, s, if it took `measured_s`; None without a clock."""
+        if not self._real_time:
+            return None
+        return measured_s if self._clock.latency == "measured" else self._clock.latency
+
+    def request_info(self) -> dict[str, Any]:
+        """Return the `Obs.info` for real-time chunking: the rows that are left; {} if there are none or it is off."""
+        return self._plan.continuation(self._delays) if self._clock.real_time_chunking else {}
+
+    def ticks(self, rows: np.ndarray, latency_s: float) -> Iterator[Tick]:
+        """Return the ticks until the next request, after an answer of `rows`, (H, D), that counts as `latency_s`."""
+        if not self._real_time:
+            yield from map(Tick, rows[: self._execute])
+            return
+        wait = math.ceil(latency_s * self._hz - _EXACTLY)
+        self._delays.append(wait)
+        asked = self._plan.executed
+        for tick in self._waiting(wait, rows.shape[1]):
+            self._last = tick.action
+            yield tick
+        # The last row is executed however late it comes: a policy slower than its chunks would else never act.
+        late = self._plan.executed - len(rows) + 1
+        self._plan.replace(rows, max(asked, late) if self._clock.align else None)
+        first = self._plan.take()
+        self._last = first.action
+        yield Tick(first.action)
+        for action in rows[first.row + 1 : self._execute]:
+            self._plan.advance()
+            self._last = action
+            yield Tick(action)
+
+    def _waiting(self, ticks: int, dim: int) -> Iterator[Tick]:
+        for _ in range(ticks):
+            step = self._plan.next if self._clock.meanwhile == "chunk" else None
+            if step is None:
+                tick = Tick(self._held(dim), waited=True, held=True)
+                if self._goes_on():
+                    self._plan.advance()
+                yield tick
+            else:
+                self._plan.advance()
+                yield Tick(step.action, waited=True)
+
+    def _goes_on(self) -> bool:
+        """Whether holding an action moves the robot; then the held action counts as a row."""
+        return self._clock.meanwhile == "hold" and self._plan.executed > 0 and stopping(self._spec) == "zero"
+
+    def _held(self, dim: int) -> np.ndarray:
+        """Return the action of a tick for which no row is left, (D,)."""
+        given = self._clock.neutral
+        start = neutral(self._spec, dim) if given is None else np.asarray(given, np.float32)
+        if start.shape != (dim,):
+            raise ConfigError(f"clock.neutral: got {len(start)} numbers, the policy's actions have {dim}")
+        if self._last is None:
+            return start
+        if self._still == "hold":
+            return self._last
+        return start if given is not None else SafeAction("zero", self._spec)(Obs(), self._last)
+
+
+def _rate(clock: ClockConfig, env: Contract) -> float:
+    hz = clock.hz or env.control_hz
+    if not hz:
+        raise ConfigError("clock: got no hz, and the env's contract states no control_hz; give clock.hz, in 1/s")
+    return hz

@@ -1,0 +1,77 @@
+"""The records of an episode and of its worker in the results."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal
+
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey
+from vlagents_ray.ray_tools.git_state import GitState
+
+Status = Literal["done", "policy_error", "infra_failed"]
+Ending = Literal["terminated", "truncated", "policy_done", "error"]
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeResult:
+    """The result of an episode. Infrastructure failures have no success, neither True nor False."""
+
+    key: EpisodeKey
+    status: Status
+    success_once: bool | None = None  # the task was solved after some step
+    success_at_end: bool | None = None  # the task was solved after the last step
+    first_success: int | None = None  # steps after which the task was solved for the first time
+    steps: int = 0  # actions executed
+    episode_return: float = 0.0  # sum of rewards
+    ending: Ending = "error"
+    instruction: str = ""
+    error: str | None = None
+    seconds: float = 0.0  # from reset to the last step
+    reset_ms: float | None = None  # reset of the environment
+    env_step_ms: float | None = None  # median
+    acts: int = 0  # answers of the policy; fewer than steps with action chunks
+    policy_ms: float | None = None  # median of one act, transport included
+    policy_p95_ms: float | None = None
+    latency_ms: float | None = None  # real-time mode: median of the latency that an act counted as
+    ticks_waited: int = 0  # real-time mode: steps between an observation and its answer
+    ticks_held: int = 0  # the ticks among them for which no row of a chunk was left
+    timing_ms: dict[str, float] = field(default_factory=dict)  # medians of the times in `act.info["timing"]`
+    transport: str = "local"
+    checkpoint: str | None = None  # the checkpoint that the policy's reset returned
+    weights: str | None = None  # digest of the loaded weights, for a policy that reports it
+    policy_version: int | None = None  # of the weights that computed the last act; 0 is the loaded checkpoint
+    policy_fingerprint: str | None = None  # of that version, computed by the replica from what it holds
+    first_policy_version: int | None = None  # of the weights that computed the first act
+    actions_sha256: str | None = None  # digest of the executed actions, (steps, D) little-endian float32, row by row
+
+    @property
+    def outcome(self) -> dict[str, Any]:
+        """Return the fields that two runs of one key must agree in: all but the times and the transport."""
+        return {one.name: getattr(self, one.name) for one in fields(self) if one.name not in _CIRCUMSTANCES}
+
+
+_TIMES = {"seconds", "reset_ms", "env_step_ms", "policy_ms", "policy_p95_ms", "timing_ms"}
+_POLICY = {"policy_version", "policy_fingerprint", "first_policy_version"}
+# Older results lack the weights: "weights" is checked separately, and other versions show in the actions.
+_CIRCUMSTANCES = _TIMES | _POLICY | {"transport", "weights"}
+
+
+@dataclass(frozen=True, slots=True)
+class EnvInfo:
+    """The description of an environment by the worker that made it."""
+
+    described: dict[str, Any]  # `EvalEnv.describe()`
+    contract: dict[str, Any]
+    code: GitState | None = None  # the state of the environment's code, if git tracks it
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerInfo:
+    """A worker, with one policy and one environment."""
+
+    host: str
+    node: str | None  # Ray's id; None for a process outside any node
+    pid: int
+    policy: str  # name of the policy in the evaluation
+    transport: str
+    renderer: str | None  # name by its driver; None if no device draws

@@ -1,0 +1,147 @@
+"""What an evaluation is made of: one policy, at one checkpoint, in one environment."""
+
+from __future__ import annotations
+
+import fnmatch
+from collections import Counter
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from vlagents_ray.envs.base import env_arguments
+from vlagents_ray.errors import ConfigError, UnknownEnv
+from vlagents_ray.evaluate.plan.config import (
+    EvalConfig,
+    PolicyConfig,
+    SuiteConfig,
+    WorkerConfig,
+    fingerprint,
+)
+from vlagents_ray.naming import plain
+from vlagents_ray.registry import env_class, env_suite
+
+_COUNTS = "executed actions"  # what rows are placed by (`client.plan.Plan`); scores from when it was ticks are others
+
+
+@dataclass(frozen=True)
+class EvalCase:
+    """A cell of the table of results: what one success rate is of."""
+
+    policy: PolicyConfig
+    step: int | None  # of training, in a sweep over checkpoints
+    suite: SuiteConfig
+    env: str  # full name
+    worker: WorkerConfig
+
+    @property
+    def contender(self) -> str:
+        """The policy at its checkpoint, in a word: "pi0", or "pi0@20000" in a sweep."""
+        return contender(self.policy.name, self.step)
+
+    @property
+    def name(self) -> tuple[str, str, str]:
+        """(contender, suite, env): no two cells of one evaluation have the same."""
+        return self.contender, self.suite.name, self.env
+
+    @property
+    def policy_options(self) -> dict[str, Any]:
+        """What is handed to every reset of the policy."""
+        return self.policy.options | ({} if self.step is None else {"checkpoint_step": self.step})
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """All that an episode depends on, apart from its number and seed."""
+        return {
+            "env": self.env,
+            "env_options": self.suite.env_options,
+            "reset_options": self.suite.reset_options,
+            "policy": self.policy.name,
+            "policy_config": self.policy.config,
+            "policy_options": self.policy_options,
+            "checkpoint": self.policy.checkpoint,
+            "execute": self.policy.execute,
+            "codec": "jpeg" if self.policy.codec == "jpeg" else "exact",
+            "num_envs": self.suite.num_envs,
+            "clock": self.suite.clock.model_dump() | {"counts": _COUNTS} if self.suite.clock else None,
+        }
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Stands for `settings` in the keys of episodes."""
+        return fingerprint(self.settings)
+
+    @cached_property
+    def kind(self) -> str:
+        """Stands for the process that a worker must be to play it."""
+        return fingerprint(self.worker.model_dump())
+
+    @cached_property
+    def place(self) -> str:
+        """Stands for the environment that a worker must have made to play it."""
+        return fingerprint([self.env, self.suite.env_options, self.suite.num_envs, self.kind])
+
+    @property
+    def planned(self) -> int:
+        """Episodes of all seeds together."""
+        return self.suite.episodes * len(self.suite.seeds)
+
+
+def contender(policy: str, step: int | None) -> str:
+    """A policy at its checkpoint, in a word."""
+    return policy if step is None else f"{policy}@{step}"
+
+
+def cells(config: EvalConfig) -> list[EvalCase]:
+    """Every cell that `config` asks for: checkpoint by checkpoint, in each suite by suite and env by env.
+
+    Raises `UnknownEnv` for an env that nobody knows, `ConfigError` for one that stands twice under one name, or
+    in two suites that do not differ: their episodes would have the same keys; and for names that differ only by signs
+    that a file's name cannot have: their episodes would have the same files.
+    """
+    envs = [(suite, env) for suite in config.suites for pattern in suite.envs for env in expand(pattern)]
+    contenders: list[tuple[PolicyConfig, int | None]] = []
+    for policy in config.policies:
+        contenders += [(policy, step) for step in policy.steps] or [(policy, None)]
+    found = [
+        EvalCase(policy, step, suite, env, suite.worker or config.worker)
+        for policy, step in contenders
+        for suite, env in envs
+    ]
+    names = Counter(cell.name for cell in found)
+    if twice := sorted({env for (_, _, env), number in names.items() if number > 1}):
+        raise ConfigError(f"suites: {twice} stand in two suites of one name; give each a `name` of its own")
+    folders: dict[tuple[str, ...], tuple[str, ...]] = {}
+    for name in names:
+        other = folders.setdefault(tuple(plain(part) for part in name), name)
+        if other != name:
+            raise ConfigError(
+                f"{' '.join(name)!r} and {' '.join(other)!r} would share their files; give one another name"
+            )
+    prints = Counter(cell.fingerprint for cell in found)
+    if twice := sorted({cell.env for cell in found if prints[cell.fingerprint] > 1}):
+        raise ConfigError(
+            f"suites: {twice} stand in two suites with the same settings, so that these are the same episodes; "
+            f"leave them out of one of the two"
+        )
+    return found
+
+
+def require_envs(config: EvalConfig) -> None:
+    """`UnknownEnv` for a task that nobody knows, `ConfigError` for options that its env does not take."""
+    for cell in cells(config):
+        env_arguments(cell.env, cell.suite.env_options)
+
+
+def expand(pattern: str) -> list[str]:
+    """The envs that a name stands for: itself, or with `*` those of the simulator's tasks that match.
+
+    Raises `UnknownEnv` for a simulator that is not registered, or if no task matches.
+    """
+    cls = env_class(pattern)
+    if "*" not in pattern:
+        return [pattern]
+    suite = env_suite(pattern)
+    known = [f"{suite}/{task}" for task in cls.tasks()]
+    if not (found := fnmatch.filter(known, pattern)):
+        raise UnknownEnv(f"{pattern!r}: matches none of the tasks of {suite!r}, which knows {known}")
+    return found

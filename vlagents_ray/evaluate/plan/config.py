@@ -1,0 +1,229 @@
+"""The settings of an evaluation: closed, typed; policies x checkpoints x suites x tasks x seeds."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    JsonValue,
+    NonNegativeFloat,
+    NonNegativeInt,
+    PositiveFloat,
+    PositiveInt,
+    field_validator,
+    model_validator,
+)
+from typing_extensions import Self
+
+from vlagents_ray.client.transports.select import TransportName
+from vlagents_ray.ray_tools.runtime_env import require_no_secrets
+
+EpisodeChoice = Literal["none", "failures", "all"]
+Tracker = Literal["wandb", "trackio", "tensorboard"]
+Name = Annotated[str, Field(min_length=1)]
+
+
+class _PlanModel(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, hide_input_in_errors=True)  # errors are logged
+
+
+class StepRange(_PlanModel):
+    """Training steps at equal distances, the last one included."""
+
+    first: NonNegativeInt
+    last: NonNegativeInt
+    every: PositiveInt
+
+    @property
+    def steps(self) -> range:
+        """All these steps."""
+        return range(self.first, self.last + 1, self.every)
+
+
+class PolicyConfig(_PlanModel):
+    """A policy, how it is reached, and which of its checkpoints are evaluated."""
+
+    name: Name = "policy"  # in the results; two policies of one evaluation have different names
+    # A registered policy or a deployment file, which `vlagents-ray eval` serves for the length of the run.
+    source: str | None = None
+    url: str | None = None  # of a server that runs already: "http://gpu-box:8000", or "serve://NAME" in this cluster
+    config: dict[str, JsonValue] = {}  # what it is served with, over a deployment file's own
+    options: dict[str, JsonValue] = {}  # passed to every `reset` of the policy
+    checkpoint: str | None = None  # that the server loads; each episode's result names the one it was played by
+    # A sweep over checkpoints: a list, or {first, last, every}; each is chosen by the reset option `checkpoint_step`.
+    steps: list[NonNegativeInt] = []
+    execute: PositiveInt | None = None  # rows executed of each action chunk; None = all
+    # How images reach a policy over a network. JPEG changes them a little, so it has to be asked for; the others
+    # do not, and "exact" takes the faster of raw and lossless, so that results never depend on the link.
+    codec: Literal["exact", "raw", "lossless", "jpeg"] = "exact"
+    transport: TransportName = "auto"
+
+    @field_validator("steps", mode="before")
+    @classmethod
+    def _range(cls, steps: object) -> object:
+        if not isinstance(steps, dict):
+            return steps
+        return list(StepRange.model_validate(steps).steps)
+
+    @field_validator("steps")
+    @classmethod
+    def _once(cls, steps: list[int]) -> list[int]:
+        if repeated := sorted({step for step in steps if steps.count(step) > 1}):
+            raise ValueError(f"{repeated} named twice; name each step once")
+        return steps
+
+    @model_validator(mode="after")
+    def _not_ours(self) -> Self:
+        ours = {"seed", "env", "contract"} | ({"checkpoint_step"} if self.steps else set())
+        if taken := sorted(ours & self.options.keys()):
+            raise ValueError(f"options: {taken} are set episode by episode; leave them out")
+        return self
+
+
+class WorkerConfig(_PlanModel):
+    """The resources of a worker, and its runtime environment."""
+
+    cpus: NonNegativeFloat = 0.5  # low, so that workers and policy fit on a small machine
+    gpus: NonNegativeFloat = 0.0
+    threads: PositiveInt = 1  # of OpenMP, MKL, llvmpipe and the like
+    # Ray's; its env_vars win over the thread settings. A simulator with packages of its own names their Python,
+    # with Ray in it: {"py_executable": "/envs/rcs/bin/python"}.
+    runtime_env: dict[str, JsonValue] = {}
+
+    @field_validator("runtime_env")
+    @classmethod
+    def _public(cls, runtime_env: dict[str, JsonValue]) -> dict[str, JsonValue]:
+        require_no_secrets(runtime_env)
+        return runtime_env
+
+
+class ClockConfig(_PlanModel):
+    """Real-time mode: the env's clock runs on while the policy thinks (see `vlagents_ray.evaluate.episode.latency`)."""
+
+    # s that each answer takes: "measured" as it comes, transport included, or injected, which repeats exactly.
+    latency: Literal["measured"] | Annotated[FiniteFloat, Field(ge=0)] = "measured"
+    # What is executed between observation and answer. "chunk": what is left of the last chunk, then what stops the
+    # robot: "zero" for relative actions, else "hold"; "hold": the last action again; "zero": no motion, the gripper
+    # as it was commanded.
+    meanwhile: Literal["chunk", "hold", "zero"] = "chunk"
+    hz: Annotated[FiniteFloat, Field(gt=0)] | None = None  # ticks per second; None: the env's control_hz
+    align: bool = True  # drop the rows in place of which others were executed until the answer came
+    # Send the policy the rest of the last chunk, and for how many ticks it will be executed (`interface.DELAY`).
+    real_time_chunking: bool = False
+    # The action that is executed before the first answer, and by "zero"; None: zeros, and the gripper open at first.
+    neutral: list[FiniteFloat] | None = None
+
+
+class StopConfig(_PlanModel):
+    """The rule by which a cell stops early (see `confidence_sequence`): `target`, `width`, or whichever comes first."""
+
+    error_rate: float = Field(default=0.05, gt=0, lt=1)  # of each cell's confidence sequence, over all looks together
+    target: float | None = Field(default=None, ge=0, le=1)  # stop when this success rate is excluded
+    width: float | None = Field(default=None, gt=0, lt=1)  # stop when the interval is narrower
+    at_least: PositiveInt = 1  # episodes
+
+    @model_validator(mode="after")
+    def _some_end(self) -> Self:
+        if self.target is None and self.width is None:
+            raise ValueError("got neither target nor width; want one of them, or both: whichever comes first stops")
+        return self
+
+
+class SuiteConfig(_PlanModel):
+    """Environments that are evaluated with the same settings."""
+
+    name: str = ""  # in the results; an env may be in two suites of different names and settings
+    envs: list[Name] = Field(min_length=1)  # registered names, "maniskill/PushCube-v1", or patterns, "libero/*"
+    env_options: dict[str, JsonValue] = {}  # passed to the constructor
+    reset_options: dict[str, JsonValue] = {}  # passed to every `reset` of the env
+    episodes: PositiveInt = 10  # of each env and seed
+    seeds: list[NonNegativeInt] = Field(default=[0], min_length=1)  # episode i uses seed + i
+    num_envs: PositiveInt = 1  # that one worker steps together, in one simulator where that can be (ManiSkill on a GPU)
+    worker: WorkerConfig | None = None  # None: as `EvalConfig.worker` says
+    clock: ClockConfig | None = None  # real-time mode; None: the env waits for the policy
+
+    @field_validator("envs")
+    @classmethod
+    def _distinct(cls, envs: list[str]) -> list[str]:
+        if repeated := sorted({name for name in envs if envs.count(name) > 1}):
+            raise ValueError(f"{repeated} named twice; name each env once and raise `episodes`")
+        return envs
+
+    @model_validator(mode="after")
+    def _measured_alone(self) -> Self:
+        if self.clock is not None and self.clock.latency == "measured" and self.num_envs > 1:
+            raise ValueError(
+                f"num_envs: got {self.num_envs} with a measured clock.latency, which would be that of the whole batch; "
+                f"want 1, or a latency in seconds"
+            )
+        return self
+
+    @model_validator(mode="after")
+    def _apart(self) -> Self:
+        ordered = sorted(self.seeds)
+        for low, high in itertools.pairwise(ordered):
+            if high - low < self.episodes:
+                raise ValueError(
+                    f"seeds: {low} and {high} with {self.episodes} episodes each would play some twice; "
+                    f"want them {self.episodes} or more apart"
+                )
+        return self
+
+
+class TrackingConfig(_PlanModel):
+    """The names under which trackers show an evaluation."""
+
+    project: Name = "vlagents-ray"
+    group: str | None = None  # of runs; default: the name of the folder of results
+    videos: NonNegativeInt = 4  # of each cell that are uploaded, failures first
+
+
+class EvalConfig(_PlanModel):
+    """The settings of an evaluation: the policies, the envs, and the folder of results."""
+
+    policies: list[PolicyConfig] = Field(min_length=1)
+    suites: list[SuiteConfig] = Field(min_length=1)
+    out: Path
+    workers: PositiveInt = 1  # environments rolled out in parallel
+    video: EpisodeChoice = "failures"  # of which episodes there are videos
+    record: EpisodeChoice = "none"  # and of which trajectories: states, actions, rewards, and what the policy saw
+    resume: bool = False
+    worker: WorkerConfig = WorkerConfig()
+    stop: StopConfig | None = None  # early stopping; None: every episode is played
+    track: list[Tracker] = []  # where rates and videos are shown beside `out`, against the training step
+    tracking: TrackingConfig = TrackingConfig()
+
+    # What happens when something breaks.
+    retries: NonNegativeInt = 3  # further attempts after an infrastructure failure
+    abort_after: NonNegativeInt = 10  # stop after so many infrastructure failures in a row; 0 = never
+    make_timeout_s: PositiveFloat = 300.0  # making an env, imports and shaders included
+    env_timeout_s: PositiveFloat = 60.0  # one reset or step
+    policy_timeout_s: PositiveFloat = 60.0  # one reset or act of the policy
+    connect_timeout_s: PositiveFloat = 120.0  # reaching the policy, a restart of its server included
+    place_timeout_s: PositiveFloat = 120.0  # until the cluster has resources for a worker
+
+    @field_validator("policies")
+    @classmethod
+    def _named_apart(cls, policies: list[PolicyConfig]) -> list[PolicyConfig]:
+        names = [policy.name for policy in policies]
+        if repeated := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"two policies are named {repeated}; give each a `name` of its own")
+        return policies
+
+
+def canonical(value: object) -> str:
+    """JSON with sorted keys and no spaces: equal values give equal text."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def fingerprint(settings: object) -> str:
+    """16 hexadecimal digits that stand for `settings`."""
+    return hashlib.sha256(canonical(settings).encode()).hexdigest()[:16]

@@ -1,0 +1,116 @@
+"""Episodes as keyed jobs, and the one queue that all workers draw from."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, deque
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+from vlagents_ray.evaluate.plan.cases import EvalCase
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeKey:
+    """All that decides an episode: two runs of one key give the same episode, wherever they run."""
+
+    env: str  # full name, suite and task
+    episode: int  # its number within the env, from 0
+    seed: int  # of the env's reset, and handed to the policy's
+    settings: str  # fingerprint of everything else that changes the outcome
+    policy_seed: int | None = None  # of the policy's reset, for episodes that share the env's; None: `seed`
+
+    def __str__(self) -> str:
+        policy = "" if self.policy_seed is None else f"/{self.policy_seed}"
+        return f"{self.env}#{self.episode}@{self.seed}{policy}:{self.settings}"
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """One attempt at an episode."""
+
+    key: EpisodeKey
+    cell: EvalCase
+    attempt: int = 1
+
+    def again(self) -> Job:
+        """The next attempt at the same episode."""
+        return replace(self, attempt=self.attempt + 1)
+
+
+def plan(cells: Iterable[EvalCase]) -> list[Job]:
+    """Every episode of `cells`, cell by cell; those of a further seed follow those of the one before."""
+    return [
+        Job(EpisodeKey(cell.env, i, seed + i, cell.fingerprint), cell)
+        for cell in cells
+        for seed in cell.suite.seeds
+        for i in range(cell.suite.episodes)
+    ]
+
+
+class JobQueue:
+    """Jobs that wait, by the environment they need, so that a worker can go on with the one it has made."""
+
+    def __init__(self, jobs: Iterable[Job]) -> None:
+        self._waiting: dict[str, deque[Job]] = {}  # by place
+        self._kinds: dict[str, str] = {}  # place -> kind
+        for job in jobs:
+            self.put(job)
+
+    def __len__(self) -> int:
+        return sum(map(len, self._waiting.values()))
+
+    def put(self, job: Job) -> None:
+        """Queue a job behind the others."""
+        self._of(job).append(job)
+
+    def put_back(self, job: Job) -> None:
+        """Queue a further attempt, ahead of the episodes that have not been tried."""
+        self._of(job).appendleft(job)
+
+    def take(self, kind: str, made: str | None, working: Mapping[str, int]) -> tuple[Job, ...]:
+        """The next jobs for a worker of `kind` that has made the env at place `made`; none if none of its kind waits.
+
+        They are of one cell, as many as it plays at once. A worker stays with its env while that has episodes; then
+        it goes where most wait for each worker, counting `working`: how many workers are busy at which place.
+        """
+        if made is not None and self._waiting.get(made):
+            return self._first(made)
+        waiting = {place: len(jobs) for place, jobs in self._waiting.items() if jobs and self._kinds[place] == kind}
+        if not waiting:
+            return ()
+        return self._first(max(waiting, key=lambda one: waiting[one] / (1 + working.get(one, 0))))
+
+    def needs_worker(self, workers: Mapping[str, int], unoccupied: Mapping[str, int]) -> EvalCase | None:
+        """A cell that one more worker would be for; None if those that are `unoccupied` suffice.
+
+        Both count workers by kind. It is of the kind of which most wait for each of the `workers`.
+        """
+        waiting: Counter[str] = Counter()
+        for place, jobs in self._waiting.items():
+            if jobs:
+                waiting[self._kinds[place]] += math.ceil(len(jobs) / jobs[0].cell.suite.num_envs)
+        short = [kind for kind, number in waiting.items() if number > unoccupied.get(kind, 0)]
+        if not short:
+            return None
+        kind = max(short, key=lambda one: waiting[one] / (1 + workers.get(one, 0)))
+        return next(jobs[0].cell for place, jobs in self._waiting.items() if jobs and self._kinds[place] == kind)
+
+    def drop(self, settings: str) -> int:
+        """Take out what waits of the cell with this fingerprint; returns how many."""
+        before = len(self)
+        for place, jobs in self._waiting.items():
+            self._waiting[place] = deque(job for job in jobs if job.key.settings != settings)
+        return before - len(self)
+
+    def _first(self, place: str) -> tuple[Job, ...]:
+        jobs = self._waiting[place]
+        taken = [jobs.popleft()]
+        cell = taken[0].cell
+        while jobs and len(taken) < cell.suite.num_envs and jobs[0].cell.fingerprint == cell.fingerprint:
+            taken.append(jobs.popleft())
+        return tuple(taken)
+
+    def _of(self, job: Job) -> deque[Job]:
+        self._kinds[job.cell.place] = job.cell.kind
+        return self._waiting.setdefault(job.cell.place, deque())

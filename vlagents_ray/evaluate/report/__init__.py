@@ -1,0 +1,1 @@
+"""Reports: the HTML page, the table in the terminal, progress."""

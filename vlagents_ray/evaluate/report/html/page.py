@@ -1,0 +1,142 @@
+"""The page: its head, its sections, and one file of it all."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from functools import cache, partial
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from vlagents_ray.evaluate.artifacts.storage import storing, whole
+from vlagents_ray.evaluate.report.html import charts, numbers
+from vlagents_ray.evaluate.report.html.comparison import compare_all, real_time_gaps
+from vlagents_ray.evaluate.report.html.episodes import AT_ONCE, Gallery, Videos, episodes, errors, failures
+from vlagents_ray.evaluate.report.html.latency import latency
+from vlagents_ray.evaluate.report.html.numbers import duration, interval, interval_name, number, percent, quantity
+from vlagents_ray.evaluate.report.html.provenance import configuration, protocol, repeat
+from vlagents_ray.evaluate.report.html.success import learning_curves, success_over_time, success_table
+from vlagents_ray.evaluate.results.reader import Results, by_timing, rate_of
+from vlagents_ray.evaluate.results.summary import Summary, summarize
+
+FILE = "report.html"
+
+
+class Figure(NamedTuple):
+    """A number of the page's head."""
+
+    value: str
+    name: str
+    note: str
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A part of the page with a heading that the table of contents leads to."""
+
+    title: str
+    macro: str  # of sections.html.j2
+    view: Any  # its argument; None or empty: the page has no such section
+
+    @property
+    def anchor(self) -> str:
+        """The id of its heading."""
+        return self.title.lower().replace(" ", "-")
+
+
+def write_report(results: Results, path: Path, *, videos: Videos = "link") -> Path:
+    """Write the report of `results` to `path`, one HTML file, whole or not at all.
+
+    Args:
+        results: Of one folder, or of several (`combined`).
+        path: The file; folders that are missing are made.
+        videos: "link" to the files (relative to `path`), "inline" up to `episodes.BUDGET` bytes and links for the
+            rest, or "none", with a still of each.
+
+    Returns:
+        `path`.
+    """
+    text = report(summarize(results), Gallery(results, path, videos))
+    with storing(path.parent), whole(path) as part:
+        part.write_text(text, encoding="utf-8")
+    return path
+
+
+def report(summary: Summary, gallery: Gallery) -> str:
+    """The page as text."""
+    results = summary.results
+    sections = [
+        Section("Success", "success", success_table(summary)),
+        Section("Comparison", "comparison", compare_all(summary)),
+        Section("Gap to the synchronous score", "real_time", real_time_gaps(summary)),
+        Section("Learning curve", "learning_curve", learning_curves(summary)),
+        Section("Success over time", "success_over_time", success_over_time(summary)),
+        Section("Latency", "latency", latency(summary)),
+        Section("Failures", "failures", failures(results, gallery)),
+        Section("Episodes", "episodes", episodes(results, gallery)),
+        Section("Errors", "errors", errors(results)),
+        Section("Protocol", "protocol", protocol(results)),
+        Section("Configuration", "configuration", configuration(results)),
+        Section("To cite and to repeat", "repeat", repeat(summary)),
+    ]
+    return (
+        _templates()
+        .get_template("page.html.j2")
+        .render(
+            summary=summary,
+            policies=list(dict.fromkeys(cell.policy for cell in results.cells)),
+            tasks=len({(cell.suite, cell.env) for cell in results.cells}),
+            run=results.runs[-1],
+            figures=_figures(summary),
+            sections=[one for one in sections if one.view],
+        )
+    )
+
+
+def _figures(summary: Summary) -> list[Figure]:
+    total = summary.total
+    return [
+        _solved(summary),
+        Figure(number(total.episodes, 0), "episodes", f"of {number(total.planned, 0)} planned"),
+        Figure(number(total.steps, 0), "env steps", f"{number(summary.steps_per_second)} a second"),
+        Figure(duration(summary.wall_seconds), "wall time", f"{quantity(total.retries, 'attempt')} repeated"),
+    ]
+
+
+def _solved(summary: Summary) -> Figure:
+    """The headline: one rate only if its cells have one in common, and of synchronous episodes if there are any."""
+    best = summary.best[0]
+    timing, part = next(iter(summary.parts(best).items()))
+    name = "solved" if len(summary.results.contenders) == 1 else f"solved by the best, {best}"
+    if len(by_timing(summary.results.cells)) > 1:
+        name += f", {timing}"
+    once = part.success_once
+    if once.pooled:
+        return Figure(f"{percent(once)} %", name, f"{interval_name(once)} {interval(once)} %")
+    cells = by_timing(summary.results.of(best))[timing]
+    rates = [rate for cell in cells if (rate := rate_of([cell], "success_once")).rate is not None]
+    low, high = (percent(pick(rates, key=lambda rate: rate.rate or 0.0)) for pick in (min, max))
+    return Figure(f"{low} to {high} %", name, f"{quantity(len(cells), 'task')} that stopped apart: no rate in common")
+
+
+@cache
+def _templates() -> Environment:
+    """The templates escape whatever they are given: names of tasks, instructions and errors are text of others."""
+    env = Environment(
+        loader=PackageLoader(__package__ or ""),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    formats = ("duration", "interval", "interval_name", "moment", "number", "p_value", "percent", "points", "quantity")
+    env.filters.update({name: getattr(numbers, name) for name in formats})
+    env.filters.update(interval_glyph=charts.interval_glyph, px=charts.px, json=partial(json.dumps, ensure_ascii=False))
+    env.globals.update(PLOT=charts.PLOT, AT_ONCE=AT_ONCE, NONE=numbers.NONE, MINUS=numbers.MINUS)
+    for kind in ("css", "js"):  # ours, and no template: nothing in them is escaped
+        env.globals[kind] = Markup((files(__package__ or "") / f"report.{kind}").read_text("utf-8").strip())  # noqa: S704
+    return env

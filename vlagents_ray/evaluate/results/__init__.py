@@ -1,0 +1,1 @@
+"""The folder of results: written exactly once, read, merged, compared, summarised."""

@@ -1,0 +1,203 @@
+"""results.db: its tables, and how it is opened, by the one evaluation that writes it and by all that read it.
+
+SQLite's write-ahead log lets readers look while an evaluation writes, but its index is shared memory: all processes
+must be on one host (https://www.sqlite.org/wal.html). On a file system that other hosts may mount, or that is not
+known, the older rollback journal is used, whose locks are the file system's.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import functools
+import os
+import sqlite3
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from vlagents_ray.errors import ConfigError
+
+FILE = "results.db"
+VERSION = 3
+
+SCHEMA = """
+CREATE TABLE runs (
+    run INTEGER PRIMARY KEY, started REAL NOT NULL, ended REAL, state TEXT NOT NULL,
+    config TEXT NOT NULL, versions TEXT NOT NULL
+);
+CREATE TABLE policies (name TEXT PRIMARY KEY, metadata TEXT NOT NULL);
+CREATE TABLE cells (
+    cell TEXT PRIMARY KEY, policy TEXT NOT NULL, step INTEGER, suite TEXT NOT NULL, env TEXT NOT NULL,
+    planned INTEGER NOT NULL, seeds TEXT NOT NULL, stop TEXT, settings TEXT NOT NULL, described TEXT, contract TEXT,
+    code TEXT
+);
+CREATE TABLE episodes (
+    key TEXT PRIMARY KEY, cell TEXT NOT NULL REFERENCES cells, env TEXT NOT NULL, episode INTEGER NOT NULL,
+    seed INTEGER NOT NULL, status TEXT NOT NULL, success_once INTEGER, success_at_end INTEGER, first_success INTEGER,
+    steps INTEGER NOT NULL, episode_return REAL NOT NULL, ending TEXT NOT NULL, instruction TEXT NOT NULL,
+    error TEXT, seconds REAL NOT NULL, reset_ms REAL, env_step_ms REAL, acts INTEGER NOT NULL,
+    policy_ms REAL, policy_p95_ms REAL, latency_ms REAL, ticks_waited INTEGER NOT NULL, ticks_held INTEGER NOT NULL,
+    timing_ms TEXT NOT NULL, transport TEXT NOT NULL, checkpoint TEXT, weights TEXT,
+    policy_version INTEGER, policy_fingerprint TEXT, first_policy_version INTEGER,
+    actions_sha256 TEXT, videos TEXT NOT NULL, trajectory TEXT, attempts INTEGER NOT NULL,
+    run INTEGER NOT NULL REFERENCES runs, finished REAL NOT NULL
+);
+CREATE INDEX episodes_of_cells ON episodes (cell, checkpoint);
+CREATE TABLE attempts (
+    key TEXT NOT NULL, cell TEXT NOT NULL REFERENCES cells, attempt INTEGER NOT NULL,
+    run INTEGER NOT NULL REFERENCES runs, at REAL NOT NULL, cause TEXT NOT NULL, code TEXT NOT NULL,
+    error TEXT NOT NULL, traceback TEXT NOT NULL, log TEXT NOT NULL, retried INTEGER NOT NULL
+);
+CREATE TABLE tracked (
+    tracker TEXT NOT NULL, what TEXT NOT NULL, episodes INTEGER NOT NULL, PRIMARY KEY (tracker, what)
+);
+"""
+
+# Apart, because older results of this version have no such table: it is added when they are resumed.
+WORKERS = """
+CREATE TABLE IF NOT EXISTS workers (
+    run INTEGER NOT NULL REFERENCES runs, at REAL NOT NULL, host TEXT NOT NULL, node TEXT, pid INTEGER NOT NULL,
+    policy TEXT NOT NULL, transport TEXT NOT NULL, renderer TEXT
+);
+"""
+
+
+# Columns that older results of this version lack: they are added when those are resumed.
+_COLUMNS = {
+    "episodes": {
+        "weights": "TEXT",
+        "policy_version": "INTEGER",
+        "policy_fingerprint": "TEXT",
+        "first_policy_version": "INTEGER",
+    }
+}
+
+
+def complete(db: sqlite3.Connection) -> None:
+    """Give older results of this version the tables and columns that were added since."""
+    db.executescript(WORKERS)
+    for table, columns in _COLUMNS.items():
+        there = _columns(db, table)
+        for name, kind in columns.items():
+            if name not in there:
+                db.execute(f"ALTER TABLE {table} ADD COLUMN {name} {kind}")
+
+
+def insert(db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> None:
+    """Insert `row`, its values by the names of their columns, which are those of `SCHEMA` and `WORKERS`."""
+    columns, marks = ", ".join(row), ", ".join("?" * len(row))
+    db.execute(f"INSERT INTO {table} ({columns}) VALUES ({marks})", tuple(row.values()))  # noqa: S608 (our own names)
+
+
+def require_readable(out: Path, db: sqlite3.Connection) -> None:
+    """Raise `ConfigError` for a results file of another version, or with other columns than this version has.
+
+    The names of columns in a file of somebody else may be any text, and `merge` inserts rows by them.
+    """
+    version = db.execute("PRAGMA user_version").fetchone()[0]
+    if version != VERSION:
+        raise ConfigError(
+            f"{out / FILE}: got version {version} of the results file, want {VERSION}; choose another out folder"
+        )
+    for table, known in _known_columns().items():
+        there = _columns(db, table)
+        if not there and table == "workers":
+            continue
+        unknown, missing = there - known, known - there - _COLUMNS.get(table, {}).keys()
+        if unknown or missing:
+            got = f"the unknown columns {sorted(unknown)}" if unknown else f"none of the columns {sorted(missing)}"
+            raise ConfigError(
+                f"{out / FILE}: got {got} in its table {table!r}, want those of this version of vlagents-ray; read it "
+                f"with the version that wrote it"
+            )
+
+
+@functools.cache
+def _known_columns() -> dict[str, set[str]]:
+    """The columns of this version, by table."""
+    with contextlib.closing(sqlite3.connect(":memory:")) as db:
+        db.executescript(SCHEMA + WORKERS)
+        tables = [name for (name,) in db.execute("SELECT name FROM sqlite_master WHERE type = 'table'")]
+        return {table: _columns(db, table) for table in tables}
+
+
+def _columns(db: sqlite3.Connection, table: str) -> set[str]:
+    return {name for (name,) in db.execute("SELECT name FROM pragma_table_xinfo(?)", (table,))}
+
+
+WAIT_S = 60.0  # for another process's transaction to end
+
+# `f_type` of statfs(2), of those that one host has to itself; see linux/magic.h and statfs(2).
+_LOCAL = {
+    0xEF53: "ext2, ext3, ext4", 0x58465342: "xfs", 0x9123683E: "btrfs", 0x2FC12FC1: "zfs", 0xF2F52010: "f2fs",
+    0xCA451A4E: "bcachefs", 0x3153464A: "jfs", 0x52654973: "reiserfs", 0x01021994: "tmpfs", 0x858458F6: "ramfs",
+    0x794C7630: "overlayfs", 0x7366746E: "ntfs3", 0x2011BAB0: "exfat", 0x4D44: "vfat",
+}  # fmt: skip
+
+
+def is_local(folder: Path) -> bool:
+    """Whether `folder` is on a file system that only this host can write to; False for one that is not known."""
+    if not sys.platform.startswith("linux"):
+        return False
+    answer = (ctypes.c_long * 64)()  # a struct statfs, which begins with `f_type`, is at most half as long
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.statfs(os.fsencode(folder), ctypes.byref(answer)):
+        return False
+    return answer[0] & 0xFFFFFFFF in _LOCAL
+
+
+def writable(out: Path) -> sqlite3.Connection:
+    """Open `out/results.db`, made if it is missing, with a journal mode that its file system supports."""
+    mode, synchronous = ("wal", "NORMAL") if is_local(out) else ("truncate", "FULL")
+    db = sqlite3.connect(out / FILE, timeout=WAIT_S)
+    try:
+        try:
+            db.execute(f"PRAGMA journal_mode = {mode}")
+        except sqlite3.OperationalError as error:
+            if "locked" not in str(error):
+                raise
+            raise ConfigError(
+                f"{out / FILE}: its journal has to be changed to one that works on its file system, but somebody has "
+                f"been reading it for {WAIT_S:g} s; end what reads it"
+            ) from error
+        # WAL with NORMAL is safe against a killed process, without an fsync an episode; a rollback journal needs FULL.
+        db.execute(f"PRAGMA synchronous = {synchronous}")
+    except BaseException:
+        db.close()
+        raise
+    return db
+
+
+def close(db: sqlite3.Connection) -> None:
+    """Close what `writable` opened. The database is one file then, which can be read on a read-only file system."""
+    try:
+        db.execute("PRAGMA busy_timeout = 0")
+        with contextlib.suppress(sqlite3.OperationalError):  # somebody reads it just now: the next writer will do it
+            db.execute("PRAGMA journal_mode = DELETE")
+    finally:
+        db.close()
+
+
+def read_only(out: Path) -> sqlite3.Connection:
+    """Open `out/results.db` so that nothing can change it; it may be on a read-only file system."""
+    uri = (out / FILE).resolve().as_uri()
+    db = sqlite3.connect(f"{uri}?mode=ro", uri=True, timeout=WAIT_S)
+    try:
+        db.execute("PRAGMA user_version").fetchone()
+    except sqlite3.OperationalError as error:
+        db.close()
+        unfinished = any(_size(out / f"{FILE}{suffix}") for suffix in ("-wal", "-journal"))  # not all is in the file
+        if unfinished or "unable to open" not in str(error):
+            raise
+        # Closed in order, with a write-ahead log that nobody here can make: nobody writes to it, either.
+        db = sqlite3.connect(f"{uri}?mode=ro&immutable=1", uri=True)
+    return db
+
+
+def _size(path: Path) -> int:
+    try:
+        return path.stat().st_size
+    except FileNotFoundError:
+        return 0

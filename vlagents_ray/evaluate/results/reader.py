@@ -1,0 +1,331 @@
+"""Reads a folder of results."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sqlite3
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate.artifacts.storage import inside, require_below
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.cases import contender
+from vlagents_ray.evaluate.plan.config import StopConfig
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey
+from vlagents_ray.evaluate.results.database import FILE, read_only, require_readable
+from vlagents_ray.evaluate.results.statistics import Rate
+from vlagents_ray.evaluate.results.stopping import Stopping, pooled
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """A recorded episode."""
+
+    result: EpisodeResult
+    videos: tuple[str, ...]  # paths relative to the folder
+    trajectory: str | None  # a path relative to the folder
+    attempts: int
+    run: int
+    finished: float  # seconds since 1970
+    beyond: bool = False  # it is after the point at which its cell stopped, or no longer planned
+
+    @property
+    def counts(self) -> bool:
+        """Whether the episode is in the rates: it is unless infrastructure failed it, or it is `beyond`."""
+        return self.result.status != "infra_failed" and not self.beyond
+
+
+@dataclass(frozen=True, slots=True)
+class Attempt:
+    """An attempt at an episode that failed because of the infrastructure, not of the policy."""
+
+    key: str
+    cell: str
+    attempt: int
+    run: int
+    at: float  # seconds since 1970
+    cause: str
+    code: str
+    error: str
+    traceback: str
+    log: str  # the end of the worker's output, if the worker died
+    retried: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Worker:
+    """A worker that connected to a policy or made an env. One that did so twice has two entries."""
+
+    run: int
+    at: float  # seconds since 1970
+    host: str
+    node: str | None  # Ray's id
+    pid: int
+    policy: str
+    transport: str
+    renderer: str | None  # with which its env draws
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """One run over the plan: the first, or one that resumed it."""
+
+    run: int
+    started: float  # seconds since 1970
+    ended: float | None  # None: it was killed
+    state: str  # "complete", "interrupted", "out of time", "stopped" by an error, or "running"
+    config: dict[str, Any]
+    versions: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class CellResults:
+    """The results of one cell: a policy, at a checkpoint, in an env of a suite."""
+
+    cell: str  # fingerprint of its settings
+    policy: str
+    step: int | None
+    suite: str
+    env: str
+    planned: int
+    settings: dict[str, Any]
+    described: dict[str, Any]  # `EvalEnv.describe()`; {} if no worker has made the env
+    contract: dict[str, Any]
+    code: dict[str, Any]  # of the env: commit, dirty, diff_sha256; {} if it is in no git repository
+    episodes: tuple[Episode, ...]  # by seed
+    attempts: tuple[Attempt, ...]
+    stop: StopConfig | None = None  # the rule by which it could stop early
+    stopped_at: int | None = None  # the number of episodes after which it stopped; later ones are kept, not counted
+
+    @property
+    def contender(self) -> str:
+        """The policy id: the policy's name, with "@STEP" in a sweep over checkpoints."""
+        return contender(self.policy, self.step)
+
+    @property
+    def task(self) -> str:
+        """The env, after the name of its suite if that has one: an env may be in several suites."""
+        return f"{self.suite} {self.env}".strip()
+
+    @property
+    def counted(self) -> list[EpisodeResult]:
+        """The results of the episodes that are in the rates."""
+        return [episode.result for episode in self.episodes if episode.counts]
+
+    @property
+    def missing(self) -> int:
+        """The number of planned episodes that have no result; a cell that stopped early misses none."""
+        return self.planned - len(self.counted) if self.stopped_at is None else 0
+
+
+@dataclass(frozen=True, slots=True)
+class Results:
+    """The results of an evaluation, as its folder has them. They are read with `Results.load`, without Ray."""
+
+    out: Path  # the folder
+    cells: tuple[CellResults, ...]  # in the order of the plan
+    runs: tuple[Run, ...]
+    policies: dict[str, dict[str, Any]]  # the metadata of each policy's server, by the policy's name
+    workers: tuple[Worker, ...] = ()  # in the order of time; empty for old results
+    parts: tuple[Path, ...] = ()  # the folders, below `out`, if several were read as one (`combined`)
+
+    @classmethod
+    def load(cls, out: str | Path) -> Results:
+        """Read a folder of results.
+
+        Args:
+            out: The folder. An evaluation may be writing to it; nothing in it is changed.
+
+        Returns:
+            One consistent state of the results.
+
+        Raises:
+            ConfigError: The folder holds no results, or they are of another version, or cannot be read.
+        """
+        out = Path(out)
+        with reading(out) as db:
+            episodes: dict[str, list[Episode]] = {}
+            for row in table(db, "episodes", "seed"):
+                episodes.setdefault(row["cell"], []).append(episode_of(row))
+            attempts: dict[str, list[Attempt]] = {}
+            for row in table(db, "attempts"):
+                attempts.setdefault(row["cell"], []).append(Attempt(**row | {"retried": bool(row["retried"])}))
+            return cls(
+                out,
+                tuple(
+                    _cell(row, tuple(episodes.get(row["cell"], ())), tuple(attempts.get(row["cell"], ())))
+                    for row in table(db, "cells")
+                ),
+                tuple(_run(row) for row in table(db, "runs")),
+                {row["name"]: json.loads(row["metadata"]) for row in table(db, "policies")},
+                tuple(Worker(**row) for row in table(db, "workers")),
+            )
+
+    @property
+    def contenders(self) -> list[str]:
+        """The policy ids: policies without steps first, then the checkpoints of each policy by their step."""
+        policies = {policy: number for number, policy in enumerate(dict.fromkeys(cell.policy for cell in self.cells))}
+        ordered = sorted(self.cells, key=lambda cell: (cell.step is not None, policies[cell.policy], cell.step or 0))
+        return list(dict.fromkeys(cell.contender for cell in ordered))
+
+    def of(self, contender: str) -> list[CellResults]:
+        """The cells of one policy id, in the order of the plan."""
+        return [cell for cell in self.cells if cell.contender == contender]
+
+    def file(self, path: str) -> Path:
+        """The absolute path of an episode's file, whose path relative to `out` is `path`, whether it exists or not.
+
+        Raises:
+            ConfigError: It is outside of its folder of results, by its path or by a symbolic link.
+        """
+        home = next((one for one in self.parts if (self.out / path).is_relative_to(one)), self.out)
+        return inside(home, str((self.out / path).relative_to(home)))
+
+    def among(self, cells: Sequence[CellResults]) -> Results:
+        """The same results with these cells only."""
+        return dataclasses.replace(self, cells=tuple(cells))
+
+    def only(self, contender: str | None = None, env: str | None = None) -> Results:
+        """Select the cells of a policy or an env.
+
+        Args:
+            contender: A policy id; None for all.
+            env: The full name of an env; None for all.
+
+        Returns:
+            The same results with these cells only.
+
+        Raises:
+            ConfigError: No cell is left.
+        """
+        left = tuple(one for one in self.cells if contender in (None, one.contender) and env in (None, one.env))
+        if not left:
+            have = sorted({f"{one.contender} in {one.env}" for one in self.cells})
+            raise ConfigError(f"{self.out}: has nothing of {contender or 'any policy'} in {env or 'any env'}: {have}")
+        return dataclasses.replace(self, cells=left)
+
+
+@contextmanager
+def reading(out: Path) -> Iterator[sqlite3.Connection]:
+    """Read one consistent state of all tables in `out`, which may be written to meanwhile."""
+    if not (out / FILE).is_file():
+        raise ConfigError(f"{out}: got no {FILE} there, want a folder that an evaluation wrote its results to")
+    try:
+        with closing(read_only(out)) as db:
+            require_readable(out, db)
+            db.row_factory = sqlite3.Row
+            db.execute("BEGIN")
+            yield db
+    except sqlite3.DatabaseError as error:
+        raise ConfigError(
+            f"{out / FILE}: cannot be read ({error}); if its evaluation was killed, --resume mends it; else take a "
+            f"copy of the whole folder from where it was written"
+        ) from error
+
+
+def table(db: sqlite3.Connection, name: str, order: str = "rowid") -> Iterator[dict[str, Any]]:
+    """The rows of a table, by its columns' names; none if the file is older than the table."""
+    if db.execute("SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ?", (name,)).fetchone() is None:
+        return iter(())
+    return (dict(row) for row in db.execute(f"SELECT * FROM {name} ORDER BY {order}"))  # noqa: S608 (constants)
+
+
+def episode_of(row: dict[str, Any]) -> Episode:
+    """The episode of a row of the table; raises `ConfigError` for a path that leads out of the folder."""
+    names = {field.name for field in dataclasses.fields(EpisodeResult)}
+    known = {name: value for name, value in row.items() if name in names and name != "key"}
+    for name in ("success_once", "success_at_end"):
+        known[name] = None if known[name] is None else bool(known[name])
+    key = EpisodeKey(row["env"], row["episode"], row["seed"], row["cell"])
+    result = EpisodeResult(**known | {"key": key, "timing_ms": json.loads(row["timing_ms"])})
+    videos = tuple(require_below(path) for path in json.loads(row["videos"]))
+    trajectory = None if row["trajectory"] is None else require_below(row["trajectory"])
+    return Episode(result, videos, trajectory, row["attempts"], row["run"], row["finished"])
+
+
+def _cell(row: dict[str, Any], episodes: tuple[Episode, ...], attempts: tuple[Attempt, ...]) -> CellResults:
+    seeds, rule = json.loads(row.pop("seeds")), row.pop("stop")
+    parsed = {name: json.loads(row[name] or "{}") for name in ("settings", "described", "contract", "code")}
+    each = row["planned"] // len(seeds)
+    episodes = tuple(replace(one, beyond=not _is_planned(one.result.key, seeds, each)) for one in episodes)
+    stop, stopped_at = None, None
+    if rule is not None:
+        stop = StopConfig.model_validate_json(rule)
+        stopping = Stopping(stop, seeds, row["planned"])
+        stopping.add_all(episode.result for episode in episodes)
+        stopped_at = stopping.at
+        episodes = tuple(replace(one, beyond=one.beyond or not stopping.counts(one.result.key)) for one in episodes)
+    return CellResults(**row | parsed, episodes=episodes, attempts=attempts, stop=stop, stopped_at=stopped_at)
+
+
+def _is_planned(key: EpisodeKey, seeds: Sequence[int], each: int) -> bool:
+    """Whether an episode is still planned.
+
+    After a resumption with fewer episodes, those that happened to be played of the others would be a selection.
+    """
+    return key.episode < each and key.seed - key.episode in seeds
+
+
+def _run(row: dict[str, Any]) -> Run:
+    return Run(**row | {name: json.loads(row[name]) for name in ("config", "versions")})
+
+
+def rate_of(cells: Sequence[CellResults], what: Literal["success_once", "success_at_end"]) -> Rate:
+    """The success rate of one cell, or of several together, with bounds that hold where cells could stop early.
+
+    Cells without a common rate (`have_common_rate`) are counted, and their rate is None.
+    """
+    counts = [(sum(bool(getattr(one, what)) for one in cell.counted), len(cell.counted)) for cell in cells]
+    successes, episodes = (sum(column) for column in zip(*counts, strict=True)) if counts else (0, 0)
+    together = have_common_rate(cells)
+    if not (rules := [cell.stop for cell in cells if cell.stop is not None]):
+        return Rate(successes, episodes, pooled=together)
+    error_rate = max(rule.error_rate for rule in rules)
+    return Rate(successes, episodes, pooled(counts, error_rate), error_rate, together)
+
+
+def have_common_rate(cells: Sequence[CellResults]) -> bool:
+    """Whether the episodes of these cells may be put into one rate.
+
+    Cells that stopped after different numbers of episodes have none, as their outcomes would decide their weights, nor
+    have cells with different clocks: success in real time and success while the env waits are two questions.
+    """
+    return len({cell.stopped_at for cell in cells}) <= 1 and len(by_timing(cells)) <= 1
+
+
+SYNCHRONOUS, REAL_TIME = "synchronous", "in real time"
+
+
+def by_timing(cells: Sequence[CellResults]) -> dict[str, list[CellResults]]:
+    """Group the cells by their clock: "synchronous" first, then "in real time", or one such group for each clock."""
+    clocks: dict[str, list[CellResults]] = {}
+    for cell in sorted(cells, key=lambda cell: cell.settings.get("clock") is not None):
+        clocks.setdefault(json.dumps(cell.settings.get("clock"), sort_keys=True), []).append(cell)
+    running = [clock for clock in clocks if clock != "null"]
+    found = {}
+    for clock, members in clocks.items():
+        suites = ", ".join(dict.fromkeys(cell.suite or "the nameless suite" for cell in members))
+        name = SYNCHRONOUS if clock == "null" else REAL_TIME if len(running) == 1 else f"{REAL_TIME} ({suites})"
+        found[name] = members
+    return found
+
+
+def synchronous_twin(results: Results, cell: CellResults) -> CellResults | None:
+    """Find the synchronous counterpart of a cell in real time: the cell that differs in its clock alone.
+
+    Args:
+        results: The results that hold both.
+        cell: Any cell of them.
+
+    Returns:
+        The cell in which the env waited for the policy; None if there is none, or if `cell` is synchronous itself.
+    """
+    if cell.settings["clock"] is None:
+        return None
+    wanted = cell.settings | {"clock": None}
+    return next((other for other in results.cells if other.settings == wanted), None)

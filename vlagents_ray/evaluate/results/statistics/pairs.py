@@ -1,0 +1,145 @@
+"""Two success rates on the same episodes: their difference, its interval, and whether chance explains it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import InvalidInput
+
+ERROR_RATE = 0.05  # of the intervals
+_PSEUDO_EPISODES = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class Pairs:
+    """Numbers of episodes that both A and B played, by which of them solved the task. Two of these can be added.
+
+    Raises:
+        InvalidInput: A number is negative.
+    """
+
+    both: int = 0
+    only_a: int = 0
+    only_b: int = 0
+    neither: int = 0
+
+    def __post_init__(self) -> None:
+        if min(self.both, self.only_a, self.only_b, self.neither) < 0:
+            raise InvalidInput(f"pairs: got {self}, want no count below 0")
+
+    def __add__(self, other: Pairs) -> Pairs:
+        return Pairs(
+            self.both + other.both,
+            self.only_a + other.only_a,
+            self.only_b + other.only_b,
+            self.neither + other.neither,
+        )
+
+    @property
+    def total(self) -> int:
+        """The number of all these episodes."""
+        return self.both + self.only_a + self.only_b + self.neither
+
+    @property
+    def difference(self) -> float | None:
+        """Success rate of A minus that of B, in [-1, 1]; None without episodes."""
+        return (self.only_a - self.only_b) / self.total if self.total else None
+
+    @property
+    def p_value(self) -> float:
+        """The p-value of McNemar's exact test (`mcnemar`); 1 without episodes."""
+        return mcnemar(self.only_a, self.only_b)
+
+    def to_json(self) -> dict[str, Any]:
+        """The four numbers, with `pairs` (their sum), `difference` and `p_value`, for JSON."""
+        counts = {"both": self.both, "only_a": self.only_a, "only_b": self.only_b, "neither": self.neither}
+        return counts | {"pairs": self.total, "difference": self.difference, "p_value": self.p_value}
+
+
+def mcnemar(only_a: int, only_b: int, *, mid: bool = False) -> float:
+    """Test the hypothesis that A and B solve equally many episodes, from those that only one of them solved.
+
+    The test is exact: under the hypothesis each such episode is A's or B's with probability 1/2, whatever the tasks
+    are, so that tasks of different difficulty may be pooled. Q. McNemar, "Note on the sampling error of the difference
+    between correlated proportions or percentages", Psychometrika 12 (1947).
+
+    Args:
+        only_a: The number of episodes that A solved and B did not.
+        only_b: The number of episodes that B solved and A did not.
+        mid: Count the observed table half, which is less conservative, and no longer exact. M. W. Fagerland,
+            S. Lydersen, P. Laake, "The McNemar test for binary matched-pairs data", BMC Medical Research Methodology
+            13:91 (2013).
+
+    Returns:
+        The two-sided p-value, in (0, 1].
+
+    Raises:
+        InvalidInput: A number is negative.
+    """
+    if min(only_a, only_b) < 0:
+        raise InvalidInput(f"mcnemar: got {only_a} and {only_b} episodes, want no count below 0")
+    n = only_a + only_b
+    ways = tail = 1  # to choose k of n, and up to k of n: integers, so that nothing is lost however many episodes
+    for k in range(min(only_a, only_b)):
+        ways = ways * (n - k) // (k + 1)
+        tail += ways
+    return min(1.0, (2 * tail - ways * mid) / (1 << n))
+
+
+def difference_interval(strata: Sequence[Pairs]) -> tuple[float, float]:
+    """Compute the 95 % interval of a difference of success rates on the same episodes.
+
+    Its bounds are percentiles of a paired bootstrap: episodes are drawn again with both of their outcomes, env by env
+    (a stratum each), as an evaluation has the same number of episodes of an env however often it is repeated. B. Efron,
+    R. J. Tibshirani, "An Introduction to the Bootstrap" (1993), chapters 8 and 13.
+
+    It draws as if two more episodes had been seen, half a one of each outcome: else 20 of 20 against none, or no
+    episode that tells A from B, would give an interval of no width, which claims certainty. A. Agresti, Y. Min, "Simple
+    improved confidence intervals for comparing matched proportions", Statistics in Medicine 24 (2005).
+
+    No random generator is used: the limit of infinitely many draws is the distribution of a sum of independent steps of
+    +1, -1 and 0, whose characteristic function is a product.
+
+    Args:
+        strata: The episodes of each env.
+
+    Returns:
+        (low, high) of the success rate of A minus that of B, each in [-1, 1]; (-1, 1) without episodes.
+    """
+    n = sum(one.total for one in strata)
+    if n == 0:
+        return -1.0, 1.0
+    turns = np.exp(2j * np.pi * np.arange(2 * n + 1) / (2 * n + 1))  # (2n + 1,), one for each sum from -n to n
+    transformed = np.ones_like(turns)
+    for one in strata:
+        more = _PSEUDO_EPISODES / 4 * one.total / n  # of each outcome: as many of an env as it has of all episodes
+        a, b = ((only + more) / (one.total + 4 * more) if one.total else 0.0 for only in (one.only_a, one.only_b))
+        transformed *= (a * turns + b / turns + (1 - a - b)) ** one.total
+    chances = np.fft.fftshift(np.fft.fft(transformed).real).clip(min=0.0)  # in proportion, of -n, …, n
+    low, high = np.searchsorted(np.cumsum(chances) / chances.sum(), [ERROR_RATE / 2, 1 - ERROR_RATE / 2]) - n
+    return float(low / n), float(high / n)
+
+
+def holm(p_values: Sequence[float]) -> list[float]:
+    """Adjust p-values for their number, by Holm's method.
+
+    If every hypothesis with an adjusted p-value below 5 % is rejected, the chance that any of these rejections is wrong
+    is at most 5 %, however the tests depend on one another. S. Holm, "A simple sequentially rejective multiple test
+    procedure", Scandinavian Journal of Statistics 6 (1979).
+
+    Args:
+        p_values: One for each test, in [0, 1].
+
+    Returns:
+        The adjusted p-values, in the same order.
+    """
+    adjusted = [0.0] * len(p_values)
+    highest = 0.0
+    for rank, index in enumerate(sorted(range(len(p_values)), key=p_values.__getitem__)):
+        highest = max(highest, min(1.0, (len(p_values) - rank) * p_values[index]))
+        adjusted[index] = highest
+    return adjusted

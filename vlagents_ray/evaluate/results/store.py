@@ -1,0 +1,302 @@
+"""Writes `results.db`: the state of an evaluation in SQLite, with one transaction for each episode.
+
+A commit survives the death of the process that made it, whenever that comes; so an evaluation
+that is killed and resumed has each episode exactly once. Read it with `vlagents_ray.evaluate.results.reader`.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import sqlite3
+import time
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate.artifacts.storage import storing
+from vlagents_ray.evaluate.episode.failures import Failure
+from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, WorkerInfo
+from vlagents_ray.evaluate.plan.cases import EvalCase, cells
+from vlagents_ray.evaluate.plan.config import EvalConfig, canonical
+from vlagents_ray.evaluate.plan.jobs import Job
+from vlagents_ray.evaluate.results import database
+from vlagents_ray.evaluate.results.database import SCHEMA, VERSION, complete, insert, require_readable
+
+LOCK = "results.lock"
+IDENTITY = ("policy", "checkpoint", "weights")  # of a policy's metadata; must not change between runs
+
+
+def changed(known: dict[str, Any], now: dict[str, Any], *, swept: bool) -> str | None:
+    """The field of a policy's identity that differs between two metadata of its server; None if none does.
+
+    Older servers report no weights. In a sweep (`swept`) sessions choose their checkpoint, whatever the server's is.
+    """
+    for field in IDENTITY[:1] if swept else IDENTITY:
+        before, after = known.get(field), now.get(field)
+        if field == "weights":
+            if before and after and before["digest"] != after["digest"]:
+                return field
+        elif before != after:
+            return field
+    return None
+
+
+class Store:
+    """The results of one `out` folder, open for one evaluation at a time. Use as a context manager."""
+
+    def __init__(self, config: EvalConfig) -> None:
+        """Open or begin the results in `config.out`.
+
+        Raises:
+            ConfigError: There are results and `config.resume` is off, they have other settings, or another evaluation
+                is writing there.
+            StorageFailed: Nothing can be written there.
+        """
+        self.cells = cells(config)
+        self._out = config.out
+        with storing(config.out):
+            self._out.mkdir(parents=True, exist_ok=True)
+            self._lock = _lock(self._out)
+        self._run = 0
+        self._weights: dict[str, str | None] = {}  # by the cell that they played; read when first needed
+        self._made: set[str] = set()  # places whose env is known to be that of earlier runs
+        try:
+            with storing(config.out):
+                self._db = self._open(config)
+        except BaseException:
+            os.close(self._lock)
+            raise
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file, and release the lock."""
+        database.close(self._db)
+        os.close(self._lock)
+
+    def begin_run(self, config: EvalConfig, versions: dict[str, Any]) -> None:
+        """Record that a run over the plan begins."""
+        with self._db:
+            row = (time.time(), "running", config.model_dump_json(), canonical(versions))
+            cursor = self._db.execute("INSERT INTO runs (started, state, config, versions) VALUES (?, ?, ?, ?)", row)
+            self._run = int(cursor.lastrowid or 0)
+
+    def end_run(self, state: str) -> None:
+        """Record how the run ended."""
+        with self._db:
+            self._db.execute("UPDATE runs SET ended = ?, state = ? WHERE run = ?", (time.time(), state, self._run))
+
+    def finished(self) -> set[str]:
+        """The keys of the episodes that will not be played again."""
+        return {key for (key,) in self._db.execute("SELECT key FROM episodes WHERE status != 'infra_failed'")}
+
+    def record(
+        self, result: EpisodeResult, attempts: int, videos: Sequence[str] = (), trajectory: str | None = None
+    ) -> None:
+        """Record an episode. It replaces one that infrastructure failed; any other stays as it is.
+
+        Raises `ConfigError` if it was played by another checkpoint than the episodes of its cell before, as after a
+        swap, or by other weights of the same name: a rate is that of one checkpoint.
+        """
+        self._require_same_checkpoint(result)
+        self._require_same_weights(result)
+        row = asdict(result)
+        key = row.pop("key")
+        del key["policy_seed"]  # every episode of an evaluation has the one of its environment
+        row |= {
+            "key": str(result.key),
+            "cell": key.pop("settings"),
+            **key,
+            "timing_ms": canonical(result.timing_ms),
+            "videos": canonical(list(videos)),
+            "trajectory": trajectory,
+            "attempts": attempts,
+            "run": self._run,
+            "finished": time.time(),
+        }
+        with self._db:
+            self._db.execute("DELETE FROM episodes WHERE key = ? AND status = 'infra_failed'", (row["key"],))
+            insert(self._db, "episodes", row)
+
+    def _require_same_checkpoint(self, result: EpisodeResult) -> None:
+        known = self._db.execute(
+            "SELECT checkpoint FROM episodes WHERE cell = ? AND checkpoint IS NOT NULL LIMIT 1", (result.key.settings,)
+        ).fetchone()
+        if known is not None and result.checkpoint not in (None, known[0]):
+            raise ConfigError(
+                f"policy: {result.key} was played by checkpoint {result.checkpoint!r}, the results in {self._out} "
+                f"are of {known[0]!r}; serve that one again, or choose another out folder"
+            )
+
+    def _require_same_weights(self, result: EpisodeResult) -> None:
+        cell = result.key.settings
+        if result.weights is None:
+            return
+        if self._weights.get(cell) is None:
+            query = "SELECT weights FROM episodes WHERE cell = ? AND weights IS NOT NULL LIMIT 1"
+            row = self._db.execute(query, (cell,)).fetchone()
+            self._weights[cell] = result.weights if row is None else row[0]
+        if result.weights != self._weights[cell]:
+            raise ConfigError(
+                f"policy: {result.key} was played by other weights than the results in {self._out}: "
+                f"{result.checkpoint!r} is {result.weights} now, and was {self._weights[cell]}. Bring the old weights "
+                f"back, or choose another out folder"
+            )
+
+    def record_attempt(self, job: Job, failure: Failure, *, retried: bool) -> None:
+        """Record an attempt that infrastructure failed."""
+        where = (str(job.key), job.key.settings, job.attempt, self._run, time.time())
+        why = (failure.cause, failure.code, failure.message, failure.traceback, failure.log, retried)
+        with self._db:
+            self._db.execute("INSERT INTO attempts VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)", where + why)
+
+    def note_worker(self, where: WorkerInfo) -> None:
+        """Record a worker that has connected to a policy or made an env."""
+        with self._db:
+            insert(self._db, "workers", asdict(where) | {"run": self._run, "at": time.time()})
+
+    def note_env(self, place: str, made: EnvInfo) -> None:
+        """Record the description, contract and code of the env of the cells at `place`.
+
+        Raises `ConfigError` if description or contract differ from an earlier run, as after an update of the simulator.
+        """
+        self._require_same_env(place, made)
+        code = {} if made.code is None else made.code.to_json()
+        found = (json.dumps(made.described, default=str), canonical(made.contract), canonical(code))
+        with self._db:
+            self._db.executemany(
+                "UPDATE cells SET described = ?, contract = ?, code = ? WHERE cell = ?",
+                [(*found, cell.fingerprint) for cell in self.cells if cell.place == place],
+            )
+
+    def _require_same_env(self, place: str, made: EnvInfo) -> None:
+        if place in self._made:  # by another worker of this run; nodes may differ in what they describe
+            return
+        self._made.add(place)
+        [cell, *_] = [cell for cell in self.cells if cell.place == place]
+        query = "SELECT described, contract FROM cells WHERE cell = ? AND described IS NOT NULL"
+        known = self._db.execute(query, (cell.fingerprint,)).fetchone()
+        if known is None:
+            return
+        now = (json.loads(json.dumps(made.described, default=str)), json.loads(canonical(made.contract)))
+        for what, old, new in zip(
+            ("says of itself", "states in its contract"), map(json.loads, known), now, strict=True
+        ):
+            if odd := [
+                f"{name}: {old.get(name)!r}, now {new.get(name)!r}" for name in new if old.get(name) != new[name]
+            ]:
+                raise ConfigError(
+                    f"env {cell.env}: what it {what} has changed since the results in {self._out}: {'; '.join(odd)}; "
+                    f"go on with what they were made with, or choose another out folder"
+                )
+
+    def note_policy(self, name: str, metadata: dict[str, Any]) -> None:
+        """Record the metadata of a policy's server; raises `ConfigError` if it is another policy than before."""
+        row = self._db.execute("SELECT metadata FROM policies WHERE name = ?", (name,)).fetchone()
+        known = None if row is None else json.loads(row[0])
+        swept = any(cell.step is not None for cell in self.cells if cell.policy.name == name)
+        if known is not None and (what := changed(known, metadata, swept=swept)):
+            raise ConfigError(
+                f"policy {name!r}: the server has {what} {metadata.get(what)!r}, the results in {self._out} are of "
+                f"{known.get(what)!r}; serve that one again, or choose another out folder"
+            )
+        with self._db:
+            value = json.dumps(metadata, default=str)
+            self._db.execute("INSERT OR REPLACE INTO policies VALUES (?, ?)", (name, value))
+
+    def _open(self, config: EvalConfig) -> sqlite3.Connection:
+        db = database.writable(self._out)
+        try:
+            version = db.execute("PRAGMA user_version").fetchone()[0]
+            if version == 0:
+                db.executescript(f"BEGIN; {SCHEMA} PRAGMA user_version = {VERSION}; COMMIT;")
+            require_readable(self._out, db)
+            complete(db)
+            self._require_resumable(db, config)
+            self._note_cells(db, config)
+        except BaseException:
+            database.close(db)
+            raise
+        return db
+
+    def _require_resumable(self, db: sqlite3.Connection, config: EvalConfig) -> None:
+        runs, episodes = (db.execute(f"SELECT COUNT(*) FROM {table}").fetchone()[0] for table in ("runs", "episodes"))  # noqa: S608
+        causes = {cause for (cause,) in db.execute("SELECT DISTINCT cause FROM attempts")}
+        if not runs or (not episodes and causes == {"user"}):
+            with db:
+                for table in ("attempts", "cells", "policies", "workers", "runs"):
+                    db.execute(f"DELETE FROM {table}")  # noqa: S608 - of a plan that could not begin
+            return
+        if not config.resume:
+            raise ConfigError(
+                f"{self._out} already has results ({episodes} episodes): resume them (--resume), "
+                f"or choose another out folder"
+            )
+        found = [f"- {text}" for cell in self.cells for text in _differences(db, cell)]
+        if found:
+            raise ConfigError(
+                f"{self._out} has results of other settings:\n"
+                + "\n".join(found)
+                + "\ntake the old settings, or choose another out folder"
+            )
+
+    def _note_cells(self, db: sqlite3.Connection, config: EvalConfig) -> None:
+        stop = config.stop.model_dump_json() if config.stop else None
+        with db:
+            for cell in self.cells:
+                identity = (cell.policy.name, cell.step, cell.suite.name, cell.env)
+                extent = (cell.planned, canonical(cell.suite.seeds), stop)
+                db.execute(
+                    "INSERT INTO cells (cell, policy, step, suite, env, settings, planned, seeds, stop)"
+                    " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT DO UPDATE SET planned = ?, seeds = ?, stop = ?",
+                    (cell.fingerprint, *identity, canonical(cell.settings), *extent, *extent),
+                )
+
+
+def _differences(db: sqlite3.Connection, cell: EvalCase) -> list[str]:
+    """The settings of `cell` that differ from those in the results, a sentence each; none if the cell is new.
+
+    The first seeds must be the same: else episode 3 would be two episodes.
+    """
+    row = db.execute(
+        "SELECT settings, seeds FROM cells WHERE policy = ? AND step IS ? AND suite = ? AND env = ?",
+        (cell.policy.name, cell.step, cell.suite.name, cell.env),
+    ).fetchone()
+    if row is None:
+        return []
+    stored, seeds = map(json.loads, row)
+    differing = [(name, stored.get(name), value) for name, value in cell.settings.items() if stored.get(name) != value]
+    if any(old != new for old, new in zip(seeds, cell.suite.seeds, strict=False)):
+        differing.append(("seeds", seeds, cell.suite.seeds))
+    where = " ".join(filter(None, cell.name))
+    return [f"{where}: {name}: the results have {old!r}, now it is {new!r}" for name, old, new in differing]
+
+
+def _lock(out: Path) -> int:
+    """Open a file with a lock on `out`, which the system releases when this process ends."""
+    file = os.open(out / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        os.close(file)
+        raise ConfigError(
+            f"{out}: another evaluation is writing there; wait for it, or choose another folder"
+        ) from error
+    except OSError as error:
+        os.close(file)
+        if error.errno not in (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK):
+            raise
+        raise ConfigError(
+            f"{out}: its file system knows no locks ({error.strerror}), so that two evaluations could write to one "
+            f"folder; choose another one with --out (Lustre: have it mounted with `-o flock`)"
+        ) from error
+    return file

@@ -1,0 +1,247 @@
+"""`summary.json`: the outcome of an evaluation, its uncertainty, and its provenance."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.evaluate.artifacts.storage import whole
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.results.comparison import gap_to_synchronous
+from vlagents_ray.evaluate.results.reader import CellResults, Results, Run, by_timing, have_common_rate, rate_of
+from vlagents_ray.evaluate.results.statistics import Rate
+
+FILE = "summary.json"
+TOTAL = "total"
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Aggregates over the episodes of one cell, or of several.
+
+    Rates count an error of the policy as no success. Episodes that infrastructure failed are in no rate.
+    """
+
+    contender: str  # the policy id: its name, with "@STEP" in a sweep; or "total"
+    suite: str
+    env: str  # or "total"
+    planned: int
+    stopped: int  # cells that stopped early
+    success_once: Rate
+    success_at_end: Rate
+    policy_errors: int  # episodes that an error of the policy ended; not successes
+    infra_failures: int  # episodes that infrastructure failed; in no rate
+    retries: int  # attempts that infrastructure failed and that were repeated
+    steps: int  # actions executed in all episodes
+    mean_steps: float | None
+    mean_return: float | None  # of the sums of rewards
+    env_step_ms: float | None  # median of the episodes' medians
+    policy_ms: float | None  # median of the episodes' medians
+    policy_p95_ms: float | None  # median of the episodes' 95th percentiles
+
+    @property
+    def episodes(self) -> int:
+        """The number of finished episodes."""
+        return self.success_once.episodes
+
+    def to_json(self) -> dict[str, Any]:
+        """The fields for JSON, with `episodes`."""
+        rates = {"success_once": self.success_once.to_json(), "success_at_end": self.success_at_end.to_json()}
+        return asdict(self) | {"episodes": self.episodes} | rates
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """The outcome of an evaluation, as `evaluate` returns it; `to_json` is the content of summary.json."""
+
+    results: Results
+    cells: tuple[Group, ...]
+    totals: tuple[Group, ...]  # one for each policy id, in the order of `results.contenders`
+    wall_seconds: float  # of all runs together, the start of the workers included
+    rollout_seconds: float  # from the first reset to the last step, of all runs together
+
+    @property
+    def out(self) -> Path:
+        """The folder of the results."""
+        return self.results.out
+
+    @property
+    def state(self) -> str:
+        """The way in which the last run ended: "complete", "interrupted", "out of time", or "stopped" by an error."""
+        return self.results.runs[-1].state
+
+    @property
+    def total(self) -> Group:
+        """All episodes together."""
+        return group_of((TOTAL, "", TOTAL), self.results.cells)
+
+    def parts(self, contender: str) -> dict[str, Group]:
+        """The totals of a policy id, by the clock of their episodes (`by_timing`)."""
+        return {
+            timing: group_of((contender, "", TOTAL), cells)
+            for timing, cells in by_timing(self.results.of(contender)).items()
+        }
+
+    @property
+    def best(self) -> list[str]:
+        """The policy ids, the best first, by the mean of the success rates of their cells."""
+        rates = {
+            name: [group.success_once.rate or 0.0 for group in self.cells if group.contender == name]
+            for name in self.results.contenders
+        }
+        return sorted(rates, key=lambda name: -sum(rates[name]) / len(rates[name]))
+
+    @property
+    def quotable(self) -> list[tuple[str, list[CellResults]]]:
+        """The largest parts of each policy id's cells that have a common rate, with names that tell them apart.
+
+        Usually these are all its cells; with several clocks, those of each; and each cell by itself where cells stopped
+        after different numbers of episodes.
+        """
+        found = []
+        for contender in self.results.contenders:
+            timings = by_timing(self.results.of(contender))
+            for timing, cells in timings.items():
+                name = contender if len(timings) == 1 else f"{contender}, {timing}"
+                if have_common_rate(cells):
+                    found.append((name, cells))
+                else:
+                    found += [(f"{name}, {' '.join(filter(None, (cell.suite, cell.env)))}", [cell]) for cell in cells]
+        return found
+
+    @property
+    def transports(self) -> list[str]:
+        """The transports by which observations reached the policies."""
+        return sorted({result.transport for cell in self.results.cells for result in cell.counted})
+
+    @property
+    def steps_per_second(self) -> float | None:
+        """Env steps of all workers together per second of `wall_seconds`; None if no time has passed."""
+        return self.total.steps / self.wall_seconds if self.wall_seconds else None
+
+    @property
+    def rollout_steps_per_second(self) -> float | None:
+        """Env steps of all workers together per second of `rollout_seconds`; None if no time has passed."""
+        return self.total.steps / self.rollout_seconds if self.rollout_seconds else None
+
+    def to_json(self) -> dict[str, Any]:
+        """The content of summary.json."""
+        cells = [
+            group.to_json()
+            | {"checkpoint": checkpoint_of(cell), "weights": weights_of(cell), "pushed_weights": pushed_of(cell)}
+            | {"settings": cell.settings, "env": cell.env}
+            | {"described": cell.described, "contract": cell.contract, "code": cell.code}
+            | {"stopped_at": cell.stopped_at, "gap_to_synchronous": gap_to_synchronous(self.results, cell)}
+            for group, cell in zip(self.cells, self.results.cells, strict=True)
+        ]  # fmt: skip
+        last = self.results.runs[-1]
+        return {
+            "state": self.state,
+            "cells": cells,
+            "totals": [group.to_json() for group in self.totals],
+            "wall_seconds": self.wall_seconds,
+            "rollout_seconds": self.rollout_seconds,
+            "steps_per_second": self.steps_per_second,
+            "rollout_steps_per_second": self.rollout_steps_per_second,
+            "transports": self.transports,
+            "policies": self.results.policies,
+            "versions": last.versions,
+            "config": last.config,
+        }
+
+
+def summarize(results: Results) -> Summary:
+    """Aggregate results, those of earlier runs included."""
+    return Summary(
+        results,
+        tuple(group_of((cell.contender, cell.suite, cell.env), [cell]) for cell in results.cells),
+        tuple(group_of((name, "", TOTAL), results.of(name)) for name in results.contenders),
+        wall_seconds=sum(_wall_seconds(results, run) for run in results.runs),
+        rollout_seconds=sum(_rollout_seconds(results, run) for run in results.runs),
+    )
+
+
+def checkpoint_of(cell: CellResults) -> str | None:
+    """The checkpoint that the episodes of a cell were played by; None if no reset named one."""
+    return next((one.checkpoint for one in cell.counted if one.checkpoint is not None), None)
+
+
+def weights_of(cell: CellResults) -> str | None:
+    """The digest of the weights that the episodes of a cell were played by; None if no server reported it."""
+    return next((one.weights for one in cell.counted if one.weights is not None), None)
+
+
+def pushed_of(cell: CellResults) -> str | None:
+    """The pushed weights that the episodes of a cell were played by, in words; None if the checkpoint's alone acted.
+
+    The rate of a cell that was played by several versions is that of no one of them.
+    """
+    named = {one.policy_version: one.policy_fingerprint for one in cell.counted if one.policy_version is not None}
+    numbers = {one.first_policy_version for one in cell.counted if one.first_policy_version is not None} | named.keys()
+    if not any(numbers):
+        return None
+    first, last = min(numbers), max(numbers)
+    return f"version {last} ({named[last]})" if first == last else f"versions {first} to {last}, one after the other"
+
+
+def write_summary(summary: Summary) -> Path:
+    """Write `summary.json`, whole or not at all."""
+    path = summary.out / FILE
+    with whole(path) as part:
+        part.write_text(json.dumps(summary.to_json(), indent=2) + "\n")
+    return path
+
+
+def group_of(name: tuple[str, str, str], cells: Sequence[CellResults]) -> Group:
+    """Aggregate these cells under the name (policy id, suite, env)."""
+    finished: list[EpisodeResult] = [result for cell in cells for result in cell.counted]
+    return Group(
+        *name,
+        planned=sum(cell.planned for cell in cells),
+        stopped=sum(cell.stopped_at is not None for cell in cells),
+        success_once=rate_of(cells, "success_once"),
+        success_at_end=rate_of(cells, "success_at_end"),
+        policy_errors=sum(one.status == "policy_error" for one in finished),
+        infra_failures=sum(
+            one.result.status == "infra_failed" and not one.beyond for cell in cells for one in cell.episodes
+        ),
+        retries=sum(attempt.retried for cell in cells for attempt in cell.attempts),
+        steps=sum(one.steps for one in finished),
+        mean_steps=_mean([one.steps for one in finished]),
+        mean_return=_mean([one.episode_return for one in finished]),
+        env_step_ms=_median([one.env_step_ms for one in finished]),
+        policy_ms=_median([one.policy_ms for one in finished]),
+        policy_p95_ms=_median([one.policy_p95_ms for one in finished]),
+    )
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return float(np.mean(values)) if values else None
+
+
+def _median(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.median(known)) if known else None
+
+
+def _wall_seconds(results: Results, run: Run) -> float:
+    """The duration of a run; of one that was killed, until its last episode."""
+    if run.ended is not None:
+        return run.ended - run.started
+    return max((finished for finished, _ in _played(results, run)), default=run.started) - run.started
+
+
+def _rollout_seconds(results: Results, run: Run) -> float:
+    played = _played(results, run)
+    return max(finished for finished, _ in played) - min(begun for _, begun in played) if played else 0.0
+
+
+def _played(results: Results, run: Run) -> list[tuple[float, float]]:
+    """When each episode of a run ended and began, in seconds since 1970."""
+    mine = [one for cell in results.cells for one in cell.episodes if one.run == run.run]
+    return [(one.finished, one.finished - one.result.seconds) for one in mine]

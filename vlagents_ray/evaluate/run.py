@@ -1,0 +1,269 @@
+"""Runs an evaluation: dispatch, retries, recording, and a clean stop."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+from collections import Counter
+from collections.abc import Callable
+
+from vlagents_ray.errors import StorageFailed, from_code
+from vlagents_ray.evaluate.artifacts.provenance import (
+    driver_code,
+    policy_code,
+    save_diffs,
+    versions,
+)
+from vlagents_ray.evaluate.artifacts.recorder import Artifacts, save
+from vlagents_ray.evaluate.artifacts.storage import storing
+from vlagents_ray.evaluate.deadline import Deadline
+from vlagents_ray.evaluate.episode.failures import Failure
+from vlagents_ray.evaluate.episode.records import EpisodeResult, WorkerInfo
+from vlagents_ray.evaluate.plan.cases import EvalCase, require_envs
+from vlagents_ray.evaluate.plan.config import EvalConfig
+from vlagents_ray.evaluate.plan.jobs import Job, JobQueue, plan
+from vlagents_ray.evaluate.report.html import FILE as REPORT
+from vlagents_ray.evaluate.report.html import write_report
+from vlagents_ray.evaluate.report.progress import Progress, SilentProgress
+from vlagents_ray.evaluate.results.reader import Results, rate_of
+from vlagents_ray.evaluate.results.stopping import Stopping
+from vlagents_ray.evaluate.results.store import Store
+from vlagents_ray.evaluate.results.summary import Summary, summarize, write_summary
+from vlagents_ray.evaluate.trackers import TrackerFeed
+from vlagents_ray.evaluate.workers.agents import AgentFactory, agents
+from vlagents_ray.evaluate.workers.cluster import ray_cluster, unused_gpus
+from vlagents_ray.evaluate.workers.dispatch import FailedAttempts, dispatch
+from vlagents_ray.evaluate.workers.pool import WorkerPool
+from vlagents_ray.evaluate.workers.rollout import Report
+from vlagents_ray.interface import Agent
+from vlagents_ray.ray_tools.signals import stop_signals
+
+log = logging.getLogger(__name__)
+
+POLL_S = 0.25  # how soon a signal is noticed
+
+
+class EvaluationInterrupted(KeyboardInterrupt):
+    """Ctrl-C or SIGTERM ended the evaluation. Finished episodes are kept, and `resume` goes on from there.
+
+    Attributes:
+        summary: The summary of what is finished.
+    """
+
+    why = "interrupted"
+
+    def __init__(self, summary: Summary) -> None:
+        done, planned = summary.total.episodes, summary.total.planned
+        super().__init__(f"{self.why} after {done} of {planned} episodes; go on with --resume --out {summary.out}")
+        self.summary = summary
+
+
+class OutOfTime(EvaluationInterrupted):
+    """No further episode would have ended by `end_at`; `resume` goes on, as after an interruption."""
+
+    why = "out of time"
+
+
+def evaluate(
+    config: EvalConfig,
+    *,
+    agent_factory: Callable[[], Agent] | None = None,
+    progress: Progress | None = None,
+    only: tuple[int, int] | None = None,
+    end_at: float | None = None,
+) -> Summary:
+    """Play every episode of `config` that has no result yet, and write the results to `config.out`.
+
+    Episodes run in Ray actors: in the cluster that this process is connected to, or else in one
+    that `RAY_ADDRESS` names, or in a local one started for the length of the run. Each worker talks to
+    the policy at its `url`, or to an agent of its own that `agent_factory` makes there. Whatever is raised, each
+    recorded episode is kept, and summary.json and report.html are written if the disk has room.
+
+    Args:
+        config: The policies, the envs, and the folder of results.
+        agent_factory: Called in each worker to make its agent, in place of a connection to the policy's `url`.
+        progress: Shows how far the evaluation is (`progress_for`); by default nothing is shown.
+        only: (number, seed) of the one episode of each env that is played; by default all are.
+        end_at: A time in seconds since 1970. No episode begins that would not end by then, judged by earlier ones.
+
+    Returns:
+        The summary of all results in `config.out`, those of earlier runs included.
+
+    Raises:
+        ConfigError: The settings are invalid, or contradict the results in `config.out`.
+        ContractMismatch: A policy and an env do not fit together.
+        StorageFailed: The disk is full, or cannot be written to.
+        EvaluationInterrupted: Ctrl-C or SIGTERM; `OutOfTime`, which is one, if `end_at` left episodes over.
+        VLAgentsError: The last infrastructure error, after `config.abort_after` lost episodes in a row.
+    """
+    factory = agents(config, agent_factory)
+    tracking = TrackerFeed(config)
+    require_envs(config)
+    with Store(config) as store:
+        with storing(config.out):
+            store.begin_run(config, versions())
+            save_diffs(config.out, driver_code().values())
+        try:
+            with tracking:
+                run = _Run(config, store, progress or SilentProgress(), tracking, only, end_at)
+                state, summary = run.play(factory)
+        except BaseException:
+            with contextlib.suppress(StorageFailed):  # of the same disk, it may be: what went wrong first is told
+                _conclude(config, store, "stopped")
+            raise
+    for stopped in (EvaluationInterrupted, OutOfTime):
+        if state == stopped.why:
+            raise stopped(summary)
+    return summary
+
+
+def _conclude(config: EvalConfig, store: Store, state: str) -> Summary:
+    """Note how the run ended, and write what it came to."""
+    with storing(config.out):
+        store.end_run(state)
+        summary = summarize(Results.load(config.out))
+        write_summary(summary)
+        write_report(summary.results, config.out / REPORT)
+    return summary
+
+
+def check(config: EvalConfig) -> None:
+    """Check the settings as `evaluate` does, before a policy is served for it.
+
+    Raises:
+        ConfigError: An env is not registered or not installed, or the settings contradict the results in `config.out`.
+    """
+    require_envs(config)
+    Store(config).close()
+
+
+class _Run:
+    """The driver's side of one run."""
+
+    def __init__(
+        self,
+        config: EvalConfig,
+        store: Store,
+        progress: Progress,
+        tracking: TrackerFeed,
+        only: tuple[int, int] | None,
+        end_at: float | None,
+    ) -> None:
+        self._config = config
+        self._store = store
+        self._progress = progress
+        self._tracking = tracking
+        self._attempts = FailedAttempts(config)
+        self._checked_gpus = False  # when an env first drew
+        earlier = {cell.cell: cell for cell in Results.load(config.out).cells}
+        self._recorded = {cell: rate_of([results], "success_once") for cell, results in earlier.items()}
+        self._stopping: dict[str, Stopping] = {}
+        if config.stop is not None:
+            for cell in store.cells:
+                stopping = Stopping(config.stop, cell.suite.seeds, cell.planned)
+                stopping.add_all(episode.result for episode in earlier[cell.fingerprint].episodes)
+                self._stopping[cell.fingerprint] = stopping
+        finished = store.finished()
+        wanted = [job for job in plan(store.cells) if only in (None, (job.key.episode, job.key.seed))]
+        pending = [job for job in wanted if str(job.key) not in finished and not self._has_stopped(job)]
+        self._queue = JobQueue(pending)
+        self._left = Counter(job.key.settings for job in pending)  # by cell
+        played = (one.result.seconds for cell in earlier.values() for one in cell.episodes)
+        self._deadline = Deadline(end_at, played)
+
+    def play(self, factory: AgentFactory) -> tuple[str, Summary]:
+        """Play all that is queued, until a signal or the deadline ends it early; returns the run's state and summary.
+
+        The summary is written before Ray is left: when a job is cancelled, its Ray is stopped at the same time and
+        answers nobody, and Slurm kills the job a few seconds later.
+        """
+        if not len(self._queue):
+            return "complete", _conclude(self._config, self._store, "complete")
+        with ray_cluster(self._config), stop_signals() as stop:
+            self._progress.begin(self._store.cells, self._recorded, len(self._queue))
+            try:
+                with WorkerPool(self._config, factory) as pool:
+                    while not stop.is_set() and not self._deadline.is_over and self._has_more(pool):
+                        self._poll_pool(pool)
+                    state = OutOfTime.why if len(self._queue) or pool.busy else "complete"
+                    if not stop.is_set():
+                        pool.close()
+                    if stop.is_set():
+                        state = EvaluationInterrupted.why
+                    return state, _conclude(self._config, self._store, state)
+            finally:
+                self._progress.end()
+
+    def _has_more(self, pool: WorkerPool) -> bool:
+        return pool.busy or (len(self._queue) > 0 and self._deadline.leaves_room)
+
+    def _poll_pool(self, pool: WorkerPool) -> None:
+        if self._deadline.leaves_room:
+            dispatch(pool, self._queue, self._deadline.begin)
+        for job, report in pool.wait(POLL_S):
+            self._deadline.end(job)
+            with storing(self._config.out):
+                self._handle(job, report)
+
+    def _handle(self, job: Job, report: Report) -> None:
+        if report.policy is not None:
+            self._store.note_policy(job.cell.policy.name, report.policy)
+            save_diffs(self._config.out, [policy_code(report.policy)])
+        if report.env is not None:
+            self._store.note_env(job.cell.place, report.env)
+            save_diffs(self._config.out, [report.env.code])
+        if report.worker is not None:
+            self._note_worker(job.cell, report.worker)
+        if report.failure is not None:
+            self._failed(job, report.failure)
+        elif report.result is not None:
+            self._attempts.note_played()
+            self._record(job, report.result, report.artifacts)
+
+    def _note_worker(self, cell: EvalCase, worker: WorkerInfo) -> None:
+        self._store.note_worker(worker)
+        if worker.renderer is not None and not self._checked_gpus:
+            self._checked_gpus = True
+            if (hint := unused_gpus(cell, worker)) is not None:
+                log.warning(hint)
+
+    def _failed(self, job: Job, failure: Failure) -> None:
+        beyond = self._has_stopped(job)  # nobody waits for it
+        retried = self._attempts.repeats(job, failure) and not beyond
+        self._store.record_attempt(job, failure, retried=retried)
+        if failure.cause == "user":
+            raise from_code(failure.code, failure.message)
+        if retried:
+            self._queue.put_back(job.again())
+            self._progress.retry(job, failure)
+            return
+        if beyond:
+            return
+        lost = EpisodeResult(job.key, "infra_failed", error=f"{failure.code}: {failure.message}")
+        self._record(job, lost, Artifacts())
+        self._attempts.note_lost(failure, "resume when this is mended (--resume)")
+
+    def _record(self, job: Job, result: EpisodeResult, kept: Artifacts) -> None:
+        # Files first: a crash in between repeats the episode, and they are overwritten.
+        videos, trajectory = save(self._config.out, job.cell, result, kept)
+        self._store.record(result, job.attempt, videos, trajectory)
+        self._progress.episode(job.cell, result)
+        self._left[job.key.settings] -= 1
+        self._stop_if_certain(job, result)
+        if not self._left[job.key.settings]:
+            self._tracking.update()
+
+    def _has_stopped(self, job: Job) -> bool:
+        stopping = self._stopping.get(job.cell.fingerprint)
+        return stopping is not None and stopping.at is not None
+
+    def _stop_if_certain(self, job: Job, result: EpisodeResult) -> None:
+        """Leave out what waits of the cell once its outcomes are enough; what is being played is played to its end."""
+        stopping = self._stopping.get(job.cell.fingerprint)
+        if stopping is None or self._has_stopped(job):
+            return
+        stopping.add(result)
+        if stopping.at is not None:
+            dropped = self._queue.drop(job.cell.fingerprint)
+            self._left[job.key.settings] -= dropped
+            self._progress.stopped(job.cell, stopping.at, dropped)

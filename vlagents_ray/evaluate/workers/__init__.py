@@ -1,0 +1,1 @@
+"""The rollout workers: Ray actors that play episodes."""

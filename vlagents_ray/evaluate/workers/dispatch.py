@@ -1,0 +1,49 @@
+"""Jobs for the workers of a pool, and what follows from an attempt that failed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from vlagents_ray.errors import from_code
+from vlagents_ray.evaluate.episode.failures import Failure
+from vlagents_ray.evaluate.plan.config import EvalConfig
+from vlagents_ray.evaluate.plan.jobs import Job, JobQueue
+from vlagents_ray.evaluate.workers.pool import WorkerPool
+
+
+def dispatch(pool: WorkerPool, queue: JobQueue, begin: Callable[[tuple[Job, ...]], None] = lambda _jobs: None) -> None:
+    """Hand waiting jobs to idle workers, and start workers while more are needed; `begin` is called with the jobs."""
+    for worker in pool.idle():
+        if jobs := queue.take(worker.kind, worker.env_place, pool.working()):
+            begin(jobs)
+            pool.dispatch(worker, jobs)
+    while (cell := queue.needs_worker(pool.kinds(), pool.unoccupied())) is not None and pool.free_slot():
+        pool.start(cell)
+
+
+class FailedAttempts:
+    """Decides whether an attempt is repeated, and when too many episodes in a row were lost."""
+
+    def __init__(self, config: EvalConfig) -> None:
+        self._config = config
+        self._lost = 0  # episodes in a row
+
+    def repeats(self, job: Job, failure: Failure) -> bool:
+        """Whether the episode of a failed attempt is to be played again."""
+        return failure.cause != "user" and job.attempt <= self._config.retries
+
+    def note_played(self) -> None:
+        """Note that an episode was played to its end."""
+        self._lost = 0
+
+    def note_lost(self, failure: Failure, cure: str) -> None:
+        """Note that an episode was lost, its last attempt to `failure`.
+
+        Raises:
+            VLAgentsError: The failure, if too many episodes in a row were lost; the message ends with the `cure`.
+        """
+        self._lost += 1
+        if self._lost == self._config.abort_after:
+            raise from_code(
+                failure.code, f"{self._lost} episodes in a row lost to infrastructure; {cure}: {failure.message}"
+            )

@@ -1,0 +1,261 @@
+"""The worker pool: Ray actors that play episodes, and that are killed when they hang. It does not handle results."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import replace
+from time import monotonic
+from typing import Any
+
+import ray
+from ray.exceptions import RayActorError, RayError
+
+from vlagents_ray.client.credentials import Credentials
+from vlagents_ray.errors import ClusterLost, EnvFailed
+from vlagents_ray.evaluate.artifacts.recorder import RecorderFactory, Recording
+from vlagents_ray.evaluate.episode.episode import Phase
+from vlagents_ray.evaluate.episode.failures import Failure
+from vlagents_ray.evaluate.plan.cases import EvalCase
+from vlagents_ray.evaluate.plan.config import EvalConfig
+from vlagents_ray.evaluate.plan.jobs import Job
+from vlagents_ray.evaluate.workers.agents import AgentFactory
+from vlagents_ray.evaluate.workers.cluster import runtime_env
+from vlagents_ray.evaluate.workers.logs import tail_at
+from vlagents_ray.evaluate.workers.placement import CapacityMonitor, Placement, strategy
+from vlagents_ray.evaluate.workers.rollout import Heartbeat, Report, Rollout
+from vlagents_ray.evaluate.workers.worker import PhaseTimeouts, WorkerHandle
+from vlagents_ray.ray_tools.head_monitor import HeadMonitor
+
+log = logging.getLogger(__name__)
+
+KILL_S = 3.0  # s for Ray to register that workers are to be killed
+CLOSE_S = 10.0  # s for workers to close their simulators when they end
+MOST_FAILED_STARTS = 3  # in a row; workers that fail together, as with their node, count as one
+UNREACHABLE_S = 60.0  # s for which a host is not asked again after it did not return a lost worker's logs
+
+
+class WorkerPool:
+    """Up to `config.workers` workers. Use it as a context manager: its end kills every worker.
+
+    While the head of the cluster does not answer, the existing workers play on, and no others are started.
+    """
+
+    def __init__(
+        self, config: EvalConfig, agent_factory: AgentFactory, recorder_factory: RecorderFactory = Recording
+    ) -> None:
+        self._config = config
+        self._recorder_factory = recorder_factory
+        self._actor_class = ray.remote(concurrency_groups={"watch": 1})(Rollout)
+        self._agent_factory = agent_factory
+        # from this process's environment, which workers on other nodes do not inherit
+        self._credentials = Credentials()
+        self._head = HeadMonitor("what was played is kept: go on with --resume when there is a cluster again")
+        self._placement = Placement()
+        self._failed_starts = 0
+        self._failed_start = 0.0  # time of the last one
+        self._unreachable: dict[str, float] = {}  # by host that does not answer: until when it is not asked
+        self._capacity = CapacityMonitor(config)
+        self._limits = PhaseTimeouts(config)
+        self._workers: list[WorkerHandle] = []
+        self._leaving: list[tuple[Any, float]] = []  # actors that are ending, and since when
+
+    def __enter__(self) -> WorkerPool:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is ClusterLost:  # nothing can kill them; Ray ends them, too, when the head is gone
+            return
+        actors = [worker.actor for worker in self._workers] + [actor for actor, _ in self._leaving]
+        # A Ray cluster that is being stopped, for instance with its job, does not answer; the results must still be
+        # kept.
+        killing = threading.Thread(target=_kill, args=(actors,), daemon=True)
+        killing.start()
+        killing.join(KILL_S)
+        self._workers.clear()
+        self._leaving.clear()
+
+    @property
+    def busy(self) -> bool:
+        """Whether an episode is being played."""
+        return any(worker.jobs for worker in self._workers)
+
+    def working(self) -> Counter[str]:
+        """Return the number of busy workers by place."""
+        return Counter(worker.jobs[0].cell.place for worker in self._workers if worker.jobs)
+
+    def kinds(self) -> Counter[str]:
+        """Return the number of workers by kind."""
+        return Counter(worker.kind for worker in self._workers)
+
+    def unoccupied(self) -> Counter[str]:
+        """Return the number of workers without jobs by kind; some may still be starting."""
+        return Counter(worker.kind for worker in self._workers if not worker.jobs)
+
+    def idle(self) -> list[WorkerHandle]:
+        """Return the workers that can take a job."""
+        return [worker for worker in self._workers if worker.starting is None and not worker.jobs]
+
+    def free_slot(self) -> bool:
+        """Return whether one more worker may start; ends an idle one if there is no room."""
+        if not self._head.answers():
+            return False
+        if len(self._workers) < self._config.workers:
+            return True
+        idle = self.idle()
+        if not idle:
+            return False
+        self._workers.remove(idle[0])
+        idle[0].actor.close.remote()  # frees its simulator; some need that for a clean exit
+        idle[0].actor.__ray_terminate__.remote()
+        self._leaving.append((idle[0].actor, monotonic()))
+        return True
+
+    def start(self, cell: EvalCase) -> None:
+        """Start one more worker that can play `cell`, close to its policy if there is room."""
+        node = self._placement.node(cell.policy.url, Counter(worker.node for worker in self._workers))
+        options = {
+            "num_cpus": cell.worker.cpus,
+            "num_gpus": cell.worker.gpus,
+            "max_restarts": 0,
+            "scheduling_strategy": strategy(node),
+            "runtime_env": runtime_env(cell),
+        }
+        actor = self._actor_class.options(**options).remote(self._config, self._agent_factory, self._recorder_factory)
+        starting, now = actor.ready.remote(self._credentials), monotonic()
+        self._workers.append(WorkerHandle(cell.worker, cell.kind, actor, starting=starting, started_at=now, node=node))
+
+    def dispatch(self, worker: WorkerHandle, jobs: tuple[Job, ...]) -> None:
+        """Let `worker` play `jobs`, side by side."""
+        phase: Phase = "env reset" if worker.env_place == jobs[0].cell.place else "make"
+        worker.jobs = jobs
+        worker.heartbeat, worker.heartbeat_at = Heartbeat(phase, 0.0, 0), monotonic()
+        worker.queried_at, worker.query = monotonic(), None
+        worker.running = worker.actor.run.remote(jobs)
+
+    def wait(self, timeout_s: float) -> Iterator[tuple[Job, Report]]:
+        """Yield the reports that arrive within `timeout_s`, including those of workers that died or hung.
+
+        Such a worker is killed, as is one that reports that its simulator broke.
+
+        Raises:
+            ClusterLost: The head of the cluster has not answered for long.
+        """
+        self._head.answers()
+        refs = {ref: worker for worker in self._workers for ref in worker.refs}
+        if refs:
+            done, waiting = ray.wait(list(refs), num_returns=1, timeout=timeout_s)
+            # take all that have arrived: each pass looks at every worker, so it must not serve only one
+            if done and waiting:
+                done += ray.wait(waiting, num_returns=len(waiting), timeout=0)[0]
+            for ref in done:
+                yield from self._handle_answer(refs[ref], ref)
+        yield from self._check_workers()
+
+    def close(self) -> None:
+        """Let idle workers close their simulators, which some need for a clean exit."""
+        closing = {worker.actor.close.remote(): worker for worker in self.idle()}
+        if not closing:
+            return
+        done, late = ray.wait(list(closing), num_returns=len(closing), timeout=CLOSE_S)
+        for ref in done:
+            try:
+                ray.get(ref)
+            except RayError as error:
+                log.warning("a worker did not close its env: %s", error)
+        if late:
+            log.warning("%d workers did not close their envs within %g s", len(late), CLOSE_S)
+
+    def _kill_worker(self, worker: WorkerHandle) -> None:
+        self._workers.remove(worker)
+        ray.kill(worker.actor)
+
+    def _handle_answer(self, worker: WorkerHandle, ref: Any) -> Iterator[tuple[Job, Report]]:
+        if ref == worker.starting:
+            self._started(worker)
+        elif ref == worker.query:
+            worker.query = None
+            try:
+                worker.heartbeat, worker.heartbeat_at = ray.get(ref), monotonic()
+            except RayError as error:  # the result of its job reports the same error
+                log.debug("a worker did not answer: %s", error)
+        elif worker.jobs:
+            jobs, worker.jobs, worker.running = worker.jobs, (), None
+            try:
+                reports: list[Report] = ray.get(ref)
+            except RayError as error:
+                what = "died" if isinstance(error, RayActorError) else "failed"
+                reason = f"the worker on {worker.process['host']} {what}: {error}"
+                reports = [Report(failure=Failure("worker", EnvFailed.code, reason))] * len(jobs)
+            if reports[0].env is not None:
+                worker.env_place = jobs[0].cell.place
+            broken = [one.failure for one in reports if one.failure is not None and one.failure.cause == "worker"]
+            if broken:
+                self._kill_worker(worker)
+                with_log = self._with_log(broken[0], worker)
+                reports = [replace(one, failure=with_log) if one.failure in broken else one for one in reports]
+            yield from zip(jobs, reports, strict=True)
+
+    def _started(self, worker: WorkerHandle) -> None:
+        try:
+            worker.process = ray.get(worker.starting)
+        except RayError as error:
+            if worker.started_at > self._failed_start:
+                self._failed_starts, self._failed_start = self._failed_starts + 1, monotonic()
+            if self._failed_starts >= MOST_FAILED_STARTS:
+                raise EnvFailed(f"workers do not start, {self._failed_starts} in a row: {error}") from error
+            self._kill_worker(worker)
+        else:
+            log.info("worker %s", worker.process)
+            self._failed_starts = 0
+            self._capacity.note_started()
+            worker.starting = None
+            worker.node = worker.process["node"]
+
+    def _check_workers(self) -> Iterator[tuple[Job, Report]]:
+        now = monotonic()
+        if self.busy:
+            self._capacity.note_playing()
+        self._reap_leaving(now)
+        for worker in list(self._workers):
+            if worker.starting is not None:
+                if self._capacity.timed_out(worker.started_at) and self._head.answers():
+                    self._capacity.report_shortage(worker.config, sum(one.starting is None for one in self._workers))
+            elif worker.jobs:
+                reason = self._limits.overdue(worker, now)
+                if reason is not None:
+                    self._kill_worker(worker)
+                    failure = self._with_log(Failure("worker", EnvFailed.code, reason, worker.heartbeat.stack), worker)
+                    yield from ((job, Report(failure=failure)) for job in worker.jobs)
+                elif worker.query_is_due(now):
+                    worker.queried_at = now
+                    worker.query = worker.actor.progress.options(concurrency_group="watch").remote()
+
+    def _reap_leaving(self, now: float) -> None:
+        """Kill workers that do not end by themselves: they hold resources that their successors wait for."""
+        for actor, since in self._leaving:
+            if now - since > CLOSE_S:
+                ray.kill(actor)
+        self._leaving = [one for one in self._leaving if now - one[1] <= CLOSE_S]
+
+    def _with_log(self, failure: Failure, worker: WorkerHandle) -> Failure:
+        """Add the worker's log to the failure; a lost node is waited for once only, however many workers it had."""
+        host: str = worker.process["host"]
+        if monotonic() < self._unreachable.get(host, 0.0) or not self._head.answers():
+            return failure
+        try:
+            return replace(failure, log=tail_at(host, worker.process["logs"]))
+        except TimeoutError:
+            self._unreachable[host] = monotonic() + UNREACHABLE_S
+            return failure
+
+
+def _kill(actors: list[Any]) -> None:
+    for actor in actors:
+        if not ray.is_initialized():  # `__exit__` has stopped waiting; a call to Ray now would start another cluster
+            return
+        with contextlib.suppress(RayError):  # it ends with this process in any case
+            ray.kill(actor)

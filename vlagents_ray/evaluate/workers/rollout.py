@@ -1,0 +1,264 @@
+"""The code of a worker process: an environment or a batch of them, an agent, and one episode after another.
+
+`Rollout` is plain Python; `vlagents_ray.evaluate.workers.pool` makes a Ray actor of it. It reports the failures of an
+episode instead of raising them, so that no exception has to survive pickling.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import socket
+import sys
+import threading
+import traceback
+from dataclasses import dataclass, field, replace
+from time import monotonic, sleep
+from typing import Any
+
+from vlagents_ray.client import RemoteAgent
+from vlagents_ray.client.credentials import Credentials
+from vlagents_ray.client.transports.local.plasma import this_node
+from vlagents_ray.contract import require_match
+from vlagents_ray.envs import make_env
+from vlagents_ray.envs.batch import BatchEnv, SequentialBatch, make_batch
+from vlagents_ray.envs.rendering.graphics import require_own
+from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, VLAgentsError
+from vlagents_ray.evaluate.artifacts.recorder import Artifacts, EpisodeRecorder, RecorderFactory, Recording
+from vlagents_ray.evaluate.episode.episode import Outcome, Phase, run_episodes, transport_of
+from vlagents_ray.evaluate.episode.failures import Failure, env_side, explain, policy_side
+from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, WorkerInfo
+from vlagents_ray.evaluate.plan.cases import EvalCase
+from vlagents_ray.evaluate.plan.config import EvalConfig, PolicyConfig
+from vlagents_ray.evaluate.plan.jobs import Job
+from vlagents_ray.evaluate.workers.agents import AgentFactory
+from vlagents_ray.evaluate.workers.logs import own_logs
+from vlagents_ray.interface import Agent
+from vlagents_ray.protocol.json_messages import plain_values
+from vlagents_ray.ray_tools.git_state import GitState, code_of
+from vlagents_ray.registry import env_class
+
+log = logging.getLogger(__name__)
+
+FIRST_WAIT_S = 0.5  # s before the next attempt to reach a policy, doubled each time
+LONGEST_WAIT_S = 10.0
+LONG_S = 1.0  # s in one phase, after which a query also reports the stack
+
+
+@dataclass(frozen=True, slots=True)
+class Report:
+    """A worker's answer to a job: a result or a failure."""
+
+    result: EpisodeResult | None = None
+    failure: Failure | None = None
+    artifacts: Artifacts = field(default_factory=Artifacts)
+    env: EnvInfo | None = None  # if an environment was made for the job
+    policy: dict[str, Any] | None = None  # metadata of the policy ({} for a local one), if the connection is new
+    worker: WorkerInfo | None = None  # if `env` or `policy` is new
+
+
+@dataclass(slots=True)
+class _Setup:
+    """The findings of a worker before an episode, whatever its outcome."""
+
+    env: EnvInfo | None = None
+    policy: dict[str, Any] | None = None
+    worker: WorkerInfo | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Heartbeat:
+    """A worker's current phase, and how long it has lasted."""
+
+    phase: Phase
+    age_s: float
+    steps: int
+    stack: str = ""  # the stack, if the phase has lasted for long
+
+
+class Rollout:
+    """Plays jobs. Keeps its agent and its environment until a job needs another."""
+
+    def __init__(
+        self, config: EvalConfig, agent_factory: AgentFactory, recorder_factory: RecorderFactory = Recording
+    ) -> None:
+        self._config = config
+        self._agent_factory = agent_factory
+        self._recorder_factory = recorder_factory
+        self._agent: Agent | None = None
+        self._policy: str | None = None  # the policy of the agent
+        self._broken_agents = 0  # in a row
+        self._sessions: list[Agent] = []  # further sessions of the agent, for episodes side by side
+        self._env: BatchEnv | None = None
+        self._place: str | None = None  # the place of the environment
+        self._thread = 0  # id of the thread that plays
+        self._current_phase: tuple[Phase, float, int] = ("idle", monotonic(), 0)
+
+    def ready(self, credentials: Credentials) -> dict[str, Any]:
+        """Return the process's host and id, and its log files, as soon as it runs.
+
+        The driver's API key is passed by this call, which goes straight to this process: the cluster's head stores the
+        arguments of an actor's constructor, and logs its runtime environment.
+        """
+        credentials.become_default()
+        return {"pid": os.getpid(), "host": socket.gethostname(), "node": this_node(), "logs": own_logs()}
+
+    def progress(self) -> Heartbeat:
+        """Return the current phase; called from another thread during `run`."""
+        phase, since, steps = self._current_phase
+        age_s = monotonic() - since
+        frame = sys._current_frames().get(self._thread) if age_s > LONG_S else None
+        return Heartbeat(phase, age_s, steps, "".join(traceback.format_stack(frame)) if frame else "")
+
+    def run(self, jobs: tuple[Job, ...]) -> list[Report]:
+        """Play the episodes of one cell, side by side if there are several; return a report for each."""
+        self._thread = threading.get_ident()
+        setup = _Setup()
+        try:
+            reports = self._played(jobs, setup)
+        except VLAgentsError as error:
+            reports = [Report(failure=explain(error))] * len(jobs)
+        finally:
+            self._set_phase("idle", 0)
+        if any(report.failure is not None and report.failure.cause == "policy" for report in reports):
+            self._broken_agents += 1
+            self._drop_agent()
+        elif any(report.result is not None for report in reports):
+            self._broken_agents = 0
+        return [replace(reports[0], env=setup.env, policy=setup.policy, worker=setup.worker), *reports[1:]]
+
+    def close(self) -> None:
+        """Free the simulator and the connection."""
+        self._drop_agent()
+        self._drop_env()
+
+    def _played(self, jobs: tuple[Job, ...], setup: _Setup) -> list[Report]:
+        cell = jobs[0].cell
+        if self._agent is None or self._policy != cell.policy.name:
+            self._agent = self._connect(cell.policy)
+            setup.policy = _metadata(self._agent)
+        if self._env is None or self._place != cell.place:
+            self._env = self._make_env(cell)
+            # The driver may have another numpy, which cannot read this one's pickles.
+            setup.env = EnvInfo(plain_values(self._env.describe()), self._env.contract.to_json(), _code(cell))
+        agent, env = self._agent, self._env
+        if setup.env is not None or setup.policy is not None:
+            require_match(agent.contract, env.contract)
+            setup.worker = _worker_info(cell.policy.name, agent, env)
+        with contextlib.ExitStack() as stack:
+            recordings = [
+                stack.enter_context(self._recorder_factory(self._config, env.contract.control_hz)) for _ in jobs
+            ]
+            return [
+                Report(result=one, artifacts=recording.finish(one))
+                if isinstance(one, EpisodeResult)
+                else Report(failure=explain(one))
+                for one, recording in zip(self._play(agent, env, jobs, recordings), recordings, strict=True)
+            ]
+
+    def _play(
+        self, agent: Agent, env: BatchEnv, jobs: tuple[Job, ...], recordings: list[EpisodeRecorder]
+    ) -> list[Outcome]:
+        cell = jobs[0].cell
+        return run_episodes(
+            env,
+            agent,
+            self._sessions_of(agent, env, len(jobs)),
+            [job.key for job in jobs],
+            execute=cell.policy.execute,
+            clock=cell.suite.clock,
+            reset_options=cell.suite.reset_options,
+            policy_options=cell.policy_options,
+            watch=self._set_phase,
+            record=lambda i, obs: recordings[i].add_observation(obs),
+            images=recordings[0].wants_images,
+            request_info=recordings[0].request_info,
+            acted=lambda i, act: recordings[i].add_act(act),
+            executed=lambda i, *done: recordings[i].add_action(*done),
+        )
+
+    def _sessions_of(self, agent: Agent, env: BatchEnv, number: int) -> list[Agent]:
+        if env.num_envs == 1:
+            return [agent]
+        if not isinstance(agent, RemoteAgent):
+            raise ConfigError("num_envs: got more than 1 for a policy in the worker's own process; give it a `url`")
+        if number > len(self._sessions):
+            self._sessions += agent.sessions(number - len(self._sessions))
+        return self._sessions[:number]
+
+    def _set_phase(self, phase: Phase, steps: int) -> None:
+        self._current_phase = (phase, monotonic(), steps)
+
+    def _connect(self, policy: PolicyConfig) -> Agent:
+        self._set_phase("connect", 0)
+        self._drop_agent()
+        if self._broken_agents:  # the server may be restarting, or full
+            sleep(min(FIRST_WAIT_S * 2 ** (self._broken_agents - 1), LONGEST_WAIT_S))
+        with policy_side("start"):
+            agent = self._agent_factory(policy)
+        try:
+            with policy_side("initialize"):
+                agent.initialize()
+                _metadata(agent)  # fetches the metadata, which checks that the server runs and knows the policy
+        except VLAgentsError:
+            agent.close()
+            raise
+        self._policy = policy.name
+        return agent
+
+    def _make_env(self, cell: EvalCase) -> BatchEnv:
+        self._set_phase("make", 0)
+        self._drop_env()  # first, so that a worker never holds two simulators
+        try:
+            with env_side(f"{cell.env!r}: make"):
+                options, number = cell.suite.env_options, cell.suite.num_envs
+                alone = number == 1  # even if the suite has a simulator for many
+                env = (
+                    SequentialBatch([make_env(cell.env, **options)])
+                    if alone
+                    else make_batch(cell.env, number, **options)
+                )
+        except EnvFailed as error:
+            reason = env_class(cell.env).missing()
+            if reason is None:
+                raise
+            raise MissingDependency(f"env {cell.env!r} cannot run here: {reason}") from error
+        self._place = cell.place
+        return env
+
+    def _drop_agent(self) -> None:
+        agents = [*self._sessions, *([] if self._agent is None else [self._agent])]
+        self._agent, self._sessions = None, []
+        for agent in agents:
+            try:
+                agent.close()
+            except VLAgentsError as error:  # the connection is broken: nothing is left to close
+                log.warning("closing the agent: %s", error)
+
+    def _drop_env(self) -> None:
+        env, self._env, self._place = self._env, None, None
+        if env is not None:
+            with env_side("close"):
+                env.close()
+
+
+def _code(cell: EvalCase) -> GitState | None:
+    return code_of(env_class(cell.env).__module__)
+
+
+def _metadata(agent: Agent) -> dict[str, Any]:
+    return dict(getattr(agent, "metadata", {}))
+
+
+def _worker_info(policy: str, agent: Agent, env: BatchEnv) -> WorkerInfo:
+    """Return this process's entry in the results.
+
+    Raises:
+        ConfigError: The environment draws on a GPU that is not this worker's.
+    """
+    renderer = env.renderer()
+    if renderer is not None:
+        require_own(renderer)
+    name = None if renderer is None else renderer.name
+    return WorkerInfo(socket.gethostname(), this_node(), os.getpid(), policy, transport_of(agent), name)

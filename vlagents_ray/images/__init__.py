@@ -1,0 +1,1 @@
+"""Images: JPEG, PNG and MP4, and the codecs that a message may use."""

@@ -1,0 +1,67 @@
+"""An encoder of videos, H.264 in MP4, which browsers play."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import InvalidObservation
+from vlagents_ray.registry import require
+
+
+class Mp4:
+    """The running video of one camera; encoding a frame of 224x224 takes about 0.3 ms."""
+
+    def __init__(
+        self, target: io.BytesIO | Path, shape: tuple[int, ...], fps: float, *, key_frames: int | None = None
+    ) -> None:
+        """Open a video.
+
+        Args:
+            target: The file, or a buffer in memory.
+            shape: The shape of its images, (H, W, 3).
+            fps: The rate of the frames, Hz.
+            key_frames: The number of frames from one key frame to the next; None is x264's default.
+        """
+        self._av: Any = require("av")
+        self._shape = shape
+        height, width = shape[:2]
+        self._pad = (height % 2, width % 2)  # yuv420p halves both dimensions
+        self._container = self._av.open(target if isinstance(target, io.BytesIO) else str(target), "w", format="mp4")
+        options = {"preset": "ultrafast", "crf": "23", "threads": "1"}
+        if key_frames is not None:
+            options["g"] = str(key_frames)
+        self._stream = self._container.add_stream(
+            "libx264", rate=Fraction(fps).limit_denominator(1000), options=options
+        )
+        self._stream.height, self._stream.width = self.size
+        self._stream.pix_fmt = "yuv420p"
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width of the video, both even: the last row or column of an odd image is repeated."""
+        return self._shape[0] + self._pad[0], self._shape[1] + self._pad[1]
+
+    def add(self, image: np.ndarray) -> None:
+        """Append an image, (H, W, 3) uint8 RGB; raises `InvalidObservation` if its shape differs."""
+        if image.shape != self._shape or image.dtype != np.uint8:
+            raise InvalidObservation(f"got an image of {image.shape} {image.dtype}, want {self._shape} uint8 as before")
+        if any(self._pad):
+            image = np.pad(image, ((0, self._pad[0]), (0, self._pad[1]), (0, 0)), mode="edge")
+        frame = self._av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
+        self._container.mux(self._stream.encode(frame))
+
+    def finish(self) -> None:
+        """Write the remaining frames and complete the file."""
+        self._container.mux(self._stream.encode(None))
+        self._container.close()
+
+    def abandon(self) -> None:
+        """Close the encoder without completing the video; errors in writing its end are ignored."""
+        with contextlib.suppress(OSError):  # PyAV's errors of the disk are OSErrors
+            self._container.close()

@@ -1,0 +1,98 @@
+"""The columns of transitions: Arrow arrays of which numpy and torch get views.
+
+A row is one step of one environment: the observation, the action that was executed on it, and what came of it. Rows of
+an episode are in order; a `pyarrow.RecordBatch` of rollouts holds one whole episode. T is the number of its rows.
+
+| column | numpy view | |
+|---|---|---|
+| `key` | (T,) str | the key of the episode, as in an evaluation |
+| `episode` | (T,) int64 | number of the start state, from 0; the episodes of a group share it |
+| `t` | (T,) int32 | steps since the reset |
+| `act` | (T,) int32 | number of the policy's answer; the rows of one action chunk share it |
+| `instruction` | (T,) str | the task in words; "" if there is none |
+| `cameras.NAME` | (T, H, W, 3) uint8 | RGB, upright |
+| `state.NAME` | (T, D) float32 | in the unit that the env's contract states |
+| `gripper` | (T,) float32 | in [0, 1], 1 = open; only if the env has one |
+| `action` | (T, D) float32 | as executed, in the unit of the env's contract |
+| `reward` | (T,) float32 | of the environment; one without a shaped reward gives 1 for a step that ends in success |
+| `terminated` | (T,) bool | the environment ended the episode with this step: the value of what follows is 0 |
+| `truncated` | (T,) bool | a step limit, or the policy (`Act.done`), ended it: bootstrap from the final observation |
+| `success` | (T,) bool | whether the task is solved in the state that the action led to |
+| `final.COLUMN` | (1, ...) | the observation after the last step, for each column of one; a row an episode |
+| `logprob` | (T,) float32 | log-probability of the row, nats, if it is wanted; see below |
+| `value`, `entropy` | (T,) float32 | of the policy at this observation, if wanted; NaN where it was not asked |
+| `version` | (T,) int64 | of the weights that chose the action; 0 if the policy names none |
+| `source` | (T,) str | who chose the action: "policy", or as `act.info["source"]` says ("human", "expert") |
+
+The log-probabilities of a chunk's rows add up to that of the chunk. If the policy states one for the whole chunk, it is
+that of the first row, and the others have NaN, as they have in `value` and `entropy`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.registry import require
+
+EXTRA = "learn"  # of the package, with pyarrow and gymnasium
+FINAL = "final."
+
+
+def arrays(transitions: Any) -> dict[str, np.ndarray]:
+    """Return the columns of transitions as numpy arrays with the shapes that the module lists.
+
+    Numbers and images of a record batch, or of a table of one chunk, are views of its memory, which is read-only;
+    several chunks are put together first, which copies them. Text is an array of objects.
+
+    Args:
+        transitions: A `pyarrow.RecordBatch` or a `pyarrow.Table` of rollouts.
+
+    Returns:
+        The arrays by name of column. They have a row a step, those of `final.` columns a row an episode.
+    """
+    pa: Any = require("pyarrow", extra=EXTRA)
+    if isinstance(transitions, pa.Table):
+        transitions = transitions.combine_chunks().to_batches()[0]
+    return {name: _view(pa, transitions.column(name)) for name in transitions.schema.names}
+
+
+def _view(pa: Any, column: Any) -> np.ndarray:
+    if isinstance(column, pa.ListArray):
+        return _view(pa, column.flatten())
+    if isinstance(column, pa.FixedShapeTensorArray):
+        tensor: np.ndarray = column.to_numpy_ndarray()
+        return tensor
+    if isinstance(column, pa.DictionaryArray):
+        words = np.array(column.dictionary.to_pylist(), object)
+        text: np.ndarray = words[column.indices.to_numpy()]
+        return text
+    numbers: np.ndarray = column.to_numpy(zero_copy_only=True)
+    return numbers
+
+
+def tensors(pa: Any, values: np.ndarray) -> Any:
+    """Return (T,) or (T, ...) values as an Arrow array that shares their memory."""
+    if values.dtype == np.bool_:
+        return pa.Bool8Array.from_numpy(values)  # Arrow's own booleans are bits, of which there is no view
+    if values.ndim == 1:
+        return pa.array(values)
+    return pa.FixedShapeTensorArray.from_numpy_ndarray(values)
+
+
+def constant(pa: Any, text: str, rows: int) -> Any:
+    """Return a column that has the same text in each row."""
+    return pa.DictionaryArray.from_arrays(pa.array(np.zeros(rows, np.int32)), pa.array([text]))
+
+
+def words(pa: Any, texts: list[str]) -> Any:
+    """Return a column of texts of which many are equal."""
+    return pa.array(texts, pa.string()).dictionary_encode()
+
+
+def at_the_end(pa: Any, value: np.ndarray, rows: int) -> Any:
+    """Return a column of lists: (1, ...) `value` in the last row, nothing in the others."""
+    offsets = np.zeros(rows + 1, np.int32)
+    offsets[-1] = 1
+    return pa.ListArray.from_arrays(pa.array(offsets), tensors(pa, value))

@@ -1,0 +1,315 @@
+"""Transitions from the workers of an evaluation, without an end."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+import os
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from vlagents_ray.errors import ConfigError, PolicyFailed, from_code
+from vlagents_ray.evaluate.episode.failures import Failure
+from vlagents_ray.evaluate.plan.cases import cells, require_envs
+from vlagents_ray.evaluate.plan.config import EvalConfig
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, JobQueue
+from vlagents_ray.evaluate.workers.agents import agents
+from vlagents_ray.evaluate.workers.cluster import ray_cluster
+from vlagents_ray.evaluate.workers.dispatch import FailedAttempts, dispatch
+from vlagents_ray.evaluate.workers.pool import WorkerPool
+from vlagents_ray.evaluate.workers.rollout import Report
+from vlagents_ray.interface import Agent
+from vlagents_ray.learn.columns import EXTRA
+from vlagents_ray.learn.transitions import WANTED, TransitionRecorder
+from vlagents_ray.registry import require
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+POLL_S = 0.25  # longest wait for a report, after which workers that are needed are started
+_CURE = "mend this, and go on with `first=rollouts.position`"
+
+
+@dataclass(slots=True)
+class RolloutStats:
+    """The episodes of rollouts so far."""
+
+    episodes: int = 0  # delivered
+    transitions: int = 0  # delivered
+    retries: int = 0  # attempts repeated after an infrastructure failure
+    stale: int = 0  # episodes played again, as the weights had changed too much
+    lost: int = 0  # episodes that no attempt brought to an end, or that an error of the policy ended
+
+
+@dataclass(slots=True)
+class _PlannedEpisode:
+    """An episode that is planned and not yet delivered."""
+
+    job: Job  # its first attempt
+    over: bool = False
+    transitions: Any = None  # if it is over; None if it is lost
+    oldest: int = 0  # version of the weights that chose any of its actions
+    pushed: int = 0  # version that the learner had pushed when the last attempt began
+
+
+class Rollouts:
+    """Plays episodes in the workers of an evaluation, and returns their transitions for a learner.
+
+        with Rollouts("tabletop/lift", "http://localhost:8000", workers=4) as rollouts:
+            for _ in range(100):
+                columns = arrays(rollouts.collect(64))
+                ...  # learn from them, and push the new weights
+
+    Episodes are numbered from 0 and delivered in this order, each exactly once, however many workers there are and
+    whichever of them die: a broken attempt is repeated, and has no transitions. So the same seeds and the same weights
+    give the same transitions. The keys are those of an evaluation of these settings.
+
+    A record batch is one whole episode with the columns of `vlagents_ray.learn.columns`. Workers on this node write it
+    into Ray's object store once, and numpy maps it from there; keeping it keeps its memory in the store.
+    """
+
+    def __init__(
+        self,
+        env: str | Sequence[str],
+        policy: str | Callable[[], Agent],
+        *,
+        workers: int = 1,
+        num_envs: int = 1,
+        groups: int = 1,
+        want: Sequence[str] = (),
+        max_lag: int | None = 0,
+        seed: int = 0,
+        first: int = 0,
+        images: bool = True,
+        env_options: Mapping[str, Any] | None = None,
+        reset_options: Mapping[str, Any] | None = None,
+        policy_options: Mapping[str, Any] | None = None,
+        execute: int | None = None,
+        settings: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Check the settings. Workers start with the first episode.
+
+        Args:
+            env: The name of the env, as for an evaluation; of several envs, each has its turn.
+            policy: The URL of the policy's server, or what each worker makes an agent of its own with.
+            workers: The number of workers.
+            num_envs: Environments that one worker steps together, with one request to the policy for all of them.
+            groups: Episodes from one start state, one after another, that differ in the seed of the policy (GRPO).
+            want: What the policy is to return for each act: "logprob", "value", "entropy".
+            max_lag: Deliver no episode with an act of weights that are more than so many versions old; it is played
+                again. 0 is on-policy; None delivers all.
+            seed: The seed of the first start state; state n has `seed` + n.
+            first: The number of the first episode: `position` of rollouts that ended, to go on with them.
+            images: Whether there are columns for the cameras.
+            env_options: The options of the env's constructor.
+            reset_options: The options of each reset of the env.
+            policy_options: The options of each reset of the policy.
+            execute: Rows of each action chunk that are executed; None: all.
+            settings: Further settings of an evaluation, such as `worker`, `retries` and `env_timeout_s`.
+
+        Raises:
+            ConfigError: A setting is wrong.
+            MissingDependency: pyarrow is not installed.
+            UnknownEnv: There is no such env.
+        """
+        for name, value, least in (("groups", groups, 1), ("first", first, 0), ("seed", seed, 0)):
+            if value < least:
+                raise ConfigError(f"{name}: got {value}, want at least {least}")
+        if unknown := sorted(set(want) - set(WANTED)):
+            raise ConfigError(f"want: got {unknown}, want some of {list(WANTED)}")
+        self._pa: Any = require("pyarrow", extra=EXTRA)
+        served = isinstance(policy, str)
+        config = EvalConfig.model_validate(
+            {
+                "policies": [{"url": policy if served else None, "options": policy_options or {}, "execute": execute}],
+                "suites": [
+                    {
+                        "envs": [env] if isinstance(env, str) else list(env),
+                        "env_options": env_options or {},
+                        "reset_options": reset_options or {},
+                        "num_envs": num_envs,
+                    }
+                ],
+                "workers": workers,
+                "out": os.devnull,  # nothing is written
+                **(settings or {}),
+            }
+        )
+        require_envs(config)
+        self._config, self._cells = config, cells(config)
+        self._factory = agents(config, None if isinstance(policy, str) else policy)
+        self._recorders = functools.partial(TransitionRecorder, want=tuple(want), images=images)
+        self._groups, self._seed, self._max_lag = groups, seed, max_lag
+        self._block = math.lcm(groups, num_envs)  # episodes that are queued together
+        self._ahead = self._block * max(2, math.ceil(2 * workers * num_envs / self._block))
+        self._position = self._planned = first
+        self._queue = JobQueue([])
+        self._episodes: dict[EpisodeKey, _PlannedEpisode] = {}  # from number `position` on
+        self._attempts = FailedAttempts(config)
+        self._resources = ExitStack()
+        self._pool: WorkerPool | None = None
+        self._version = self._pushed = 0
+        self.stats = RolloutStats()
+        """The numbers of episodes so far."""
+
+    @property
+    def version(self) -> int:
+        """The newest version of the weights, from which the lag is counted.
+
+        It rises by itself with the version that acts name. A learner that iterates may set it after a push, to what the
+        push returned, so that no episode of older weights is delivered from then on.
+        """
+        return self._version
+
+    @version.setter
+    def version(self, pushed: int) -> None:
+        self._pushed, self._version = pushed, max(self._version, pushed)
+
+    @property
+    def position(self) -> int:
+        """The number of the next episode, which a learner keeps in its checkpoint, to go on from there (`first`)."""
+        return self._position
+
+    def __iter__(self) -> Self:
+        return self
+
+    def __next__(self) -> Any:
+        """Return the transitions of the next episode, a `pyarrow.RecordBatch`; workers go on with those after it."""
+        delivered: list[Any] = []
+        while not delivered:
+            start = self._position // self._block * self._block
+            delivered = self._deliver(self._position + 1, start + self._ahead)
+        return delivered[0]
+
+    def collect(self, episodes: int) -> Any:
+        """Play the next episodes, and queue no other ones, so that the workers play none with weights of the past.
+
+        Args:
+            episodes: Their number; whole groups, if there are groups.
+
+        Returns:
+            Their transitions, a `pyarrow.Table` of one chunk an episode, in their order. Lost episodes are left out; if
+            all are lost, it is as many of the next ones.
+
+        Raises:
+            ConfigError: The number is not that of whole groups, or the envs have different columns.
+            VLAgentsError: The last infrastructure error, after `abort_after` lost episodes in a row.
+        """
+        if episodes < 1 or episodes % self._groups:
+            raise ConfigError(f"collect: got {episodes} episodes, want a multiple of groups, {self._groups}")
+        batches: list[Any] = []
+        while not batches:
+            end = self._position + episodes
+            batches = self._deliver(end, end)
+        try:
+            return self._pa.Table.from_batches(batches)
+        except (self._pa.ArrowInvalid, ValueError) as error:
+            raise ConfigError(f"collect: the episodes do not fit into one table, iterate over them: {error}") from error
+
+    def close(self) -> None:
+        """End the workers, and the Ray cluster if it was started for them; safe to call twice.
+
+        What was delivered lies in Ray's memory: copy what is used after the end of Ray. If more episodes are asked for,
+        workers start again, and begin the episodes again that were not delivered.
+        """
+        if self._pool is not None:
+            self._pool.close()
+        self._end(None, None, None)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *exc: Any) -> None:
+        if exc[0] is None:
+            self.close()
+        else:
+            self._end(*exc)
+
+    def _end(self, *exc: Any) -> None:
+        for episode in self._episodes.values():
+            episode.over, episode.transitions = False, None  # they lie in the memory of a Ray that may end
+        self._pool = None
+        self._resources.__exit__(*exc)
+
+    def _deliver(self, end: int, limit: int) -> list[Any]:
+        """Play until the episodes before number `end` are over; meanwhile those before number `limit` may begin."""
+        self._plan(max(end, limit))
+        wanted = list(itertools.islice(self._episodes.items(), end - self._position))
+        self._replay_stale()
+        while not all(episode.over for _, episode in wanted):
+            self._play_on()
+            self._replay_stale()
+        for key, _ in wanted:
+            del self._episodes[key]
+        self._position = end
+        batches = [episode.transitions for _, episode in wanted if episode.transitions is not None]
+        self.stats.episodes += len(batches)
+        self.stats.transitions += sum(batch.num_rows for batch in batches)
+        return batches
+
+    def _plan(self, limit: int) -> None:
+        """Queue the episodes up to number `limit`."""
+        for number in range(self._planned, limit):
+            state, member = divmod(number, self._groups)
+            episode, turn = divmod(state, len(self._cells))
+            cell = self._cells[turn]
+            # The first of a group is the episode of an evaluation; the others have numbers above its own seed's.
+            policy_seed = self._seed + number if member else None
+            job = Job(EpisodeKey(cell.env, episode, self._seed + episode, cell.fingerprint, policy_seed), cell)
+            self._episodes[job.key] = _PlannedEpisode(job)
+            self._queue.put(job)
+        self._planned = max(self._planned, limit)
+
+    def _play_on(self) -> None:
+        """Hand out jobs, and take the reports that arrive; any error ends the workers."""
+        try:
+            if self._pool is None:
+                self._resources.enter_context(ray_cluster(self._config))
+                self._pool = self._resources.enter_context(WorkerPool(self._config, self._factory, self._recorders))
+                self._queue = JobQueue(episode.job for episode in self._episodes.values())
+            dispatch(self._pool, self._queue, self._begin)
+            for job, report in self._pool.wait(POLL_S):
+                self._handle(job, report)
+        except BaseException:
+            self._end(*sys.exc_info())
+            raise
+
+    def _begin(self, jobs: tuple[Job, ...]) -> None:
+        for job in jobs:
+            self._episodes[job.key].pushed = self._pushed
+
+    def _handle(self, job: Job, report: Report) -> None:
+        failure, transitions, episode = report.failure, report.artifacts.transitions, self._episodes[job.key]
+        if failure is not None and failure.cause == "user":
+            raise from_code(failure.code, failure.message)
+        if failure is not None and self._attempts.repeats(job, failure):
+            self.stats.retries += 1
+            self._queue.put_back(job.again())
+            return
+        episode.over, episode.transitions = True, transitions
+        if transitions is None:
+            self.stats.lost += 1
+            error = report.result.error if report.result is not None else None
+            self._attempts.note_lost(failure or Failure("policy", PolicyFailed.code, f"{job.key}: {error}"), _CURE)
+            return
+        self._attempts.note_played()
+        versions = transitions.column("version").to_numpy()
+        episode.oldest, self._version = int(versions.min()), max(self._version, int(versions.max()))
+        if self._max_lag is not None and episode.pushed - episode.oldest > self._max_lag:  # so it would be forever
+            raise ConfigError(
+                f"version: {job.key} began when rollouts.version had been set to {episode.pushed}, but its acts name "
+                f"{episode.oldest}; set it to what a push returned, after it has (a policy that names none has 0)"
+            )
+
+    def _replay_stale(self) -> None:
+        """Queue the episodes again that have acts of weights which are too old by now."""
+        for episode in self._episodes.values():
+            lag = self._version - episode.oldest if episode.transitions is not None else 0
+            if self._max_lag is not None and lag > self._max_lag:
+                episode.over, episode.transitions = False, None
+                self.stats.stale += 1
+                self._queue.put_back(episode.job)

@@ -1,0 +1,147 @@
+"""The recorder that a worker keeps transitions with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import ConfigError, EnvFailed
+from vlagents_ray.evaluate.artifacts.recorder import Artifacts, EpisodeRecorder
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.config import EvalConfig
+from vlagents_ray.interface import BEHAVIOUR, WANT, Act, Obs
+from vlagents_ray.learn.columns import EXTRA, FINAL, at_the_end, constant, tensors, words
+from vlagents_ray.registry import require
+
+WANTED = ("logprob", "value", "entropy")  # columns that a policy fills
+
+
+_FIRST_ROWS = 128  # memory that is not written to costs nothing
+
+
+class TransitionRecorder(EpisodeRecorder):
+    """Keeps the transitions of one episode, as `vlagents_ray.learn.columns` describes them."""
+
+    def __init__(
+        self, _config: EvalConfig, _hz: float | None, *, want: Sequence[str] = (), images: bool = True
+    ) -> None:
+        """Begin an episode.
+
+        Args:
+            want: Names of `WANTED`, which each request asks of the policy.
+            images: Whether there are columns for the cameras.
+        """
+        self._pa: Any = require("pyarrow", extra=EXTRA)
+        self._want, self._images = tuple(want), images
+        self.request_info: Mapping[str, Any] = {WANT: list(want)} if want else {}
+        self._seen: dict[str, _Rows] = {}  # the columns of the observations
+        self._rows: list[tuple[np.ndarray, float, bool, int, int, str]] = []  # action, reward, success, act, version …
+        self._wanted: dict[str, list[float]] = {name: [] for name in self._want}
+        self._acts = 0
+        self._version, self._source = 0, "policy"
+        self._next: dict[str, list[float]] = {}  # what was wanted, for the next rows of the act
+
+    @property
+    def wants_images(self) -> bool:
+        return self._images
+
+    def add_observation(self, obs: Obs) -> None:
+        seen: dict[str, Any] = {f"cameras.{name}": image for name, image in sorted(obs.cameras.items()) if self._images}
+        seen |= {f"state.{name}": part for name, part in sorted(obs.state.items())}
+        if obs.gripper is not None:
+            seen["gripper"] = np.float32(obs.gripper)
+        got = {name: part.shape for name, part in seen.items()}
+        if not self._seen:
+            self._seen = {name: _Rows(part, np.uint8 if part.ndim == 3 else np.float32) for name, part in seen.items()}
+        elif got != (want := {name: rows.shape for name, rows in self._seen.items()}):
+            raise EnvFailed(f"env step: got {got}, want {want} as after reset")
+        for name, part in seen.items():
+            self._seen[name].add(part)
+
+    def add_act(self, act: Act) -> None:
+        self._acts += 1
+        self._version = version_of(act)
+        self._source = str(act.info.get("source", "policy"))
+        stated = act.info.get(BEHAVIOUR, {})
+        if lacking := [name for name in self._want if name not in stated]:
+            raise ConfigError(
+                f"want: got no {' and no '.join(lacking)} in act.info[{BEHAVIOUR!r}], which has {sorted(stated)}; "
+                f"take a policy that returns it, or leave it out of `want`"
+            )
+        rows = len(act.rows())
+        self._next = {name: _by_row(stated[name], rows, name) for name in self._want}
+
+    def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
+        row = (np.array(action, np.float32), reward, success, self._acts - 1, self._version, self._source)
+        self._rows.append(row)
+        for name, values in self._wanted.items():
+            values.append(self._next[name].pop(0))
+
+    def finish(self, result: EpisodeResult) -> Artifacts:
+        """Return the transitions of a whole episode; none of one that an error of the policy ended."""
+        if result.status != "done":
+            return Artifacts()
+        return Artifacts(transitions=self._batch(result))
+
+    def _batch(self, result: EpisodeResult) -> Any:
+        pa, rows = self._pa, len(self._rows)
+        actions, rewards, success, acts, versions, sources = zip(*self._rows, strict=True)
+        last = np.arange(rows) == rows - 1
+        seen = {name: column.all() for name, column in self._seen.items()}  # (T + 1, ...)
+        numbers: dict[str, np.ndarray] = {
+            "episode": np.full(rows, result.key.episode, np.int64),
+            "t": np.arange(rows, dtype=np.int32),
+            "act": np.array(acts, np.int32),
+            **{name: values[:-1] for name, values in seen.items()},
+            "action": np.stack(actions),
+            "reward": np.array(rewards, np.float32),
+            "terminated": last & (result.ending == "terminated"),
+            "truncated": last & (result.ending != "terminated"),
+            "success": np.array(success, np.bool_),
+            **{name: np.array(values, np.float32) for name, values in self._wanted.items()},
+            "version": np.array(versions, np.int64),
+        }
+        columns = {"key": constant(pa, str(result.key), rows), "instruction": constant(pa, result.instruction, rows)}
+        columns |= {name: tensors(pa, values) for name, values in numbers.items()}
+        columns |= {FINAL + name: at_the_end(pa, values[-1:], rows) for name, values in seen.items()}
+        columns["source"] = words(pa, list(sources))
+        return pa.RecordBatch.from_pydict(columns)
+
+
+class _Rows:
+    """Arrays of one shape, copied into an array that grows, so that none of them is copied twice."""
+
+    def __init__(self, first: np.ndarray, dtype: Any) -> None:
+        self.shape = first.shape
+        self._rows = np.empty((_FIRST_ROWS, *first.shape), dtype)
+        self._number = 0
+
+    def add(self, row: np.ndarray) -> None:
+        if self._number == len(self._rows):
+            self._rows = np.concatenate([self._rows, np.empty_like(self._rows)])
+        self._rows[self._number] = row
+        self._number += 1
+
+    def all(self) -> np.ndarray:
+        return self._rows[: self._number]
+
+
+def version_of(act: Act) -> int:
+    """Return the version of the weights that chose an action; 0 if the policy names none."""
+    said = act.info.get("policy")
+    return int(said.get("version", 0)) if isinstance(said, Mapping) else 0
+
+
+def _by_row(stated: Any, rows: int, name: str) -> list[float]:
+    """Return a number for each row of an act: those stated by row, or the total in the first, and NaN in the others.
+
+    `stated` is a number; or (H,) or (H, D) numbers, H rows; or any others, such as one for each token, which add up.
+    """
+    values = np.asarray(stated, np.float64)
+    if values.ndim and len(values) == rows:
+        return [float(value) for value in values.reshape(rows, -1).sum(axis=1)]
+    if name != "logprob" and values.size != 1:
+        raise ConfigError(f"act.info[{BEHAVIOUR!r}][{name!r}]: got shape {values.shape}, want a number, or ({rows},)")
+    return [float(values.sum()), *[float("nan")] * (rows - 1)]

@@ -1,0 +1,233 @@
+"""Our environments as a `gymnasium.vector.VectorEnv`, for learners that step environments themselves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+import numpy as np
+
+from vlagents_ray.envs.batch import BatchEnv, make_batch
+from vlagents_ray.errors import ConfigError, InvalidAction, NotReset
+from vlagents_ray.evaluate.episode.env_outputs import checked_obs, checked_step
+from vlagents_ray.evaluate.episode.episode import options_of_reset
+from vlagents_ray.evaluate.episode.failures import env_side
+from vlagents_ray.interface import Act, Obs
+from vlagents_ray.learn.columns import EXTRA
+from vlagents_ray.learn.spaces import Observation, action_space, observation_space, observed
+from vlagents_ray.registry import require
+
+gymnasium: Any = require("gymnasium", extra=EXTRA)
+vector: Any = require("gymnasium.vector", extra=EXTRA)
+
+_RESET_MASK = "reset_mask"  # Gymnasium's name of the option
+
+
+def as_vector_env(
+    env: str,
+    num_envs: int = 1,
+    *,
+    observation: Observation = "all",
+    autoreset: Literal["same_step", "next_step", "disabled"] = "same_step",
+    env_options: Mapping[str, Any] | None = None,
+    reset_options: Mapping[str, Any] | None = None,
+) -> BatchVectorEnv:
+    """Make environments that learners written for Gymnasium step together.
+
+    A simulator that runs many environments at once, such as ManiSkill on a GPU, is one of them; others are stepped one
+    after another in this process.
+
+    Args:
+        env: The name of the env, as for `make_env`.
+        num_envs: The number of environments, N.
+        observation: "all" is a dict of `cameras/NAME` (N, H, W, 3) uint8, `state/NAME` (N, D) float32 and `gripper`
+            (N, 1) float32. "state" is all but the images, as one array (N, D) float32: the parts of the state by name,
+            then the gripper.
+        autoreset: What follows the end of an episode (https://farama.org/Vector-Autoreset-Mode). With "same_step", the
+            observation is that of the next episode already, and `infos["final_obs"]` has the last one of the old one.
+        env_options: The options of the env's constructor.
+        reset_options: The options of each reset of an environment.
+
+    Returns:
+        The environments, which the caller closes.
+
+    Raises:
+        ConfigError: An option is wrong, or the env's contract does not state a size.
+        MissingDependency: Gymnasium or the simulator is not installed.
+        UnknownEnv: The name or the task is unknown.
+    """
+    batch = make_batch(env, num_envs, **(env_options or {}))
+    try:
+        return BatchVectorEnv(batch, observation, vector.AutoresetMode[autoreset.upper()], reset_options)
+    except BaseException:
+        batch.close()
+        raise
+
+
+class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
+    """The environments of a `BatchEnv` with Gymnasium's interface.
+
+    `reset(seed=S)` begins episodes 0 to N - 1. Episode i has the seed S + i, as in an evaluation, and the next one that
+    an environment begins is the next number. Without a seed, numbers go on; the first S is drawn at random.
+
+    `infos["success"]` says whether the task is solved. `infos["instruction"]` and `infos["episode_seed"]` are there
+    whenever an episode begins. A step limit of the environment truncates an episode.
+    """
+
+    def __init__(
+        self,
+        batch: BatchEnv,
+        observation: Observation = "all",
+        autoreset: Any = vector.AutoresetMode.SAME_STEP,
+        reset_options: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Wrap environments, which are closed together with this object.
+
+        Args:
+            batch: The environments.
+            observation: The form of the observations, as for `as_vector_env`.
+            autoreset: A `gymnasium.vector.AutoresetMode`.
+            reset_options: The options of each reset of an environment.
+
+        Raises:
+            ConfigError: The environments' contract does not state a size.
+        """
+        self._batch, self._observation, self._reset_options = batch, observation, dict(reset_options or {})
+        self._autoreset = autoreset
+        self._contract = batch.contract
+        self.num_envs = batch.num_envs
+        self.metadata = {"render_modes": [], "autoreset_mode": autoreset}
+        self.single_observation_space = observation_space(gymnasium.spaces, self._contract, observation)
+        self.single_action_space = action_space(gymnasium.spaces, self._contract)
+        self.observation_space = vector.utils.batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = vector.utils.batch_space(self.single_action_space, self.num_envs)
+        self._seed: int | None = None  # of episode 0
+        self._begun = 0  # episodes
+        self._over = np.zeros(self.num_envs, np.bool_)
+        self._steps = np.zeros(self.num_envs, np.int64)
+        self._seen: list[Obs] = []  # the current observation of each; none before the first reset
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begin an episode in each environment.
+
+        Args:
+            seed: The seed S of episode 0; None to go on with the next numbers.
+            options: Options of the environments' resets. `reset_mask`, (N,) bool, is Gymnasium's: only these begin one.
+
+        Returns:
+            The observations, and the infos.
+        """
+        super().reset(seed=seed)
+        given = dict(options or {})
+        mask = given.pop(_RESET_MASK, None)
+        if seed is not None:
+            self._seed, self._begun = seed, 0
+        elif self._seed is None:
+            self._seed = int(self.np_random.integers(2**31))
+        infos: dict[str, Any] = {}
+        self._begin(np.ones(self.num_envs, np.bool_) if mask is None else _checked(mask, self.num_envs), infos, given)
+        return self._observations(), infos
+
+    def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Execute an action in each environment.
+
+        Args:
+            actions: One action for each environment, (N, D) float32.
+
+        Returns:
+            The observations, the rewards (N,) float64, what was terminated and what truncated (N,) bool, and the infos.
+        """
+        self._require_begun()
+        rows = np.asarray(actions, np.float32)
+        if rows.shape != self.action_space.shape:
+            raise InvalidAction(
+                f"actions: got {rows.shape}, want {self.action_space.shape}, a row for each environment"
+            )
+        rewards = np.zeros(self.num_envs)
+        terminated, truncated = np.zeros(self.num_envs, np.bool_), np.zeros(self.num_envs, np.bool_)
+        infos: dict[str, Any] = {}
+        restarted, moving = self._over.copy(), ~self._over  # some are over in mode "next_step" alone
+        if restarted.any():
+            self._begin(restarted, infos)
+        for i, step, info in self._moved(rows, moving):
+            rewards[i], terminated[i], self._seen[i] = step.reward, step.terminated, step.obs
+            truncated[i] = not step.terminated and (step.truncated or self._steps[i] >= self._batch.max_steps)
+            self._over[i] = terminated[i] or truncated[i]
+            last = self._over[i] and self._autoreset == vector.AutoresetMode.SAME_STEP
+            said = {"final_obs": observed(step.obs, self._observation), "final_info": info} if last else info
+            self._add_info(infos, said, i)
+        if self._over.any() and self._autoreset == vector.AutoresetMode.SAME_STEP:
+            self._begin(self._over.copy(), infos)
+        return self._observations(), rewards, terminated, truncated, infos
+
+    def close_extras(self, **_kwargs: Any) -> None:
+        """Close the environments."""
+        self._batch.close()
+
+    def _moved(self, rows: np.ndarray, moving: np.ndarray) -> list[tuple[int, Any, dict[str, Any]]]:
+        """Step the environments that are `moving`; return the number, the outputs and the info of each."""
+        if not moving.any():
+            return []
+        self._batch.looked_at = images = self._observation == "all"
+        with env_side("step"):
+            acts = [Act(row) if moves else None for row, moves in zip(rows, moving, strict=True)]
+            seen, rewards, terminated, truncated, infos = self._batch.step(acts)
+        self._steps += moving
+        return [
+            (
+                i,
+                checked_step(seen[i], rewards[i], terminated[i], truncated[i], infos[i], self._contract, images=images),
+                dict(infos[i]),
+            )
+            for i in np.flatnonzero(moving).tolist()
+        ]
+
+    def _begin(self, which: np.ndarray, infos: dict[str, Any], given: Mapping[str, Any] | None = None) -> None:
+        """Begin an episode in these environments, and add what is said of it to `infos`."""
+        assert self._seed is not None  # noqa: S101 - `reset` has set it
+        chosen = np.flatnonzero(which).tolist()
+        if not which.all() and not self._batch.restarts:
+            raise ConfigError(
+                f"{len(chosen)} of {self.num_envs} episodes are over, and this simulator resets all its environments "
+                f"together; want one whose episodes end together, as those of a step limit do, or num_envs=1"
+            )
+        if not which.all() and not self._seen:
+            raise NotReset(f"reset: got a {_RESET_MASK} before the first reset; call reset(seed=...) for all first")
+        numbers = range(self._begun, self._begun + len(chosen))
+        seeds = [self._seed + number for number in numbers]
+        options = [
+            options_of_reset(self._batch, number, {**self._reset_options, **(given or {})}) for number in numbers
+        ]
+        with env_side("reset"):
+            if which.all():
+                self._seen = [*self._batch.reset(seeds=seeds, options=options)]
+            else:
+                for i, seed, option in zip(chosen, seeds, options, strict=True):
+                    self._seen[i] = self._batch.restart(i, seed=seed, options=option)
+            instructions = self._batch.instructions
+        self._begun += len(chosen)
+        self._over[which], self._steps[which] = False, 0
+        for i, seed in zip(chosen, seeds, strict=True):
+            checked_obs(self._seen[i], self._contract, "reset")
+            self._add_info(infos, {"instruction": instructions[i], "episode_seed": seed}, i)
+
+    def _observations(self) -> Any:
+        rows = [observed(obs, self._observation) for obs in self._seen]
+        if self._observation == "state":
+            return np.stack(rows)
+        return {name: np.stack([row[name] for row in rows]) for name in self.single_observation_space}
+
+    def _require_begun(self) -> None:
+        if not self._seen:
+            raise NotReset("step before reset; call reset(seed=...) first")
+        if self._over.any() and self._autoreset == vector.AutoresetMode.DISABLED:
+            raise NotReset(
+                f"environments {np.flatnonzero(self._over).tolist()} are over, and autoreset is disabled; call "
+                f"reset(options={{'reset_mask': ...}})"
+            )
+
+
+def _checked(mask: Any, number: int) -> np.ndarray:
+    if not isinstance(mask, np.ndarray) or mask.dtype != np.bool_ or mask.shape != (number,) or not mask.any():
+        raise ConfigError(f"{_RESET_MASK}: got {mask!r}, want a bool array of shape ({number},), true somewhere")
+    return mask

@@ -1,0 +1,43 @@
+"""Distinct names for files, and suggestions for misspelt names."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from collections.abc import Callable, Iterable
+
+
+def plain(name: str) -> str:
+    """Return `name` as a part of a file's name: "maniskill/PushCube-v1" -> "maniskill_PushCube-v1"; "pi0@20" stays."""
+    return re.sub(r"[^\w.@-]+", "_", name)
+
+
+def distinct(names: Iterable[str], simplify: Callable[[str], str] = plain) -> dict[str, str]:
+    """Simplify names, and append numbers where two of them would become the same.
+
+    "left/wrist" becomes "left_wrist"; beside a "left_wrist", which keeps its name, it becomes "left_wrist_2".
+    The result does not depend on the order of the names.
+
+    Args:
+        names: The names; duplicates count once.
+        simplify: A function of a name.
+
+    Returns:
+        The new name of each name; no two are the same.
+    """
+    wanted = sorted(set(names), key=lambda name: (simplify(name) != name, name))
+    found: dict[str, str] = {}
+    for name in wanted:
+        own, number = simplify(name), 1
+        while own in found.values():
+            number += 1
+            own = f"{simplify(name)}_{number}"
+        found[name] = own
+    return found
+
+
+def did_you_mean(got: str, known: Iterable[str]) -> str:
+    """Suggest a known name as the end of a message, "; did you mean 'scripted'?"; "" if none is similar to `got`."""
+    by_lower = {name.lower(): name for name in known}
+    close = difflib.get_close_matches(got.lower(), by_lower, n=1)
+    return f"; did you mean {by_lower[close[0]]!r}?" if close else ""

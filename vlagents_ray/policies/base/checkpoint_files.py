@@ -1,0 +1,195 @@
+"""Checks of a checkpoint's files, without a model: whether they are complete, and which weights they hold.
+
+`unfinished` judges by the files alone, and in doubt reports nothing. `weights_of` tells weights apart by a digest that
+takes seconds, and by the commit on the hub.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fnmatch
+import hashlib
+import itertools
+import json
+import re
+import zipfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import BinaryIO
+
+# The names that trainers give to files in progress: orbax' folders, and the usual suffixes.
+TEMPORARY = ("*.orbax-checkpoint-tmp*", "*.tmp", "*.tmp-*", "*.part", "*.partial", "*.incomplete", "tmp-*", ".tmp*")
+
+_TEXT = (".json", ".yaml", ".yml", ".txt", ".md", ".jinja")  # written beside weights, and often before them
+
+METHOD = "sampled-sha256"
+_WHOLE = 2**20  # bytes; a file up to this size is read in full
+_BLOCK, _BLOCKS = 4096, 256
+_LONGEST_HEADER = 10**8  # bytes; the limit of safetensors
+_COMMIT = re.compile(r"[0-9a-f]{40}")
+_BESIDE = (".md", ".gitattributes", ".log")  # files about a checkpoint, which do not change what it does
+
+
+def is_temporary(name: str) -> bool:
+    """Whether the name of a file or folder says that it will be renamed when it is complete."""
+    return any(fnmatch.fnmatchcase(name, pattern) for pattern in TEMPORARY)
+
+
+def unfinished(path: Path) -> str | None:
+    """Return what shows that a checkpoint, a file or a folder, is incomplete; None if nothing does.
+
+    A .safetensors file must be as long as its header says, an index may name only existing files, JSON must be valid,
+    and a zip file, as torch.save writes it, must end with its directory. Files of other kinds show nothing: the caller
+    must also check that they no longer grow. A folder without weights is incomplete.
+    """
+    try:
+        entries = [path, *sorted(path.rglob("*"))] if path.is_dir() else [path]
+        files = [entry for entry in entries if entry.is_file()]
+        if not files:
+            return f"{path.name}: no file is there"
+        if all(file.suffix in _TEXT for file in files):
+            return f"{path.name}: holds no weights, only {[file.name for file in files]}"
+        for entry in entries:
+            if is_temporary(entry.name):
+                return f"{entry.name}: its name is a temporary one"
+        for file in files:
+            trouble = _trouble(file)
+            if trouble is not None:
+                return f"{file.name}: {trouble}"
+    except FileNotFoundError as error:
+        return f"{error.filename}: went away while it was looked at"
+    return None
+
+
+def _trouble(file: Path) -> str | None:
+    check = next((check for suffix, check in _CHECKS.items() if file.name.endswith(suffix)), None)
+    try:
+        return None if check is None else check(file)
+    # truncated, or of another format than its name says
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        return f"cannot be read ({error})"
+
+
+def _safetensors(file: Path) -> str | None:
+    """Check the format: 8 bytes with the header's length, the header (JSON), and the data that it describes."""
+    size = file.stat().st_size
+    with file.open("rb") as opened:
+        length = int.from_bytes(opened.read(8), "little")
+        if size < 8 + length:
+            return f"has {size} bytes, its header alone has {8 + length}"
+        header = json.loads(opened.read(length))
+    ends = [tensor["data_offsets"][1] for name, tensor in header.items() if name != "__metadata__"]
+    wanted = 8 + length + max(ends, default=0)
+    return None if size == wanted else f"has {size} bytes, its header says {wanted}"
+
+
+def _index(file: Path) -> str | None:
+    names = set(json.loads(file.read_text(encoding="utf-8"))["weight_map"].values())
+    absent = sorted(name for name in names if not (file.parent / name).is_file())
+    return f"names {absent}, which are missing" if absent else None
+
+
+def _json(file: Path) -> str | None:
+    json.loads(file.read_text(encoding="utf-8"))
+    return None
+
+
+def _zip(file: Path) -> str | None:
+    with file.open("rb") as opened:
+        begins = opened.read(4)
+    if not begins:
+        return "is empty"
+    return "is a zip file without its end" if begins == b"PK\x03\x04" and not zipfile.is_zipfile(file) else None
+
+
+_CHECKS: dict[str, Callable[[Path], str | None]] = {
+    ".safetensors": _safetensors,
+    ".index.json": _index,
+    ".json": _json,
+    ".pt": _zip,
+    ".pth": _zip,
+    ".bin": _zip,
+    ".ckpt": _zip,
+}
+
+
+def weights_of(paths: Sequence[Path]) -> dict[str, str | None] | None:
+    """Return `Agent.weights_id`: the digest of these files and folders, and their commit; None if there are none."""
+    return {"digest": digest(paths), "revision": next(filter(None, map(revision, paths)), None)} if paths else None
+
+
+def digest(paths: Iterable[Path]) -> str:
+    """Return `sampled-sha256:` and 64 hexadecimal digits, which are equal for equal files with equal names.
+
+    The digest covers the name and the size of each file, those of a folder in the order of their names, and part of its
+    content: up to 1 MiB all of it; of a larger .safetensors file the header and 4 KiB in the middle of each tensor; of
+    a zip file, as torch.save writes it, the directory with the CRC-32 of each part; of any other file 256 blocks of 4
+    KiB at equal distances. So other weights have another digest, and so have other statistics and settings beside them;
+    a deliberate change of a few bytes may go unnoticed. Hidden files and READMEs do not count.
+    """
+    found = hashlib.sha256()
+    for path in paths:
+        for file in _files(path):
+            name = file.name if file == path else file.relative_to(path).as_posix()
+            with contextlib.suppress(OSError):  # unreadable or gone, so it was not loaded
+                size = file.stat().st_size
+                found.update(json.dumps([name, size]).encode())
+                with file.open("rb") as opened:
+                    for part in _parts(file, opened, size):
+                        found.update(part)
+    return f"{METHOD}:{found.hexdigest()}"
+
+
+def revision(path: Path) -> str | None:
+    """Return the commit of the hub's repository if `path` is in a snapshot of the hub's cache, else None."""
+    parts = path.absolute().parts
+    commits = [commit for folder, commit in itertools.pairwise(parts) if folder == "snapshots"]
+    return next((commit for commit in commits if _COMMIT.fullmatch(commit)), None)
+
+
+def _files(path: Path) -> list[Path]:
+    if path.is_file():
+        return [path]
+    return sorted(
+        file
+        for file in path.rglob("*")
+        if file.is_file()
+        and file.suffix not in _BESIDE
+        and not any(part.startswith((".", "__pycache__")) for part in file.relative_to(path).parts)
+    )
+
+
+def _parts(file: Path, opened: BinaryIO, size: int) -> Iterator[bytes]:
+    if size <= _WHOLE:
+        yield opened.read()
+    elif file.suffix == ".safetensors" and (header := _header(opened)) is not None:
+        text, starts = header
+        yield text
+        for start, length in starts:
+            opened.seek(start)
+            yield opened.read(length)
+    elif zipfile.is_zipfile(file):
+        with contextlib.suppress(zipfile.BadZipFile), zipfile.ZipFile(file) as archive:
+            yield json.dumps([[one.filename, one.file_size, one.CRC] for one in archive.infolist()]).encode()
+    else:
+        for i in range(_BLOCKS):
+            opened.seek((size - _BLOCK) * i // (_BLOCKS - 1))
+            yield opened.read(_BLOCK)
+
+
+def _header(opened: BinaryIO) -> tuple[bytes, list[tuple[int, int]]] | None:
+    """Return the header of a .safetensors file, and the start and length of a block in the middle of each tensor.
+
+    Returns None if the file has another format. The format is: 8 bytes with the header's length, the header (JSON), and
+    the data that it describes.
+    """
+    length = int.from_bytes(opened.read(8), "little")
+    if length > _LONGEST_HEADER:
+        return None
+    text = opened.read(length)
+    try:
+        ranges = [tensor["data_offsets"] for name, tensor in json.loads(text).items() if name != "__metadata__"]
+        blocks = [(max(begin, (begin + end - _BLOCK) // 2), min(_BLOCK, end - begin)) for begin, end in ranges]
+    except (ValueError, KeyError, TypeError, AttributeError):
+        return None
+    return text, [(8 + length + start, size) for start, size in blocks]

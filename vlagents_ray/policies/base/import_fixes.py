@@ -1,0 +1,131 @@
+"""Fixes for torchvision and LeRobot where their wheels do not fit this machine, applied when they are imported.
+
+PyPI's torchvision for Linux is compiled against CUDA, so beside a CPU-only torch its operators do not load, and `import
+torchvision` fails. LeRobot 0.4.4 reads videos with torchcodec, which needs an installed FFmpeg, or with torchvision's
+`VideoReader`, which newer versions lack. Where the wheels fit, nothing is changed.
+
+`vlagents-ray env make` copies this file, which imports nothing of this package, into the environments that it makes,
+with a `.pth` file that calls `install`, so that LeRobot's own commands work there as well.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import logging
+import sys
+from collections.abc import Callable, Sequence
+from importlib.machinery import ModuleSpec, PathFinder
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+Execute = Callable[[ModuleType], None]
+
+log = logging.getLogger(__name__)
+_operators: list[Any] = []  # operators exist as long as the object that defined them
+
+
+def install() -> None:
+    """Fix later imports of torchvision and of LeRobot's `video_utils`; imports nothing itself."""
+    if not any(isinstance(finder, _Finder) or type(finder).__name__ == _Finder.__name__ for finder in sys.meta_path):
+        sys.meta_path.insert(0, _Finder())
+
+
+class _Finder:
+    """Finds the modules of `_FIXES` as Python does, and lets their entries execute them."""
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None = None, target: ModuleType | None = None
+    ) -> ModuleSpec | None:
+        fix = _FIXES.get(name)
+        spec = PathFinder.find_spec(name, path, target) if fix is not None else None
+        if fix is not None and spec is not None and spec.loader is not None:
+            execute = spec.loader.exec_module
+            spec.loader.exec_module = lambda module: fix(execute, module)  # type: ignore[method-assign]
+        return spec
+
+
+def _torchvision(execute: Execute, module: ModuleType) -> None:
+    """Declare the operators that the import looks up and that are missing.
+
+    That suffices for transforms and models; calls of the operators still fail, as they must.
+    """
+    torch = importlib.import_module("torch")
+    try:
+        execute(module)
+    except RuntimeError as error:
+        if "torchvision::" not in str(error) or torch.version.cuda or torch.version.hip:
+            raise
+    else:
+        return
+    for name in [name for name in sys.modules if name.startswith("torchvision.")]:
+        del sys.modules[name]
+        vars(module).pop(name.removeprefix("torchvision."), None)
+    library = torch.library.Library("torchvision", "FRAGMENT")
+    for operator in ("nms", "qnms"):
+        library.define(f"{operator}(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+    _operators.append(library)
+    execute(module)
+
+
+def _video_utils(execute: Execute, module: Any) -> None:
+    """Read videos with PyAV, which includes FFmpeg, where LeRobot's own decoders are missing."""
+    execute(module)
+    if importlib.util.find_spec("torchcodec") is not None:
+        try:
+            importlib.import_module("torchcodec.decoders")
+        except (ImportError, OSError, RuntimeError) as error:
+            log.warning("torchcodec does not load (%s); videos are read with PyAV", str(error).partition("\n")[0])
+            module.get_safe_default_codec = lambda: "pyav"
+    else:
+        module.get_safe_default_codec = lambda: "pyav"  # LeRobot's own function warns at every import
+    if not hasattr(importlib.import_module("torchvision.io"), "VideoReader"):
+        module.decode_video_frames_torchvision = decode_frames
+
+
+_FIXES: dict[str, Callable[[Execute, ModuleType], None]] = {
+    "torchvision": _torchvision,
+    "lerobot.datasets.video_utils": _video_utils,
+}
+
+
+def decode_frames(
+    video_path: Path | str,
+    timestamps: Sequence[float],
+    tolerance_s: float,
+    *_: object,
+    **__: object,
+) -> Any:
+    """Return the frames nearest to `timestamps`, s, as LeRobot's `decode_video_frames_torchvision` does.
+
+    Returns:
+        (N, 3, H, W) float32 in [0, 1].
+
+    Raises:
+        ValueError: LeRobot's `FrameTimestampError`: a frame is `tolerance_s` or more away.
+    """
+    av, np, torch = (importlib.import_module(name) for name in ("av", "numpy", "torch"))
+    frames: list[Any] = []
+    with av.open(str(video_path)) as container:
+        stream = container.streams.video[0]
+        first = max(0.0, min(timestamps) - tolerance_s)
+        container.seek(int(first / stream.time_base), stream=stream)  # to the key frame at or before that time
+        for frame in container.decode(stream):
+            frames.append(frame)
+            if frame.time >= max(timestamps) - tolerance_s:
+                break
+    nearest: list[Any] = [
+        min(frames, key=lambda frame: abs(frame.time - wanted), default=None) for wanted in timestamps
+    ]
+    off = [
+        wanted
+        for frame, wanted in zip(nearest, timestamps, strict=True)
+        if frame is None or abs(frame.time - wanted) >= tolerance_s
+    ]
+    if off:
+        raise importlib.import_module("lerobot.datasets.video_utils").FrameTimestampError(
+            f"{video_path}: has no frame within {tolerance_s} s of {off} s"
+        )
+    pixels = np.stack([frame.to_ndarray(format="rgb24") for frame in nearest])
+    return torch.from_numpy(pixels).permute(0, 3, 1, 2).float() / 255

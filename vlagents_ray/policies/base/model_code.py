@@ -1,0 +1,73 @@
+"""Python code of models from elsewhere: a checkout of their repository, or code in or named by a checkpoint.
+
+The code of a checkpoint runs with all rights of this process.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NoReturn
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.registry import require
+
+CURE = "if you trust whoever can write there, set trust_remote_code: true"
+
+
+def use_source(package: str, variable: str, source_dir: str | None = None, within: Sequence[str] = (".",)) -> None:
+    """Make `package` importable: from `source_dir`, from the checkout that `variable` names, or from an installation.
+
+    A named checkout goes first, since Python would import any folder with the package's name, such as a checkout in the
+    working directory.
+
+    Args:
+        package: The name of the package.
+        variable: The environment variable that names a checkout.
+        source_dir: A checkout, in place of the variable's.
+        within: The folders of the checkout to import from; the first one holds `package`.
+
+    Raises:
+        ConfigError: None of them holds the package.
+    """
+    checkout = source_dir or os.environ.get(variable)
+    if not checkout and importlib.util.find_spec(package) is not None:
+        return
+    folders = [] if not checkout else [Path(checkout).expanduser().resolve() / folder for folder in within]
+    if not folders or not (folders[0] / package).is_dir():
+        where = f"${variable}, which is not set" if not checkout else f"{checkout!r}"
+        raise ConfigError(
+            f"{package!r}: neither installed nor in {where}; check out its repository, and name that folder as the "
+            f"policy's source_dir or in {variable}"
+        )
+    sys.path[:0] = [str(folder) for folder in folders if str(folder) not in sys.path]
+
+
+@contextlib.contextmanager
+def remote_code(*, allowed: bool) -> Iterator[None]:
+    """Keep transformers from importing code of a checkpoint or hub repository in this context, unless it is allowed.
+
+    That holds also if a library requests such code: some pass `trust_remote_code=True` with a name that they read from
+    the checkpoint. A model that needs it fails with a `ConfigError`.
+    """
+    if allowed or importlib.util.find_spec("transformers") is None:
+        yield
+        return
+    dynamic: Any = require("transformers.dynamic_module_utils")
+
+    def refuse(name: Any, *_: Any, **__: Any) -> NoReturn:
+        raise ConfigError(f"{str(name)!r}: is Python code of the checkpoint, or of what it names on the hub; {CURE}")
+
+    # All imports of such code pass through these two: the first copies it to the cache, the second executes it.
+    ways = {name: getattr(dynamic, name) for name in ("create_dynamic_module", "get_class_in_module")}
+    for name in ways:
+        setattr(dynamic, name, refuse)
+    try:
+        yield
+    finally:
+        for name, way in ways.items():
+            setattr(dynamic, name, way)

@@ -1,0 +1,132 @@
+"""The inputs of a model from an observation: its cameras, its state vector, and the requests in `Obs.info`."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from vlagents_ray.contract import CameraSpec, Contract, StateSpec
+from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, MissingState
+from vlagents_ray.interface import LEFTOVER, SAMPLES, Obs
+from vlagents_ray.policies.base.config import ModelConfig
+from vlagents_ray.registry import require
+
+GRIPPER = "gripper"  # the part of the state that is `Obs.gripper`
+CLOSED = "gripper_closed"  # the part that is its closedness: 1 - `Obs.gripper`
+
+
+def choose_cameras(chosen: Mapping[str, str] | None, usual: Mapping[str, str], known: Sequence[str]) -> dict[str, str]:
+    """Map the model's name of each camera to the observation's: `chosen`, or the family's usual mapping.
+
+    `known` are the model's cameras. An unknown or missing camera raises `ConfigError`; it never becomes zeros.
+    """
+    mapping = dict(usual if chosen is None else chosen)
+    if set(mapping) != set(known):
+        raise ConfigError(
+            f"cameras: got {sorted(mapping)}, want {sorted(known)}, the checkpoint's own names, each with the name of "
+            f"one of yours, as in cameras: {{{', '.join(f'{name}: …' for name in known)}}}"
+        )
+    return mapping
+
+
+def camera_images(obs: Obs, cameras: Mapping[str, str]) -> dict[str, np.ndarray]:
+    """Return the images by the model's names, (H, W, 3) uint8 RGB, not copied."""
+    for ours in cameras.values():
+        if ours not in obs.cameras:
+            raise MissingCamera(ours, have=obs.cameras)
+    return {name: obs.cameras[ours] for name, ours in cameras.items()}
+
+
+def state_vector(obs: Obs, parts: Sequence[str], dim: int | None = None) -> np.ndarray:
+    """Return the parts in their order as one new (dim,) float32 vector."""
+    found = []
+    for part in parts:
+        if part in (GRIPPER, CLOSED):
+            if obs.gripper is None:
+                raise InvalidObservation("gripper: got none, want a number in [0, 1] where 1 = open")
+            found.append(np.array([obs.gripper if part == GRIPPER else 1.0 - obs.gripper], np.float32))
+        elif part in obs.state:
+            found.append(np.asarray(obs.state[part], np.float32))
+        else:
+            raise MissingState(part, have=obs.state)
+    vector = np.concatenate(found) if found else np.zeros(0, np.float32)
+    if dim is not None and vector.shape != (dim,):
+        raise InvalidObservation(
+            f"state: got {len(vector)} numbers from {list(parts)}, want {dim}, as the checkpoint was trained; "
+            f"set the policy's `state` to the parts that it was trained with"
+        )
+    return vector
+
+
+def camera_specs(cameras: Mapping[str, str]) -> dict[str, CameraSpec]:
+    """Return the cameras of a contract: images of any size, which the adapter resizes as its family does."""
+    return {ours: CameraSpec() for ours in cameras.values()}
+
+
+def needs_gripper(parts: Sequence[str]) -> bool:
+    """Whether `Obs.gripper` is among the parts, for a contract."""
+    return GRIPPER in parts or CLOSED in parts
+
+
+def state_specs(parts: Sequence[str], dim: int | None = None) -> dict[str, StateSpec]:
+    """Return the states of a contract: the parts, and the length of a part that is the whole vector."""
+    own = [part for part in parts if part not in (GRIPPER, CLOSED)]
+    return {part: StateSpec(dim=dim if list(parts) == own and len(own) == 1 else None) for part in own}
+
+
+def wanted_samples(obs: Obs, config: ModelConfig) -> int:
+    """Return how many samples of the action distribution the observation requests."""
+    samples = count_in(obs, SAMPLES)
+    if samples > config.max_samples:
+        raise InvalidObservation(
+            f"info[{SAMPLES!r}]: got {samples}, want at most {config.max_samples}; ask for fewer, or set the policy's "
+            f"`max_samples`"
+        )
+    if samples and config.actions != "chunk":
+        raise InvalidObservation(
+            f"info[{SAMPLES!r}]: got {samples} with actions: {config.actions}, want none; samples are of whole chunks, "
+            f"so set the policy's `actions` to 'chunk'"
+        )
+    return samples
+
+
+def leftover_plan(obs: Obs, contract: Contract | None) -> np.ndarray:
+    """Return a copy of the plan to continue from, (H, D) float32, of an observation that has one."""
+    given = obs.info[LEFTOVER]
+    dim = None if contract is None else contract.action.dim
+    try:
+        left = np.array(given, np.float32)
+    except (TypeError, ValueError):
+        left = np.zeros(0, np.float32)  # not numbers, which is refused below
+    if left.ndim != 2 or dim not in (None, left.shape[1]) or not np.isfinite(left).all():
+        got = given.shape if isinstance(given, np.ndarray) else type(given).__name__
+        raise InvalidObservation(f"info[{LEFTOVER!r}]: got {got}, want (H, {dim or 'D'}) finite float32")
+    return left
+
+
+def count_in(obs: Obs, name: str) -> int:
+    """Return the integer of that name in `Obs.info`; 0 if there is none."""
+    value = obs.info.get(name) or 0
+    if not isinstance(value, int | np.integer) or value < 0:
+        raise InvalidObservation(f"info[{name!r}]: got {value!r}, want an int from 0")
+    return int(value)
+
+
+def resize_with_pad(image: np.ndarray, height: int, width: int) -> np.ndarray:
+    """Scale the whole (H, W, 3) uint8 image and centre it on black (height, width, 3); always returns a copy.
+
+    Bilinear, by Pillow, and rounded like openpi's `image_tools.resize_with_pad`: its policies were trained on such
+    images.
+    """
+    have_height, have_width = image.shape[:2]
+    if (have_height, have_width) == (height, width):
+        return image.copy()
+    ratio = max(have_width / width, have_height / height)
+    inner_height, inner_width = max(1, int(have_height / ratio)), max(1, int(have_width / ratio))
+    pil = require("PIL.Image")
+    small = pil.fromarray(np.ascontiguousarray(image)).resize((inner_width, inner_height), pil.Resampling.BILINEAR)
+    padded = np.zeros((height, width, 3), np.uint8)
+    top, left = (height - inner_height) // 2, (width - inner_width) // 2
+    padded[top : top + inner_height, left : left + inner_width] = small
+    return padded

@@ -1,0 +1,113 @@
+"""The common parts of OpenVLA and OpenVLA-OFT: settings, the dataset of an answer, the contract."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.contract import ActionSpec
+from vlagents_ray.errors import InvalidObservation, NotReset
+from vlagents_ray.interface import Obs
+from vlagents_ray.policies.base import ModelPolicy, Prediction, Row
+from vlagents_ray.policies.openvla.prismatic import Prismatic
+from vlagents_ray.policies.openvla.statistics import Scale, Statistics
+
+UNNORM_KEY = "unnorm_key"  # key of reset's options and of an observation's info, as sent by OpenVLA's clients
+_SINGLE_ARM = 7  # six numbers of a motion, and one of the gripper
+
+
+@dataclass(frozen=True, slots=True)
+class PreparedRow:
+    """A valid row, ready for the model."""
+
+    row: Row
+    scale: Scale  # the scale of its dataset's actions
+    model_input: Any
+
+
+@dataclass(frozen=True, slots=True)
+class DecodedChunk:
+    """A chunk (H, D) in [-1, 1], and the distribution whose mode it is, where the model states one."""
+
+    values: np.ndarray
+    mean: np.ndarray | None = None
+    spread: np.ndarray | None = None
+
+    def prediction(self, scale: Scale) -> Prediction:
+        """Convert the answer to physical units."""
+        return Prediction(
+            scale.restore(self.values),
+            None if self.mean is None else scale.restore(self.mean),
+            None if self.spread is None else scale.restore_spread(self.spread),
+        )
+
+
+class PrismaticPolicy(ModelPolicy):
+    """Computes all valid rows of a batch together, each in the units of its own dataset."""
+
+    config: Any
+
+    @property
+    @abc.abstractmethod
+    def _checkpoint(self) -> Prismatic | None:
+        """The checkpoint; None before it is loaded."""
+
+    @abc.abstractmethod
+    def _model_input(self, row: Row, key: str) -> Any:
+        """Return the model's input for a row with that dataset; an error fails that row only."""
+
+    @abc.abstractmethod
+    def _compute(self, prepared: Sequence[PreparedRow]) -> list[DecodedChunk]:
+        """Compute all rows in one batch."""
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        """Begin an episode; `kwargs` may contain `unnorm_key`, the dataset of its actions."""
+        info = super().reset(obs, instruction, **kwargs)
+        self._begun().memory[UNNORM_KEY] = self._named(kwargs)
+        return info
+
+    def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
+        """Compute one chunk for each row."""
+        results: dict[int, Prediction | Exception] = {}
+        prepared: dict[int, PreparedRow] = {}
+        for i, row in enumerate(rows):
+            try:
+                key = self._key(row)
+                prepared[i] = PreparedRow(row, self._statistics.scale(key), self._model_input(row, key))
+            except Exception as error:  # noqa: BLE001 - handed to the session whose request failed
+                results[i] = error
+        answers = self._compute(list(prepared.values())) if prepared else []
+        for (i, entry), answer in zip(prepared.items(), answers, strict=True):
+            results[i] = answer.prediction(entry.scale)
+        return [results[i] for i in range(len(rows))]
+
+    @property
+    def _statistics(self) -> Statistics:
+        checkpoint = self._checkpoint
+        if checkpoint is None:
+            raise NotReset(f"{type(self).__name__}: not loaded; call initialize() first")
+        return checkpoint.statistics
+
+    def _named(self, options: Mapping[str, Any]) -> str | None:
+        """Return the dataset that `options` name, or None."""
+        key = options.get(UNNORM_KEY)
+        if key is None:
+            return None
+        if not isinstance(key, str):
+            raise InvalidObservation(f"unnorm_key: got {type(key).__name__}, want a dataset's name")
+        return self._statistics.key(key)
+
+    def _key(self, row: Row) -> str:
+        """Return the dataset of a row: the observation's, the episode's, the config's, or the only one."""
+        return self._statistics.key(self._named(row.info) or row.memory.get(UNNORM_KEY) or self.config.unnorm_key)
+
+    def _action(self) -> ActionSpec:
+        """Describe an action: its meaning depends on the dataset, except for the gripper of a single arm."""
+        dims = set() if self._checkpoint is None else self._statistics.action_dims(self.config.unnorm_key)
+        dim = dims.pop() if len(dims) == 1 else None
+        single = dim == _SINGLE_ARM
+        return ActionSpec(dim=dim, gripper_open=1.0 if single else None, gripper_closed=0.0 if single else None)

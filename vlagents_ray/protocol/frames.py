@@ -1,0 +1,281 @@
+"""The binary frame: a complete message, with its images and arrays as aligned raw bytes.
+
+The same frame travels in an HTTP body, in a WebSocket message and through shared memory. Its header (see
+`vlagents_ray.protocol.frame_layout`) is one request or reply, or a list of them under "requests" or "replies", as a
+vector of environments sends them.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Any, cast
+
+from vlagents_ray.errors import (
+    MalformedMessage,
+    MessageTooLarge,
+    Overloaded,
+    TooManyRequests,
+    VLAgentsError,
+    from_code,
+)
+from vlagents_ray.images.codecs import RAW, ImageCodec
+from vlagents_ray.interface import Act
+from vlagents_ray.protocol.arrays import Buffer
+from vlagents_ray.protocol.budget import Budget
+from vlagents_ray.protocol.frame_layout import (
+    assemble,
+    dump,
+    pack,
+    unpack,
+)
+from vlagents_ray.protocol.messages import (
+    DEFAULT_LIMITS,
+    NAME_CHARACTERS,
+    OPS,
+    RANKS,
+    Limits,
+    Op,
+    Reply,
+    Request,
+    is_name,
+)
+from vlagents_ray.protocol.observations import is_number, read_obs, write_obs
+from vlagents_ray.protocol.values import ValueReader, ValueWriter
+
+CONTENT_TYPE = "application/x-vlagents-frame"
+_OPTIONAL: dict[str, Any] = {
+    "request_id": "",
+    "session": "",
+    "rank": "robot",
+    "step": None,
+    "deadline_ms": None,
+}  # with defaults
+_WITH_OBS = ("reset", "act", "observe")
+_OF_CLOSE = ("op", *_OPTIONAL)
+_REQUEST_KEYS = {"op", "obs", "instruction", "kwargs", "contract", "history", "blobs", *_OPTIONAL}
+
+
+def encode_request(request: Request, codec: ImageCodec = RAW) -> bytes:
+    """Encode a request as one frame. `request.obs` is not changed."""
+    return b"".join(request_parts([request], codec))
+
+
+def encode_requests(requests: Sequence[Request], codec: ImageCodec = RAW) -> bytes:
+    """Encode requests as one frame, the inverse of `decode_requests`."""
+    return b"".join(request_parts(requests, codec))
+
+
+def request_parts(requests: Sequence[Request], codec: ImageCodec = RAW) -> list[Buffer]:
+    """Return the pieces of a frame of requests, in order; raw images and arrays are views, not copies."""
+    writer = ValueWriter()
+    nodes = [_write_request(request, writer, codec) for request in requests]
+    return pack(nodes[0] if len(nodes) == 1 else {"requests": nodes}, writer.blobs)
+
+
+def _write_request(request: Request, writer: ValueWriter, codec: ImageCodec) -> dict[str, Any]:
+    node: dict[str, Any] = {"op": request.op}
+    if request.obs is not None:
+        node["obs"] = write_obs(request.obs, writer, codec)
+    if request.instruction is not None:
+        node["instruction"] = request.instruction
+    if request.kwargs:
+        node["kwargs"] = writer.value(request.kwargs)
+    if request.contract is not None:
+        node["contract"] = request.contract
+    if request.history:
+        node["history"] = [write_obs(obs, writer, codec) for obs in request.history]
+    for name, default in _OPTIONAL.items():
+        if (value := getattr(request, name)) != default:
+            node[name] = value
+    return node
+
+
+def decode_request(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> Request:
+    """Return the request in a frame. Its arrays are views of `data`; nothing in it is executed or unpickled."""
+    header, blobs = unpack(data, limits)
+    return _read_request(header, ValueReader(blobs, Budget(limits)), limits)
+
+
+def decode_requests(data: Buffer, budget: Budget, ops: Sequence[Op] = OPS) -> list[Request | Reply]:
+    """Return the requests in a frame, each one of `ops`; a refused request is replaced by the reply with its error.
+
+    `budget` is charged for each request before any of it is decoded.
+    """
+    limits = budget.limits
+    header, blobs = unpack(data, limits)
+    nodes = header.get("requests", [header])
+    if not isinstance(nodes, list) or not nodes or not all(isinstance(node, dict) for node in nodes):
+        raise MalformedMessage(f"requests: got {str(nodes)[:40]}, want a list of requests")
+    if len(nodes) > limits.requests:
+        raise MessageTooLarge(f"requests: got {len(nodes)}, the limit is {limits.requests} in one frame")
+    read: list[Request | Reply] = []
+    reader = ValueReader(blobs, budget)
+    for node in nodes:
+        try:
+            budget.begin(node.get("op"), node.get("rank"))
+            reader.begin()
+            read.append(_read_request(node, reader, limits, ops))
+        except VLAgentsError as error:
+            name = node.get("request_id")
+            read.append(Reply(name if isinstance(name, str) and is_name(name) else "", error=error))
+    return read
+
+
+def _read_request(node: dict[str, Any], reader: ValueReader, limits: Limits, ops: Sequence[Op] = OPS) -> Request:
+    unknown = node.keys() - _REQUEST_KEYS
+    if unknown:
+        raise MalformedMessage(f"request: unknown keys {sorted(unknown)}, want some of {sorted(_REQUEST_KEYS)}")
+    if node.get("op") not in ops:
+        raise MalformedMessage(f"op: got {str(node.get('op'))[:40]!r}, want one of {list(ops)}")
+    if node["op"] == "close":  # costs nothing, and carries nothing
+        node = {name: value for name, value in node.items() if name in _OF_CLOSE}
+    obs, history = node.get("obs"), node.get("history") or []
+    if not isinstance(history, list):
+        raise MalformedMessage(f"history: got {type(history).__name__}, want a list of observations")
+    if len(history) > limits.history:
+        raise MessageTooLarge(f"history: got {len(history)} observations, the limit is {limits.history}")
+    return check_request(
+        Request(
+            op=cast(Op, node["op"]),
+            obs=None if obs is None else read_obs(obs, reader, limits),
+            instruction=node.get("instruction"),
+            kwargs=reader.value(node.get("kwargs") or {}),
+            contract=node.get("contract"),
+            history=[read_obs(one, reader, limits) for one in history],
+            **{name: node.get(name, default) for name, default in _OPTIONAL.items()},
+        ),
+        limits,
+    )
+
+
+def check_request(request: Request, limits: Limits) -> Request:
+    """Check the types and sizes that JSON does not fix, for requests of any format; returns the request."""
+    if request.obs is None and request.op in _WITH_OBS:
+        raise MalformedMessage(f"{request.op}: no 'obs'; send the observation")
+    for name in ("instruction", "request_id", "session"):
+        text = getattr(request, name)
+        if text is not None and not isinstance(text, str):
+            raise MalformedMessage(f"{name}: got {type(text).__name__}, want text")
+        if text and len(text) > (limits.text if name == "instruction" else NAME_CHARACTERS):
+            raise MessageTooLarge(f"{name}: got {len(text)} characters, which is over the limit")
+        if text and name != "instruction" and not is_name(text):
+            raise MalformedMessage(f"{name}: got {text[:40]!r}, want visible ASCII characters without spaces")
+    for name in ("kwargs", "contract"):
+        value = getattr(request, name)
+        if value is not None and not isinstance(value, dict):
+            raise MalformedMessage(f"{name}: got {type(value).__name__}, want an object")
+    if request.rank not in RANKS:
+        raise MalformedMessage(f"rank: got {str(request.rank)[:40]!r}, want one of {list(RANKS)}")
+    if request.step is not None and (type(request.step) is not int or request.step < 0):
+        raise MalformedMessage(f"step: got {str(request.step)[:40]}, want a whole number of acts")
+    if request.deadline_ms is not None and not (is_number(request.deadline_ms) and request.deadline_ms > 0):
+        raise MalformedMessage(f"deadline_ms: got {str(request.deadline_ms)[:40]}, want a positive number")
+    return request
+
+
+def encode_reply(reply: Reply) -> bytes:
+    """Encode a reply as one frame."""
+    return encode_replies([reply])
+
+
+def encode_replies(replies: Sequence[Reply], *, arrived: float | None = None) -> bytes:
+    """Encode the replies to one frame of requests, in the requests' order, as one frame.
+
+    With `arrived`, the `time.perf_counter()` at which the requests arrived, the timing of replies without an error also
+    gets `encode_ms` and `total_ms`, which include all but joining the parts of the frame.
+    """
+    begun = time.perf_counter()
+    writer = ValueWriter()
+    nodes = [dump(_write_reply(reply, writer)) for reply in replies]
+    if len(nodes) > 1 and sum(map(len, (*nodes, *writer.blobs))) > DEFAULT_LIMITS.body_bytes:
+        large = MessageTooLarge(f"replies: over {DEFAULT_LIMITS.body_bytes} bytes together; ask for fewer at once")
+        return encode_replies([Reply(reply.request_id, error=large) for reply in replies], arrived=arrived)
+    if arrived is not None:
+        ended = time.perf_counter()
+        both = {"encode_ms": (ended - begun) * 1e3, "total_ms": (ended - arrived) * 1e3}
+        for reply in replies:
+            if reply.error is None:
+                reply.timing |= both
+    for i, reply in enumerate(replies):  # last and separately, so that it includes the time of the rest
+        if reply.timing:
+            nodes[i] = f'{nodes[i][:-1]},"timing":{_timing(reply.timing)}}}'
+    blobs = dump([len(blob) for blob in writer.blobs])
+    head = nodes[0][1:-1] if len(nodes) == 1 else f'"replies":[{",".join(nodes)}]'
+    return b"".join(assemble(f'{{{head},"blobs":{blobs}}}', writer.blobs))
+
+
+def _timing(timing: dict[str, float]) -> str:
+    """Return the timing as JSON, with times to 0.1 us: their last digits would take a third of an encoder's time."""
+    return "{" + ",".join([f'"{k}":{v:.4f}' if type(v) is float else f'"{k}":{v}' for k, v in timing.items()]) + "}"
+
+
+def _write_reply(reply: Reply, writer: ValueWriter) -> dict[str, Any]:
+    node: dict[str, Any] = {"request_id": reply.request_id}
+    if reply.error is not None:
+        node["error"] = describe_error(reply.error)
+    if reply.act is not None:
+        node["act"] = {
+            "action": writer.array(reply.act.action),
+            "done": bool(reply.act.done),
+            "info": writer.value(reply.act.info),
+        }
+    if reply.info is not None:
+        node["info"] = writer.value(reply.info)
+    if reply.step is not None:
+        node["step"] = reply.step
+    if reply.draining:
+        node["draining"] = True
+    return node
+
+
+def decode_reply(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> Reply:
+    """Return the reply in a frame; a server's error has the class that the server raised."""
+    return decode_replies(data, limits)[0]
+
+
+def decode_replies(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> list[Reply]:
+    """Return the replies in a frame, at least one."""
+    header, blobs = unpack(data, limits)
+    nodes = header.get("replies", [header])
+    if not isinstance(nodes, list) or not nodes or not all(isinstance(node, dict) for node in nodes):
+        raise MalformedMessage(f"replies: got {str(nodes)[:40]}, want a list of replies")
+    return [_read_reply(node, ValueReader(blobs, Budget(limits))) for node in nodes]
+
+
+def _read_reply(node: dict[str, Any], reader: ValueReader) -> Reply:
+    reply = Reply(
+        request_id=str(node.get("request_id", "")),
+        step=node.get("step"),
+        draining=bool(node.get("draining")),
+        timing=node.get("timing") or {},
+    )
+    if (error := node.get("error")) is not None:
+        reply.error = read_error(error)
+    elif (act := node.get("act")) is not None:
+        try:
+            reply.act = Act(reader.blob(act["action"]), bool(act["done"]), reader.value(act["info"]))
+        except (KeyError, TypeError) as error:
+            raise MalformedMessage(f"reply: got {str(act)[:80]}, want action, done and info") from error
+    else:
+        reply.info = reader.value(node.get("info") or {})
+    return reply
+
+
+def describe_error(error: VLAgentsError) -> dict[str, Any]:
+    """Return an error as a node of a reply or a problem+json document; the inverse of `read_error`."""
+    node: dict[str, Any] = {"code": error.code, "detail": str(error)}
+    if isinstance(error, TooManyRequests | Overloaded):
+        node["retry_after_s"] = round(error.retry_after_s, 3)
+    return node
+
+
+def read_error(node: Any) -> VLAgentsError:
+    """Return the error that a reply or a problem+json document describes."""
+    if not isinstance(node, dict):
+        return VLAgentsError(str(node))
+    error = from_code(str(node.get("code", "")), str(node.get("detail", "")))
+    wait_s: Any = node.get("retry_after_s")
+    if isinstance(error, TooManyRequests | Overloaded) and is_number(wait_s) and wait_s >= 0:
+        error.retry_after_s = float(wait_s)
+    return error

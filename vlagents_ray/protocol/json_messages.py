@@ -1,0 +1,112 @@
+"""Requests and replies for clients without this project's frames: JSON, with images as separate JPEG or PNG files.
+
+The JSON of a request holds `instruction`, `gripper`, `state`, `info`, and for reset `kwargs` and `contract`; each
+camera is a separate file. Arrays in a reply become lists.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import MalformedMessage, VLAgentsError
+from vlagents_ray.protocol.budget import Budget
+from vlagents_ray.protocol.frame_layout import require_few_values
+from vlagents_ray.protocol.frames import check_request, describe_error
+from vlagents_ray.protocol.messages import Op, Reply, Request
+from vlagents_ray.protocol.observations import read_obs
+from vlagents_ray.protocol.values import ValueReader
+
+PROBLEM_TYPE = "application/problem+json"
+CAMERA_PREFIX = "cameras."
+_KEYS = {"instruction", "gripper", "state", "info", "kwargs", "contract", "request_id", "deadline_ms"}
+
+
+def request_from_parts(op: Op, text: str | bytes, images: Mapping[str, bytes], budget: Budget) -> Request:
+    """Return a request from its JSON document and its images by camera name, each a JPEG or PNG file.
+
+    `budget` is charged before any of it is decoded.
+    """
+    limits = budget.limits
+    budget.begin(op)
+    require_few_values(text)
+    try:
+        document = json.loads(text, object_pairs_hook=_distinct)
+    except (ValueError, RecursionError) as error:
+        raise MalformedMessage(f"obs: not JSON ({error})") from error
+    if not isinstance(document, dict):
+        raise MalformedMessage(f"obs: got {type(document).__name__}, want an object")
+    unknown = document.keys() - _KEYS
+    if "cameras" in unknown:
+        raise MalformedMessage(
+            "obs: got 'cameras' in the JSON document; send multipart/form-data, in it the document as part 'obs' and "
+            "each image as a file 'cameras.<name>', JPEG or PNG"
+        )
+    if unknown:
+        raise MalformedMessage(f"obs: unknown keys {sorted(unknown)}, want some of {sorted(_KEYS)}")
+    names = [] if op == "close" else list(images)  # costs nothing, and carries nothing
+    reader = ValueReader([images[name] for name in names], budget)
+    obs = {key: document[key] for key in ("gripper", "state", "info") if key in document}
+    obs["cameras"] = {name: {"$": ["img", index]} for index, name in enumerate(names)}
+    return check_request(
+        Request(
+            op=op,
+            obs=read_obs(obs, reader, limits),
+            instruction=document.get("instruction"),
+            kwargs=reader.value(document.get("kwargs") or {}),
+            contract=document.get("contract"),
+            request_id=document.get("request_id", ""),
+            deadline_ms=document.get("deadline_ms"),
+        ),
+        limits,
+    )
+
+
+def _distinct(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return a JSON object; raises an error for a key that occurs twice, since it is unclear which value counts."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        keys = [key for key, _ in pairs]
+        twice = next(key for key in keys if keys.count(key) > 1)
+        raise ValueError(f"the key {twice[:80]!r} stands twice in one object")
+    return found
+
+
+def reply_to_json(reply: Reply) -> dict[str, Any]:
+    """Return a reply without an error as plain JSON values."""
+    document: dict[str, Any] = {"request_id": reply.request_id}
+    if reply.act is not None:
+        document |= {"action": reply.act.action.tolist(), "done": reply.act.done, "info": plain_values(reply.act.info)}
+    else:
+        document["info"] = plain_values(reply.info or {})
+    return document | {"timing": reply.timing}
+
+
+def problem(error: VLAgentsError, request_id: str = "") -> dict[str, Any]:
+    """Return the problem+json document (RFC 9457) of an error; `code` is the stable name to test for."""
+    return {
+        "type": "about:blank",
+        "title": type(error).__name__,
+        "status": error.status,
+        **describe_error(error),
+        "request_id": request_id,
+    }
+
+
+def plain_values(value: Any) -> Any:
+    """Convert a value to JSON's types, without any of numpy: arrays become lists, bytes become base64."""
+    if isinstance(value, Mapping):
+        return {key: plain_values(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain_values(item) for item in value]
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, (bytes, bytearray, memoryview)):
+        return base64.b64encode(value).decode()
+    return value

@@ -1,0 +1,349 @@
+"""Acts between two processes of one machine, without repeating what stays the same from step to step.
+
+An observation's layout (session, class, names and sizes of cameras and state) is sent once, as JSON, and referred to by
+its number from then on. The rest of a request is an `ITEM`, and its arrays, which lie one after the other in shared
+memory, each at a multiple of 64. The reply is an `ANSWER`, its action, and the `WEIGHTS` that acted. All other messages
+(a reset, `info`, an error) travel as frames; see `vlagents_ray.protocol.frames`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge
+from vlagents_ray.interface import POLICY, Act, Obs
+from vlagents_ray.protocol.arrays import Buffer
+from vlagents_ray.protocol.frames import check_request
+from vlagents_ray.protocol.messages import Limits, RankName, Reply, Request, is_name
+
+_ALIGN = 64
+_ID_BYTES = 40  # of a request's id
+_MOST = 1024  # most layouts of one connection
+_NONE = float("nan")
+_UINT8, _FLOAT32 = np.dtype(np.uint8), np.dtype(np.float32)
+
+COUNT = struct.Struct("<I")
+ITEM = struct.Struct(f"<IIqdd{_ID_BYTES}s")  # layout, bytes of its JSON, step or -1, deadline ms, gripper, request id
+ANSWER = struct.Struct(f"<{_ID_BYTES}sqBB2xIIIddddd")  # id, step, flags, dimensions, H, D, batch size, times in ms
+_DONE, _DRAINING, _POLICY = 1, 2, 4
+WEIGHTS = struct.Struct("<q16s")  # of each answer, after all actions, with the flag _POLICY: version, digest
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """The constant part of a session's requests, and the places of their arrays."""
+
+    session: str
+    rank: RankName
+    cameras: tuple[tuple[str, tuple[int, ...], int], ...]  # name, (H, W, 3) uint8, offset in bytes
+    state: tuple[tuple[str, tuple[int, ...], int], ...]  # name, (D,) float32, offset in bytes
+    size: int  # bytes of all arrays
+
+    @classmethod
+    def of(cls, session: str, rank: RankName, cameras: Sequence[Any], state: Sequence[Any]) -> Layout:
+        """Return the layout with the offsets that follow from the shapes.
+
+        `cameras` and `state` are pairs of name and shape.
+        """
+        at = 0
+        placed: tuple[list[Any], list[Any]] = ([], [])
+        for group, arrays, width in zip(placed, (cameras, state), (1, 4), strict=True):
+            for name, shape in arrays:
+                group.append((name, tuple(shape), at))
+                at += -(-math.prod(shape) * width // _ALIGN) * _ALIGN
+        return cls(session, rank, tuple(placed[0]), tuple(placed[1]), at)
+
+    def placed(self, request: Request, at: int) -> list[tuple[int, np.ndarray]] | None:
+        """Return the offset of each array if the first one is at `at`; None for requests other than acts of this
+        layout.
+
+        Comparing each array is faster than computing its `_key`.
+        """
+        obs = request.obs
+        if obs is None or not _is_plain(request, obs) or request.rank != self.rank:
+            return None
+        if len(obs.cameras) != len(self.cameras) or len(obs.state) != len(self.state):
+            return None
+        arrays = []
+        for (name, shape, offset), (own, image) in zip(self.cameras, obs.cameras.items(), strict=True):
+            if type(image) is not np.ndarray or own != name or image.shape != shape or image.dtype != _UINT8:
+                return None
+            arrays.append((at + offset, image))
+        for (name, shape, offset), (own, part) in zip(self.state, obs.state.items(), strict=True):
+            if type(part) is not np.ndarray or own != name or part.shape != shape or part.dtype.kind != "f":
+                return None
+            arrays.append((at + offset, part if part.dtype == _FLOAT32 else part.astype(np.float32)))
+        return arrays
+
+
+class ShmWriter:
+    """Writes the acts of one connection; remembers which layouts the receiver knows."""
+
+    def __init__(self) -> None:
+        self._known: dict[Any, tuple[int, Layout]] = {}
+        self._latest: dict[str, tuple[int, Layout]] = {}  # by session; its next act probably has the same layout
+
+    def write(self, requests: Sequence[Request]) -> Written | None:
+        """Return the message and the offsets of the arrays; None if the requests must travel as a frame."""
+        items, texts = [COUNT.pack(len(requests))], []
+        arrays: list[tuple[int, np.ndarray]] = []
+        new: dict[Any, tuple[int, Layout]] = {}
+        latest: dict[str, tuple[int, Layout]] = {}
+        at = 0
+        for request in requests:
+            text = b""
+            known = self._latest.get(request.session)
+            placed = None if known is None else known[1].placed(request, at)
+            if known is None or placed is None:
+                if (key := _key(request)) is None:
+                    return None
+                if (known := self._known.get(key) or new.get(key)) is None:
+                    if (number := len(self._known) + len(new)) >= _MOST:
+                        return None
+                    known = new[key] = (number, Layout.of(*key))
+                    text = json.dumps(key).encode()
+                    texts.append(text)
+                latest[request.session] = known
+                placed = known[1].placed(request, at) or []
+            number, layout = known
+            arrays += placed
+            at += layout.size
+            obs: Obs = request.obs  # type: ignore[assignment]  # a request with a layout has one
+            step = -1 if request.step is None else request.step
+            deadline_ms = _NONE if request.deadline_ms is None else request.deadline_ms
+            gripper = _NONE if obs.gripper is None else obs.gripper
+            items.append(ITEM.pack(number, len(text), step, deadline_ms, gripper, request.request_id.encode()))
+        if latest:
+            self._known |= new
+            self._latest |= latest
+        return Written(b"".join(items + texts), max(at, _ALIGN), arrays)
+
+
+@dataclass(slots=True)
+class Written:
+    """Acts, ready to be sent."""
+
+    message: bytes
+    size: int  # bytes of memory that the arrays take
+    arrays: list[tuple[int, np.ndarray]]  # offset, array
+
+    def parts(self) -> list[Buffer]:
+        """Return the memory in pieces, in order: the arrays, not copied where possible, and the gaps between them."""
+        pieces: list[Buffer] = []
+        end = 0
+        for at, array in self.arrays:
+            if array.size:
+                pieces += (bytes(at - end), np.ascontiguousarray(array).data.cast("B"))
+                end = at + array.nbytes
+        pieces.append(bytes(self.size - end))
+        return pieces
+
+
+class ShmReader:
+    """Reads the acts of one connection."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self._known: dict[int, Layout] = {}
+
+    def read(self, message: memoryview, memory: np.ndarray) -> list[Request]:
+        """Return the requests, whose arrays are views of `memory`, (N,) uint8.
+
+        Raises `InvalidInput` if there are none.
+        """
+        try:
+            (count,) = COUNT.unpack_from(message)
+            text_at = COUNT.size + count * ITEM.size
+            requests = []
+            at = 0
+            for item in ITEM.iter_unpack(message[COUNT.size : text_at]):
+                number, text_bytes, step, deadline_ms, gripper, request_id = item
+                if text_bytes:
+                    if len(self._known) >= _MOST:
+                        raise MessageTooLarge(f"local: more than {_MOST} layouts on one connection; connect again")
+                    self._known[number] = self._layout(bytes(message[text_at : text_at + text_bytes]))
+                    text_at += text_bytes
+                layout = self._known[number]
+                if at + layout.size > memory.size:
+                    raise MalformedMessage(f"local: {memory.size} bytes of memory, the arrays need more")
+                if not is_name(name_of_request := request_id.rstrip(b"\0").decode()):
+                    raise MalformedMessage(f"local: request_id: got {name_of_request!r}, want visible ASCII characters")
+                obs = Obs(gripper=None if math.isnan(gripper) else gripper)
+                for name, shape, place in layout.cameras:
+                    obs.cameras[name] = np.ndarray(shape, _UINT8, memory, at + place)
+                for name, shape, place in layout.state:
+                    obs.state[name] = np.ndarray(shape, _FLOAT32, memory, at + place)
+                at += layout.size
+                request = Request(
+                    "act",
+                    obs,
+                    session=layout.session,
+                    rank=layout.rank,
+                    step=None if step < 0 else step,
+                    request_id=name_of_request,
+                    deadline_ms=None if math.isnan(deadline_ms) else deadline_ms,
+                )
+                requests.append(request)
+        except (struct.error, ValueError, KeyError, TypeError) as error:
+            if isinstance(error, MalformedMessage | MessageTooLarge):
+                raise
+            raise MalformedMessage(f"local: not an act ({type(error).__name__}: {error})") from error
+        if len(requests) != count or not count:
+            raise MalformedMessage(f"local: {len(requests)} acts in a message that says {count}")
+        return requests
+
+    def _layout(self, text: bytes) -> Layout:
+        limits = self._limits
+        session, rank, cameras, state = json.loads(text)
+        check_request(Request("close", session=session, rank=rank), limits)
+        if not isinstance(cameras, list) or not isinstance(state, list):
+            raise MalformedMessage("local: cameras and state: want lists of names and shapes")
+        if max(len(cameras), len(state)) > limits.cameras:
+            raise MessageTooLarge(
+                f"obs: got {len(cameras)} cameras and {len(state)} states, the limit is {limits.cameras}"
+            )
+        for (name, shape), dimensions, most in (
+            *((each, 3, limits.pixels) for each in cameras),
+            *((each, 1, limits.state_values) for each in state),
+        ):
+            if not isinstance(name, str) or not isinstance(shape, list) or len(shape) != dimensions:
+                raise MalformedMessage(f"local: got {name!r} of {shape!r}, want a name and {dimensions} dimensions")
+            if not all(type(n) is int and n >= 0 for n in shape) or (dimensions == 3 and shape[2] != 3):
+                raise MalformedMessage(f"local: {name!r}: got shape {shape!r}, want (H, W, 3) or (D,)")
+            if (size := math.prod(shape[:2])) > most:
+                raise MessageTooLarge(f"local: {name!r}: got {size} pixels or values, the limit is {most}")
+        return Layout.of(session, rank, cameras, state)
+
+
+def _is_plain(request: Request, obs: Obs) -> bool:
+    """Whether a request may have a layout, apart from its arrays."""
+    if request.op != "act" or obs.info or len(request.request_id) > _ID_BYTES:
+        return False
+    return obs.gripper is None or 0.0 <= obs.gripper <= 1.0  # else an error, for which the act must travel as a frame
+
+
+def _key(request: Request) -> tuple[Any, ...] | None:
+    """Return what determines the layout; None if the request must travel as a frame."""
+    obs = request.obs
+    if obs is None or not _is_plain(request, obs):
+        return None
+    for image in obs.cameras.values():
+        if type(image) is not np.ndarray or image.dtype != _UINT8 or image.ndim != 3 or image.shape[2] != 3:
+            return None
+    for part in obs.state.values():
+        if type(part) is not np.ndarray or part.ndim != 1 or part.dtype.kind != "f":
+            return None
+    return (
+        request.session,
+        request.rank,
+        tuple([(name, image.shape) for name, image in obs.cameras.items()]),
+        tuple([(name, part.shape) for name, part in obs.state.items()]),
+    )
+
+
+def write_answers(replies: Sequence[Reply], *, arrived: float) -> bytes | None:
+    """Return the replies to acts, with `timing` as by `encode_replies`; None if they must travel as a frame."""
+    begun = time.perf_counter()
+    actions, weights = [], []
+    for reply in replies:
+        act = reply.act
+        if reply.error is not None or act is None or act.action.dtype != _FLOAT32:
+            return None
+        if act.info:
+            if (packed := _packed(act.info)) is None:
+                return None
+            weights.append(packed)
+        if act.action.ndim not in (1, 2) or act.action.shape[0] > 0xFFFF or len(reply.request_id) > _ID_BYTES:
+            return None
+        actions.append(act.action.tobytes())
+    if weights and len(weights) != len(replies):  # all name them, or none does
+        return None
+    named = _POLICY if weights else 0
+    ended = time.perf_counter()
+    parts = [COUNT.pack(len(replies))]
+    for reply in replies:
+        act = reply.act
+        timing = reply.timing
+        encode_ms = timing["encode_ms"] = (ended - begun) * 1e3
+        total_ms = timing["total_ms"] = (ended - arrived) * 1e3
+        shape = act.action.shape  # type: ignore[union-attr]
+        flags = named | (_DONE if act.done else 0) | (_DRAINING if reply.draining else 0)  # type: ignore[union-attr]
+        parts.append(
+            ANSWER.pack(
+                reply.request_id.encode(),
+                reply.step or 0,
+                flags,
+                len(shape),
+                shape[0],
+                shape[-1],
+                int(timing["batch_size"]),
+                timing["queue_ms"],
+                timing["inference_ms"],
+                timing["decode_ms"],
+                encode_ms,
+                total_ms,
+            )
+        )
+    return b"".join(parts + actions + weights)
+
+
+def _packed(info: Mapping[str, Any]) -> bytes | None:
+    """Return the weights that the info of an act names; None if it holds anything else."""
+    policy = info.get(POLICY)
+    if len(info) != 1 or type(policy) is not dict or len(policy) != 2:
+        return None
+    try:
+        return _pack(policy["version"], policy["fingerprint"])
+    except (KeyError, TypeError, AttributeError, ValueError, struct.error):  # the policy itself names something else
+        return None
+
+
+@lru_cache(64)
+def _pack(version: int, digest: str) -> bytes | None:
+    return WEIGHTS.pack(version, digest.encode("ascii")) if len(digest) <= 16 and "\0" not in digest else None
+
+
+@lru_cache(64)
+def _text(digest: bytes) -> str:
+    return digest.rstrip(b"\0").decode("ascii")
+
+
+def read_answers(message: memoryview) -> list[Reply]:
+    """Return the replies in a message, the inverse of `write_answers`."""
+    (count,) = COUNT.unpack_from(message)
+    at = COUNT.size + count * ANSWER.size
+    named = len(message) - count * WEIGHTS.size  # with the flag _POLICY
+    replies = []
+    for answer in ANSWER.iter_unpack(message[COUNT.size : at]):
+        request_id, step, flags, dimensions, rows, columns, batch_size, queue, inference, decode, encode, total = answer
+        action = np.frombuffer(message, _FLOAT32, columns if dimensions == 1 else rows * columns, at).copy()
+        at += action.nbytes
+        if dimensions == 2:
+            action = action.reshape(rows, columns)
+        timing = {
+            "queue_ms": queue,
+            "inference_ms": inference,
+            "decode_ms": decode,
+            "encode_ms": encode,
+            "total_ms": total,
+            "batch_size": batch_size,
+        }
+        info = {}
+        if flags & _POLICY:
+            version, digest = WEIGHTS.unpack_from(message, named)
+            named += WEIGHTS.size
+            info = {POLICY: {"version": version, "fingerprint": _text(digest)}}
+        act = Act(action, bool(flags & _DONE), info)
+        reply = Reply(request_id.rstrip(b"\0").decode(), act, step=step, timing=timing)
+        reply.draining = bool(flags & _DRAINING)
+        replies.append(reply)
+    return replies

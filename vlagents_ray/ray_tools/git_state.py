@@ -1,0 +1,79 @@
+"""The version of the running code: the commit of its git repository, and the difference from it."""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import importlib.util
+import os
+import shutil
+import subprocess
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+MOST_BYTES = 1_000_000  # largest part of a diff that is kept
+_TIMEOUT_S = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class GitState:
+    """The state of a repository's tracked files; untracked files are not part of it."""
+
+    commit: str  # 40 hexadecimal digits
+    diff_sha256: str | None  # of the complete difference from the commit; None if there is none
+    diff: bytes  # output of `git diff`, at most its first `MOST_BYTES`
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the commit and the hash of the difference, without the difference itself."""
+        return {"commit": self.commit, "dirty": self.diff_sha256 is not None, "diff_sha256": self.diff_sha256}
+
+
+def code_in(folder: Path) -> GitState | None:
+    """Return the state of the repository that contains a folder; None if there is none, or git is not installed."""
+    top = _git(folder, "rev-parse", "--show-toplevel")
+    return None if top is None else _code(top.decode().rstrip("\n"))
+
+
+def code_of(target: str) -> GitState | None:
+    """Return the state of the repository of "module" or "module:Class"; None if git does not track its file.
+
+    The module is located, but not imported.
+    """
+    try:
+        spec = importlib.util.find_spec(target.partition(":")[0])
+    except (ImportError, ValueError):  # a parent package is not installed, or the module has no spec
+        return None
+    if spec is None or spec.origin is None or not Path(spec.origin).is_file():
+        return None
+    file = Path(spec.origin)
+    # An installed package may be in a virtual environment within a repository that does not track it.
+    if _git(file.parent, "ls-files", "--error-unmatch", "--", file.name) is None:
+        return None
+    return code_in(file.parent)
+
+
+@functools.cache
+def _code(top: str) -> GitState | None:
+    """Return the state at the first call, as later edits do not change the running code."""
+    commit = _git(Path(top), "rev-parse", "--verify", "HEAD")
+    diff = _git(Path(top), "diff", "--no-ext-diff", "--no-textconv", "--no-color", "HEAD")
+    if commit is None or diff is None:
+        return None
+    sha256 = hashlib.sha256(diff).hexdigest() if diff else None
+    return GitState(commit.decode().strip(), sha256, diff[:MOST_BYTES])
+
+
+def _git(folder: Path, *words: str) -> bytes | None:
+    """Return the output of git; None if it fails."""
+    git = shutil.which("git")
+    if git is None:
+        return None
+    quiet = os.environ | {"GIT_OPTIONAL_LOCKS": "0"}
+    try:
+        asked = subprocess.run(  # noqa: S603 - words of ours, and a folder
+            [git, "-C", str(folder), *words], capture_output=True, timeout=_TIMEOUT_S, env=quiet, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return asked.stdout if asked.returncode == 0 else None

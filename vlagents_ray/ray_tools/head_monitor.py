@@ -1,0 +1,98 @@
+"""A monitor of the cluster's head and of Ray's daemon on this machine.
+
+Ray kills a process that has lost the cluster's head after a minute, without a chance to write anything. It does not
+notice the end of its daemon (the raylet) on the same machine. Most calls of Ray block meanwhile. So the driver checks
+both by itself, and ends in time.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import socket
+from pathlib import Path
+from time import monotonic
+from typing import Any
+
+import ray
+
+from vlagents_ray.errors import ClusterLost
+from vlagents_ray.ray_tools.private import node_of_this_process, output_printer, set_output_printer
+
+log = logging.getLogger(__name__)
+
+PERIOD_S = 2.0  # between two checks
+ANSWER_S = 1.0  # timeout of a check, which blocks the driver
+_RAY_TIMEOUT = "RAY_gcs_rpc_server_reconnect_timeout_s"  # time after which Ray kills a process without a head
+_RAY_TIMEOUT_S = 60.0  # its default
+_SHARE = 0.4  # of Ray's timeout; the rest is for an orderly end
+_LAST_WORDS = "Raylet is terminated."
+_SOCKETS = Path("/proc/net/unix")
+
+
+class HeadMonitor:
+    """Checks whether the cluster's head accepts connections, and whether the local daemon's socket exists."""
+
+    def __init__(self, cure: str) -> None:
+        """Monitor the cluster to which this process is connected; `cure` ends the message when it is lost."""
+        host, _, port = ray.get_runtime_context().gcs_address.rpartition(":")
+        self.node = node_of_this_process()
+        self._address = host.strip("[]"), int(port)
+        self._name = f"the head of the Ray cluster, {host}:{port},"
+        self._cure = cure
+        self._timeout_s = _SHARE * float(os.environ.get(_RAY_TIMEOUT) or _RAY_TIMEOUT_S)
+        if self.node is not None and self.node.is_head():
+            self._timeout_s = min(self._timeout_s, PERIOD_S)  # started by this process: it will not be replaced
+        self._daemon = None if self.node is None else str(self.node.raylet_socket_name)
+        if self._daemon is not None and not _exists(self._daemon):  # the machine does not list its sockets
+            self._daemon = None
+        self._looked = self._answered = monotonic()
+
+    def answers(self) -> bool:
+        """Whether the head answered the last check, which is repeated every `PERIOD_S`.
+
+        Raises:
+            ClusterLost: The head has not answered for too long, or the daemon on this machine has ended.
+        """
+        if monotonic() - self._looked > PERIOD_S:
+            self._look()
+        silent_s = self._looked - self._answered
+        if silent_s > self._timeout_s:
+            raise ClusterLost(f"{self._name} has not answered for {silent_s:.0f} s; {self._cure}")
+        return silent_s == 0.0
+
+    def _look(self) -> None:
+        if self._daemon is not None and not _exists(self._daemon):
+            raise ClusterLost(f"Ray's daemon on this machine, the raylet, has ended; {self._cure}")
+        try:
+            socket.create_connection(self._address, ANSWER_S).close()
+        except OSError as error:
+            if self._looked == self._answered and self._timeout_s > PERIOD_S:
+                log.warning(
+                    "%s does not answer (%s): no worker is started until it does; this ends after %.0f s",
+                    self._name, error, self._timeout_s,
+                )  # fmt: skip
+            self._looked = monotonic()
+        else:
+            self._looked = self._answered = monotonic()
+
+
+def keep_from_printing_last_words() -> None:
+    """Suppress the log of a daemon that died, which Ray prints twice beside the error that is raised here."""
+    printed = output_printer()
+    if printed.__module__ == __name__:
+        return
+
+    def print_to_stdstream(data: dict[str, Any], *args: Any, **kwargs: Any) -> None:
+        if not str(data["lines"][0]).startswith(_LAST_WORDS):
+            printed(data, *args, **kwargs)
+
+    set_output_printer(print_to_stdstream)
+
+
+def _exists(unix_socket: str) -> bool:
+    """Whether a Unix socket is open; its file may remain after the listener has ended."""
+    try:
+        return any(line.endswith(f" {unix_socket}") for line in _SOCKETS.read_text().splitlines())
+    except OSError:  # not Linux
+        return False

@@ -1,0 +1,294 @@
+"""The private names of Ray and of Ray Serve that this package uses, all in one place.
+
+They were read in Ray 2.60; read them again before another version is allowed. Ray is imported inside the functions, as
+clients without Ray import this module. Only `vlagents_ray.serve.scaling.router` uses others, as its class overrides
+private methods of Serve's, and Serve sends that module by value to processes that need not have this package.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import pickle
+import sys
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+# The loggers of what Ray and Serve say in the process that started them.
+LOGGERS = ("ray.serve", "ray._private.worker", "ray._private.authentication.authentication_token_setup")
+
+# The connection of this process.
+
+
+def is_connected() -> bool:
+    """Whether this process is a driver or a worker of a cluster; with a Ray client (ray://) it is none."""
+    import ray
+
+    return bool(ray._private.worker.global_worker.connected)
+
+
+def node_of_this_process() -> Any:
+    """Return Ray's record of the local daemons; None if this process is not connected, or did not import Ray.
+
+    The record exists before the connection does; a call of Ray from another thread would then start a second cluster.
+    """
+    worker: Any = sys.modules.get("ray._private.worker")
+    if worker is None or not worker.global_worker.connected:
+        return None
+    return worker.global_worker.node
+
+
+def output_printer() -> Callable[..., None]:
+    """Return the function by which Ray prints the output of other processes: of batches with "lines", and "pid"."""
+    import ray
+
+    printer: Callable[..., None] = ray._private.worker.print_to_stdstream
+    return printer
+
+
+def set_output_printer(printer: Callable[..., None]) -> None:
+    """Replace the function that `output_printer` returns."""
+    import ray
+
+    ray._private.worker.print_to_stdstream = printer
+
+
+def use_loopback(on: bool) -> bool:
+    """Set whether Ray takes this machine for no part of a cluster, and uses loopback addresses as they are.
+
+    Ray reads this from `RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER` when it is imported.
+
+    Returns:
+        The setting before.
+    """
+    from ray._private import ray_constants
+
+    before = not ray_constants.ENABLE_RAY_CLUSTER
+    ray_constants.ENABLE_RAY_CLUSTER = not on
+    return before
+
+
+def reread_authentication_mode() -> None:
+    """Let Ray read `RAY_AUTH_MODE` again, as it does when it is imported."""
+    import ray
+
+    ray._raylet.Config.initialize("")
+
+
+def address_of_ray_start() -> str | None:
+    """Return the address of the cluster that `ray start` started last on this machine; None if there is none."""
+    from ray._private.utils import read_ray_address
+
+    address: str | None = read_ray_address()
+    return address
+
+
+# The start of a cluster.
+
+
+@contextlib.contextmanager
+def only_needed_processes(options: Mapping[str, Any]) -> Iterator[None]:
+    """Let `ray.init(**options)` start only the processes that a local cluster needs, as each costs a second of a core.
+
+    It starts no autoscaler, as there are no machines to add; without a dashboard, no dashboard server, which Ray starts
+    even then for usage statistics; and no log monitor if the driver gets no logs. The dashboard agent gets a free port:
+    by default every Ray on a machine uses 52365, and a second one would wait for 3.4 s.
+    """
+    from ray._private import parameter
+    from ray._private.node import Node
+
+    params, start_api_server = parameter.RayParams, Node.start_api_server
+    logs = options.get("log_to_driver", True)
+    parameter.RayParams = functools.partial(
+        params, dashboard_agent_listen_port=0, no_monitor=True, include_log_monitor=logs
+    )
+    if options.get("include_dashboard") is False:
+        Node.start_api_server = lambda *_, **__: None
+    try:
+        yield
+    finally:
+        parameter.RayParams, Node.start_api_server = params, start_api_server
+
+
+def node_that_failed(error: BaseException) -> Any:
+    """Return the node that was being started when `error` was raised; None if there was none."""
+    from ray._private.node import Node
+
+    found = (frame.f_locals.get("self") for frame, _ in traceback.walk_tb(error.__traceback__))
+    return next((one for one in found if isinstance(one, Node)), None)
+
+
+def gpus_here() -> float:
+    """Count the GPUs that a Ray started on this machine would offer, without starting one and without torch."""
+    from ray._private.accelerators import get_accelerator_manager_for_resource
+
+    manager = get_accelerator_manager_for_resource("GPU")
+    if manager is None:
+        return 0.0
+    visible = manager.get_current_process_visible_accelerator_ids()  # from CUDA_VISIBLE_DEVICES and similar variables
+    found = manager.get_current_node_num_accelerators()
+    return float(found if visible is None else min(found, len(visible)))
+
+
+# Channels: mutable objects in plasma, the memory under Ray's `Channel`.
+
+
+def plasma_folder() -> Path:
+    """Return the folder of the socket of this node's object store."""
+    import ray
+
+    return Path(ray._private.worker.global_worker.node.plasma_store_socket_name).parent
+
+
+def create_channel(size: int) -> Any:
+    """Return the ref of a new channel of `size` bytes, which this process reads."""
+    import ray
+
+    worker = ray._private.worker.global_worker
+    ref = worker.put_object(bytes(size), _is_experimental_channel=True)
+    worker.core_worker.experimental_channel_register_reader(ref)
+    return ref
+
+
+def register_writer(channel: Any) -> None:
+    """Let this process write to a channel."""
+    import ray
+
+    ray._private.worker.global_worker.core_worker.experimental_channel_register_writer(channel, {})
+
+
+def write_channel(channel: Any, content: Any, wait_ms: int) -> str | None:
+    """Write the content to a channel; return the reason why it cannot be written, None if it was.
+
+    An error raised from here would keep the channel's memory as long as anything holds its traceback.
+    """
+    import ray
+
+    core = ray._private.worker.global_worker.core_worker
+    try:
+        core.experimental_channel_put_serialized(content, channel, 1, wait_ms)
+    except ray.exceptions.RayChannelError as error:
+        return str(error)
+    return None
+
+
+def read_channel(channel: Any) -> Any:
+    """Return what was written last, with `metadata` and `data`, in place: it is valid as long as the caller holds it.
+
+    Raises `ray.exceptions.RayChannelTimeoutError` if nothing was written since.
+    """
+    import ray
+
+    return ray._private.worker.global_worker.core_worker.get_objects([channel], 0)[0]
+
+
+def channel_content(tag: bytes, pieces: Iterable[memoryview]) -> Any:
+    """Return pieces of memory in a form that Ray copies straight into a channel, one after the other.
+
+    This is Ray's writer of out-of-band buffers, with nothing pickled in band.
+    """
+    import ray
+
+    writer = ray._raylet.Pickle5Writer()
+    for piece in pieces:
+        writer.buffer_callback(pickle.PickleBuffer(piece))
+    return ray._raylet.Pickle5SerializedObject(tag, b"", writer, [])
+
+
+def plain_content(data: bytes) -> Any:
+    """Return bytes in a form that Ray copies into a channel, without the tag and the pieces of `channel_content`."""
+    import ray
+
+    return ray._raylet.RawSerializedObject(data)
+
+
+def channel_pieces(data: Any) -> Any:
+    """Return the pieces in the data of a channel, in place; Ray's parser trusts the data. Nothing is unpickled."""
+    import ray
+
+    _, pieces = ray._raylet.unpack_pickle5_buffers(data)
+    return pieces
+
+
+# Ray Serve.
+
+
+def start_serve(http: dict[str, Any], location: str) -> tuple[Any, list[Any]]:
+    """Return Serve's client and the refs of its proxies, like `serve_start`, but without waiting for them.
+
+    The proxies start while a policy is built and loaded.
+    """
+    from ray.serve._private import api
+    from ray.serve._private.client import ServeControllerClient
+    from ray.serve.context import _get_global_client, _set_global_client
+
+    if _get_global_client(raise_if_no_controller_running=False) is not None:
+        return api.serve_start(http_options=http, proxy_location=location), []
+    options = api._coerce_controller_options(None)
+    controller, proxies = api._create_controller_and_proxy_refs(http, None, None, None, options, location)
+    client = ServeControllerClient(controller)
+    _set_global_client(client)
+    return client, proxies
+
+
+def proxy_timeout_s() -> float:
+    """Return the time in which Serve's proxies have to listen."""
+    from ray.serve._private.constants import HTTP_PROXY_TIMEOUT
+
+    return float(HTTP_PROXY_TIMEOUT)
+
+
+def build_app(app: Any, **options: Any) -> Any:
+    """Build an application, of which Serve's client deploys several at once."""
+    from ray.serve._private import build_app as serves
+
+    return serves.build_app(app, **options)
+
+
+def long_polls(client: Any) -> Iterator[Any]:
+    """Yield the long polls of the controller by the handles of Serve's client, each with `stop`."""
+    from ray.serve._private.router import SharedRouterLongPollClient
+
+    for handle in client.handle_cache.values():
+        router = getattr(handle._router, "_asyncio_router", None)
+        if router is not None:
+            yield router.long_poll_client
+            yield SharedRouterLongPollClient.get_or_create(client._controller, router._event_loop).long_poll_client
+
+
+def end_controller(client: Any) -> Any:
+    """Begin the end of Serve; return the ref of the call, which fails because the controller ends during it."""
+    return client._controller.graceful_shutdown.options(max_task_retries=0).remote()
+
+
+def forget_serve(client: Any) -> None:
+    """Let this process have no Serve any more, after `end_controller`."""
+    from ray.serve.context import _set_global_client
+
+    client._shutdown = True
+    _set_global_client(None)
+
+
+def http_options() -> Any:
+    """Return Serve's HTTP options: `host`, `port`, `ssl_certfile`, ..."""
+    from ray.serve.context import _get_global_client
+
+    return _get_global_client().http_config
+
+
+def replica_is_ending() -> bool:
+    """Whether Serve has begun to stop the replica that this process is; it has no hook for that."""
+    import ray
+
+    worker = ray._private.worker.global_worker
+    actor = worker.actors.get(worker.actor_id)
+    return bool(actor._replica_impl._shutting_down)
+
+
+def replica_request(request_id: str, method: str) -> bytes:
+    """Return the header of a call of a replica's method, as Serve's own router sends it to the replica's actor."""
+    from ray.serve._private.common import RequestMetadata
+
+    return pickle.dumps(RequestMetadata(request_id=request_id, internal_request_id=request_id, call_method=method))

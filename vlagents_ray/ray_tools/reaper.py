@@ -1,0 +1,122 @@
+"""Cleans up after a driver that was killed: `python reaper.py FOLDER`, with a pipe as its standard input.
+
+A local cluster normally ends with its driver. After `kill -9` parts of it can remain: an HAProxy whose manager was
+killed first, agents that take a minute to notice, the folder. The end of the pipe shows this process that the driver
+has ended. A driver that ends in order, with its Ray alive, first writes a byte. Then only processes that use files of
+the folder can remain: an HAProxy that waits for the end of its last connection, and Ray's agents, which take a moment
+to notice.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+MARK = "VLAGENTS_RAY_CLUSTER"  # in the environment of every process of the cluster
+_GRACE_S = 3.0  # for Ray to end by itself
+_ORDERLY = b"."
+_SWEEPS = 20
+_QUIET_SWEEPS = 3  # consecutive sweeps without a find; a process has no environment while it starts a program
+
+
+@contextmanager
+def reaped(folder: Path, lost: type[Exception]) -> Iterator[None]:
+    """End the processes marked with `folder` if this process dies within the context.
+
+    Args:
+        folder: The folder of the cluster.
+        lost: An exception of this type within the context has the same effect, as the cluster then does not end its
+            remaining processes.
+    """
+    # The reaper runs as a script, which starts quickly; so this module imports no other one of the package.
+    command = [sys.executable, "-I", __file__, str(folder)]
+    reaper = subprocess.Popen(command, stdin=subprocess.PIPE, start_new_session=True)  # noqa: S603 - our own module
+    if reaper.stdin is None:
+        raise OSError("the reaper has no standard input")
+    message = _ORDERLY
+    try:
+        yield
+    except lost:
+        message = b""
+        raise
+    finally:
+        with suppress(OSError):
+            reaper.stdin.write(message)
+        with suppress(OSError):
+            reaper.stdin.close()
+        reaper.wait()
+
+
+def marked(folder: str) -> list[int]:
+    """List this user's processes that were started for the cluster of `folder`.
+
+    The title that Ray gives its processes may overwrite the mark in their environment. These have their logs open in
+    the folder; so have drivers that joined the cluster and continue.
+    """
+    mark = f"{MARK}={folder}".encode()
+    found = []
+    for process in Path("/proc").glob("[0-9]*"):
+        try:
+            ours = mark in (process / "environ").read_bytes().split(b"\0")
+            ours = ours or (is_titled(process) and has_open_files(process, folder))
+            if ours and int(process.name) != os.getpid():
+                found.append(int(process.name))
+        except OSError:  # it has ended, or is another user's
+            continue
+    return found
+
+
+def is_titled(process: Path) -> bool:
+    """Whether a process, given as a folder of /proc, has a title of Ray's."""
+    return (process / "cmdline").read_bytes().startswith(b"ray::")
+
+
+def has_open_files(process: Path, folder: str) -> bool:
+    """Whether a process, given as a folder of /proc, has a file of `folder` open; `OSError` if it is another user's."""
+    for descriptor in (process / "fd").iterdir():
+        with suppress(OSError):  # closed meanwhile
+            if os.readlink(descriptor).startswith(f"{folder}/"):
+                return True
+    return False
+
+
+def about(folder: str) -> list[int]:
+    """List the marked processes that no user started: their command line names the folder, or is a title of Ray's."""
+    found = []
+    for pid in marked(folder):
+        with suppress(OSError):
+            process = Path(f"/proc/{pid}")
+            if is_titled(process) or f"{folder}/".encode() in (process / "cmdline").read_bytes():
+                found.append(pid)
+    return found
+
+
+def main() -> None:
+    """Wait for the end of the driver, and kill the processes that remain."""
+    folder = sys.argv[1]
+    orderly = os.read(0, 1) == _ORDERLY
+    if not orderly:
+        time.sleep(_GRACE_S)
+    quiet = 0
+    for _ in range(_SWEEPS):  # a process may have started another one before it was killed
+        left = about(folder) if orderly else marked(folder)
+        quiet = 0 if left else quiet + 1
+        if quiet == _QUIET_SWEEPS:
+            break
+        for pid in left:
+            with suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        time.sleep(0.05)
+    if not orderly:  # else the driver removes it
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+if __name__ == "__main__":
+    main()

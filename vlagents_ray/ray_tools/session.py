@@ -1,0 +1,187 @@
+"""The connection of this process to a Ray cluster: one that runs, or one that it starts."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from vlagents_ray.errors import ClusterLost, ConfigError
+from vlagents_ray.ray_tools.local_servers import join, local_servers
+from vlagents_ray.ray_tools.private import address_of_ray_start, node_that_failed, only_needed_processes
+from vlagents_ray.ray_tools.reaper import MARK, reaped
+from vlagents_ray.ray_tools.signals import own_sigterm
+
+log = logging.getLogger(__name__)
+
+_ATTEMPTS = 3
+_FAILED = "Check failed: "  # in the log of a daemon that ended
+FILES = "ray"  # the folder of Ray's files in a `ray_folder`
+_SHORT = "/tmp"  # noqa: S108 - used if the names of Ray's sockets would be too long elsewhere
+_SOCKETS = (  # the longest names below such a folder: Ray's, and HAProxy's, whose folder has the name of the node
+    f"{FILES}/session_2026-01-31_12-00-00_123456_1234567/sockets/.vla12345678",
+    f"{'0' * 56}/admin.1234567.tmp",
+)
+_LONGEST = 107 - len("/vlr-12345678/") - max(map(len, _SOCKETS))
+_REMOVALS = 100  # attempts, 0.05 s apart, as a process that is ending may still write to the folder
+
+
+@contextlib.contextmanager
+def joined(address: str | None = None, **options: Any) -> Iterator[None]:
+    """Connect this process to a Ray cluster within the context, or use the cluster to which it is connected already.
+
+    Args:
+        address: The address of the cluster. None is the cluster of RAY_ADDRESS, or of this machine. The URL of a server
+            on this machine stands for its Ray cluster, as does "auto" if there is no other one. "local" starts a
+            cluster that ends with the context.
+        options: Further options of `ray.init`.
+
+    Raises:
+        ConfigError: There is no such cluster, or it requires another token.
+    """
+    import ray
+
+    if ray.is_initialized():
+        yield
+        return
+    options = {"log_to_driver": False, "logging_level": "WARNING"} | options
+    with contextlib.ExitStack() as stack:
+        try:
+            if address == "local":
+                folder = stack.enter_context(ray_folder())
+                with _marked(folder):
+                    start_ray(_temp_dir=str(folder / FILES), **options)
+            elif (server := _local_server(address or os.environ.get("RAY_ADDRESS"))) is not None:
+                with own_sigterm():
+                    join(server or None, **options)
+            else:
+                with own_sigterm():
+                    ray.init(address=address, **options)
+        except (ConnectionError, ray.exceptions.AuthenticationError) as error:
+            where = address or os.environ.get("RAY_ADDRESS")
+            raise ConfigError(
+                f"cannot connect to a Ray cluster at {where!r}: {error}. Start Ray on this machine, or join it to a "
+                f"cluster (`ray start`); the page docs/cluster/ray.md shows how"
+            ) from error
+        stack.push(unless_lost(ray.shutdown))
+        yield
+
+
+def _local_server(address: str | None) -> str | None:
+    """Return the URL of the server on this machine to join; "" for any; None if the address is one of Ray's."""
+    if address is not None and urlsplit(address).scheme in ("http", "https"):
+        return address
+    if address != "auto":
+        return None
+    # If `ray start` started none, Ray would try that of a server on this machine, and wait for ten minutes.
+    return "" if address_of_ray_start() is None and local_servers() else None
+
+
+@contextlib.contextmanager
+def ray_folder() -> Iterator[Path]:
+    """Make a folder that no other user can enter, with a subfolder `FILES` for the Ray that this process starts.
+
+    Ray opens the folders of its sockets and logs to every user of the machine. At the end of the context, or when this
+    process is killed, the folder is removed and the processes that run there are ended.
+    """
+    base = os.environ.get("RAY_TMPDIR") or tempfile.gettempdir()
+    if len(os.fsencode(base)) > _LONGEST:
+        log.info("Ray's files are in %s: the names of its sockets would be too long in %s", _SHORT, base)
+        base = _SHORT
+    Path(base).mkdir(parents=True, exist_ok=True)
+    folder = Path(tempfile.mkdtemp(prefix="vlr-", dir=base))
+    try:
+        with reaped(folder, lost=ClusterLost):
+            yield folder
+    finally:
+        for _ in range(_REMOVALS):
+            shutil.rmtree(folder, ignore_errors=True)
+            if not folder.exists():
+                break
+            time.sleep(0.05)
+
+
+@contextlib.contextmanager
+def _marked(folder: Path) -> Iterator[None]:
+    """Mark the processes that are started within the context as belonging to a folder, with which they end."""
+    before = os.environ.get(MARK)
+    os.environ[MARK] = str(folder)
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[MARK]
+        else:
+            os.environ[MARK] = before
+
+
+def start_ray(**options: Any) -> None:
+    """Start a Ray cluster with `ray.init("local")`, with another attempt if its start takes too long.
+
+    Ray's daemon waits at most 15 s for each of its helpers (ray issue 65983), which a busy machine or a slow disk with
+    Python's modules can exceed. The next attempt is faster, as the modules are cached by then.
+
+    Args:
+        options: Further options of `ray.init`.
+
+    Raises:
+        ConfigError: No attempt succeeded.
+    """
+    import ray
+
+    for attempt in range(1, _ATTEMPTS + 1):
+        try:
+            with own_sigterm(), only_needed_processes(options):  # "local" starts one even if RAY_ADDRESS is set
+                ray.init("local", **options)
+        except Exception as error:  # Ray raises a plain Exception
+            node = node_that_failed(error)
+            if node is None or not node.all_processes:  # nothing was started, so time is not the cause
+                raise
+            node.kill_all_processes(check_alive=False, wait=True)  # Ray leaves them running
+            if isinstance(error, ValueError):  # a wrong option
+                raise
+            reason = f"{error} {_daemon_error(node)}".rstrip()
+            if attempt == _ATTEMPTS:
+                raise ConfigError(
+                    f"Ray did not start on this machine in {_ATTEMPTS} attempts: {reason}. If the machine is busy, run "
+                    f"less on it; if Python's modules are on a slow disk, copy the environment to a local one. Logs: "
+                    f"{_kept_logs(node)}"
+                ) from error
+            log.warning("Ray did not start, trying again (attempt %d of %d): %s", attempt + 1, _ATTEMPTS, reason)
+        else:
+            return
+
+
+def _kept_logs(node: Any) -> Path:
+    """Copy a node's logs to a folder of this user, as the cluster's folder is about to be removed."""
+    kept = Path(tempfile.mkdtemp(prefix="vlr-logs-"))
+    with contextlib.suppress(OSError):  # shutil.Error is one; the other files were copied
+        shutil.copytree(node.get_logs_dir_path(), kept, dirs_exist_ok=True)
+    return kept
+
+
+def _daemon_error(node: Any) -> str:
+    """Return the reason why a node's daemon ended, from its log; "" if it has none."""
+    try:
+        text = (Path(node.get_logs_dir_path()) / "raylet.err").read_text(errors="replace")
+    except OSError:
+        return ""
+    reasons = [line.partition(_FAILED)[2] for line in text.splitlines() if _FAILED in line]
+    return f"(Ray's daemon: {reasons[-1]})" if reasons else ""
+
+
+def unless_lost(leave: Callable[[], None]) -> Callable[..., None]:
+    """Make an exit callback for an `ExitStack` that skips `leave` if the head is lost, as `leave` would then block."""
+
+    def end(kind: type[BaseException] | None, *_: object) -> None:
+        if kind is not ClusterLost:
+            leave()
+
+    return end

@@ -1,0 +1,346 @@
+"""API keys and the permissions of each; the module uses neither sockets nor Ray.
+
+A key is 256 random bits (`vlagents_ray.serve.access.key_store.new_key`); the server stores its SHA-256. That is as
+secure as a slow password hash, which is necessary only because people choose guessable passwords: these keys are
+random, and a slow hash at every request would take longer than the policy. Therefore users cannot choose keys.
+
+Limits apply per replica and per gateway: two replicas together allow a key twice its rate and sessions.
+"""
+
+from __future__ import annotations
+
+import enum
+import hashlib
+import hmac
+import logging
+import os
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from contextvars import ContextVar
+from dataclasses import dataclass
+from pathlib import Path
+
+from vlagents_ray.client.credentials import is_loopback
+from vlagents_ray.errors import ConfigError, Forbidden, TooManyRequests, Unauthorized, VLAgentsError
+from vlagents_ray.protocol.messages import RankName
+from vlagents_ray.serve.access.audit import Audit
+from vlagents_ray.serve.access.key_store import Key, parse_keys, read_text
+
+logger = logging.getLogger(__name__)
+
+FILE_VARIABLE, TEXT_VARIABLE = "VLAGENTS_RAY_KEYS_FILE", "VLAGENTS_RAY_KEYS"
+_THROTTLED_S = (0.05, 1.0)  # minimum and maximum time for which a sender over its rate is not read
+_CHECK_S = 1.0  # minimum time between two checks of the file
+_CLOSE_S = 300.0  # time for which the keys stay valid while the file cannot be read
+_REMIND_S = 60.0  # time between two log lines about an unreadable file
+_UNREAD = object()  # the state of a file that could not be read: each check tries again
+
+
+class NoKey(enum.Enum):
+    """The reason why a request needs no API key, in place of a `Caller`."""
+
+    OPEN = "the server has no keys"
+    INSIDE = "it comes from the same Ray cluster, or from the replica itself"
+
+
+class Keys:
+    """The keys of a server, read again when their file changes; thread-safe.
+
+    If the file is deleted, all keys are refused. If the file cannot be read or parsed, the keys stay valid for
+    `_CLOSE_S`, so that an editing mistake or a short failure of a network drive stops no robot; the log and a metric
+    report it at once. After that time all keys are refused, as some may have been revoked, until it can be read.
+    """
+
+    def __init__(self, read: Callable[[], str], changed: Callable[[], object]) -> None:
+        """`read` returns the text of a key file; `changed` an object that differs when the text may have changed."""
+        self._read = read
+        self._changed = changed
+        self._keys: dict[bytes, Key] = {}
+        self._buckets: dict[str, _Bucket] = {}
+        self._held: Counter[str] = Counter()  # number of connections, by the key's name
+        self._checked = float("-inf")
+        self._unreadable: float | None = None  # time since which the file is unreadable, s; None if it is readable
+        self._reminded = 0.0
+        self._lock = threading.Lock()
+        self.audit = Audit()
+        self._state: object = self._changed()
+        self._load(self._read())
+
+    @classmethod
+    def from_file(cls, path: str | Path) -> Keys:
+        """Return the keys in a file, which is checked for changes; raise `ConfigError` if it is not a key file."""
+        file = Path(path)
+        return cls(lambda: read_text(file), lambda: _stamp(file))
+
+    @classmethod
+    def from_text(cls, text: str) -> Keys:
+        """Return the keys in the text of a key file; they cannot be revoked while this process lives."""
+        return cls(lambda: text, lambda: None)
+
+    def check(self, token: str | None, app: str) -> Caller:
+        """Return the caller that the key `token` belongs to, for the application `app`.
+
+        Raises:
+            Unauthorized: The key is missing, unknown, revoked or expired.
+            Forbidden: The key is for other applications.
+        """
+        if not token:
+            self.audit.refused("", "no key")
+            raise Unauthorized("this server wants an API key; send the header 'Authorization: Bearer KEY'")
+        self._refresh()
+        digest = hashlib.sha256(token.encode(errors="surrogateescape")).digest()
+        found: bytes | None = None
+        keys = self._keys  # another thread may replace the attribute
+        for known in keys:  # compares with all of them, so that the time reveals nothing
+            if hmac.compare_digest(known, digest):
+                found = known
+        if found is None:
+            self.audit.refused("", "an unknown key")
+            raise Unauthorized("this API key is not known here; ask whoever runs the server for one")
+        caller = Caller(self, found, keys[found].name, app)
+        caller.admit(free=True)
+        return caller
+
+    def key(self, digest: bytes) -> Key | None:
+        """Return the key with this SHA-256 as the file has it now; None if there is none."""
+        self._refresh()
+        return self._keys.get(digest)
+
+    def take(self, key: Key) -> None:
+        """Count a request of `key`; raise `TooManyRequests` if the key is over its rate."""
+        if key.rate is None:
+            return
+        with self._lock:
+            bucket = self._buckets.get(key.name)
+            if bucket is None or bucket.rate != key.rate:
+                bucket = self._buckets[key.name] = _Bucket(key.rate)
+            wait_s = bucket.take(time.monotonic())
+        if wait_s > 0:
+            error = TooManyRequests(f"key {key.name!r}: over {key.rate:g} requests a second; wait {wait_s:.2g} s")
+            error.retry_after_s = wait_s
+            raise error
+
+    def hold(self, name: str, number: int, most: int | None) -> None:
+        """Count `number` more connections of a key; over `most` count none and raise `TooManyRequests`."""
+        with self._lock:
+            held = self._held[name] + number
+            if most is not None and number > 0 and held > most:
+                raise TooManyRequests(f"key {name!r} has {held - number} connections here and may hold {most} sessions")
+            self._held[name] = held
+            if held <= 0:
+                del self._held[name]
+
+    @property
+    def unreadable_s(self) -> float:
+        """Time since which the file cannot be read, s; 0 if it can."""
+        self._refresh()
+        since = self._unreadable
+        return 0.0 if since is None else time.monotonic() - since
+
+    def _refresh(self) -> None:
+        now = time.monotonic()
+        if now - self._checked < _CHECK_S:
+            return
+        with self._lock:
+            if now - self._checked < _CHECK_S:
+                return
+            self._checked = now
+            try:
+                state = self._changed()
+                if state == self._state:
+                    return
+                self._load(None if state is None else self._read())
+            except Exception as error:  # noqa: BLE001 - no content of the file and no disk error may fail a request
+                self._handle_unreadable(error, now)
+                return
+            self._state = state
+            if self._unreadable is not None:
+                logger.warning("the key file can be read again")
+                self._unreadable = None
+
+    def _handle_unreadable(self, error: Exception, now: float) -> None:
+        """Handle a failed reading of the file; the caller holds the lock."""
+        first = self._unreadable is None
+        since = self._unreadable = now if self._unreadable is None else self._unreadable
+        self._state = _UNREAD
+        left_s = _CLOSE_S - (now - since)
+        if left_s <= 0 and self._keys:
+            self._keys = {}
+            logger.critical("nobody is let in any more: for %g s no key file could be read: %s", _CLOSE_S, error)
+        elif first or now - self._reminded >= _REMIND_S:
+            until = f"the keys stay as they were for {left_s:.0f} s more" if left_s > 0 else "nobody is let in"
+            logger.error("the key file cannot be read; %s: %s", until, error)
+        else:
+            return
+        self._reminded = now
+
+    def _load(self, text: str | None) -> None:
+        self._keys = {} if text is None else {bytes.fromhex(key.sha256): key for key in parse_keys(text)}
+
+
+@dataclass(frozen=True, slots=True)
+class Caller:
+    """The holder of a key, for one connection; the permissions of the key are looked up at each request."""
+
+    _keys: Keys
+    _digest: bytes
+    name: str  # name of the key; keys of other names cannot use its sessions
+    app: str
+
+    @property
+    def rank(self) -> RankName | None:
+        """The most urgent class that the caller's requests may have; None for any."""
+        key = self._keys.key(self._digest)
+        return None if key is None else key.rank
+
+    @property
+    def sessions(self) -> int | None:
+        """Maximum number of sessions that the key may hold at one replica; None for any number."""
+        key = self._keys.key(self._digest)
+        return 0 if key is None else key.sessions
+
+    def admit(self, *, free: bool = False, scope: str | None = None) -> None:
+        """Check the key, and its `scope` if one is stated, before each request, and count that unless it is `free`.
+
+        Raises:
+            Unauthorized: The key is revoked or has expired.
+            Forbidden: The key is no longer for this application, or lacks the scope.
+            TooManyRequests: The key is over its rate.
+        """
+        try:
+            self._admit(free, scope)
+        except VLAgentsError as error:
+            self._keys.audit.refused(self.name, error.code)
+            raise
+
+    def refusal(self) -> str | None:
+        """Return the reason if the key is no longer valid; None if it is valid."""
+        try:
+            self._admit(free=True)
+        except VLAgentsError as error:
+            return str(error)
+        return None
+
+    def hold(self, number: int = 1) -> None:
+        """Count `number` more (or, negative, fewer) connections; raise `TooManyRequests` over the key's sessions."""
+        try:
+            self._keys.hold(self.name, number, self.sessions)
+        except TooManyRequests as error:
+            self._keys.audit.refused(self.name, error.code)
+            raise
+
+    def note(self, what: str, of: str) -> None:
+        """Write what the key did into the audit log, see `vlagents_ray.serve.access.audit`."""
+        self._keys.audit.did(self.name, what, of)
+
+    def _admit(self, free: bool, scope: str | None = None) -> None:
+        key = self._keys.key(self._digest)
+        if key is None or key.revoked:
+            raise Unauthorized(f"key {self.name!r} was revoked; ask whoever runs the server for another")
+        if key.expires is not None and time.time() >= key.expires:
+            raise Unauthorized(f"key {self.name!r} has expired; ask whoever runs the server for another")
+        if key.apps and self.app not in key.apps:
+            raise Forbidden(f"key {self.name!r} is for {sorted(key.apps)}, not for {self.app!r}")
+        if scope is not None and scope not in key.scopes:
+            raise Forbidden(f"key {self.name!r}: lacks the scope {scope!r}; use one of `keys new NAME --scope {scope}`")
+        if not free:
+            self._keys.take(key)
+
+
+def throttled_s(refused: TooManyRequests) -> float:
+    """Return the time for which the server does not read a sender that was over its key's rate, to slow it down, s."""
+    least_s, most_s = _THROTTLED_S
+    return min(most_s, max(least_s, refused.retry_after_s))
+
+
+class _Bucket:
+    """A token bucket with room for the tokens of one second, and for one token at least."""
+
+    def __init__(self, rate: float) -> None:
+        self.rate = rate  # requests/s
+        self._tokens = self._capacity = max(1.0, rate)
+        self._refilled = time.monotonic()
+
+    def take(self, now: float) -> float:
+        """Take a token and return 0 if there is one; else return the time until there is one, s."""
+        self._tokens = min(self._capacity, self._tokens + (now - self._refilled) * self.rate)
+        self._refilled = now
+        if self._tokens < 1:
+            return (1 - self._tokens) / self.rate
+        self._tokens -= 1
+        return 0.0
+
+
+def load_keys(file: str | None = None, environment: Mapping[str, str] = os.environ) -> Keys | None:
+    """Return the keys in `file`, or else those of the environment; None if neither names any.
+
+    In the environment, `VLAGENTS_RAY_KEYS_FILE` is the path of a key file, `VLAGENTS_RAY_KEYS` its text.
+    """
+    if file or (file := environment.get(FILE_VARIABLE)):
+        return Keys.from_file(file)
+    text = environment.get(TEXT_VARIABLE)
+    return Keys.from_text(text) if text else None
+
+
+def token_of(headers: Mapping[str, str]) -> str | None:
+    """Return the key of a request: `Authorization: Bearer KEY`, `Authorization: Api-Key KEY` or `x-api-key: KEY`.
+
+    openpi's client sends the second form. The names in `headers` must be in lower case.
+    """
+    kind, _, token = headers.get("authorization", "").strip().partition(" ")
+    if kind.lower() in ("bearer", "api-key") and token.strip():
+        return token.strip()
+    return headers.get("x-api-key") or None
+
+
+Identity = Caller | NoKey
+"""The sender of requests: the holder of a key, or the reason why none is needed."""
+
+_CALLER: ContextVar[Identity] = ContextVar("vlagents_ray_caller")
+
+
+def current_caller() -> Identity:
+    """Return the caller whose request this task processes; raise `LookupError` outside of `on_behalf_of`."""
+    return _CALLER.get()
+
+
+@contextmanager
+def on_behalf_of(caller: Identity) -> Iterator[None]:
+    """Let `current_caller` return `caller` inside the context, and in tasks that are started there."""
+    token = _CALLER.set(caller)
+    try:
+        yield
+    finally:
+        _CALLER.reset(token)
+
+
+def _stamp(file: Path) -> object:
+    """Return an object that changes when the file is written or replaced; None if the file is gone."""
+    try:
+        stat = file.stat()
+    except FileNotFoundError:
+        return None
+    return stat.st_mtime_ns, stat.st_ctime_ns, stat.st_size, stat.st_ino
+
+
+def require_access(host: str, keys: Keys | None, insecure: bool) -> None:
+    """Raise `ConfigError` if the server would accept other machines without keys and `insecure` does not allow that."""
+    if keys is None and not insecure and not is_loopback(host):
+        raise ConfigError(
+            f"host {host}: whoever reaches this server could command the policy. Make keys (`vlagents-ray keys new "
+            f"NAME --file keys.json`) and serve with `--keys keys.json` (in a deployment file: "
+            f"`access: {{keys_file: PATH}}` under `args`); or say `--insecure` (`access: {{insecure: true}}`)"
+        )
+
+
+def warn_of_plain_http(host: str) -> None:
+    """Log a warning if API keys would cross a network unencrypted."""
+    if not is_loopback(host):
+        logger.warning(
+            "host %s: API keys come unencrypted over the network, and others may read them: serve with --tls-cert and "
+            "--tls-key, or say that TLS ends elsewhere, with --plain-http (`access: {plain_http: true}`)",
+            host,
+        )

@@ -1,0 +1,69 @@
+"""Audit log of API keys, `vlagents_ray.serve.audit`: one line per key and kind of event, not one per request.
+
+    key arm-1: let in by websocket
+    key arm-1: reset session 'robot-1'
+    key arm-1: refused: too_many_requests (57 more like this since the last line)
+    key (none): refused: an unknown key
+
+A kind of event is logged at once, and again after `_EVERY_S` at the earliest, with the number of events left out. Only
+names of keys are written, never keys. Refusals have the level WARNING, all other events INFO.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from dataclasses import dataclass
+
+LOG = "vlagents_ray.serve.audit"  # users' logging configurations refer to this name
+logger = logging.getLogger(LOG)
+
+_EVERY_S = 10.0
+
+
+def write_audit() -> None:
+    """Let this process write the log, to stderr (which Ray stores per process) unless logging is configured already."""
+    logger.setLevel(logging.INFO)
+    if not logger.hasHandlers():
+        handler = logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        logger.addHandler(handler)
+
+
+@dataclass(slots=True)
+class _Kind:
+    logged: float  # s, monotonic
+    left_out: int = 0
+
+
+class Audit:
+    """Writes the audit log; thread-safe. Only names of known keys are passed, so that there are few kinds of events."""
+
+    def __init__(self) -> None:
+        self._kinds: dict[tuple[str, str], _Kind] = {}
+        self._lock = threading.Lock()
+
+    def did(self, name: str, what: str, of: str) -> None:
+        """Log that the key `name` did `what` ("let in by", "reset session"); `of` is the object of this event."""
+        if (more := self._due(name, what)) is not None:
+            logger.info("key %s: %s %s%s", name, what, of, more)
+
+    def refused(self, name: str, why: str) -> None:
+        """Log that the key `name` was refused; an empty name stands for a missing or an unknown key."""
+        if (more := self._due(name, why)) is not None:
+            logger.warning("key %s: refused: %s%s", name or "(none)", why, more)
+
+    def _due(self, name: str, what: str) -> str | None:
+        """Return the suffix of the line to log, or None if such an event was logged within `_EVERY_S`."""
+        now = time.monotonic()
+        with self._lock:
+            kind = self._kinds.get((name, what))
+            if kind is None:
+                self._kinds[name, what] = _Kind(now)
+                return ""
+            if now - kind.logged < _EVERY_S:
+                kind.left_out += 1
+                return None
+            left_out, kind.left_out, kind.logged = kind.left_out, 0, now
+        return f" ({left_out} more like this since the last line)" if left_out else ""

@@ -1,0 +1,243 @@
+"""The file of API keys: a JSON document with the hash and the permissions of each key, without the keys themselves.
+
+    {"keys": [{"name": "arm-1", "sha256": "9f86…", "apps": ["pi0"], "rate": 60, "sessions": 2,
+               "rank": "robot", "scopes": ["weights"], "expires": 1798675200, "revoked": false}]}
+
+All fields but `name` and `sha256` are optional. `rate` is in requests/s, `expires` in seconds since 1970 (UTC).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import hashlib
+import json
+import os
+import re
+import secrets
+import subprocess
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.protocol.messages import RANKS, RankName
+
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
+_SHA256 = re.compile(r"[0-9a-f]{64}")
+_ACL = "system.posix_acl_access"  # the extended attribute that holds a file's access list
+SCOPES = ("weights",)  # what a key may do besides commanding the policy: push new weights
+_PREFIX = "vlr_"  # lets scanners of repositories and logs find leaked keys
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """The permissions of one key."""
+
+    name: str
+    sha256: str  # SHA-256 of the key's UTF-8 text, 64 hexadecimal digits
+    apps: tuple[str, ...] = ()  # the applications that the key is for; empty for all
+    rate: float | None = None  # maximum, requests/s
+    sessions: int | None = None  # maximum held at once
+    rank: RankName | None = None  # "simulation" applies to all requests of the key; else each request states its class
+    scopes: tuple[str, ...] = ()  # of `SCOPES`
+    expires: float | None = None  # s since 1970
+    revoked: bool = False
+
+    def __post_init__(self) -> None:
+        """Raise `ConfigError` if a field is invalid."""
+        if not isinstance(self.name, str) or not _NAME.fullmatch(self.name):
+            raise ConfigError(f"key name: got {self.name!r}, want 1 to 64 letters, digits, '.', '_' or '-'")
+        if not isinstance(self.sha256, str) or not _SHA256.fullmatch(self.sha256):
+            raise ConfigError(f"key {self.name!r}: sha256: want 64 hexadecimal digits, as `keys new` makes them")
+        if not all(isinstance(app, str) for app in self.apps):
+            raise ConfigError(f"key {self.name!r}: apps: got {self.apps!r}, want names of applications")
+        for field, kinds in (("rate", (int, float)), ("sessions", (int,)), ("expires", (int, float))):
+            value = getattr(self, field)
+            if value is not None and (isinstance(value, bool) or not isinstance(value, kinds) or not 0 < value < 1e12):
+                raise ConfigError(f"key {self.name!r}: {field}: got {value!r}, want a positive number")
+        if self.rank is not None and self.rank not in RANKS:
+            raise ConfigError(f"key {self.name!r}: rank: got {self.rank!r}, want one of {list(RANKS)}")
+        if unknown := sorted(map(str, set(self.scopes) - set(SCOPES))):
+            raise ConfigError(f"key {self.name!r}: scopes: got {unknown}, want some of {list(SCOPES)}")
+        if not isinstance(self.revoked, bool):
+            raise ConfigError(f"key {self.name!r}: revoked: got {self.revoked!r}, want true or false")
+
+
+def parse_keys(text: str) -> list[Key]:
+    """Return the keys in the text of a key file; raise `ConfigError` if it is invalid or two keys share a name."""
+    try:
+        document = json.loads(text)
+        entries = document["keys"]
+    except (ValueError, TypeError, KeyError, RecursionError) as error:
+        raise ConfigError('keys: want a JSON document {"keys": [...]}; `vlagents-ray keys new` writes one') from error
+    if not isinstance(entries, list):
+        raise ConfigError(f"keys: got {type(entries).__name__}, want a list")
+    keys = [_parse(entry) for entry in entries]
+    names = [key.name for key in keys]
+    if double := sorted({name for name in names if names.count(name) > 1}):
+        raise ConfigError(f"keys: {double} stand there more than once; each needs a name of its own")
+    return keys
+
+
+def _parse(entry: Any) -> Key:
+    if not isinstance(entry, dict) or not {"name", "sha256"} <= entry.keys():
+        raise ConfigError(f"keys: got {str(entry)[:80]!r}, want an object with 'name' and 'sha256' at least")
+    known = {field.name for field in fields(Key)}
+    if unknown := entry.keys() - known:
+        raise ConfigError(f"key {entry['name']!r}: unknown {sorted(unknown)}, want some of {sorted(known)}")
+    lists = {field: entry.get(field) or [] for field in ("apps", "scopes")}
+    for field, values in lists.items():
+        if not isinstance(values, list) or not all(isinstance(value, str) for value in values):
+            raise ConfigError(f"key {entry['name']!r}: {field}: got {values!r}, want a list of names")
+    return Key(**{**entry, **{field: tuple(values) for field, values in lists.items()}})
+
+
+def read_text(file: Path) -> str:
+    """Return the text of a key file; raise `ConfigError` if it does not exist or cannot be read."""
+    try:
+        return file.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(
+            f"keys file {file}: cannot be read ({error.strerror}); `vlagents-ray keys new` makes one"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"keys file {file}: cannot be read, as it is not UTF-8 ({error.reason})") from error
+
+
+def read_keys(file: Path) -> list[Key]:
+    """Return the keys in a file; an empty list if there is no such file."""
+    try:
+        return parse_keys(read_text(file))
+    except ConfigError as error:
+        if isinstance(error.__cause__, FileNotFoundError):
+            return []
+        raise
+
+
+def new_key(file: Path, name: str, **allowed: Any) -> str:
+    """Generate a key, add its hash to the file, and return the key, which is stored nowhere.
+
+    Args:
+        file: The key file; a new one is readable by its owner alone.
+        name: The name of the key; that of a revoked key may be used again.
+        allowed: The other fields of `Key`.
+
+    Raises:
+        ConfigError: The name is in use, a field is invalid, or the file cannot be changed.
+    """
+    token = _PREFIX + secrets.token_urlsafe(32)
+    key = Key(name, hashlib.sha256(token.encode()).hexdigest(), **allowed)
+
+    def add(keys: list[Key]) -> list[Key]:
+        if any(other.name == name and not other.revoked for other in keys):
+            raise ConfigError(f"key {name!r} is there already; choose another name, or revoke it first")
+        return [*(other for other in keys if other.name != name), key]
+
+    _change(file, add)
+    return token
+
+
+def revoke(file: Path, name: str) -> None:
+    """Mark a key as revoked, which running servers detect within seconds; raise `ConfigError` for an unknown name."""
+
+    def mark(keys: list[Key]) -> list[Key]:
+        if all(key.name != name for key in keys):
+            raise ConfigError(f"no key {name!r} in {file}; there are {sorted(key.name for key in keys)}")
+        return [replace(key, revoked=True) if key.name == name else key for key in keys]
+
+    _change(file, mark)
+
+
+def _change(file: Path, change: Callable[[list[Key]], list[Key]]) -> None:
+    """Read, change and replace the file as a whole, so that a server never reads half of it.
+
+    The new file keeps the owner of the old one, since a server that cannot read it would use the old keys for a while.
+    If the owner cannot be kept, nothing is changed and `ConfigError` is raised.
+    """
+    with _locked(file):
+        keys = change(read_keys(file))
+        text = json.dumps({"keys": [_document(key) for key in keys]}, indent=2) + "\n"
+        descriptor, name = tempfile.mkstemp(dir=file.parent, prefix=f".{file.name}.")
+        try:
+            with os.fdopen(descriptor, "w", encoding="utf-8") as written:
+                _belong(descriptor, file)
+                written.write(text)
+                written.flush()
+                os.fsync(descriptor)
+            Path(name).replace(file)
+        except BaseException:
+            Path(name).unlink(missing_ok=True)
+            raise
+        _sync_folder(file.parent)
+    _require_readable(file)
+
+
+def _belong(descriptor: int, file: Path) -> None:
+    """Give the open file `descriptor` the owner, group, mode and access list of `file`, which it will replace."""
+    try:
+        old = file.stat()
+    except FileNotFoundError:
+        os.fchmod(descriptor, 0o600)
+        return
+    new = os.fstat(descriptor)
+    try:
+        if (old.st_uid, old.st_gid) != (new.st_uid, new.st_gid):
+            os.fchown(descriptor, old.st_uid, old.st_gid)
+        os.fchmod(descriptor, old.st_mode & 0o777)
+        if hasattr(os, "listxattr") and _ACL in os.listxattr(file):
+            os.setxattr(descriptor, _ACL, os.getxattr(file, _ACL))
+    except OSError as error:
+        raise ConfigError(
+            f"keys file {file}: is user {old.st_uid}'s (group {old.st_gid}), which a new one cannot be made "
+            f"({error.strerror}); nothing was changed: run this as that user, or as root"
+        ) from error
+
+
+def _sync_folder(folder: Path) -> None:
+    """Write the folder to disk, so that a revocation survives a power failure."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _require_readable(file: Path) -> None:
+    """Raise `ConfigError` if the owner of the file, as whom the server runs, cannot read it."""
+    parse_keys(read_text(file))
+    owner = file.stat()
+    if not _readable_by(file, owner.st_uid, owner.st_gid):
+        raise ConfigError(
+            f"keys file {file}: was changed, and user {owner.st_uid}, whose it is, cannot read it: a server of that "
+            f"user lets nobody in before long; look at the modes of the folders above it"
+        )
+
+
+def _readable_by(file: Path, user: int, group: int) -> bool:
+    """Whether `user` can read the file; assumed to be so unless this process is root, which alone can test it."""
+    if os.geteuid() != 0 or user == 0:
+        return True
+    command = ["test", "-r", str(file.absolute())]
+    who: dict[str, Any] = {"user": user, "group": group, "extra_groups": ()}
+    return subprocess.run(command, check=False, **who).returncode == 0  # noqa: S603 - a program of the system's
+
+
+def _document(key: Key) -> dict[str, Any]:
+    return {name: value for name, value in asdict(key).items() if value not in (None, (), False)}
+
+
+@contextlib.contextmanager
+def _locked(file: Path) -> Iterator[None]:
+    """Hold a lock on the folder of the file, so that of two simultaneous commands no change is lost."""
+    try:
+        descriptor = os.open(file.parent, os.O_RDONLY)
+    except OSError as error:
+        raise ConfigError(f"keys file {file}: no such folder ({error.strerror})") from error
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)

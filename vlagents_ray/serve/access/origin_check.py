@@ -1,0 +1,81 @@
+"""Check of requests from pages in a browser, which can reach a server on their machine like any other program.
+
+A server with API keys needs no such check, since the page needs a key, too.
+
+A browser states the site of the requesting page in `origin`, and the host name of the server in `host`. Only pages at
+this server's address count as its own: another site can let its own name resolve to this machine once its page is
+loaded (DNS rebinding). Requests of such a page to that name carry no `origin`. Therefore a request is refused if its
+`host` is a name that others could own: accepted are addresses, names without a dot, names of private networks, this
+machine's own name and those in `access.hosts`. Programs that send no `host` are not browsers.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+import socket
+from collections.abc import Collection, Mapping
+from functools import cache, lru_cache
+from urllib.parse import urlsplit
+
+from vlagents_ray.errors import Forbidden
+
+_PRIVATE = (".localhost", ".local", ".internal", ".lan", ".home.arpa", ".svc")  # suffixes outside of the public DNS
+_LONGEST = 260  # maximum length of a DNS name (253 characters) and a port
+
+
+def require_own_page(headers: Mapping[str, str], hosts: Collection[str] = ()) -> None:
+    """Refuse requests of another site's page.
+
+    Args:
+        headers: The headers of the request, with names in lower case.
+        hosts: Further host names of this server, in lower case, without a port.
+
+    Raises:
+        Forbidden: The page belongs to another site, or could belong to one.
+    """
+    origin, host = headers.get("origin"), headers.get("host")
+    if origin is not None and not _is_own(origin, host):
+        raise Forbidden(f"origin {origin[:100]!r}: a page of another site commands no robot; serve with keys to let it")
+    if host is not None and not _is_ours(host, hosts):
+        raise Forbidden(
+            f"host {host[:100]!r}: a name that could be another site's, which has it lead here; if it is the server's, "
+            f"state it under `access: {{hosts: [...]}}`, use the server's address, or serve with keys"
+        )
+
+
+def _is_own(origin: str, host: str | None) -> bool:
+    try:
+        parts = urlsplit(origin)
+    except ValueError:  # the origin is not a URL
+        return False
+    return parts.netloc == host and parts.hostname is not None and _is_address(parts.hostname)
+
+
+def _is_ours(host: str, hosts: Collection[str]) -> bool:
+    if len(host) > _LONGEST:
+        return False
+    name, ours = _name_of(host)
+    return ours or name in hosts or name == _here()
+
+
+@lru_cache(maxsize=64)  # every request of a robot sends the same one
+def _name_of(host: str) -> tuple[str, bool]:
+    """Return the name in a `host` header, without the port, and whether no other site can own it."""
+    try:
+        name = (urlsplit(f"//{host}").hostname or "").rstrip(".")
+    except ValueError:  # the header holds no valid host
+        return "", False
+    return name, "." not in name or name.endswith(_PRIVATE) or _is_address(name)
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return name == "localhost"
+    return True
+
+
+@cache
+def _here() -> str:
+    return socket.gethostname().lower()

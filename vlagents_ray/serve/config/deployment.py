@@ -1,0 +1,285 @@
+"""The settings of a deployment, under `args:` in a deployment file; unknown keys are errors."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import fields
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from vlagents_ray.interface import Agent
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
+from vlagents_ray.serve.access.api_keys import Keys, load_keys
+from vlagents_ray.serve.config.dialects import DialectArgs
+from vlagents_ray.serve.config.python_env import EnvironmentArgs
+from vlagents_ray.serve.models.checkpoints import Checkpoints
+from vlagents_ray.serve.queue.call_limits import CallLimits
+
+POLICY, GATEWAY = "Policy", "Gateway"  # the deployments of an application
+
+
+class _DeploymentModel(BaseModel):
+    model_config = ConfigDict(extra="forbid", hide_input_in_errors=True)  # errors are logged
+
+
+class BatchArgs(_DeploymentModel):
+    """The settings of the batch queue of one replica."""
+
+    max_size: int = Field(default=16, ge=1, description="observations in one forward pass, at most")
+    sizes: list[int] | None = Field(
+        default=None,
+        description="for compiled models: the only batch sizes to run, ascending; smaller batches are padded up to "
+        "the next one. The largest is max_size, which may then be left out",
+    )
+    patience: float = Field(
+        default=0.1,
+        ge=0,
+        le=1,
+        description="how long a batch may wait for simulations that were in the batch before and are coming back, as "
+        "a share of that batch's duration; 0 never waits. No robot waits, nor does a lone session",
+    )
+
+    @model_validator(mode="after")
+    def _consistent(self) -> BatchArgs:
+        if self.sizes is None:
+            return self
+        if not self.sizes or self.sizes[0] < 1 or self.sizes != sorted(set(self.sizes)):
+            raise ValueError(f"sizes: got {self.sizes}, want ascending positive numbers, such as [1, 2, 4, 8, 16]")
+        if "max_size" in self.model_fields_set and self.max_size != self.sizes[-1]:
+            raise ValueError(f"max_size {self.max_size} is not the largest of sizes {self.sizes}; leave it out")
+        self.max_size = self.sizes[-1]
+        return self
+
+
+class CheckpointArgs(_DeploymentModel):
+    """The checkpoints that a session may choose, as in `reset(..., checkpoint="late")` or `checkpoint_step=20000`."""
+
+    choices: dict[str, dict[str, Any]] = Field(
+        default_factory=dict, description="by name, the settings that take the place of those in `config`"
+    )
+    steps: bool = Field(default=False, description="any step of a checkpoint whose path holds {step}")
+    loaded: int = Field(default=2, ge=1, description="checkpoints in the memory of one replica at once, at most")
+
+    def of(self, make: Callable[[Mapping[str, Any]], Agent], config: Mapping[str, Any]) -> Checkpoints:
+        """Return the checkpoints of a policy.
+
+        Args:
+            make: Builds the policy with given settings.
+            config: The deployment's settings of the policy.
+        """
+        return Checkpoints(make, config, self.choices, steps=self.steps, loaded=self.loaded)
+
+
+class SessionArgs(_DeploymentModel):
+    """The limits of the sessions of one replica."""
+
+    limit: int = Field(default=1000, ge=1, description="sessions held at once; the next reset gets 503")
+    idle_s: float = Field(default=600.0, gt=0, description="a session that sends nothing for so long is forgotten")
+
+
+class StreamArgs(_DeploymentModel):
+    """Each replica's own port for WebSockets, which avoids the proxy.
+
+    Clients get its address from the metadata; clients that cannot reach it (a firewall, a tunnel) use the proxy.
+    """
+
+    enabled: bool = True
+    ports: tuple[int, int] | None = Field(
+        default=None, description="first and last port to choose from; unset: any. Each replica of a node takes one"
+    )
+
+    @model_validator(mode="after")
+    def _ascending(self) -> StreamArgs:
+        if self.ports is not None and not 1 <= self.ports[0] <= self.ports[1] <= 65_535:
+            raise ValueError(f"ports: got {list(self.ports)}, want the first and the last one, such as [9000, 9015]")
+        return self
+
+
+class LimitArgs(_DeploymentModel):
+    """The size limits of a request, over which it gets 413, and the time limits of clients and of the policy."""
+
+    slow_s: float = Field(
+        default=30.0,
+        gt=0,
+        description="a request's body has to be here, a WebSocket's reply to be taken in this time; else its "
+        "connection is cut",
+    )
+    act_s: float = Field(
+        default=CallLimits().act_s,
+        gt=0,
+        description="a batch of acts, or a reset, that takes longer, and longer than ten times the longest so far, "
+        "makes the replica unhealthy: Serve replaces it, and sessions go on elsewhere",
+    )
+    warm_up_s: float = Field(
+        default=CallLimits().warm_up_s,
+        gt=0,
+        description="the same for the first two resets and batches, of each of `batch.sizes`, which may compile",
+    )
+    load_s: float = Field(default=CallLimits().load_s, gt=0, description="that loading a checkpoint may take")
+    body_bytes: int = Field(default=DEFAULT_LIMITS.body_bytes, ge=1024)
+    reply_bytes: int = Field(
+        default=DEFAULT_LIMITS.reply_bytes,
+        ge=1024,
+        le=DEFAULT_LIMITS.body_bytes,  # no client reads a longer reply
+        description="of the action and the info of one reply; a policy that returns more has failed (500)",
+    )
+    decoded_bytes: int = Field(
+        default=DEFAULT_LIMITS.decoded_bytes,
+        ge=1024,
+        description="of the images and bytes of one request, decoded, each as often as it is named; with the rate of a "
+        "key it bounds what that has decoded in a second",
+    )
+    in_flight_bytes: int = Field(
+        default=DEFAULT_LIMITS.in_flight_bytes,
+        ge=1024,
+        description="of all messages that a replica works on, encoded and decoded; over it the next ones get 503. A "
+        "quarter is kept for robots",
+    )
+    pixels: int = Field(default=DEFAULT_LIMITS.pixels, ge=1, description="of one image")
+    cameras: int = Field(default=DEFAULT_LIMITS.cameras, ge=0)
+    state_values: int = Field(
+        default=DEFAULT_LIMITS.state_values, ge=0, description="of one part of the proprioception"
+    )
+    depth: int = Field(default=DEFAULT_LIMITS.depth, ge=1, description="nesting of info and kwargs")
+    items: int = Field(default=DEFAULT_LIMITS.items, ge=1, description="values in info and kwargs")
+    text: int = Field(default=DEFAULT_LIMITS.text, ge=1, description="characters of an instruction")
+
+    def limits(self) -> Limits:
+        """Return the limits of the decoders."""
+        return Limits(**self.model_dump(include={field.name for field in fields(Limits)}))
+
+    def call_limits(self) -> CallLimits:
+        """Return the time limits of the engine's calls."""
+        return CallLimits(self.act_s, self.warm_up_s, self.load_s)
+
+
+class AccessArgs(_DeploymentModel):
+    """The access settings of the server, see `vlagents_ray.serve.access.api_keys`."""
+
+    keys_file: str | None = Field(
+        default=None,
+        description="path of the API keys, on every node the same; unset: what VLAGENTS_RAY_KEYS_FILE or "
+        "VLAGENTS_RAY_KEYS say where the replica runs",
+    )
+    insecure: bool = Field(default=False, description="let in anybody who reaches the port from another machine")
+    plain_http: bool = Field(
+        default=False, description="keys may cross the network unencrypted: no warning (TLS ends elsewhere, a VPN)"
+    )
+    hosts: list[str] = Field(
+        default_factory=list,
+        description="without keys: names in the public DNS by which clients reach the server; its addresses, names "
+        "without a dot and those of private networks need not be stated",
+    )
+
+    @field_validator("hosts")
+    @classmethod
+    def _lower(cls, value: list[str]) -> list[str]:
+        return [host.lower() for host in value]
+
+    @model_validator(mode="after")
+    def _one(self) -> AccessArgs:
+        if self.keys_file is not None and self.insecure:
+            raise ValueError("keys_file and insecure exclude each other; keep one")
+        return self
+
+    def keys(self) -> Keys | None:
+        """Return the API keys of the file or the environment; None if requests need no key.
+
+        Raises:
+            ConfigError: The keys cannot be read.
+        """
+        return None if self.insecure else load_keys(self.keys_file)
+
+
+class AutoscalingArgs(_DeploymentModel):
+    """The number of replicas by measured load over all transports, see `vlagents_ray.serve.scaling.autoscaling`."""
+
+    min_replicas: int = Field(default=1, ge=0)
+    max_replicas: int = Field(default=1, ge=1)
+    initial_replicas: int | None = Field(default=None, ge=0)
+    target_utilisation: float = Field(
+        default=0.7, gt=0, le=1, description="share of the time in which a replica's policy is busy"
+    )
+    target_waiting: float = Field(
+        default=1.0, gt=0, description="mean number of requests in a replica's queue, in batches of the largest size"
+    )
+    target_sessions: float | None = Field(default=None, gt=0, description="sessions of a replica; unset: any number")
+    look_back_s: float = Field(default=15.0, gt=0, description="load is averaged over this time")
+    upscale_delay_s: float = Field(default=10.0, ge=0, description="more must be wanted for this long")
+    downscale_delay_s: float = Field(default=300.0, ge=0, description="less must be wanted for this long")
+
+    @model_validator(mode="after")
+    def _ordered(self) -> AutoscalingArgs:
+        if self.min_replicas > self.max_replicas:
+            raise ValueError(f"min_replicas {self.min_replicas} is over max_replicas {self.max_replicas}")
+        return self
+
+    def options(self) -> dict[str, Any]:
+        """Return Serve's `autoscaling_config`."""
+        chosen = {"target_utilisation", "target_waiting", "target_sessions"}
+        return {
+            **self.model_dump(exclude_none=True, exclude=chosen | {"look_back_s"}),
+            "look_back_period_s": self.look_back_s,
+            # A replica reports as often as it measures; Serve's own default is every 10 s.
+            "metrics_interval_s": min(2.0, self.look_back_s / 5),
+            "policy": {
+                "policy_function": "vlagents_ray.serve.scaling.autoscaling:MeasuredLoad",
+                "policy_kwargs": self.model_dump(include=chosen),
+            },
+        }
+
+
+class ResourceArgs(_DeploymentModel):
+    """The resources that Ray reserves for each replica."""
+
+    num_cpus: float = Field(default=0.0, ge=0, description="0 never competes with the rollouts for a slot")
+    num_gpus: float = Field(default=0.0, ge=0)
+    memory: float | None = Field(default=None, gt=0, description="bytes")
+    custom: dict[str, float] = Field(default_factory=dict, description="the cluster's own resources, by name")
+
+
+class ServerArgs(_DeploymentModel):
+    """The settings of a server for one policy."""
+
+    policy: str = Field(description="a registered name (`vlagents-ray policies`) or 'module:Class'")
+    config: dict[str, Any] = Field(default_factory=dict, description="the policy's own settings")
+    wrappers: list[str | dict[str, dict[str, Any]]] = Field(
+        default=[],
+        description="what changes the policy's observations, the first being the nearest to the robot: names, or "
+        "{name: settings}",
+    )
+    checkpoints: CheckpointArgs = CheckpointArgs()
+    replicas: int | None = Field(default=None, ge=1, description="a fixed number; excludes `autoscaling`")
+    autoscaling: AutoscalingArgs | None = None
+    answer_while_loading: bool | None = Field(
+        default=None,
+        description="deprecated, without effect: a replica runs only once its policy has loaded; remove it",
+    )
+    batch: BatchArgs = BatchArgs()
+    sessions: SessionArgs = SessionArgs()
+    limits: LimitArgs = LimitArgs()
+    access: AccessArgs = AccessArgs()
+    stream: StreamArgs = StreamArgs()
+    resources: ResourceArgs = ResourceArgs()
+    environment: EnvironmentArgs = Field(default=EnvironmentArgs(), description="the Python that the policy runs in")
+    dialects: DialectArgs = Field(default=DialectArgs(), description="other systems' clients that may connect")
+
+    @field_validator("answer_while_loading")
+    @classmethod
+    def _always_answered(cls, value: bool | None) -> bool | None:
+        if value is not None:
+            warnings.warn(
+                "answer_while_loading has no effect any more: an application runs only once its policy has loaded, and "
+                "is answered 503 until then; remove it from the deployment file",
+                FutureWarning,
+                stacklevel=2,
+            )
+        return value
+
+    @model_validator(mode="after")
+    def _one_scaling(self) -> ServerArgs:
+        if self.replicas is not None and self.autoscaling is not None:
+            raise ValueError("replicas and autoscaling exclude each other; keep one")
+        return self

@@ -1,0 +1,107 @@
+"""The settings under `args.dialects` in a deployment file; a dialect that is not named there is off.
+
+Each dialect defines its own settings as `Config` of its class. This module defines the settings that they share, and
+the section of all dialects by name: a registered name, or "module:Class".
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, create_model, field_validator, model_validator
+from pydantic.fields import FieldInfo
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.protocol.messages import RankName
+from vlagents_ray.registry import DIALECTS, dialect_class, names
+from vlagents_ray.serve.mapping.mapping import KeyMapping
+from vlagents_ray.serve.mapping.presets import read_mapping
+
+MappingSetting = str | dict[str, Any]
+
+
+class DialectConfig(BaseModel):
+    """The settings that all dialects have; the `Config` of a dialect adds its own."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    mapping: MappingSetting | None = Field(
+        default=None,
+        description="how the client's observations become ours: a preset's name, or an object, see "
+        "vlagents_ray.serve.mapping.mapping; unset: the client uses our names",
+    )
+    rank: RankName = Field(default="robot", description="class of its requests: robots go before simulations")
+
+    @field_validator("mapping")
+    @classmethod
+    def _readable(cls, value: MappingSetting | None) -> MappingSetting | None:
+        if value is not None:
+            read_mapping(value)
+        return value
+
+    def keys(self) -> KeyMapping | None:
+        """The mapping; None if the client uses our names."""
+        return None if self.mapping is None else read_mapping(self.mapping)
+
+
+class PortConfig(DialectConfig):
+    """The settings of all dialects that have their own port."""
+
+    port: int = Field(ge=1, le=65535, description="that clients connect to; a taken one fails the deployment")
+    host: str | None = Field(
+        default=None,
+        description="the address that it listens at; default: that of the server which `vlagents-ray serve` starts, "
+        "and 127.0.0.1 under `serve deploy`",
+    )
+
+
+class DialectArgs(BaseModel):
+    """The settings of all dialects that are on, by name."""
+
+    model_config = ConfigDict(extra="allow")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _by_their_own_models(cls, data: Any) -> Any:
+        """Let the `Config` of each dialect read its settings; the errors of all of them are raised together."""
+        if not isinstance(data, Mapping):
+            return data
+        fields: dict[str, Any] = {str(name): (_config_of(str(name)) | None, None) for name in data}
+        read = create_model("_Dialects", **fields).model_validate(data)
+        found = {name: getattr(read, name) for name in fields}
+        return {name: found[name] for name in (*DIALECTS, *found) if found.get(name) is not None}
+
+    @model_validator(mode="after")
+    def _ports_of_their_own(self) -> DialectArgs:
+        ports = {name: one.port for name, one in self.gateways().items()}
+        for port, times in Counter(ports.values()).items():
+            if times > 1:
+                shared = " and ".join(name for name, one in ports.items() if one == port)
+                raise ValueError(f"{shared} share port {port}; each needs one of its own")
+        return self
+
+    def on(self) -> dict[str, DialectConfig]:
+        """Return the settings of all dialects that are on, by name, in the order of the registry."""
+        return dict(self.model_extra or {})
+
+    def gateways(self) -> dict[str, PortConfig]:
+        """Return the settings of the dialects that have their own port, by name."""
+        return {name: one for name, one in self.on().items() if isinstance(one, PortConfig)}
+
+    @classmethod
+    def registered_fields(cls) -> dict[str, FieldInfo]:
+        """Return the known settings, for messages about unknown ones."""
+        return {name: FieldInfo(annotation=_config_of(name)) for name in names("dialects")}
+
+
+def _config_of(name: str) -> type[DialectConfig]:
+    cls = dialect_class(name)
+    config = getattr(cls, "Config", None)
+    if not (isinstance(config, type) and issubclass(config, DialectConfig)):
+        raise ConfigError(
+            f"{name}: {cls.__module__}.{cls.__qualname__} has no Config; want a subclass of "
+            "vlagents_ray.serve.dialects.base.Dialect, whose Config is a DialectConfig"
+        )
+    return config

@@ -1,0 +1,270 @@
+"""The base classes of all dialects, and the steps to add one.
+
+A dialect is another system's protocol. It has one folder, `vlagents_ray/serve/dialects/NAME/`:
+
+1. `codec.py` converts bytes to values and back, within `Limits`, without unpickling. It imports nothing of the server.
+2. `handler.py` has one class, which states its settings (`Config`), the system whose clients it serves, the packages
+   that it requires and the mappings that deployment files may name, and serves those clients: an `HttpDialect` for
+   plain requests over HTTP, a `RouteDialect` for WebSockets and anything else on the server's own port, or a
+   `PortDialect` for a protocol that needs its own port.
+3. `DIALECTS` in `vlagents_ray/registry.py` has one line for it. A third-party package has an entry point in the group
+   `vlagents_ray.dialects` instead; without either, a deployment file names the class, as `my_package:MyDialect`.
+4. `deployments/NAME.yaml` names the dialect under `args.dialects`.
+5. `tests/serve/dialects/NAME/` tests it with the bytes of the real client, and with garbage.
+
+The following is a complete dialect, for clients that post `{"q": [...], "task": "..."}` and read a list of numbers::
+
+    from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
+    from vlagents_ray.serve.dialects.http import HttpDialect
+    from vlagents_ray.serve.dialects import json_numpy
+
+
+    class PlainConfig(DialectConfig):
+        mapping: MappingSetting = {"state": {"joints": "q"}, "instruction": "task"}
+
+
+    class PlainDialect(HttpDialect):
+        Config = PlainConfig
+        clients = "the example"
+        paths = {"POST /plain": "act"}
+
+        async def act(self, http):
+            return await self.answer(http, self.decode, lambda rows: json_numpy.dumps(rows[0].tolist()).encode())
+
+        @staticmethod
+        def decode(data, budget):
+            return json_numpy.loads(data, budget.limits)
+
+`tests/serve/dialects/test_third_party.py` runs this example.
+"""
+
+from __future__ import annotations
+
+import abc
+import logging
+import socket
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+from starlette.routing import BaseRoute, Route, WebSocketRoute
+from starlette.websockets import WebSocket
+
+from vlagents_ray.contract import Contract
+from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, VLAgentsError
+from vlagents_ray.interface import Obs
+from vlagents_ray.protocol.budget import Budget
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits, Reply
+from vlagents_ray.serve.access.api_keys import Identity, NoKey, current_caller
+from vlagents_ray.serve.config.dialects import DialectConfig, PortConfig
+from vlagents_ray.serve.dialects.gateway_sessions import Connect
+from vlagents_ray.serve.dialects.implicit_session import ImplicitSession
+from vlagents_ray.serve.endpoints.http_messages import LONG_BYTES, problem_response
+from vlagents_ray.serve.engine.admission import Admission, MessageAdmission
+from vlagents_ray.serve.engine.dispatch import Dispatcher
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
+from vlagents_ray.serve.mapping.presets import read_mapping
+from vlagents_ray.serve.ports import LOOPBACK
+
+T = TypeVar("T")
+Stream = Callable[[WebSocket], Awaitable[None]]
+Check = Callable[[str | None], Identity]
+"""Returns the caller that a client's API key belongs to, or raises `Unauthorized` or `Forbidden`; None means no key."""
+
+logger = logging.getLogger(__name__)
+
+POLICY_VIOLATION, INTERNAL_ERROR, TRY_AGAIN_LATER = 1008, 1011, 1013  # WebSocket close codes
+_OUR_NAMES = "vlagents"  # preset for clients without a mapping
+
+
+@dataclass(frozen=True, slots=True)
+class ReplicaContext:
+    """The replica in which the dialects of the server's own port run."""
+
+    engine: Engine
+    metadata: Callable[[], dict[str, Any]]
+    limits: Limits
+
+    @property
+    def contract(self) -> Contract | None:
+        """The contract of the policy; None until the policy is loaded."""
+        return self.engine.contract
+
+
+@dataclass(frozen=True, slots=True)
+class GatewayContext:
+    """The gateway, a separate process that runs the dialects with their own port."""
+
+    app: str
+    connect: Connect  # connects to the application, for one client
+    limits: Limits
+    sessions: int  # maximum number of clients of one dialect
+    idle_s: float  # the sessions of a client that sends nothing for this time end
+    contract: Contract | None
+    check: Check | NoKey  # checks the key of a client, or states why none is needed
+    admission: Admission = field(default_factory=lambda: Admission(DEFAULT_LIMITS.in_flight_bytes))
+
+
+class Dialect(abc.ABC):
+    """A dialect that is on in a deployment; its two kinds are `RouteDialect` and `PortDialect`.
+
+    Args:
+        name: The dialect's name in the deployment, which is also the transport in statistics.
+        config: The dialect's settings.
+        context: The replica or the gateway in which the dialect runs.
+    """
+
+    Config: ClassVar[type[DialectConfig]] = DialectConfig
+    clients: ClassVar[str]  # the system whose clients it serves, as named in `/docs`
+    summary: ClassVar[str] = ""  # text of `/docs` about sessions, episodes and errors
+    requires: ClassVar[Sequence[str]] = ()  # modules of optional packages, without which a deployment is refused
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}  # mappings that deployment files may name
+
+    def __init__(self, name: str, config: DialectConfig, context: ReplicaContext | GatewayContext) -> None:
+        self.name = name
+        self.config = config
+        self.context = context
+        self.mapping = config.keys() or read_mapping(_OUR_NAMES)
+
+    @classmethod
+    def lacks(cls, config: DialectConfig, contract: Contract | None) -> list[str]:
+        """Return what the policy needs and no observation of these clients has, one sentence each with its remedy."""
+        mapping = config.keys()
+        return [] if mapping is None else mapping.lacks(contract)
+
+    @classmethod
+    @abc.abstractmethod
+    def places(cls, config: DialectConfig) -> dict[str, Any]:
+        """Return the `paths` or the `address` at which clients connect, for the metadata."""
+
+    def read(self, theirs: Any) -> tuple[Obs, str | None]:
+        """Return a client's observation, a map, as `Obs`, and its instruction; None if there is none."""
+        if not isinstance(theirs, dict):
+            raise MalformedMessage(f"observation: got {type(theirs).__name__}, want a map")
+        return self.mapping.obs(theirs, self.context.limits, self.context.contract)
+
+    def rows(self, reply: Reply) -> np.ndarray:
+        """Return the action in the reply to an act, (H, D) float32, in the client's gripper convention."""
+        if reply.act is None:
+            raise VLAgentsError("act: answered without an action")
+        contract = self.context.contract
+        return self.mapping.rows(reply.act.action, None if contract is None else contract.action)
+
+
+class RouteDialect(Dialect):
+    """A dialect over HTTP or WebSocket, on the server's own port, in each replica."""
+
+    paths: ClassVar[Mapping[str, str]]  # "POST /act" or "WS /openpi" -> the name of the method that serves it
+    root: ClassVar[str] = ""  # protocol of its clients at the server's root, if they connect there
+    context: ReplicaContext
+
+    def __init__(self, name: str, config: DialectConfig, context: ReplicaContext) -> None:
+        super().__init__(name, config, context)
+        self.rank = config.rank
+
+    @classmethod
+    def places(cls, config: DialectConfig) -> dict[str, Any]:  # noqa: ARG003 - overrides
+        return {"paths": list(cls.paths)}
+
+    def routes(self) -> list[BaseRoute]:
+        """Return the routes of its paths, without the root."""
+        return [_route(getattr(self, method), *path.split()) for path, method in self.paths.items()]
+
+    def at_root(self, sharing: Sequence[Any]) -> Stream:
+        """Serve WebSockets at the server's root for all dialects that speak this protocol there, this one first."""
+        raise NotImplementedError(f"{self.name} states a root and does not serve it")
+
+    def sender(self, session_id: str = "") -> Dispatcher:
+        """Return a dispatcher for a connection or, with a session's name, for a request.
+
+        It does not count requests for the key, as `decoded` has counted them.
+        """
+        caller, connected = current_caller(), not session_id
+        return Dispatcher(self.context.engine, self.name, session_id, caller=caller, connected=connected, counted=True)
+
+    def gate(self, *, counted: bool = False) -> Dispatcher:
+        """Return a dispatcher whose `admission` provides the budget for decoding messages.
+
+        Args:
+            counted: Whether each message was counted for the key when it arrived.
+        """
+        return Dispatcher(self.context.engine, self.name, caller=current_caller(), connected=False, counted=counted)
+
+    def session(self, sender: Dispatcher) -> ImplicitSession:
+        """Return a session of that sender, which begins without a reset by the client."""
+        return ImplicitSession(self.context.engine, sender, self.name, self.rank)
+
+    def trace(self) -> RequestTrace:
+        """Start the timing of an observation."""
+        return RequestTrace(self.context.engine.stats, self.name, "act", self.rank)
+
+
+class PortDialect(Dialect):
+    """A dialect with its own port, on threads of the gateway."""
+
+    Config: ClassVar[type[DialectConfig]] = PortConfig
+    scheme: ClassVar[str] = "tcp"  # URL scheme of the address in the metadata
+    context: GatewayContext
+
+    def __init__(self, name: str, config: PortConfig, context: GatewayContext) -> None:
+        super().__init__(name, config, context)
+
+    @classmethod
+    def places(cls, config: DialectConfig) -> dict[str, Any]:
+        host, port = getattr(config, "host", None), getattr(config, "port", None)
+        return {"address": f"{cls.scheme}://{host or LOOPBACK}:{port}"}
+
+    @abc.abstractmethod
+    def serve(self, listener: socket.socket) -> None:
+        """Start to accept clients, and return.
+
+        Args:
+            listener: A socket that is bound to the port and does not listen yet; the dialect must close it.
+        """
+
+    @abc.abstractmethod
+    def alive(self) -> bool:
+        """Return whether the dialect still accepts clients; if not, the gateway is replaced."""
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Stop accepting clients, and end all sessions."""
+
+
+def _route(endpoint: Callable[..., Any], method: str, path: str) -> BaseRoute:
+    return WebSocketRoute(path, endpoint) if method == "WS" else Route(path, endpoint, methods=[method])
+
+
+async def decoded(read: Callable[[bytes, Budget], T], data: bytes, admission: MessageAdmission) -> T:
+    """Return the result of `read` on a message, which counts as one request of the key, even if it is invalid."""
+    admission.begin("act")
+    return await admission.decoded(partial(read, data), long=len(data) > LONG_BYTES)
+
+
+def public_problem(error: Exception, what: str, request_id: str) -> VLAgentsError:
+    """Return the error that a client may see; the details of an unexpected error go to the log."""
+    if isinstance(error, VLAgentsError):
+        return error
+    logger.error("%s failed (request %s)", what, request_id, exc_info=error)
+    return VLAgentsError("internal error; the server's log has the details")
+
+
+async def accept_or_refuse(websocket: WebSocket, context: ReplicaContext) -> bool:
+    """Accept a WebSocket; return False if it was refused because the policy is not ready or the replica is full."""
+    try:
+        context.engine.require_ready()
+        sessions = context.engine.sessions
+        if len(sessions) >= sessions.limit:
+            raise PolicyUnavailable(f"this replica holds {len(sessions)} sessions, its limit")
+    except VLAgentsError as error:
+        if "websocket.http.response" in (websocket.scope.get("extensions") or {}):
+            await websocket.send_denial_response(problem_response(error, "", PolicyUnavailable.status))
+        else:
+            await websocket.accept()
+            await websocket.close(TRY_AGAIN_LATER, str(error)[:120])
+        return False
+    await websocket.accept()
+    return True

@@ -1,0 +1,108 @@
+"""The Serve deployment of the dialects with their own port: a separate process, which is a client of the replicas."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from functools import partial
+from typing import Any
+
+from ray import serve
+
+from vlagents_ray.client.agent import RemoteAgent
+from vlagents_ray.contract import Contract
+from vlagents_ray.errors import PolicyUnavailable
+from vlagents_ray.protocol.messages import RankName
+from vlagents_ray.registry import dialect_class
+from vlagents_ray.serve.access.api_keys import NoKey, require_access
+from vlagents_ray.serve.access.audit import write_audit
+from vlagents_ray.serve.config.deployment import ServerArgs
+from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
+from vlagents_ray.serve.dialects.gateway_sessions import Connect
+from vlagents_ray.serve.dialects.routes import describe, require_fit
+from vlagents_ray.serve.engine.admission import Admission
+from vlagents_ray.serve.ports import LOOPBACK, reserve
+
+logger = logging.getLogger(__name__)
+
+_LOADING_S = 3600.0  # time for the policy to load; a failure to load is raised at once
+_ANSWER_S = 30.0
+
+
+class Gateway:
+    """Reserves its ports when it starts, and is RUNNING and accepts clients only once the policy can act."""
+
+    async def __init__(self, args: dict[str, Any]) -> None:  # type: ignore[misc]  # Serve awaits it
+        self._dialects: list[PortDialect] = []
+        settings = ServerArgs(**args)
+        self._description = describe(settings.dialects)
+        await asyncio.to_thread(self._open, settings)
+
+    def _open(self, args: ServerArgs) -> None:
+        wanted = args.dialects.gateways()
+        keys = args.access.keys()
+        if keys is not None:
+            write_audit()
+        for one in wanted.values():
+            require_access(one.host or LOOPBACK, keys, args.access.insecure)
+        listeners = {name: reserve(name, one.host or LOOPBACK, one.port) for name, one in wanted.items()}
+        try:
+            app = serve.get_replica_context().app_name
+            contract = _wait_for_policy(app)
+            require_fit(args.dialects, contract)
+            limits = args.limits.limits()
+            admission = Admission(limits.in_flight_bytes)
+            for name, one in wanted.items():
+                context = GatewayContext(
+                    app=app,
+                    connect=_connector(app, one.rank, keyed=keys is not None),
+                    limits=limits,
+                    sessions=args.sessions.limit,
+                    idle_s=args.sessions.idle_s,
+                    contract=contract,
+                    check=NoKey.OPEN if keys is None else partial(keys.check, app=app),
+                    admission=admission,
+                )
+                self._dialects.append(dialect_class(name)(name, one, context))
+            for dialect in self._dialects:
+                dialect.serve(listeners[dialect.name])
+        except BaseException:
+            for listener in listeners.values():
+                listener.close()
+            raise
+
+    async def description(self) -> dict[str, Any]:
+        """Return the description of the dialects for the metadata of replicas, see `describe`."""
+        return self._description
+
+    def check_health(self) -> None:
+        """Raise if a dialect no longer accepts clients; Serve calls this, and replaces the gateway."""
+        if failed := [dialect.name for dialect in self._dialects if not dialect.alive()]:
+            raise PolicyUnavailable(f"the gateway no longer accepts clients of {failed}; its log has the details")
+
+    async def __del__(self) -> None:
+        for dialect in getattr(self, "_dialects", []):
+            await asyncio.to_thread(dialect.close)
+
+
+def _wait_for_policy(app: str) -> Contract | None:
+    """Wait until the policy can act and return its contract; raise the error if it does not load."""
+    with RemoteAgent(f"serve://{app}", transport="handle", connect_timeout_s=_LOADING_S) as agent:
+        return agent.contract
+
+
+def _connector(app: str, rank: RankName, *, keyed: bool) -> Connect:
+    def connect(key: str | None, allowed: RankName | None) -> RemoteAgent:
+        # The gateway itself enforces the permissions of the key, in `GatewaySessions`, as not every transport to a
+        # replica carries the key. A client without a key could not use the replica's shared memory, which requires
+        # one; the handle does not.
+        return RemoteAgent(
+            f"serve://{app}",
+            transport="handle" if keyed and key is None else "auto",
+            rank=allowed or rank,
+            timeout_s=_ANSWER_S,
+            connect_timeout_s=_ANSWER_S,
+            api_key=key,
+        )
+
+    return connect

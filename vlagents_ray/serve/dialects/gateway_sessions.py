@@ -1,0 +1,160 @@
+"""The sessions of one client of the gateway, whose episodes begin as in `ImplicitEpisode`.
+
+The gateway enforces the permissions of the client's key, since not every transport to a replica carries a key: each
+observation (with the reset before it) counts against the key's rate, each session against its sessions, and the key's
+class applies to all its requests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from vlagents_ray.client.agent import RemoteAgent
+from vlagents_ray.contract import Contract
+from vlagents_ray.errors import TooManyRequests
+from vlagents_ray.interface import Act, Obs
+from vlagents_ray.protocol.messages import RankName
+from vlagents_ray.serve.access.api_keys import Caller, Identity, throttled_s
+from vlagents_ray.serve.dialects.implicit_session import ImplicitEpisode
+
+Connect = Callable[[str | None, RankName | None], RemoteAgent]
+"""Connects to the application for one client, with its API key and the most urgent class that the key allows; None
+stands for no key, and for any class."""
+
+
+class GatewaySessions:
+    """The sessions of one client, all over one connection; for one thread at a time."""
+
+    def __init__(self, connect: Connect, contract: Contract | None) -> None:
+        """Prepare the sessions; `show` must be called first, with the client. `contract` is the policy's."""
+        self._connect = connect
+        self._contract = contract
+        self._caller: Identity | None = None
+        self._key: str | None = None
+        self._rank: RankName | None = None
+        self._throttled_s = 0.0
+        self._counted = 0  # number of requests of the current message that were counted before it was read
+        self._held = 0  # number of sessions that are counted for the key
+        self._agents: list[RemoteAgent] = []
+        self._episodes: list[ImplicitEpisode] = []  # the episode of each of `_agents`
+
+    @property
+    def begun(self) -> bool:
+        """Whether the client has a session."""
+        return bool(self._agents)
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        """Begin the next episode of the client's only session; return the reply's info."""
+        agent = self._sessions(1)[0]
+        self._admit(1)
+        self.restart()
+        info = agent.reset(obs, instruction, **kwargs)
+        self._episodes[0].began(instruction)
+        return info
+
+    def act(self, obs: Obs, instruction: str | None) -> Act:
+        """Return the next action of the client's only session, which is reset first for a new instruction."""
+        return self.act_batch([obs], [instruction])[0]
+
+    def act_on(self, obs: Obs) -> Act:
+        """Return the next action of the client's only session, without a reset; raise `NotReset` before the first."""
+        agent = self._sessions(1)[0]
+        self._admit(1)
+        return agent.act(obs)
+
+    def act_batch(self, obs: Sequence[Obs], instructions: Sequence[str | None]) -> list[Act]:
+        """Return the next action of each session, one per observation; raise the first error among them."""
+        agents = self._sessions(len(obs))
+        self._admit(len(obs))
+        texts = [episode.instruction for episode in self._episodes]
+        fresh = [i for i, text in enumerate(instructions) if self._episodes[i].begins(text)]
+        for i in fresh:
+            texts[i] = self._episodes[i].opening(instructions[i], self._contract)
+        self.restart()  # undone below, once all sessions have replied
+        if fresh:
+            if isinstance(self._caller, Caller):
+                self._caller.note("reset sessions by a gateway:", str(len(fresh)))
+            infos = agents[0].reset_batch(
+                [obs[i] for i in fresh], [texts[i] for i in fresh], [agents[i] for i in fresh]
+            )
+            _raise_first(infos)
+        acts = agents[0].act_batch(obs, agents)
+        for episode, text in zip(self._episodes, texts, strict=True):
+            episode.began(text)
+        _raise_first(acts)
+        return [act for act in acts if isinstance(act, Act)]
+
+    def show(self, caller: Identity, key: str | None) -> None:
+        """Set the client and its API key; sessions of another client or class end."""
+        rank = caller.rank if isinstance(caller, Caller) else None
+        if caller != self._caller or rank != self._rank:
+            self.close()
+            self._caller, self._key, self._rank = caller, key, rank
+            if isinstance(caller, Caller):
+                caller.note("let in by", "a gateway")
+
+    def refusal(self) -> str | None:
+        """Return the reason if the client's key is no longer valid; None if it is valid or there is none."""
+        return self._caller.refusal() if isinstance(self._caller, Caller) else None
+
+    def begin(self) -> None:
+        """Count a message for the key before it is read; this counts the first of its requests."""
+        self._counted = 0
+        self._admit(1)
+        self._counted = 1
+
+    def throttled_s(self) -> float:
+        """Return the time for which not to read the client, s: over 0 if it exceeded its rate since the last call."""
+        wait_s, self._throttled_s = self._throttled_s, 0.0
+        return wait_s
+
+    def restart(self) -> None:
+        """Have every session reset before its next action."""
+        for episode in self._episodes:
+            episode.end()
+
+    def close(self) -> None:
+        """End the client's sessions; later requests begin new ones."""
+        agents, self._agents, self._episodes = self._agents, [], []
+        self._hold(0)
+        for agent in agents:
+            agent.close()
+
+    def _sessions(self, number: int) -> list[RemoteAgent]:
+        if self._caller is None:
+            raise TypeError("a session without a client: call show() first")
+        self._hold(max(number, self._held))  # counts sessions before they exist, and until they have ended
+        if not self._agents:
+            self._agents = [self._connect(self._key, self._rank)]
+        for agent in self._agents[number:]:
+            agent.close()
+        del self._agents[number:]
+        self._hold(number)
+        if missing := number - len(self._agents):
+            self._agents += self._agents[0].sessions(missing)
+        self._episodes = [*self._episodes[:number], *(ImplicitEpisode() for _ in range(number - len(self._episodes)))]
+        return self._agents
+
+    def _hold(self, number: int) -> None:
+        """Set the number of sessions that count for the key; raise `TooManyRequests` over its limit."""
+        if isinstance(self._caller, Caller) and number != self._held:
+            self._caller.hold(number - self._held)
+        self._held = number
+
+    def _admit(self, number: int) -> None:
+        """Count requests for the key; raise `TooManyRequests` over its rate, before any of them is sent."""
+        counted, self._counted = self._counted, 0
+        if isinstance(self._caller, Caller):
+            try:
+                for _ in range(number - counted):
+                    self._caller.admit()
+            except TooManyRequests as error:
+                self._throttled_s = throttled_s(error)
+                raise
+
+
+def _raise_first(found: Sequence[object]) -> None:
+    for one in found:
+        if isinstance(one, Exception):
+            raise one

@@ -1,0 +1,1 @@
+"""GR00T's protocol: msgpack over ZeroMQ, on its own port."""

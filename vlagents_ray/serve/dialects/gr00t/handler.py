@@ -1,0 +1,205 @@
+"""GR00T's `PolicyClient`s over ZeroMQ: one ROUTER socket for all clients, and a session and a thread for each."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import queue
+import socket
+import threading
+import time
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, ClassVar
+
+from pydantic import Field
+
+from vlagents_ray.errors import PolicyUnavailable
+from vlagents_ray.registry import require
+from vlagents_ray.serve.config.dialects import MappingSetting, PortConfig
+from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
+from vlagents_ray.serve.dialects.gr00t import codec
+from vlagents_ray.serve.dialects.gr00t.connection import WAITING, GR00TConnection
+
+logger = logging.getLogger(__name__)
+
+Envelope = tuple[bytes, ...]  # sender of a message: the connection's id, and the parts between it and the payload
+_ENVELOPE = 8  # maximum number of parts
+_HEARTBEAT_MS = 10_000
+_TICK_MS = 500
+_QUIET_S = 30.0  # a client without a session is removed after this time without a request
+_END_S = 3.0
+
+
+class GR00TDialectConfig(PortConfig):
+    """The settings of GR00T's ZeroMQ protocol, that of its `PolicyServer`."""
+
+    mapping: MappingSetting = "gr00t"
+    port: int = Field(default=5555, ge=1, le=65535)
+
+
+class GR00TDialect(PortDialect):
+    """GR00T's protocol; one thread owns the ROUTER socket, and each client has a separate thread."""
+
+    Config = GR00TDialectConfig
+    clients = "GR00T"
+    summary = (
+        "A session is the client, until it is idle; `reset` begins an episode, and a batch of B is B "
+        "sessions. `api_token` is the API key. An error is a map with `error`."
+    )
+    requires = ("zmq", "msgpack")
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        # N1.6 and newer: {"video": {k: (1, T, H, W, 3)}, "state": {k: (1, T, D)}, "language": {"task": [[text]]}}; the
+        # names of an action's columns depend on the robot, so a deployment adds `action`
+        "gr00t": {
+            "cameras": {"*": "video/*"},
+            "state": {"*": "state/*"},
+            "instruction": "language/*",
+        },
+        # N1.5 has the same with flat keys
+        "gr00t-n1.5": {
+            "cameras": {"*": "video.*"},
+            "state": {"*": "state.*"},
+            "instruction": "annotation.human.*",
+        },
+    }
+
+    def __init__(self, name: str, config: GR00TDialectConfig, context: GatewayContext) -> None:
+        super().__init__(name, config, context)
+        self._clients: dict[Envelope, GR00TConnection] = {}
+        self._looked = float("-inf")  # time of the last check of all clients, s
+        self._answers: queue.SimpleQueue[tuple[Envelope, bytes]] = queue.SimpleQueue()
+        self._bell, self._ring = socket.socketpair()
+        self._ring.setblocking(False)
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def serve(self, listener: socket.socket) -> None:
+        require("zmq"), require("msgpack")
+        listener.listen()
+        self._thread = threading.Thread(target=self._run, args=(listener,), name="gr00t", daemon=True)
+        self._thread.start()
+
+    def alive(self) -> bool:
+        return self._thread is not None and self._thread.is_alive()
+
+    def close(self) -> None:
+        self._closing.set()
+        self._wake()
+        if self._thread is not None:
+            self._thread.join(_END_S)
+        for client in list(self._clients.values()):
+            client.end()
+        for client in list(self._clients.values()):
+            client.join(_END_S)
+        self._bell.close()
+        self._ring.close()
+
+    def answer(self, envelope: Envelope, message: bytes) -> None:
+        """Send a message to a client, from any thread."""
+        self._answers.put((envelope, message))
+        self._wake()
+
+    def _wake(self) -> None:
+        with contextlib.suppress(OSError):  # the thread is being woken already, or the dialect is closed
+            self._ring.send(b".")
+
+    def _run(self, listener: socket.socket) -> None:
+        zmq = require("zmq")
+        context = zmq.Context(io_threads=1)
+        router, authenticator = context.socket(zmq.ROUTER), context.socket(zmq.REP)
+        try:
+            router.setsockopt(zmq.LINGER, 0)
+            router.setsockopt(zmq.MAXMSGSIZE, self.context.limits.body_bytes)
+            router.setsockopt(zmq.RCVHWM, WAITING)
+            router.setsockopt(zmq.SNDHWM, WAITING)  # replies that a client does not read are dropped
+            router.setsockopt(zmq.HEARTBEAT_IVL, _HEARTBEAT_MS)
+            router.setsockopt(zmq.HEARTBEAT_TIMEOUT, 3 * _HEARTBEAT_MS)
+            router.setsockopt(zmq.HANDSHAKE_IVL, _HEARTBEAT_MS)
+            # With an authenticator ZMQ refuses peers with protocols before 3.0, whose dead connections it would keep.
+            authenticator.bind("inproc://zeromq.zap.01")
+            router.setsockopt(zmq.ZAP_DOMAIN, b"gr00t")
+            router.setsockopt(zmq.USE_FD, listener.fileno())
+            host, port = listener.getsockname()[:2]
+            router.bind(f"tcp://[{host}]:{port}" if ":" in host else f"tcp://{host}:{port}")
+            listener.detach()  # ZMQ owns it now and closes it with the ROUTER socket
+            poller = zmq.Poller()
+            poller.register(router, zmq.POLLIN)
+            poller.register(authenticator, zmq.POLLIN)
+            poller.register(self._bell, zmq.POLLIN)
+            while not self._closing.is_set():
+                ready = dict(poller.poll(_TICK_MS))
+                if self._bell.fileno() in ready:
+                    self._bell.recv(4096)
+                    self._send(router, zmq)
+                if authenticator in ready:  # accepts every peer, as API keys are in the messages
+                    version, request, *_ = authenticator.recv_multipart()
+                    authenticator.send_multipart([version, request, b"200", b"", b"", b""])
+                if router in ready:
+                    self._receive(router, zmq)
+                self._forget_quiet()
+        except Exception:
+            logger.exception("gr00t: the dialect has failed, and accepts no more clients")
+        finally:
+            listener.close()
+            router.close()
+            authenticator.close()
+            context.destroy(linger=0)
+
+    def _send(self, router: Any, zmq: Any) -> None:
+        while True:
+            try:
+                envelope, message = self._answers.get_nowait()
+            except queue.Empty:
+                return
+            with contextlib.suppress(zmq.ZMQError):  # the client is gone, or does not read
+                router.send_multipart([*envelope, message], zmq.NOBLOCK)
+
+    def _receive(self, router: Any, zmq: Any) -> None:
+        for _ in range(64):  # then replies are sent again
+            try:
+                parts = router.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            except zmq.ZMQError as error:
+                logger.info("gr00t: a message was lost: %s", error)
+                return
+            if not 2 <= len(parts) <= _ENVELOPE:
+                continue
+            *envelope, payload = parts
+            self._take(tuple(envelope), payload)
+
+    def _take(self, envelope: Envelope, payload: bytes) -> None:
+        client = self._clients.get(envelope)
+        if client is None:
+            if len(self._clients) >= self.context.sessions and not self._forget_one():
+                full = PolicyUnavailable(f"{len(self._clients)} clients are connected, the limit; try again later")
+                self.answer(envelope, codec.pack({"error": f"{full.code}: {full}"}))
+                return
+            client = self._clients[envelope] = GR00TConnection(
+                self.context, self.mapping, partial(self.answer, envelope)
+            )
+        if not client.put(payload):
+            self.answer(envelope, codec.pack({"error": "malformed: wait for the answer before the next request"}))
+
+    def _forget_quiet(self) -> None:
+        """End the sessions of idle clients and of clients whose key is no longer valid, twice a second."""
+        now = time.monotonic()
+        if now - self._looked < _TICK_MS / 1e3:
+            return
+        self._looked = now
+        for envelope, client in list(self._clients.items()):
+            patience_s = self.context.idle_s if client.begun else min(_QUIET_S, self.context.idle_s)
+            if client.quiet_s(now) > patience_s or client.refusal() is not None:
+                client.end()
+                del self._clients[envelope]
+
+    def _forget_one(self) -> bool:
+        """Remove the client without a session that has been idle for the longest; return False if there is none."""
+        now = time.monotonic()
+        idle = [(client.quiet_s(now), envelope) for envelope, client in self._clients.items() if not client.begun]
+        quiet_s, envelope = max(idle, default=(0.0, ()))
+        if quiet_s <= 0:
+            return False
+        self._clients.pop(envelope).end()
+        return True

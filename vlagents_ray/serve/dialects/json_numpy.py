@@ -1,0 +1,88 @@
+"""JSON with arrays in the format of the package `json_numpy`: `{"__numpy__": base64, "dtype", "shape"}`."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
+from vlagents_ray.protocol.arrays import read_array
+from vlagents_ray.protocol.messages import Limits
+from vlagents_ray.protocol.values import require_plain
+
+_KEYS = {"__numpy__", "dtype", "shape"}
+
+
+def loads(text: str | bytes, limits: Limits, levels: int = 0) -> Any:
+    """Return the value of a document; arrays are read-only.
+
+    Args:
+        text: The document.
+        limits: The limits of its size, its number of values and their nesting.
+        levels: Levels of nesting that the document's format adds above the limited values.
+
+    Raises:
+        MalformedMessage: It is not JSON, or an array in it is invalid.
+        MessageTooLarge: It is over a limit.
+    """
+    if len(text) > limits.body_bytes:
+        raise MessageTooLarge(f"document: got {len(text)} bytes, the limit is {limits.body_bytes}")
+    marks: tuple[Any, ...] = (",", "[", "{") if isinstance(text, str) else (b",", b"[", b"{")
+    if sum(map(text.count, marks)) > limits.items:  # base64 contains none of these characters
+        raise MessageTooLarge(f"document: more than {limits.items} values; send arrays as json-numpy writes them")
+    try:
+        value = json.loads(text, object_hook=_hook)
+    except MalformedMessage:
+        raise
+    except (ValueError, RecursionError) as error:
+        raise MalformedMessage(f"document: not JSON ({error})") from error
+    require_plain(value, limits.depth + levels)
+    return value
+
+
+def dumps(value: Any) -> str:
+    """Return the document of a value; raise `InvalidInput` for a type that it cannot hold."""
+    return json.dumps(value, default=_plain)
+
+
+def decode_base64(data: object, what: str) -> bytes:
+    """Return the bytes of base64 in the standard or the URL-safe alphabet; `what` names it in errors."""
+    if not isinstance(data, str):
+        raise MalformedMessage(f"{what}: got {type(data).__name__}, want base64")
+    try:
+        altchars = b"-_" if "-" in data or "_" in data else None
+        return base64.b64decode(data, altchars, validate=True)
+    except (binascii.Error, ValueError) as error:
+        raise MalformedMessage(f"{what}: not base64 ({error})") from error
+
+
+def _hook(node: dict[str, Any]) -> Any:
+    if "__numpy__" not in node:
+        return node
+    if node.keys() != _KEYS:
+        raise MalformedMessage(f"array: got keys {sorted(map(str, node))[:8]}, want {sorted(_KEYS)}")
+    return read_array(decode_base64(node["__numpy__"], "array"), node["dtype"], node["shape"])
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, (np.ndarray, np.generic)):
+        if value.dtype.kind not in "biuf":
+            raise InvalidInput(f"document: got dtype {value.dtype}, want bool, integers or floats")
+        array = np.ascontiguousarray(value, dtype=value.dtype.newbyteorder("<"))
+        return {
+            "__numpy__": base64.b64encode(array.tobytes()).decode(),
+            "dtype": array.dtype.str,
+            "shape": list(np.shape(value)),
+        }
+    if isinstance(value, Mapping):
+        return dict(value)
+    if isinstance(value, (bytes, bytearray, memoryview)):
+        return base64.b64encode(value).decode()
+    if isinstance(value, Sequence):
+        return list(value)
+    raise InvalidInput(f"document: got {type(value).__name__}, want what JSON or an array can say")

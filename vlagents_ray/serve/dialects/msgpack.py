@@ -1,0 +1,83 @@
+"""Reading of msgpack within limits, for the messages of other systems; ours are frames.
+
+A short message can need much memory (each byte may be an empty list); therefore the values are counted while they are
+read, and reading stops at the limit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
+from vlagents_ray.protocol.messages import Limits
+from vlagents_ray.protocol.values import require_plain
+from vlagents_ray.registry import require
+
+Hook = Callable[[dict[Any, Any]], Any]
+
+
+def unpack(data: bytes | memoryview, limits: Limits, hook: Hook, text: int | None = None) -> Any:
+    """Read the value in `data`; the keys of maps that the hook returns must be text.
+
+    Args:
+        data: The message.
+        limits: The limits of its size, its number of values and their nesting.
+        hook: Gets each map, innermost first, and returns the value that replaces it. The values of a list that it
+            returns, such as an array of text, are counted too; the hook limits them to `limits.items` itself.
+        text: Maximum size of one text, bytes; None if the size of the message is limit enough.
+
+    Raises:
+        MalformedMessage: It is not msgpack, or holds extension types.
+        MessageTooLarge: It is over a limit.
+        InvalidInput: The hook raised it.
+    """
+    if len(data) > limits.body_bytes:
+        raise MessageTooLarge(f"message: got {len(data)} bytes, the limit is {limits.body_bytes}")
+    msgpack = require("msgpack")
+    count = 0
+
+    def counted(values: Any) -> Any:
+        nonlocal count
+        count += len(values) + 1
+        if count > limits.items:
+            raise MessageTooLarge(f"message: more than {limits.items} values; send arrays instead of lists")
+        return values
+
+    def hooked(values: dict[Any, Any]) -> Any:
+        counted(values)
+        found = hook(values)
+        for texts in [found, *found] if isinstance(found, list) else ():
+            if isinstance(texts, list):
+                counted(texts)
+        return found
+
+    try:
+        value = msgpack.unpackb(
+            data,
+            object_hook=hooked,
+            list_hook=counted,
+            ext_hook=_refuse,
+            strict_map_key=False,
+            max_str_len=len(data) if text is None else text,
+            max_array_len=limits.items,
+            max_map_len=limits.items,
+        )
+    except InvalidInput:
+        raise
+    except (msgpack.exceptions.UnpackException, ValueError, TypeError, OverflowError) as error:
+        if "exceeds max_" in str(error):  # msgpack has no error class for it
+            raise MessageTooLarge(f"message: {error}; send arrays instead of lists") from error
+        raise MalformedMessage(f"message: no msgpack ({type(error).__name__}: {str(error)[:100]})") from error
+    require_plain(value, limits.depth)
+    return value
+
+
+def pack(value: Any, default: Callable[[Any], Any]) -> bytes:
+    """Return `value` as msgpack; `default` converts types that msgpack does not support, such as arrays, to maps."""
+    packed: bytes = require("msgpack").packb(value, default=default)
+    return packed
+
+
+def _refuse(code: int, _data: bytes) -> Any:
+    raise MalformedMessage(f"message: got an extension type, {code}; want plain values and arrays")

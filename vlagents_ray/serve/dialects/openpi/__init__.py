@@ -1,0 +1,1 @@
+"""openpi's protocol: msgpack over WebSocket."""

@@ -1,0 +1,81 @@
+"""The messages of `openpi-client`: msgpack, in which a map with the key b"__ndarray__" is an array.
+
+The convention is that of `openpi_client.msgpack_numpy`, 0.1.2; RoboArena's client has a copy of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge
+from vlagents_ray.protocol.arrays import plain_dtype, read_array
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
+from vlagents_ray.serve.dialects.msgpack import pack, unpack
+
+
+def decode(data: bytes, limits: Limits = DEFAULT_LIMITS) -> dict[str, Any]:
+    """Return the map in a message; arrays are read-only views, and an array of text becomes a list.
+
+    Raises `MalformedMessage` or `MessageTooLarge`.
+    """
+    value = unpack(data, limits, lambda node: _array(node, limits.items))
+    if not isinstance(value, dict):
+        raise MalformedMessage(f"message: got {type(value).__name__}, want a map")
+    return value
+
+
+def encode(value: Any) -> bytes:
+    """Return the message with `value`, plain values and arrays, in the client's format."""
+    return pack(value, _node)
+
+
+def _array(node: dict[Any, Any], most: int) -> Any:
+    if b"__ndarray__" in node:
+        data, dtype, shape = node.get(b"data"), node.get(b"dtype"), node.get(b"shape")
+        if isinstance(dtype, str) and dtype.startswith("<U") and isinstance(data, bytes):
+            return _texts(data, dtype, most)
+        return read_array(data, dtype, shape)  # type: ignore[arg-type]  # it checks
+    if b"__npgeneric__" in node:
+        value = node.get(b"data")
+        if not isinstance(value, (bool, int, float)):
+            raise MalformedMessage(f"scalar: got {type(value).__name__}, want a number")
+        dtype = plain_dtype(node.get(b"dtype"))
+        try:
+            if dtype.kind in "iu" and not np.iinfo(dtype).min <= value <= np.iinfo(dtype).max:
+                raise OverflowError
+            return dtype.type(value)
+        except (OverflowError, ValueError) as error:
+            raise MalformedMessage(f"scalar: {str(value)[:40]} is no {dtype}") from error
+    return node
+
+
+def _texts(data: bytes, dtype: str, most: int) -> list[str]:
+    """Return an array of at most `most` texts as a flat list; some clients send a prompt in this way."""
+    length = dtype.removeprefix("<U")
+    size = 4 * int(length) if length.isascii() and length.isdigit() and len(length) < 9 else 0
+    if not size or len(data) % size:
+        raise MalformedMessage(f"array: got {len(data)} bytes, want texts of {dtype[:20]!r}")
+    if len(data) // size > most:
+        raise MessageTooLarge(f"array: got {len(data) // size} texts, want {most} more at most")
+    try:
+        return [data[at : at + size].decode("utf-32-le").rstrip("\0") for at in range(0, len(data), size)]
+    except UnicodeDecodeError as error:
+        raise MalformedMessage(f"array: no text ({error.reason})") from error
+
+
+def _node(value: Any) -> Any:
+    if isinstance(value, np.ndarray) and value.dtype.kind in "biuf":
+        return {
+            b"__ndarray__": True,
+            b"data": value.tobytes(),
+            b"dtype": value.dtype.str,
+            b"shape": value.shape,
+        }
+    if isinstance(value, np.generic) and value.dtype.kind in "biuf":
+        return value.item()
+    if isinstance(value, Mapping):
+        return dict(value)
+    raise TypeError(f"cannot send {type(value).__name__}; want plain values and arrays of numbers")

@@ -1,0 +1,1 @@
+"""OpenVLA's protocol: json_numpy over HTTP."""

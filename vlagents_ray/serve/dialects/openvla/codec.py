@@ -1,0 +1,45 @@
+"""OpenVLA's REST bodies: JSON with arrays in the format of `json-numpy`, encoded once or twice.
+
+`{"__numpy__": base64, "dtype": "|u1", "shape": [H, W, 3]}` is an array. Clients that do not patch their json module
+encode twice: a request is `{"encoded": "<the JSON>"}` and its reply a JSON string that holds the JSON.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
+from vlagents_ray.serve.dialects import json_numpy
+
+
+def decode(body: bytes, limits: Limits = DEFAULT_LIMITS) -> tuple[dict[str, Any], bool]:
+    """Return the observation in a request's body, and whether it was encoded twice.
+
+    Raises `MalformedMessage` or `MessageTooLarge`.
+    """
+    if len(body) > limits.body_bytes:
+        raise MessageTooLarge(f"body: got {len(body)} bytes, the limit is {limits.body_bytes}")
+    payload = _load(body, limits)
+    if twice := "encoded" in payload:
+        if len(payload) != 1 or not isinstance(payload["encoded"], str):
+            raise MalformedMessage("body: want 'encoded' alone, and text in it")
+        payload = _load(payload["encoded"].encode("utf-8", "replace"), limits)
+    return payload, twice
+
+
+def encode(action: np.ndarray | Sequence[np.ndarray], twice: bool) -> bytes:
+    """Return the reply with one action, (D,), or several."""
+    text = json_numpy.dumps(action)
+    return (json.dumps(text) if twice else text).encode()
+
+
+def _load(text: bytes, limits: Limits) -> dict[str, Any]:
+    payload = json_numpy.loads(text, limits)
+    if not isinstance(payload, dict):
+        raise MalformedMessage(f"body: got {type(payload).__name__}, want an object")
+    return payload

@@ -1,0 +1,83 @@
+"""RoboArena's clients: they use openpi's protocol, with a configuration at the start and an `endpoint` per request."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field
+
+from vlagents_ray.errors import MalformedMessage
+from vlagents_ray.protocol.messages import NAME_CHARACTERS, Reply
+from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
+from vlagents_ray.serve.dialects.openpi.handler import MapConnection, MapDialect
+
+
+class RoboArenaDialectConfig(DialectConfig):
+    """The settings of RoboArena's client; except for `bare`, the fields are those of its PolicyServerConfig."""
+
+    mapping: MappingSetting = "roboarena"
+    image_resolution: tuple[int, int] | None = Field(default=(224, 224), description="height, width; null: any")
+    needs_wrist_camera: bool = True
+    n_external_cameras: int = Field(default=1, ge=0, le=2)
+    needs_stereo_camera: bool = False
+    needs_session_id: bool = False
+    action_space: Literal["joint_position", "joint_velocity", "cartesian_position", "cartesian_velocity"] = (
+        "joint_position"
+    )
+    bare: bool = Field(default=False, description="answer the array itself, as older clients want it")
+
+    def first(self) -> dict[str, Any]:
+        """Return the fields of PolicyServerConfig."""
+        return self.model_dump(mode="json", exclude={"mapping", "rank", "bare"})
+
+
+class RoboArenaDialect(MapDialect):
+    """RoboArena's protocol: an episode ends with `reset`, or with another `session_id`."""
+
+    Config = RoboArenaDialectConfig
+    clients = "RoboArena"
+    summary = (
+        "A session is the connection; `reset` or a new `session_id` begins an episode. An error is a text, "
+        "then close 1011."
+    )
+    paths: ClassVar[Mapping[str, str]] = {"WS /roboarena": "stream"}
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        # openpi's DROID keys, but the numbers of the cameras begin with 0
+        "roboarena": {
+            "cameras": {
+                "front": {"key": "observation/exterior_image_0_left", "layout": "any"},
+                "front_2": {"key": "observation/exterior_image_1_left", "layout": "any", "optional": True},
+                "wrist": {"key": "observation/wrist_image_left", "layout": "any", "optional": True},
+            },
+            "state": {"joints": {"key": "observation/joint_position", "stop": 7}},
+            "gripper": {"key": "observation/gripper_position", "open": 0.0, "closed": 1.0},
+            "instruction": "prompt",
+            "info": {"session_id": "session_id"},
+            "action_gripper": {"index": 7, "open": 0.0, "closed": 1.0},
+        },
+    }
+    config: RoboArenaDialectConfig
+
+    def first(self) -> dict[str, Any]:
+        return self.config.first()
+
+    def speaks(self, message: dict[str, Any]) -> bool:
+        return "endpoint" in message
+
+    def begins(self, message: dict[str, Any], connection: MapConnection) -> str | None:
+        endpoint = message.get("endpoint", "infer")
+        if not isinstance(endpoint, str) or endpoint not in ("infer", "reset"):
+            raise MalformedMessage(f"endpoint: got {str(endpoint)[:40]!r}, want 'infer' or 'reset'")
+        if endpoint == "reset":
+            connection.session.episode.end()
+            return "reset successful"
+        if (named := message.get("session_id")) is not None:
+            episode = str(named)[:NAME_CHARACTERS]  # the client sends a text, or an array with one text
+            if connection.episode not in (None, episode):
+                connection.session.episode.end()
+            connection.episode = episode
+        return None
+
+    def answer(self, reply: Reply, before_ms: float | None) -> Any:
+        return self.rows(reply) if self.config.bare else super().answer(reply, before_ms)

@@ -1,0 +1,165 @@
+"""The part of RPyC's protocol that a service with text as arguments and results needs; facts from rpyc 6.0.
+
+RPyC lets a peer access attributes of the server's objects, call them, and pass objects that the server calls back. This
+reader supports none of that: it knows the root and its methods by number, and accepts only values without references.
+So a peer can call the methods that the server offers, and nothing else.
+
+A frame is a header (length, compressed?), a message and a newline. A message is its kind and one value, written
+in "brine": `(sequence number, content)`.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge
+from vlagents_ray.serve.dialects.vlagents import brine
+
+HEADER = struct.Struct("!LB")  # size of the message in bytes, and whether it is compressed
+END = b"\n"
+ROOT = 0  # the number of the root; its methods have the following numbers
+_ROOT_NAME = ("vlagents_ray.Policy", 1, 1)  # a peer's reference to it: its class, numbers of class and object
+_METHOD_CLASS = "builtins.method"  # a peer knows this class and does not inspect it
+_METHODS_AT_MOST = 64
+_COMPRESS_OVER = 3000  # bytes, RPyC's own threshold
+_REQUEST, _REPLY, _EXCEPTION = 1, 2, 3
+_VALUE, _TUPLE, _LOCAL, _REMOTE = 1, 2, 3, 4  # labels of boxed values
+
+
+class Handler(IntEnum):
+    """The operations that a peer may request; RPyC's other ones would access objects."""
+
+    PING = 1
+    CLOSE = 2
+    GETROOT = 3
+    GETATTR = 4
+    CALL = 7
+    CALLATTR = 8
+    DEL = 15
+    INSPECT = 16
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """A peer's reference to the root, or to one of its methods."""
+
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class RpycCall:
+    """A request of the peer."""
+
+    sequence: int
+    handler: Handler
+    args: tuple[Any, ...]
+
+
+def read_header(header: bytes | bytearray, limit: int) -> tuple[int, bool]:
+    """Return the number of bytes that follow, the newline included, and whether the message is compressed."""
+    length, compressed = HEADER.unpack(header)
+    if length > limit:
+        raise MessageTooLarge(f"rpyc: a message of {length} bytes, the limit is {limit}")
+    if compressed > 1 or length == 0:
+        raise MalformedMessage("rpyc: not a frame")
+    return length + len(END), bool(compressed)
+
+
+def read_call(body: bytes | bytearray, compressed: bool, limit: int) -> RpycCall | None:
+    """Return the request in a frame's body, which follows the header; None if the message needs no reply."""
+    message = memoryview(body)[: -len(END)]
+    if compressed:
+        message = memoryview(_inflate(message, limit))
+    if len(message) == 0:
+        raise MalformedMessage("rpyc: an empty message")
+    kind = message[0]
+    if kind in (_REPLY, _EXCEPTION):  # the server sends no requests, so it expects no replies
+        return None
+    if kind != _REQUEST:
+        raise MalformedMessage(f"rpyc: got a message of kind {kind}, want a request")
+    content = brine.read(message[1:])
+    if not (isinstance(content, tuple) and len(content) == 2 and _is_int(content[0])):
+        raise MalformedMessage("rpyc: want (sequence number, request)")
+    sequence, request = content
+    if not (isinstance(request, tuple) and len(request) == 2 and _is_int(request[0])):
+        raise MalformedMessage("rpyc: want (handler, arguments)")
+    try:
+        handler = Handler(request[0])
+    except ValueError:
+        raise Refused(sequence, f"rpyc: handler {request[0]} is not offered here") from None
+    try:
+        args = _unbox(request[1])
+    except MalformedMessage as error:
+        raise Refused(sequence, str(error)) from error
+    if not isinstance(args, tuple):
+        raise Refused(sequence, "rpyc: want a tuple of arguments")
+    return RpycCall(sequence, handler, args)
+
+
+class Refused(MalformedMessage):
+    """A request that is decodable but refused; its sender gets the error as a reply."""
+
+    def __init__(self, sequence: int, text: str) -> None:
+        super().__init__(text)
+        self.sequence = sequence
+
+
+def reply(sequence: int, value: Any) -> bytes:
+    """Return the frame of a reply with a value: None, bool, int, float, text, bytes or tuples of these."""
+    return _frame(_REPLY, (sequence, (_VALUE, value)))
+
+
+def reference_reply(sequence: int, number: int) -> bytes:
+    """Return the frame of a reply with a reference to the root, or to one of its methods."""
+    name = _ROOT_NAME if number == ROOT else (_METHOD_CLASS, 2, number)
+    return _frame(_REPLY, (sequence, (_REMOTE, name)))
+
+
+def exception(sequence: int, kind: str, text: str) -> bytes:
+    """Return the frame that raises the built-in exception `kind` at the peer, without a traceback."""
+    return _frame(_EXCEPTION, (sequence, (("builtins", kind), (text,), (), "")))
+
+
+def _frame(kind: int, content: tuple[Any, ...]) -> bytes:
+    message = bytes([kind]) + brine.write(content)
+    compressed = len(message) > _COMPRESS_OVER
+    if compressed:
+        message = zlib.compress(message, 1)
+    return HEADER.pack(len(message), compressed) + message + END
+
+
+def _inflate(data: memoryview, limit: int) -> bytes:
+    machine = zlib.decompressobj()
+    try:
+        message = machine.decompress(data, limit + 1)
+    except zlib.error as error:
+        raise MalformedMessage(f"rpyc: not compressed as its header says ({error})") from error
+    if len(message) > limit:
+        raise MessageTooLarge(f"rpyc: a message of more than {limit} bytes")
+    if not machine.eof:
+        raise MalformedMessage("rpyc: a compressed message without an end")
+    return message
+
+
+def _unbox(boxed: Any) -> Any:
+    if not (isinstance(boxed, tuple) and len(boxed) == 2):
+        raise MalformedMessage("rpyc: want (label, value)")
+    label, value = boxed
+    if label == _VALUE:
+        return value
+    if label == _TUPLE and isinstance(value, tuple):
+        return tuple(_unbox(item) for item in value)
+    if label == _LOCAL and isinstance(value, tuple) and len(value) == 3:
+        if value == _ROOT_NAME:
+            return Reference(ROOT)
+        if value[:2] == (_METHOD_CLASS, 2) and _is_int(value[2]) and 0 < value[2] < _METHODS_AT_MOST:
+            return Reference(value[2])
+    raise MalformedMessage("rpyc: objects are not taken here; send values")
+
+
+def _is_int(value: object) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool)

@@ -1,0 +1,1 @@
+"""The endpoints of a replica: shared memory, plasma, WebSocket and HTTP."""

@@ -1,0 +1,241 @@
+"""Access control of a replica's HTTP paths and WebSockets: API keys, and time limits for slow clients.
+
+The middleware is an ASGI application around another one, so that everything behind it, the dialects included, is
+protected in the same way. Only `/healthz` requires no key; it reports only whether the policy is ready. A WebSocket is
+refused before it is accepted.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import uuid
+from collections.abc import Collection
+from contextlib import suppress
+
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from vlagents_ray.errors import MalformedMessage, Unauthorized, VLAgentsError
+from vlagents_ray.protocol.messages import REQUEST_ID_HEADER
+from vlagents_ray.serve.access.api_keys import (
+    Caller,
+    Identity,
+    Keys,
+    NoKey,
+    on_behalf_of,
+    token_of,
+)
+from vlagents_ray.serve.access.origin_check import require_own_page
+from vlagents_ray.serve.endpoints.http_messages import headers_of, named, problem_response
+
+logger = logging.getLogger(__name__)
+
+_TICK_S = 0.5  # period at which a WebSocket's key and time limits are checked
+_DROPPED_BYTES = 2**20  # a refused request with a longer body loses its connection
+_GOING_AWAY, _POLICY_VIOLATION = 1001, 1008  # WebSocket close codes
+_TIMEOUT = 408
+
+
+class AccessMiddleware:
+    """Accepts requests with a valid key, or all requests if the server has no keys; cuts off slow clients."""
+
+    def __init__(
+        self,
+        app: ASGIApp,
+        keys: Keys | None,
+        name: str,
+        *,
+        slow_s: float = 30.0,
+        idle_s: float = 600.0,
+        hosts: Collection[str] = (),
+    ) -> None:
+        """Protect `app`.
+
+        Args:
+            app: The ASGI application that gets the accepted requests.
+            keys: The server's keys; None if it has none.
+            name: The name of the Serve application.
+            slow_s: Maximum time that a request may take to arrive, or a WebSocket's client to accept a message, s.
+            idle_s: Maximum time that a WebSocket may be silent, s.
+            hosts: Further host names of the server, see `require_own_page`.
+        """
+        self._app = app
+        self._keys = keys
+        self._name = name
+        self._hosts = hosts
+        self._slow_s = slow_s
+        self._idle_s = idle_s
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Serve one connection as specified by ASGI."""
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        headers = headers_of(scope)
+        caller: Identity = NoKey.OPEN
+        try:
+            if _asks_for_health(scope):
+                pass
+            elif self._keys is None:
+                require_own_page(headers, self._hosts)  # any page that the robot's user opens can reach loopback
+            else:
+                key = caller = self._keys.check(token_of(headers), self._name)
+                if scope["type"] == "http":
+                    key.admit()
+                else:
+                    key.hold()
+                key.note("let in by", scope["type"])
+        except VLAgentsError as error:
+            await _refuse(error, named(headers.get(REQUEST_ID_HEADER, "")), scope, receive, send)
+            return
+        with on_behalf_of(caller):
+            if scope["type"] == "websocket":
+                try:
+                    await _TimedWebSocket(caller, self._slow_s, self._idle_s, receive, send).run(self._app, scope)
+                finally:
+                    if isinstance(caller, Caller):
+                        caller.hold(-1)
+            elif _has_body(scope):
+                await _TimedUpload(self._slow_s, send).run(self._app, scope, receive)
+            else:
+                await self._app(scope, receive, send)
+
+
+def _asks_for_health(scope: Scope) -> bool:
+    path: str = scope["path"]
+    root: str = scope.get("root_path", "")
+    return scope["type"] == "http" and scope["method"] in ("GET", "HEAD") and path in ("/healthz", f"{root}/healthz")
+
+
+def _has_body(scope: Scope, most: int = 0) -> bool:
+    """Whether a body of more than `most` bytes, or of unstated length, follows the headers."""
+    headers = headers_of(scope)
+    stated = headers.get("content-length", "0")
+    return "transfer-encoding" in headers or not stated.isdecimal() or int(stated) > most
+
+
+async def _refuse(error: VLAgentsError, request_id: str, scope: Scope, receive: Receive, send: Send) -> None:
+    answer = problem_response(error, request_id)
+    if isinstance(error, Unauthorized):
+        answer.headers["www-authenticate"] = 'Bearer realm="vlagents_ray"'
+    if scope["type"] == "http" and _has_body(scope, _DROPPED_BYTES):
+        answer.headers["connection"] = "close"  # the body is not read, not even to discard it
+    if scope["type"] == "websocket":
+        await receive()  # the "websocket.connect" message
+        if "websocket.http.response" not in scope.get("extensions", {}):
+            await send({"type": "websocket.close", "code": _POLICY_VIOLATION})  # before acceptance it means HTTP 403
+            return
+    await answer(scope, receive, send)
+
+
+class _TimedUpload:
+    """An HTTP request whose body must arrive within a time limit."""
+
+    def __init__(self, slow_s: float, send: Send) -> None:
+        self._slow_s = slow_s
+        self._send = send
+        self._late = False
+        self._answering = False
+
+    async def run(self, app: ASGIApp, scope: Scope, receive: Receive) -> None:
+        task = asyncio.current_task()
+
+        def time_out() -> None:
+            self._late = True
+            if task is not None:
+                task.cancel()
+
+        timer = asyncio.get_running_loop().call_later(self._slow_s, time_out)
+
+        async def timed() -> Message:
+            message = await receive()
+            if message["type"] == "http.disconnect" or not message.get("more_body", False):
+                timer.cancel()
+            return message
+
+        async def answer(message: Message) -> None:
+            timer.cancel()  # the rest of the body is no longer awaited
+            self._answering = True
+            await self._send(message)
+
+        try:
+            await app(scope, timed, answer)
+        except asyncio.CancelledError:
+            if not self._late or self._answering:
+                raise
+            _uncancel(task)
+            late = MalformedMessage(f"body: not here within {self._slow_s:g} s; is the connection that slow?")
+            response = problem_response(late, uuid.uuid4().hex, _TIMEOUT)
+            response.headers["connection"] = "close"
+            await response(scope, receive, self._send)
+        finally:
+            timer.cancel()
+
+
+class _TimedWebSocket:
+    """A WebSocket that ends when its key becomes invalid, or its client is silent or does not read replies."""
+
+    def __init__(self, caller: Identity, slow_s: float, idle_s: float, receive: Receive, send: Send) -> None:
+        self._caller = caller
+        self._slow_s = slow_s
+        self._idle_s = idle_s
+        self._receive = receive
+        self._send = send
+        self._loop = asyncio.get_running_loop()
+        self._silent_since: float | None = None  # start of the wait for the next message, s; None outside of one
+        self._sending_since: float | None = None  # start of the current sending, s; None outside of one
+        self._end: tuple[int, str] | None = None  # close code and reason, once the WebSocket has to end
+
+    async def run(self, app: ASGIApp, scope: Scope) -> None:
+        task = asyncio.current_task()
+
+        def tick() -> None:
+            self._timer = self._loop.call_later(_TICK_S, tick)  # first, so that an error below cannot stop the checks
+            self._end = self._close_cause()
+            if self._end is not None and task is not None:
+                self._timer.cancel()
+                task.cancel()
+
+        self._timer = self._loop.call_later(_TICK_S, tick)
+        try:
+            await app(scope, self._timed_receive, self._timed_send)
+        except asyncio.CancelledError:
+            if self._end is None:
+                raise
+            _uncancel(task)
+            await self._close(*self._end)
+        finally:
+            self._timer.cancel()
+
+    async def _timed_receive(self) -> Message:
+        self._silent_since = self._loop.time()
+        message = await self._receive()
+        self._silent_since = None
+        return message
+
+    async def _timed_send(self, message: Message) -> None:
+        self._sending_since = self._loop.time()
+        await self._send(message)
+        self._sending_since = None
+
+    def _close_cause(self) -> tuple[int, str] | None:
+        now = self._loop.time()
+        if self._sending_since is not None and now - self._sending_since > self._slow_s:
+            return _POLICY_VIOLATION, "replies are not taken"
+        if self._silent_since is not None and now - self._silent_since > self._idle_s:
+            return _GOING_AWAY, "silent for too long"
+        if isinstance(self._caller, Caller) and (reason := self._caller.refusal()) is not None:
+            return _POLICY_VIOLATION, reason
+        return None
+
+    async def _close(self, code: int, reason: str) -> None:
+        logger.info("a WebSocket is closed: %s", reason)
+        with suppress(asyncio.TimeoutError, RuntimeError):  # the client does not read, or has closed meanwhile
+            closing = self._send({"type": "websocket.close", "code": code, "reason": reason[:120]})
+            await asyncio.wait_for(closing, _TICK_S)
+
+
+def _uncancel(task: asyncio.Task[object] | None) -> None:
+    """Undo the task's cancellation, which came from this module and has been handled."""
+    if task is not None and hasattr(task, "uncancel"):  # since Python 3.11
+        task.uncancel()

@@ -1,0 +1,133 @@
+"""`GET /docs`: one page that shows how clients use this server and loads nothing from the network."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+from typing import Any
+
+from vlagents_ray.errors import BY_CODE
+from vlagents_ray.protocol.frames import CONTENT_TYPE
+from vlagents_ray.protocol.messages import (
+    DEADLINE_HEADER,
+    RANK_HEADER,
+    REQUEST_ID_HEADER,
+    SESSION_HEADER,
+    STEP_HEADER,
+)
+
+_STYLE = """
+:root { color-scheme: light dark; font: 16px/1.5 system-ui, sans-serif; }
+body { max-width: 52rem; margin: 2rem auto; padding: 0 1rem; }
+pre, code { font: 0.9em/1.4 ui-monospace, monospace; }
+pre { padding: 0.8rem; overflow-x: auto; border: 1px solid #8884; border-radius: 6px; }
+dd { margin: 0 0 0.4rem 1.5rem; }
+"""
+_CURL = f"""\
+curl -H '{SESSION_HEADER}: robot-1' -F 'obs={{"instruction": "push the cube to the goal", "gripper": 1.0}}' \\
+     -F 'cameras.front=@front.jpg' http://HOST:8000/v1/reset
+curl -H '{SESSION_HEADER}: robot-1' -F 'obs={{"gripper": 1.0, "state": {{"joints": [0, 0, 0, 0, 0, 0, 0]}}}}' \\
+     -F 'cameras.front=@front.jpg' http://HOST:8000/v1/act"""
+_PYTHON = """\
+from vlagents_ray import Obs, RemoteAgent
+
+with RemoteAgent("http://HOST:8000") as agent:
+    agent.reset(obs, "push the cube to the goal")
+    act = agent.act(obs)"""
+# Each entry is one line, followed by its indented description.
+_PATHS = f"""\
+`POST /v1/reset`, `POST /v1/act`
+    `multipart/form-data`: a JSON part `obs` (instruction, gripper, state, info; for reset also kwargs, contract) and a
+    JPEG or PNG file `cameras.<name>` for each camera; or `application/json` without cameras; or one frame,
+    `{CONTENT_TYPE}`. The answer is JSON, or a frame if `Accept` asks for it.
+`POST /v1/close`
+    Ends the session.
+`WS /v1/stream`
+    Binary frames; sessions end with the connection. A message that begins with `VLA?` is a probe.
+`POST /v1/probe`
+    For measuring the link: `VLA?`, four zero bytes and any others, which reach neither a session nor the policy. The
+    answer, at once, is `VLA!` and the number of bytes, 64 bits, little-endian. With a one in place of the first zero,
+    a frame follows, which is decoded first.
+`WS /v1/weights`, `GET /v1/weights`
+    New weights from a learner, with a key of the scope `weights`; see `vlagents_ray.learn.Publisher`. The versions
+    that act.
+`GET /v1/metadata`
+    Policy, checkpoint, contract, protocol version, every way in.
+`GET /healthz`
+    200 when the policy can act, 503 until then.
+"""
+_HEADERS = f"""\
+`{RANK_HEADER}`
+    `robot` (the default, goes first) or `simulation`.
+`{DEADLINE_HEADER}`
+    After which an answer is useless (504: with `deadline_exceeded` the request was not acted on and never will be, with
+    `outcome_unknown` the policy was at work on it).
+`{STEP_HEADER}`
+    Stands in each answer. Sent back with the next request of the session, it keeps that from any other state of it (404
+    `unknown_session`), such as an episode that was left at another replica.
+`{REQUEST_ID_HEADER}`
+    Comes back with the answer and stands in the server's log.
+"""
+_TIMING = """\
+`decode_ms`
+    The request, whose last byte is here, out of its bytes.
+`queue_ms`
+    Waiting for the policy.
+`inference_ms`
+    The batch that it was in, until the device was done.
+`encode_ms`
+    The answer into bytes.
+`total_ms`
+    All of that and what lies between, on the server.
+`batch_size`
+    Observations in that batch; no time.
+`round_trip_ms`, `wire_ms`
+    Added by our client: the whole, and what of it was not the server's.
+"""
+
+
+def docs_page(metadata: dict[str, Any]) -> str:
+    """Return the page as HTML.
+
+    Args:
+        metadata: The document of `GET /v1/metadata`; each dialect provides its own entry in it.
+    """
+    policy = html.escape(str(metadata["policy"]))
+    dialects = "".join(
+        f"`{', '.join(one.get('paths') or [one['address']])}`\n    Clients of {one['clients']}. {one['summary']}\n"
+        for one in (metadata.get("dialects") or {}).values()
+    )
+    errors = "".join(
+        f"{cls.status} `{code}`\n    {(cls.__doc__ or '').strip().partition(chr(10))[0]}\n"
+        for code, cls in sorted(BY_CODE.items(), key=lambda item: (item[1].status, item[0]))
+    )
+    return f"""<!doctype html><html lang="en"><head><meta charset="utf-8">
+<meta name="viewport" content="width=device-width"><title>vlagents_ray: {policy}</title>
+<style>{_STYLE}</style></head><body>
+<h1>{policy}</h1>
+<p>A policy served by vlagents_ray {html.escape(str(metadata["version"]))}, protocol {metadata["protocol"]}.
+Choose a session id for each robot or environment and send it as <code>{SESSION_HEADER}</code> with every request:
+<code>reset</code> begins an episode, <code>act</code> gives the next action or chunk of actions.</p>
+<p>Where the server has API keys, send yours with every request: <code>Authorization: Bearer KEY</code>.</p>
+<h2>With curl</h2><pre>{html.escape(_CURL)}</pre>
+<h2>With Python</h2><pre>{html.escape(_PYTHON)}</pre>
+<h2>Paths</h2>{_entries(_PATHS)}
+<p>A replica that stops hands its sessions over: the next request of the same session id goes on where it was.</p>
+<h2>Headers</h2>{_entries(_HEADERS)}
+{"<h2>Clients of other systems, as they are</h2>" + _entries(dialects) if dialects else ""}
+<h2>Timing</h2><p>The answer to <code>act</code> says where the milliseconds went, in <code>timing</code>:</p>
+{_entries(_TIMING)}
+<h2>Metrics</h2>
+<p>Prometheus reads them at the metrics port of each Ray node, as <code>ray_vlagents_…</code>: requests by op,
+transport, class and outcome, latency, time by stage, batch sizes, queue depth, sessions by transport, utilisation.</p>
+<h2>Errors</h2><p><code>application/problem+json</code> with a stable <code>code</code>:</p>
+{_entries(errors)}
+<h2>This policy</h2><pre>{html.escape(json.dumps(metadata, indent=2))}</pre>
+</body></html>"""
+
+
+def _entries(text: str) -> str:
+    """Return a list of entries as HTML, from plain text with `code` in backquotes."""
+    marked = re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(text))
+    return "<dl>" + re.sub(r"(\S.*)\n((?: {4}.*\n)*)", r"<dt>\1</dt>\n<dd>\2</dd>\n", marked) + "</dl>"

@@ -1,0 +1,254 @@
+"""The HTTP endpoint: HTTP and WebSocket on one port, as an ASGI application over an engine.
+
+    POST /v1/reset, /v1/act, /v1/close   multipart/form-data, application/json, or one binary frame
+    POST /v1/probe                       answered at once, for measuring the link
+    WS   /v1/stream                      sessions that end with the connection; binary frames or probes
+    WS   /v1/weights                     new weights from a learner, see `vlagents_ray.serve.endpoints.weights`
+    GET  /healthz, /v1/metadata, /docs
+
+Errors over HTTP are problem+json with a stable code; over WebSocket they are reply frames.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+import uuid
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Any, cast
+
+from starlette.applications import Starlette
+from starlette.exceptions import HTTPException
+from starlette.requests import ClientDisconnect
+from starlette.requests import Request as HttpRequest
+from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
+from starlette.routing import BaseRoute, Route, WebSocketRoute
+from starlette.types import Message
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from vlagents_ray.client.transports.probe import answer, is_probe, read_probe
+from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, UnknownApp, VLAgentsError
+from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_replies
+from vlagents_ray.protocol.messages import (
+    MACHINE_HEADER,
+    OPS,
+    RANK_HEADER,
+    STEP_HEADER,
+    Limits,
+    Op,
+    Reply,
+    Request,
+)
+from vlagents_ray.serve.access.api_keys import current_caller
+from vlagents_ray.serve.endpoints.docs_page import docs_page
+from vlagents_ray.serve.endpoints.http_messages import (
+    RequestDecoder,
+    headers_of,
+    problem_response,
+    request_id,
+    session_id,
+)
+from vlagents_ray.serve.engine.dispatch import Dispatcher
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
+
+logger = logging.getLogger(__name__)
+
+_TRY_AGAIN_LATER = 1013  # a WebSocket close code
+_HEALTH_S = 1.5  # `/healthz` replies within this time
+
+
+def build_http_app(
+    engine: Engine,
+    metadata: Callable[[], dict[str, Any]],
+    limits: Limits,
+    machine_metadata: Callable[[str], Awaitable[dict[str, Any]]] | None = None,
+    dialects: Sequence[BaseRoute] = (),
+    weights: Sequence[BaseRoute] = (),
+) -> Starlette:
+    """Build the ASGI application of a replica.
+
+    It must run behind a `vlagents_ray.serve.endpoints.access_middleware.AccessMiddleware`, which identifies the caller
+    of each request: without one, requests fail.
+
+    Args:
+        engine: Executes the requests.
+        metadata: Returns the document of `GET /v1/metadata`.
+        limits: Of a request.
+        machine_metadata: Returns the metadata for a caller on the machine with the given boot id.
+        dialects: The routes of other systems' clients, see `vlagents_ray.serve.dialects`.
+        weights: The routes of learners, see `vlagents_ray.serve.endpoints.weights`.
+    """
+    server = _HttpEndpoint(engine, metadata, limits, machine_metadata)
+    return Starlette(
+        routes=[
+            *(Route(f"/v1/{op}", server.endpoint(op), methods=["POST"]) for op in OPS),
+            Route("/v1/probe", server.probe, methods=["POST"]),
+            WebSocketRoute("/v1/stream", server.stream),
+            Route("/v1/metadata", server.show_metadata),
+            Route("/healthz", server.health),
+            Route("/docs", server.docs),
+            *dialects,
+            *weights,
+        ],
+        exception_handlers={HTTPException: _http_problem},
+    )
+
+
+class _HttpEndpoint:
+    def __init__(
+        self,
+        engine: Engine,
+        metadata: Callable[[], dict[str, Any]],
+        limits: Limits,
+        machine_metadata: Callable[[str], Awaitable[dict[str, Any]]] | None,
+    ) -> None:
+        self._engine = engine
+        self._metadata = metadata
+        self._limits = limits
+        self._requests = RequestDecoder(limits)
+        self._machine_metadata = machine_metadata
+
+    async def health(self, http: HttpRequest) -> Response:
+        """Reply whether the policy is ready, and nothing else, since this path requires no key."""
+        try:
+            ready = await asyncio.wait_for(asyncio.to_thread(lambda: self._engine.ready), _HEALTH_S)
+        except asyncio.TimeoutError:  # a policy's own check hangs
+            ready = False
+        if ready:
+            return PlainTextResponse("OK\n")
+        unready = PolicyUnavailable("the policy is loading, or did not load; GET /v1/metadata says which")
+        return problem_response(unready, request_id(http))
+
+    async def show_metadata(self, http: HttpRequest) -> Response:
+        machine = http.headers.get(MACHINE_HEADER)
+        if machine and self._machine_metadata is not None and self._engine.ready:
+            return JSONResponse(await self._machine_metadata(machine))
+        return self._when_ready(http, lambda: JSONResponse(self._metadata()))
+
+    async def docs(self, http: HttpRequest) -> Response:
+        return self._when_ready(http, lambda: HTMLResponse(docs_page(self._metadata())))
+
+    async def probe(self, http: HttpRequest) -> Response:
+        """Reply to a probe, without a session and without the policy."""
+        sender = Dispatcher(self._engine, "http", caller=current_caller(), connected=False)
+        admission = sender.admission(self._limits, rank="simulation")
+        try:
+            message = await self._requests.body(http, admission)
+            read_probe(message, admission)
+            return Response(answer(len(message)), media_type="application/octet-stream")
+        except ClientDisconnect:
+            return Response(status_code=499)
+        except VLAgentsError as error:
+            return problem_response(error, request_id(http))
+
+    def _when_ready(self, http: HttpRequest, answer: Callable[[], Response]) -> Response:
+        try:
+            self._engine.require_ready()
+        except VLAgentsError as error:
+            return problem_response(error, request_id(http), 503)
+        return answer()
+
+    def endpoint(self, op: Op) -> Callable[[HttpRequest], Awaitable[Response]]:
+        """Return the handler of `POST /v1/<op>`."""
+
+        async def handle(http: HttpRequest) -> Response:
+            trace = RequestTrace(self._engine.stats, "http", op)
+            name, headers = request_id(http), headers_of(http.scope)
+            try:
+                sender = Dispatcher(self._engine, "http", session_id(http), caller=current_caller(), connected=False)
+                admission = sender.admission(self._limits, rank=headers.get(RANK_HEADER, "robot"))
+                requests = await self._requests.read(op, _timed(http, trace), admission)
+                trace.decoded(requests)
+                if isinstance(requests[0], Request):
+                    name = requests[0].request_id = requests[0].request_id or name
+                replies = await sender.ask(requests, admission)
+                if len(replies) == 1 and (error := replies[0].error) is not None:
+                    raise error
+                if CONTENT_TYPE in headers.get("accept", "") or len(replies) > 1:
+                    return Response(trace.frame(replies), media_type=CONTENT_TYPE)
+                step = {} if replies[0].step is None else {STEP_HEADER: str(replies[0].step)}
+                return Response(trace.document(replies[0]), headers=step, media_type="application/json")
+            except ClientDisconnect:
+                trace.refused("disconnected")
+                return Response(status_code=499)
+            except Exception as error:
+                if not isinstance(error, VLAgentsError):
+                    logger.exception("%s failed (request %s)", op, name)
+                    error = VLAgentsError("internal error; the server's log has the details")
+                trace.refused(error.code)
+                return problem_response(error, name)
+
+        return handle
+
+    async def stream(self, socket: WebSocket) -> None:
+        """Serve one WebSocket, whose sessions end with it; a malformed request gets an error and changes no session."""
+        await socket.accept()
+        if len(self._engine.sessions) >= self._engine.sessions.limit:
+            full = PolicyUnavailable(f"this replica holds {len(self._engine.sessions)} sessions, its limit")
+            await socket.send_bytes(encode_replies([Reply(error=full)]))
+            await socket.close(_TRY_AGAIN_LATER, str(full)[:120])
+            return
+        sender = Dispatcher(self._engine, "websocket", caller=current_caller())
+        try:
+            while True:
+                message = await socket.receive()
+                if message["type"] == "websocket.disconnect":
+                    return
+                await socket.send_bytes(await self._reply_to(sender, message.get("bytes")))
+                await asyncio.sleep(sender.throttled_s())
+        except WebSocketDisconnect:
+            return
+        finally:
+            sender.release()
+
+    async def _reply_to(self, sender: Dispatcher, message: bytes | None) -> bytes:
+        if message is None or not is_probe(message):
+            trace = RequestTrace(self._engine.stats, "websocket")
+            return trace.frame(await self._answer(sender, message, trace))
+        admission = sender.admission(self._limits, len(message), "simulation")
+        try:
+            read_probe(message, admission)
+            return answer(len(message))
+        except VLAgentsError as error:
+            admission.count_unreadable()
+            return encode_replies([Reply(error=error)])
+
+    async def _answer(self, sender: Dispatcher, frame: bytes | None, trace: RequestTrace) -> list[Reply]:
+        admission = sender.admission(self._limits, 0 if frame is None else len(frame))
+        try:
+            if frame is None:
+                raise MalformedMessage("stream: got a text message, want a binary frame")
+            requests = await self._requests.decode(frame, admission)
+            trace.decoded(requests)
+            return await sender.ask(requests, admission)
+        except VLAgentsError as error:
+            admission.count_unreadable()
+            return [Reply(error=error)]
+        except Exception:
+            name = uuid.uuid4().hex
+            logger.exception("stream failed (request %s)", name)
+            return [Reply(name, error=VLAgentsError("internal error; the server's log has the details"))]
+
+
+def _timed(http: HttpRequest, trace: RequestTrace) -> HttpRequest:
+    """Return a request whose trace starts when its body has arrived, so that the upload counts as network time."""
+
+    async def receive() -> Message:
+        message = await http.receive()
+        trace.arrived = time.perf_counter()
+        return message
+
+    return HttpRequest(http.scope, receive)
+
+
+async def _http_problem(http: HttpRequest, error: Exception) -> Response:
+    """Reply to what the router refuses: an unknown path, or a method that the path does not support."""
+    refused = cast(HTTPException, error)
+    if refused.status_code == 404:
+        return problem_response(UnknownApp("no such path; GET /docs lists what there is"), request_id(http))
+    cause = MalformedMessage(f"{refused.detail}; GET /docs lists what there is")
+    response = problem_response(cause, request_id(http), refused.status_code)
+    response.headers.update(refused.headers or {})
+    return response

@@ -1,0 +1,245 @@
+"""Decoding of HTTP requests: forms, JSON documents and frames, within the limits of the deployment."""
+
+from __future__ import annotations
+
+import math
+import uuid
+from functools import partial
+from typing import cast
+
+from starlette.exceptions import HTTPException
+from starlette.formparsers import MultiPartException
+from starlette.requests import Request as HttpRequest
+from starlette.responses import JSONResponse, Response
+from starlette.types import Message, Receive, Scope
+
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, Overloaded, TooManyRequests, VLAgentsError
+from vlagents_ray.protocol.frames import CONTENT_TYPE, check_request, decode_requests
+from vlagents_ray.protocol.json_messages import CAMERA_PREFIX, PROBLEM_TYPE, problem, request_from_parts
+from vlagents_ray.protocol.messages import (
+    DEADLINE_HEADER,
+    RANK_HEADER,
+    REQUEST_ID_HEADER,
+    SESSION_HEADER,
+    STEP_HEADER,
+    Limits,
+    Op,
+    RankName,
+    Reply,
+    Request,
+    is_name,
+)
+from vlagents_ray.serve.engine.admission import MessageAdmission
+
+LONG_BYTES = 512 * 1024  # longer JSON or msgpack is decoded in another thread, as other requests need the event loop
+_GZIP = b"\x1f\x8b"  # the first bytes of a gzip file
+_HEADERS = "vlagents_ray.headers"  # key of the decoded headers in an ASGI scope
+
+
+class _Refused(MultiPartException):
+    """Stops the reading of a form, so that the parser closes its files."""
+
+    def __init__(self, error: VLAgentsError) -> None:
+        super().__init__(str(error))
+        self.error = error
+
+
+class RequestDecoder:
+    """Reads HTTP requests; an error that concerns the whole body is raised."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+
+    async def read(self, op: Op, http: HttpRequest, admission: MessageAdmission) -> list[Request | Reply]:
+        """Return the requests of a POST to the path of `op`, with an error reply in place of each refused one."""
+        headers = headers_of(http.scope)
+        kind = headers.get("content-type", "").partition(";")[0].strip().lower()
+        declared = headers.get("content-length", "")
+        if declared.isdigit() and int(declared) > self._limits.body_bytes:
+            raise MessageTooLarge(f"body: declares {declared} bytes, the limit is {self._limits.body_bytes}")
+        if kind == "multipart/form-data":
+            request = await self._read_form(op, http, admission)
+        elif op == "close" and not kind:
+            request = Request("close")
+        else:
+            body = await self.body(http, admission)
+            if kind == CONTENT_TYPE:
+                return self._checked(op, await self.decode(body, admission), http)
+            if kind == "application/json":
+                request = await admission.decoded(
+                    partial(request_from_parts, op, body, {}), long=len(body) > LONG_BYTES
+                )
+            else:
+                raise MalformedMessage(
+                    f"content-type: got {kind or 'none'!r}, "
+                    f"want multipart/form-data, application/json or {CONTENT_TYPE}"
+                )
+        return self._checked(op, [request], http)
+
+    def _checked(self, op: Op, requests: list[Request | Reply], http: HttpRequest) -> list[Request | Reply]:
+        headers = headers_of(http.scope)
+        deadline, rank, step = headers.get(DEADLINE_HEADER), headers.get(RANK_HEADER), headers.get(STEP_HEADER)
+        for request in requests:
+            if not isinstance(request, Request):
+                continue
+            if request.op != op:
+                raise MalformedMessage(f"op: the frame says {request.op!r}, the path says {op!r}")
+            if deadline:
+                request.deadline_ms = _positive(deadline)
+            if step:
+                request.step = _whole(step)
+            if rank:
+                request.rank = cast(RankName, rank)
+                check_request(request, self._limits)
+        return requests
+
+    async def _read_form(self, op: Op, http: HttpRequest, admission: MessageAdmission) -> Request:
+        _require_uncompressed(http)
+        limits = self._limits
+        document: str | bytes | None = None
+        files: dict[str, bytes] = {}
+        try:
+            async with HttpRequest(http.scope, self._limited(http, admission)).form(
+                max_files=limits.cameras + 1, max_fields=limits.cameras + 1, max_part_size=limits.body_bytes
+            ) as form:
+                for name, part in form.multi_items():
+                    data = part if isinstance(part, str) else await part.read()
+                    camera = name.removeprefix(CAMERA_PREFIX)
+                    if (name == "obs" and document is not None) or (name != camera and camera in files):
+                        raise MalformedMessage(f"form: got the part {name[:80]!r} twice, want it once")
+                    if name == "obs":
+                        document = data
+                    elif camera not in ("", name) and isinstance(data, bytes):
+                        files[camera] = data
+                    else:
+                        raise MalformedMessage(f"form: {_wrong_part(name)}")
+        except (MultiPartException, HTTPException) as error:
+            for refused in (error, error.__context__):
+                if isinstance(refused, _Refused):
+                    raise refused.error from None
+            text = error.message if isinstance(error, MultiPartException) else error.detail
+            raise MalformedMessage(f"form: {text}") from error
+        if document is None:
+            raise MalformedMessage("form: no part 'obs'; send a JSON document, {} at least")
+        return await admission.decoded(
+            partial(request_from_parts, op, document, files), long=len(document) > LONG_BYTES
+        )
+
+    def _limited(self, http: HttpRequest, admission: MessageAdmission) -> Receive:
+        """Return a `receive` that limits the whole body: the parser limits each part alone, and files not at all."""
+        size = 0
+
+        async def receive() -> Message:
+            nonlocal size
+            message = await http.receive()
+            length = len(message.get("body", b""))
+            size += length
+            try:
+                if size > self._limits.body_bytes:
+                    raise MessageTooLarge(f"body: over {self._limits.body_bytes} bytes, the limit")
+                admission.receive(length)
+            except VLAgentsError as error:
+                raise _Refused(error) from error
+            return message
+
+        return receive
+
+    async def body(self, http: HttpRequest, admission: MessageAdmission) -> bytes:
+        """Return the whole body.
+
+        Raises:
+            MessageTooLarge: It is over the limit of a body.
+            MalformedMessage: It is compressed.
+            Overloaded: The replica has no room for it among the messages in flight.
+        """
+        _require_uncompressed(http)
+        chunks: list[bytes] = []
+        size = 0
+        async for chunk in http.stream():
+            size += len(chunk)
+            if size > self._limits.body_bytes:
+                raise MessageTooLarge(f"body: over {self._limits.body_bytes} bytes, the limit")
+            admission.receive(len(chunk))
+            chunks.append(chunk)
+        if chunks and chunks[0].startswith(_GZIP):
+            raise MalformedMessage("body: got gzip, want it uncompressed; send it as it is")
+        return b"".join(chunks)
+
+    async def decode(self, frame: bytes, admission: MessageAdmission) -> list[Request | Reply]:
+        """Return the requests of a frame."""
+        return await admission.decoded(partial(decode_requests, frame))
+
+
+def _wrong_part(name: str) -> str:
+    if name == CAMERA_PREFIX:
+        return f"the part {name!r} names no camera, want 'cameras.<name>'"
+    if name.startswith(CAMERA_PREFIX):
+        return (
+            f"the part {name[:80]!r} is text, want a file: send it with a filename, as curl -F {name[:80]}=@FILE does"
+        )
+    return f"unknown part {name[:80]!r}, want 'obs' and files 'cameras.<name>'"
+
+
+def _require_uncompressed(http: HttpRequest) -> None:
+    coding = headers_of(http.scope).get("content-encoding", "identity").strip().lower()
+    if coding not in ("", "identity"):
+        raise MalformedMessage(
+            f"content-encoding: got {coding[:40]!r}, want none; send the body as it is (images are compressed already)"
+        )
+
+
+def headers_of(scope: Scope) -> dict[str, str]:
+    """Return the headers of a request by lower-case name, decoded once; of two equal names the last one counts."""
+    headers: dict[str, str] | None = scope.get(_HEADERS)
+    if headers is None:
+        headers = {name.decode("latin-1").lower(): value.decode("latin-1") for name, value in scope["headers"]}
+        scope[_HEADERS] = headers
+    return headers
+
+
+def session_id(http: HttpRequest) -> str:
+    """Return the session id that every request must state in its header; raise `MalformedMessage` without one."""
+    name = headers_of(http.scope).get(SESSION_HEADER, "")
+    if not name or not is_name(name):
+        raise MalformedMessage(
+            f"header {SESSION_HEADER}: got {name[:40]!r}, want 1 to 128 visible ASCII characters; "
+            f"choose one for each robot or env and send it with every request"
+        )
+    return name
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 < value < 1e9:
+        raise MalformedMessage(f"header {DEADLINE_HEADER}: got {text[:40]!r}, want a positive number of milliseconds")
+    return value
+
+
+def _whole(text: str) -> int:
+    if not text.isdecimal() or len(text) > 19:
+        raise MalformedMessage(f"header {STEP_HEADER}: got {text[:40]!r}, want what the last answer's header says")
+    return int(text)
+
+
+def request_id(http: HttpRequest) -> str:
+    """Return the request id of the caller, or the one that Serve assigned; Serve sends either back as a header."""
+    return named(headers_of(http.scope).get(REQUEST_ID_HEADER, ""))
+
+
+def named(shown: str) -> str:
+    """Return the request id of a header, or a new one if that is empty, no valid name, or could forge a log line."""
+    return shown if shown and is_name(shown) else uuid.uuid4().hex
+
+
+def problem_response(error: VLAgentsError, request_id: str, status: int | None = None) -> Response:
+    """Return the problem document of an error, with the status of the error unless another is given."""
+    document = problem(error, request_id)
+    if status is not None:
+        document["status"] = status
+    response = JSONResponse(document, status_code=document["status"], media_type=PROBLEM_TYPE)
+    if isinstance(error, TooManyRequests | Overloaded):
+        response.headers["retry-after"] = str(max(1, math.ceil(error.retry_after_s)))
+    return response

@@ -1,0 +1,77 @@
+"""Send buffer of one connection: a client that reads slowly delays no other client."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import select
+import socket
+import threading
+
+logger = logging.getLogger(__name__)
+
+_SLOW_S = 10.0  # within this time a client must take a part of the bytes that its connection does not hold
+
+
+class SendBuffer:
+    """The bytes that one connection has to send.
+
+    Call the methods with the connection's lock held; the thread that sends to a slow client acquires the same lock.
+    """
+
+    def __init__(self, connection: socket.socket, lock: threading.Lock, limit: int) -> None:
+        """Create an empty buffer; a client is cut off if more than `limit` bytes wait, or if it reads none for 10 s."""
+        self._connection = connection
+        self._lock = lock
+        self._limit = limit
+        self._unsent = bytearray()
+        self._slow = False  # whether a thread sends the rest
+        self._closed = False
+
+    def send(self, data: bytes) -> None:
+        """Send as many bytes as the connection takes now; a thread sends the rest later."""
+        if self._closed:
+            return
+        self._unsent += data
+        if not self._slow:
+            self._send_now()
+            if self._unsent:
+                self._slow = True
+                threading.Thread(target=self._send_rest, name="send-slowly", daemon=True).start()
+        elif len(self._unsent) > self._limit:
+            self._disconnect()
+
+    def close(self) -> None:
+        """Stop sending; call it before the connection is closed."""
+        self._closed = True
+
+    def _send_now(self) -> None:
+        try:
+            sent = self._connection.send(self._unsent) if self._unsent else 0
+        except BlockingIOError:
+            return
+        except OSError as error:  # the client is gone; the thread that reads handles the end of the connection
+            logger.info("client: %s", error)
+            sent = len(self._unsent)
+        del self._unsent[:sent]
+
+    def _send_rest(self) -> None:
+        poller = select.poll()
+        poller.register(self._connection, select.POLLOUT)
+        while True:
+            writable = poller.poll(_SLOW_S * 1e3)
+            with self._lock:
+                if self._closed:
+                    return
+                if not writable:
+                    self._disconnect()
+                self._send_now()
+                if not self._unsent:
+                    self._slow = False
+                    return
+
+    def _disconnect(self) -> None:
+        logger.warning("client: takes no replies; cut off")
+        self._unsent.clear()
+        with contextlib.suppress(OSError):  # the client closed it already
+            self._connection.shutdown(socket.SHUT_RDWR)

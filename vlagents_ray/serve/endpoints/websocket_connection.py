@@ -1,0 +1,350 @@
+"""One WebSocket connection at a replica's own port, from its handshake to its end.
+
+See `vlagents_ray.serve.endpoints.websocket`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import ClassVar, NamedTuple
+
+from websockets.frames import Frame, Opcode
+from websockets.http11 import Request as Handshake
+from websockets.http11 import Response
+from websockets.protocol import State
+from websockets.server import ServerProtocol
+
+from vlagents_ray.client.transports.probe import answer, is_probe, read_probe
+from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, TooManyRequests, VLAgentsError
+from vlagents_ray.protocol.frames import decode_requests
+from vlagents_ray.protocol.messages import STREAM_BYTES, Limits, Reply, Request
+from vlagents_ray.serve.access.api_keys import Caller, Identity
+from vlagents_ray.serve.endpoints.send_buffer import SendBuffer
+from vlagents_ray.serve.engine import arrival
+from vlagents_ray.serve.engine.admission import MessageAdmission, NeedsDecodingThread, decode_in_background, image_bytes
+from vlagents_ray.serve.engine.dispatch import Dispatcher
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
+
+logger = logging.getLogger(__name__)
+
+_READ_BYTES = 256 * 1024
+_HANDSHAKE_BYTES = 16 * 1024  # maximum size of a handshake
+_HANDSHAKE_S = 5.0  # maximum time of a handshake
+_END_OF_HEADERS = b"\r\n\r\n"
+_UNANSWERED = 256  # maximum of unanswered messages of one client: further ones stay unread in its connection
+_GOING_AWAY, _UNSUPPORTED_DATA, _POLICY_VIOLATION = 1001, 1003, 1008  # close codes
+
+
+class WebSocketConnection:
+    """One connection of a client; its sessions end with it."""
+
+    name: ClassVar[str] = "websocket"
+
+    def __init__(
+        self,
+        connection: socket.socket,
+        engine: Engine,
+        limits: Limits,
+        admit: Callable[[WebSocketConnection, Handshake], Identity],
+        on_close: Callable[[WebSocketConnection], None],
+        *,
+        slow_s: float,
+        idle_s: float,
+    ) -> None:
+        """`admit` identifies a handshake's caller or raises, `on_close` is called at the end; see `WebSocketServer`."""
+        self._engine = engine
+        self._limits = limits
+        self._admit = admit
+        self._on_close = on_close
+        self._slow_s, self._idle_s = slow_s, idle_s
+        self._connection = connection
+        self._arrived = 0.0  # arrival time of the bytes read last, s
+        self._protocol = ServerProtocol(max_size=STREAM_BYTES)
+        self._head = b""  # received part of the handshake
+        self._sender: Dispatcher | None = None  # None until the handshake is accepted
+        self.caller: Identity | None = None  # None until the handshake is accepted
+        self._sending = threading.Lock()  # guards the protocol and the sending: other threads send replies
+        self._out = SendBuffer(connection, self._sending, STREAM_BYTES)
+        self._ended = False
+        self._polled = True  # whether the batch queue polls the connection
+        self._paused = False  # not polled until some of its messages are answered
+        self._decoding = self._throttled = False  # not polled until a frame is decoded, or the key under its rate again
+        self._frames: deque[tuple[Frame, float]] = deque()  # received but unprocessed frames and their arrival times, s
+        self._unanswered = 0
+        self._unanswered_bytes = 0  # includes the decoded images
+        self._messages = 0  # number received so far
+        self._ending = False  # `end` was called; bytes that arrive now are ignored
+        # Used by `overdue` alone: the count of messages at its last call, the time since which that has not changed
+        # (s), and the time since which a part of the next message has been here (s).
+        self._seen, self._quiet_since, self._part_since = 0, time.monotonic(), float("inf")
+
+    def ready(self) -> None:
+        """Read the connection, which has bytes or has ended."""
+        try:
+            self._read()
+        except Exception:
+            logger.exception("stream client: disconnected after an error")
+            self.disconnect()
+
+    def _read(self) -> None:
+        try:
+            most = _HANDSHAKE_BYTES if self._sender is None else _READ_BYTES
+            data, control, _, _ = self._connection.recvmsg(most, arrival.SPACE)
+            self._arrived = time.perf_counter() - arrival.waited_s(control)
+        except BlockingIOError:
+            return
+        except OSError as error:
+            logger.info("stream client: %s", error)
+            data = b""
+        if self._ending or (self._sender is None and not data):
+            self.disconnect()
+            return
+        if self._sender is None:
+            self._head += data
+            end = self._head.find(_END_OF_HEADERS)
+            if end < 0 and len(self._head) <= _HANDSHAKE_BYTES:
+                return
+            head, data = self._head[: end + len(_END_OF_HEADERS)], self._head[end + len(_END_OF_HEADERS) :]
+            if end < 0 or not self._handshake(head):
+                self.disconnect()
+                return
+            self._head = b""
+            if not data:
+                return
+        self._receive(data)
+
+    def _receive(self, data: bytes) -> None:
+        """Process bytes that follow the handshake; empty `data` means that the connection has ended."""
+        with self._sending:
+            if data:
+                self._protocol.receive_data(data)
+            else:
+                self._protocol.receive_eof()
+            events = self._protocol.events_received()
+            self._flush()
+        for event in events:
+            if isinstance(event, Frame) and event.opcode in (Opcode.BINARY, Opcode.TEXT, Opcode.CONT):
+                self._messages += 1
+                self._frames.append((event, self._arrived))
+        self._process_frames()
+        if not data or self._protocol.state in (State.CLOSING, State.CLOSED):
+            self.disconnect()
+            return
+        with self._sending:
+            self._paused = self._is_backlogged()
+        if self._paused or self._must_wait:
+            self._stop_polling()
+
+    @property
+    def _must_wait(self) -> bool:
+        """Whether the next frames have to wait."""
+        return self._decoding or self._throttled
+
+    def disconnect(self) -> None:
+        """Stop polling the connection and close it; call it on the thread that polls."""
+        if not self._ended:
+            self._stop_polling()
+            self.release()
+
+    def _stop_polling(self) -> None:
+        if self._polled:
+            self._polled = False
+            self._engine.queue.unwatch(self._connection)
+
+    def _resume_polling(self) -> None:
+        if not self._ended and not self._polled and not (self._paused or self._must_wait):
+            self._polled = True
+            self._engine.queue.watch(self._connection, self.ready)
+
+    def _is_backlogged(self) -> bool:
+        """Whether the client has too many unanswered messages or bytes; the caller holds the lock."""
+        return self._unanswered >= _UNANSWERED or self._unanswered_bytes > self._limits.body_bytes
+
+    def release(self) -> None:
+        """Close the connection and end its sessions."""
+        if self._sender is not None:
+            self._sender.release()
+        with self._sending:
+            self._ended = True  # the number of its descriptor may soon be reused
+            self._out.close()
+            self._connection.close()
+        self._on_close(self)
+
+    def overdue(self, now: float, refusal: Callable[[Caller], str | None]) -> tuple[int, str] | None:
+        """Return a close code and a reason if the connection has to end; called periodically.
+
+        `refusal` returns the reason if a key is no longer valid. Time counts against the client only while the server
+        has read all that arrived: a slow policy keeps its thread from reading.
+        """
+        if isinstance(self.caller, Caller) and (reason := refusal(self.caller)) is not None:
+            return _POLICY_VIOLATION, reason
+        if self._messages != self._seen or self._unanswered or not self._polled:
+            self._seen, self._quiet_since, self._part_since = self._messages, now, float("inf")
+        if not self._protocol.reader.buffer:
+            self._part_since = float("inf")
+        elif self._part_since > now:
+            self._part_since = now
+        cause: tuple[int, str] | None = None
+        if self._sender is None and now - self._quiet_since > _HANDSHAKE_S:
+            cause = _POLICY_VIOLATION, "no handshake"
+        elif now - self._part_since > self._slow_s:
+            cause = _POLICY_VIOLATION, f"a message took longer than {self._slow_s:g} s"
+        elif now - self._quiet_since > self._idle_s:
+            cause = _GOING_AWAY, "silent for too long"
+        with self._sending:
+            if cause is not None and not self._ended and arrival.has_unread(self._connection):
+                self._quiet_since, self._part_since, cause = now, float("inf"), None
+        return cause
+
+    def end(self, code: int, reason: str) -> None:
+        """Close the connection from any thread, even while the policy runs; bytes that still arrive are ignored."""
+        logger.info("a WebSocket at the replica's own port is closed: %s", reason)
+        with self._sending:
+            if self._ended:
+                return
+            self._ending = True
+            if self._protocol.state is State.OPEN:
+                self._protocol.send_close(code, reason[:120])
+                self._flush()
+            with contextlib.suppress(OSError):  # the client closed it already
+                self._connection.shutdown(socket.SHUT_RDWR)
+
+    def _handshake(self, head: bytes) -> bool:
+        """Reply to the handshake; return False if it was refused."""
+        with self._sending:
+            self._protocol.receive_data(head)
+            events = self._protocol.events_received()
+        if len(events) == 1 and isinstance(events[0], Handshake):
+            response = self._handshake_response(events[0])
+            with self._sending:
+                self._protocol.send_response(response)
+        with self._sending:
+            self._flush()
+        if self._protocol.state is not State.OPEN or self.caller is None:
+            return False
+        self._sender = Dispatcher(self._engine, self.name, caller=self.caller)
+        return True
+
+    def _handshake_response(self, request: Handshake) -> Response:
+        try:
+            self.caller = self._admit(self, request)
+            return self._protocol.accept(request)
+        except VLAgentsError as refused:
+            response = self._protocol.reject(refused.status, f"{refused}\n")
+            if isinstance(refused, TooManyRequests | PolicyUnavailable):
+                response.headers["Retry-After"] = "1"
+            return response
+
+    def _process_frames(self) -> None:
+        """Process the received frames in order, until one has to wait."""
+        while self._frames and not self._must_wait and not self._ended:
+            self._process(*self._frames.popleft())
+
+    def _continue(self) -> None:
+        """Continue after a delay has ended; call it on the thread that polls."""
+        self._process_frames()
+        self._resume_polling()
+
+    def _unthrottle(self) -> None:
+        self._throttled = False
+        self._continue()
+
+    def _process(self, frame: Frame, arrived: float) -> None:
+        if self._sender is None:  # nothing is read before the handshake is accepted
+            raise VLAgentsError("stream: a message before the handshake was accepted")
+        trace = RequestTrace(self._engine.stats, "websocket")
+        if frame.opcode is Opcode.CONT or not frame.fin:
+            with self._sending:
+                self._protocol.fail(_UNSUPPORTED_DATA, "messages in fragments; send each in one frame")
+                self._flush()
+            return
+        data, sender = bytes(frame.data), self._sender
+        probe = is_probe(data)
+        admission = sender.admission(self._limits, len(data), "simulation" if probe else "robot")
+        try:
+            if frame.opcode is Opcode.TEXT:
+                raise MalformedMessage("stream: got a text message, want a binary frame")
+            if probe:
+                read_probe(data, admission)
+                self._send(answer(len(data)))
+            else:
+                self._decode(_Message(sender, admission, trace, len(data), arrived), data)
+        except VLAgentsError as error:
+            admission.count_unreadable()
+            self._send(trace.frame([Reply(error=error)]))
+        if (throttled_s := sender.throttled_s()) > 0:
+            self._throttled = True
+            self._engine.queue.call_later(throttled_s, self._unthrottle)
+
+    def _decode(self, message: _Message, data: bytes) -> None:
+        read = partial(decode_requests, data)
+        try:
+            self._dispatch(message, read(message.admission))
+        except NeedsDecodingThread:
+            self._decoding = True
+            decode_in_background(self._engine.queue, message.admission, read, partial(self._decoded, message))
+
+    def _dispatch(self, message: _Message, requests: Sequence[Request | Reply]) -> None:
+        """Send the requests of a message to the engine; their deadlines count from the arrival of the message."""
+        trace = message.trace
+        trace.decoded(requests)
+        if (waited_s := time.perf_counter() - message.arrived) > arrival.LEAST_S:
+            arrival.count_wait(requests, waited_s)
+        size = message.size + sum(map(image_bytes, requests))
+        with self._sending:
+            self._unanswered += 1
+            self._unanswered_bytes += size
+        message.sender.send(requests, lambda replies: self._answer(trace, replies, size), admission=message.admission)
+
+    def _decoded(self, message: _Message, result: Callable[[], Sequence[Request | Reply]]) -> None:
+        """Take a message that another thread has decoded; called on the thread that polls."""
+        if self._ended:
+            return
+        try:
+            self._dispatch(message, result())
+        except VLAgentsError as error:
+            self._send(message.trace.frame([Reply(error=error)]))
+        except Exception:
+            logger.exception("stream client: disconnected after an error")
+            self.disconnect()
+        self._decoding = False
+        self._continue()
+
+    def _answer(self, trace: RequestTrace, replies: list[Reply], size: int) -> None:
+        with self._sending:
+            self._unanswered -= 1
+            self._unanswered_bytes -= size
+            resume = self._paused and not self._is_backlogged()
+            if resume:
+                self._paused = False
+        if resume:
+            self._engine.queue.call_soon(self._resume_polling)
+        self._send(trace.frame(replies))
+
+    def _send(self, message: bytes) -> None:
+        with self._sending:
+            if not self._ended and self._protocol.state is State.OPEN:
+                self._protocol.send_binary(message)
+                self._flush()
+
+    def _flush(self) -> None:
+        """Send the bytes that the protocol has produced; the caller holds the lock."""
+        self._out.send(b"".join(self._protocol.data_to_send()))
+
+
+class _Message(NamedTuple):
+    """A complete message of a client, and the objects that process it."""
+
+    sender: Dispatcher
+    admission: MessageAdmission
+    trace: RequestTrace
+    size: int  # bytes
+    arrived: float  # s, of `time.perf_counter`

@@ -1,0 +1,169 @@
+"""The endpoint for learners on other machines: new weights in the safetensors format, over a WebSocket.
+
+    WS   /v1/weights?mode=keep   a header, then the bytes of the values in parts; each is acknowledged
+    GET  /v1/weights             the newest version of each replica
+
+One connection is one push, and ends with it, so that all of its parts reach one replica, and nothing is left of a push
+whose learner dies. A learner sends a part when the one before is acknowledged, so that no proxy on the way collects
+them. The header is checked against the policy's own weights, whose size bounds the push, before memory is allocated.
+Keys need the scope "weights"; without keys, only processes of this machine may push.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import fields
+from typing import Any, Protocol
+
+from starlette.requests import Request as HttpRequest
+from starlette.responses import JSONResponse, Response
+from starlette.routing import BaseRoute, Route, WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from vlagents_ray.errors import Forbidden, InvalidInput, MalformedMessage, MessageTooLarge, Overloaded, VLAgentsError
+from vlagents_ray.protocol.json_messages import problem
+from vlagents_ray.serve.access.api_keys import Caller, current_caller
+from vlagents_ray.serve.endpoints.http_messages import problem_response, request_id
+from vlagents_ray.serve.weights.updates import PushOptions, PushResult
+from vlagents_ray.weights.safetensors import MESSAGE_BYTES, ValueSpec, ValuesReader, read_header
+
+logger = logging.getLogger(__name__)
+
+PATH = "/v1/weights"
+_SCOPE = "weights"
+_POLICY_VIOLATION = 1008  # a WebSocket close code
+_TRUTH = {"true": True, "false": False}
+
+
+class ReceivesWeights(Protocol):
+    """The replicas of a policy, for which one of them receives new weights."""
+
+    def require_fit(self, announced: Mapping[str, ValueSpec], options: PushOptions) -> None:
+        """Raise an error if values of these types and shapes do not fit the policy."""
+        ...
+
+    async def push_received(self, named: Mapping[str, Any], options: PushOptions) -> PushResult:
+        """Let all replicas act with new weights."""
+        ...
+
+    async def versions_of_weights(self) -> list[int]:
+        """Return the newest version of each replica."""
+        ...
+
+
+def weights_routes(replicas: ReceivesWeights, slow_s: float, *, open_to_network: bool) -> list[BaseRoute]:
+    """Return the routes for new weights.
+
+    Args:
+        replicas: The replicas that get them.
+        slow_s: Time limit for the next part to arrive, s.
+        open_to_network: Whether other machines reach this server without a key; none may then push.
+    """
+    endpoint = _WeightsEndpoint(replicas, slow_s, open_to_network)
+    return [Route(PATH, endpoint.show), WebSocketRoute(PATH, endpoint.receive)]
+
+
+class _WeightsEndpoint:
+    def __init__(self, replicas: ReceivesWeights, slow_s: float, open_to_network: bool) -> None:
+        self._replicas = replicas
+        self._slow_s = slow_s
+        self._open_to_network = open_to_network
+        self._receiving = False
+
+    async def show(self, http: HttpRequest) -> Response:
+        try:
+            self._require_scope()
+            return JSONResponse({"versions": await self._replicas.versions_of_weights()})
+        except VLAgentsError as error:
+            return problem_response(error, request_id(http))
+
+    async def receive(self, socket: WebSocket) -> None:
+        try:
+            self._require_scope()
+        except VLAgentsError as error:
+            if "websocket.http.response" in (socket.scope.get("extensions") or {}):
+                await socket.send_denial_response(problem_response(error, ""))
+            else:
+                await socket.close(_POLICY_VIOLATION)
+            return
+        await socket.accept()
+        try:
+            answer = await self._pushed(socket)
+        except WebSocketDisconnect:
+            logger.info("a push of weights ended before all of them had arrived; nothing was changed")
+            return
+        except VLAgentsError as error:
+            answer = problem(error)
+        except Exception:
+            logger.exception("a push of weights failed")
+            answer = problem(VLAgentsError("internal error; the server's log has the details"))
+        with suppress(WebSocketDisconnect, RuntimeError):  # the learner has gone meanwhile
+            await socket.send_text(json.dumps(answer))
+            await socket.close()
+
+    async def _pushed(self, socket: WebSocket) -> dict[str, Any]:
+        if self._receiving:
+            raise Overloaded("weights: another push is under way here; push again when it is over")
+        self._receiving = True
+        try:
+            options = _options(socket.query_params)
+            caller = current_caller()
+            header = await self._message(socket)
+            if isinstance(caller, Caller):
+                caller.admit()  # a push counts as one request
+                caller.note("pushes weights:", f"mode {options.mode}")
+            announced = await asyncio.to_thread(read_header, header)
+            await asyncio.to_thread(self._replicas.require_fit, announced, options)
+            reader = ValuesReader(announced)
+            while reader.received < reader.size:
+                await socket.send_text(json.dumps({"received": reader.received}))
+                reader.add(await self._message(socket))
+            # Once all values are here, the push does not depend on the learner's connection.
+            pushed = await asyncio.shield(self._replicas.push_received(reader.values(), options))
+            replicas = len(pushed.replicas)
+            return {"version": pushed.version, "fingerprint": pushed.fingerprint, "replicas": replicas}
+        finally:
+            self._receiving = False
+
+    async def _message(self, socket: WebSocket) -> bytes:
+        try:
+            message = await asyncio.wait_for(socket.receive(), self._slow_s)
+        except asyncio.TimeoutError:
+            raise MalformedMessage(
+                f"weights: no part within {self._slow_s:g} s; is the connection that slow?"
+            ) from None
+        if message["type"] == "websocket.disconnect":
+            raise WebSocketDisconnect(message["code"])
+        self._require_scope()
+        part: bytes | None = message.get("bytes")
+        if part is None:
+            raise MalformedMessage("weights: got a text message, want a binary one")
+        if len(part) > MESSAGE_BYTES:
+            raise MessageTooLarge(f"weights: got a part of {len(part)} bytes, the limit is {MESSAGE_BYTES}")
+        return part
+
+    def _require_scope(self) -> None:
+        caller = current_caller()
+        if isinstance(caller, Caller):
+            caller.admit(free=True, scope=_SCOPE)
+        elif self._open_to_network:
+            raise Forbidden(
+                f"weights: a server with `--insecure` takes none; make a key with `vlagents-ray keys new NAME --scope "
+                f"{_SCOPE}` and serve with `--keys`, or serve on loopback without `--insecure`"
+            )
+
+
+def _options(query: Mapping[str, str]) -> PushOptions:
+    """Return the options of a push from the query of its URL, such as `mode=keep&partial=true`."""
+    stated: dict[str, Any] = {}
+    for name, value in query.items():
+        if name not in {field.name for field in fields(PushOptions)}:
+            raise InvalidInput(f"weights: got the option {name[:40]!r}, want mode, partial, allow_same or pin")
+        if name != "mode" and value not in _TRUTH:
+            raise InvalidInput(f"weights: {name}: got {value[:40]!r}, want true or false")
+        stated[name] = value if name == "mode" else _TRUTH[value]
+    return PushOptions(**stated)

@@ -1,0 +1,1 @@
+"""The engine: it checks requests, puts them into the batch queue, runs batches, and builds replies."""

@@ -1,0 +1,237 @@
+"""Admission of messages to a replica before they are decoded: rate limits, memory limits, and the decoding thread.
+
+A message has a `MessageAdmission` from its arrival until it is answered. A decoder uses that as its `Budget`, so that
+these limits apply before anything is decoded:
+
+- Each request counts towards the rate limit of the caller's key (429).
+- Its decoded size is bounded by `limits.decoded_bytes` (413). With the rate limit, that bounds a key's bytes a second.
+- All messages of a replica together take at most `limits.in_flight_bytes`; a quarter is reserved for robots (503).
+- Images of more than a megapixel are decoded on separate threads, those of simulations on half of the cores, so that
+  neither the policy's thread nor an event loop waits for them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Protocol, TypeVar
+
+from vlagents_ray.errors import MessageTooLarge, Overloaded, PolicyUnavailable, VLAgentsError
+from vlagents_ray.images import cpu_affinity
+from vlagents_ray.protocol.budget import Budget
+from vlagents_ray.protocol.messages import Limits, Reply, Request
+
+T = TypeVar("T")
+
+INLINE_BYTES = 3 * 2**20  # decoded size (a megapixel, 8 ms of one core) above which another thread decodes
+_ROBOTS_SHARE = 0.25  # share of the bytes in flight that is reserved for robots
+
+
+class NeedsDecodingThread(Exception):
+    """Raised when decoding a message would take too long on the current thread."""
+
+
+class Admission:
+    """The bytes in flight of one replica, and the threads that decode large messages. Thread-safe."""
+
+    def __init__(self, in_flight_bytes: int) -> None:
+        self._limit = in_flight_bytes
+        self._held = 0
+        self._lock = threading.Lock()
+        self._threads: dict[bool, ThreadPoolExecutor] = {}  # the pool for robots (True), and for all others (False)
+        self._closed = False
+
+    @property
+    def held(self) -> int:
+        """Number of bytes in flight."""
+        return self._held
+
+    def hold(self, size: int, robot: bool, message_bytes: int) -> None:
+        """Count `size` more bytes as in flight for a message that holds `message_bytes` bytes already.
+
+        Raises:
+            Overloaded: The bytes in flight leave no room for them at the moment.
+            MessageTooLarge: The message alone exceeds the limit.
+        """
+        most = self._limit if robot else int(self._limit * (1 - _ROBOTS_SHARE))
+        with self._lock:
+            if self._held + size <= most:
+                self._held += size
+                return
+            held = self._held
+        if message_bytes + size > most:
+            raise MessageTooLarge(
+                f"message: takes {message_bytes + size} bytes, decoded, and all in flight may take {most}; send fewer "
+                f"requests at once, or raise `limits.in_flight_bytes`"
+            )
+        raise Overloaded(
+            f"the messages in flight here take {held} bytes, and may take {most}; send the request again after "
+            f"{Overloaded.retry_after_s:g} s, or raise `limits.in_flight_bytes`"
+        )
+
+    def release(self, size: int) -> None:
+        """Count `size` bytes as no longer in flight."""
+        with self._lock:
+            self._held -= size
+
+    def submit(self, call: Callable[[], T], robot: bool) -> Future[T]:
+        """Run `call` on a decoding thread; `PolicyUnavailable` after `close`."""
+        with self._lock:
+            if self._closed:
+                raise PolicyUnavailable("the replica is stopping; connect again")
+            threads = self._threads.get(robot)
+            if threads is None:
+                number = max(1, cpu_affinity.allowed() - 1 if robot else cpu_affinity.allowed() // 2)
+                name = f"decode-{'robots' if robot else 'others'}"
+                threads = self._threads[robot] = ThreadPoolExecutor(number, name)
+            return threads.submit(call)
+
+    def close(self) -> None:
+        """Cancel waiting decoding jobs, and accept no further ones."""
+        with self._lock:
+            self._closed = True
+            threads = list(self._threads.values())
+        for each in threads:
+            each.shutdown(wait=False, cancel_futures=True)
+
+
+class Queue(Protocol):
+    """The queue that continues with decoded messages: `vlagents_ray.serve.queue.batch_queue.BatchQueue`."""
+
+    def call_soon(self, call: Callable[[], None]) -> None:
+        """Schedule `call` to run on the thread that polls the connections."""
+        ...
+
+
+def decode_in_background(
+    queue: Queue, admission: MessageAdmission, read: Callable[[Budget], T], then: Callable[[Callable[[], T]], None]
+) -> None:
+    """Decode a message with `read` on a decoding thread, then call `then` on the polling thread of `queue`.
+
+    `then` receives a function that returns the decoded message, or raises the error of `read`.
+    """
+    admission.decode_on_thread(read).add_done_callback(lambda done: queue.call_soon(lambda: then(done.result)))
+
+
+class MessageAdmission(Budget):
+    """The admission of one message, until the message is answered or dropped. Not thread-safe."""
+
+    __slots__ = ("_admission", "_admit", "_decoded", "_held", "_index", "_inline", "_refusals", "_robot", "_size")
+
+    def __init__(
+        self,
+        admission: Admission,
+        limits: Limits,
+        admit: Callable[[object], bool] | None,
+        size: int = 0,
+        *,
+        robot: bool = True,
+        inline: bool = True,
+    ) -> None:
+        """Create the admission of one message.
+
+        Args:
+            admission: The replica's bytes in flight.
+            limits: Limits for decoding the message.
+            admit: Counts a request of an op for the sender's key, or raises; returns False if the request is
+                scheduled after those of robots. None if the sender has no key.
+            size: Bytes of the message itself, which the replica keeps while it works on the message.
+            robot: Whether the message may use the bytes reserved for robots.
+            inline: Whether the first decoding thread has other work waiting for it, so that large messages are decoded
+                elsewhere.
+        """
+        super().__init__(limits)
+        self._admission = admission
+        self._admit = admit
+        self._size = size  # size of the message, until it is counted
+        self._robot = robot
+        self._held = 0  # bytes counted as in flight
+        self._decoded = 0  # decoded bytes among `_held`
+        self._index = -1  # index of the current request
+        self._refusals: list[VLAgentsError | None] = []  # result of `admit` for each request
+        self._inline = inline
+
+    def begin(self, op: object, rank: object = "robot") -> None:
+        """See `Budget`. A message that is decoded again, on another thread, counts once."""
+        self._left = self.limits.decoded_bytes
+        if rank == "simulation":
+            self._robot = False
+        if self._admit is not None:
+            self._index += 1
+            if self._index == len(self._refusals):
+                self._refusals.append(self._refusal_of(self._admit, op))
+            if (refusal := self._refusals[self._index]) is not None:
+                raise refusal
+        self.serial = not (self._robot or self._inline)
+        if self._size:
+            self.receive(self._size)
+            self._size = 0
+
+    def count_unreadable(self) -> None:
+        """Count an unreadable message once towards the rate limit."""
+        if self._admit is not None and not self._refusals:
+            self._refusals.append(self._refusal_of(self._admit, "unreadable"))
+
+    def receive(self, size: int) -> None:
+        """Count bytes of the message itself as in flight; raises the errors of `Admission.hold`."""
+        self._admission.hold(size, self._robot, self._held)
+        self._held += size
+
+    def hold(self, size: int) -> None:
+        """See `Budget`; raises `NeedsDecodingThread` if decoding the message would take too long on this thread."""
+        self.count(size)
+        if self._inline and self._decoded + size > INLINE_BYTES:
+            raise NeedsDecodingThread
+        self.receive(size)
+        self._decoded += size
+
+    def decode_on_thread(self, read: Callable[[Budget], T]) -> Future[T]:
+        """Return a future of the result of `read` on a decoding thread; `PolicyUnavailable` if the replica stops."""
+        self._admission.release(self._decoded)
+        self._held -= self._decoded
+        self._decoded = 0
+        self._left = self.limits.decoded_bytes
+        self._index = -1
+        self._inline = False
+        return self._admission.submit(lambda: read(self), self._robot)
+
+    async def decoded(self, read: Callable[[Budget], T], *, long: bool = False) -> T:
+        """Return the result of `read`, on another thread if `long` or if the images are large."""
+        if not long:
+            try:
+                return read(self)
+            except NeedsDecodingThread:
+                pass
+        return await asyncio.wrap_future(self.decode_on_thread(read))
+
+    @property
+    def holds(self) -> bool:
+        """Whether the message counts as in flight."""
+        return self._held > 0
+
+    def release(self) -> None:
+        """Release the bytes of the message, which is answered or never will be."""
+        held, self._held, self._decoded = self._held, 0, 0
+        if held:
+            self._admission.release(held)
+
+    def __del__(self) -> None:
+        self.release()
+
+    def _refusal_of(self, admit: Callable[[object], bool], op: object) -> VLAgentsError | None:
+        try:
+            if not admit(op):
+                self._robot = False
+        except VLAgentsError as error:
+            return error
+        return None
+
+
+def image_bytes(request: Request | Reply) -> int:
+    """Return the decoded size of all images of a request, including its history, in bytes; 0 for a reply."""
+    if isinstance(request, Reply):
+        return 0
+    seen = request.history if request.obs is None else [request.obs, *request.history]
+    return sum(image.nbytes for obs in seen for image in obs.cameras.values())

@@ -1,0 +1,121 @@
+"""Resets of sessions, whose checkpoints may have to be loaded first.
+
+A reset whose checkpoint is not loaded leaves the queue. It is queued again when the checkpoint is loaded, and answered
+with an error if that fails. Meanwhile the session may be reset again or closed, or its client may stop waiting.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from vlagents_ray.errors import PolicyFailed, UnknownSession, VLAgentsError
+from vlagents_ray.protocol.messages import Reply
+from vlagents_ray.serve.engine.responses import require_serializable, timing
+from vlagents_ray.serve.models.loaded_model import LoadedModel
+from vlagents_ray.serve.models.model_cache import too_late
+from vlagents_ray.serve.models.model_manager import ModelManager
+from vlagents_ray.serve.queue.batch_queue import BatchQueue, PendingRequest
+from vlagents_ray.serve.sessions import Session, SessionFinder, SessionTable
+
+
+class Resets:
+    """Runs the resets of one engine, on the policy's thread."""
+
+    def __init__(
+        self,
+        sessions: SessionTable[LoadedModel],
+        models: ModelManager,
+        queue: BatchQueue,
+        finder: SessionFinder | None,
+        clock: Callable[[], float],
+        reply_bytes: int,
+    ) -> None:
+        """Create the resets of one engine.
+
+        Args:
+            sessions: The engine's sessions.
+            models: The engine's models.
+            queue: The queue for a reset whose checkpoint was loaded.
+            finder: Announces sessions that begin here to the other replicas, if there are any.
+            clock: Time, s.
+            reply_bytes: Largest size of a reply's info, bytes.
+        """
+        self._sessions = sessions
+        self._models = models
+        self._queue = queue
+        self._finder = finder
+        self._clock = clock
+        self._reply_bytes = reply_bytes
+
+    def run(self, ticket: PendingRequest) -> None:
+        """Begin the episode that the ticket requests and answer it, or queue it again after its checkpoint loaded."""
+        if ticket.loaded is None:
+            if self._sessions.is_past(ticket.session_id, ticket.first):
+                raise UnknownSession(
+                    f"session {ticket.session_id!r}: reset elsewhere, or ended, while this reset waited"
+                )
+            session = self._sessions.open(ticket.session_id, ticket.owner, ticket.transport, ticket.connection)
+            session.agent, session.weights, session.follows = None, None, ticket.follows
+            session.steps, session.resetting = ticket.first, ticket
+            session.first, session.moves = ticket.first, 0
+            session.expected = max(session.expected, ticket.first)
+            is_abandoned = partial(self._is_abandoned, ticket, session)
+            if self._models.hold(session, ticket.choice, partial(self._requeue, ticket), is_abandoned) is None:
+                return  # `_requeue` queues it again
+        else:
+            session = self._sessions.get(ticket.session_id)
+            if session.resetting is not ticket:
+                raise UnknownSession(f"session {ticket.session_id!r}: reset anew, or closed, while this reset waited")
+            if self._is_abandoned(ticket, session):
+                self._models.release_model(session)
+                raise too_late(ticket.choice)
+        session.resetting = None
+        try:
+            self._begin(ticket, session)
+        except BaseException:
+            self._models.release_model(
+                session
+            )  # otherwise the session might hold the model for long without an episode
+            raise
+
+    def _begin(self, ticket: PendingRequest, session: Session[LoadedModel]) -> None:
+        """Begin an episode on the model that the session holds, and answer the ticket."""
+        request, model = ticket.request, session.model
+        if model is None or request.obs is None:  # the decoder ensures the second
+            raise UnknownSession(f"session {ticket.session_id!r}: closed before its reset was over")
+        model.check(request)
+        with model.busy, model.call("reset") as call:
+            model.require_open()
+            model.parameters.use(model.parameters.begin(session, follows=ticket.follows))
+            agent = model.copies.make()
+            info = agent.reset(request.obs, request.instruction, **request.kwargs)
+            if not isinstance(info, dict):
+                raise PolicyFailed(f"reset: the policy returned {type(info).__name__}, want a dict")
+            for obs in request.history:
+                agent.observe(obs)
+        info = {**info, **model.identity}
+        spent = timing(ticket.arrived, call)
+        require_serializable(info, self._reply_bytes)
+        session.agent = agent
+        model.padding.record_reset(request)
+        request.obs, request.history = None, []
+        if not session.announced and self._finder is not None:
+            session.announced = True
+            self._finder.announce(session.id, session.steps)
+        ticket.answer(Reply(request.request_id, info=info, step=session.steps, timing=spent))
+
+    def _requeue(self, ticket: PendingRequest, error: VLAgentsError | None) -> None:
+        """Queue a reset again whose checkpoint was loaded, or answer it with the error."""
+        ticket.loaded = self._clock()
+        try:
+            if error is not None:
+                raise error
+            self._queue.put(ticket)
+        except VLAgentsError as reason:
+            ticket.request.obs, ticket.request.history = None, []  # the session may still refer to the ticket
+            ticket.answer(Reply(ticket.request.request_id, error=reason))
+
+    def _is_abandoned(self, ticket: PendingRequest, session: Session[LoadedModel]) -> bool:
+        """Return whether the caller no longer waits for that reset, or the session was reset again."""
+        return ticket.cancelled or ticket.expired(self._clock()) or session.resetting is not ticket

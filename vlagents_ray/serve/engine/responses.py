@@ -1,0 +1,136 @@
+"""Replies from a policy's results and errors, checked and bounded before they leave the server."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.contract import Contract
+from vlagents_ray.errors import InvalidInput, MessageTooLarge, PolicyFailed, VLAgentsError
+from vlagents_ray.interface import Act
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Reply
+from vlagents_ray.protocol.values import ValueWriter
+from vlagents_ray.serve.models.loaded_model import LoadedModel
+from vlagents_ray.serve.queue.batch_queue import PendingRequest
+from vlagents_ray.serve.queue.call_limits import PolicyCall
+from vlagents_ray.serve.sessions import Session
+from vlagents_ray.validation import check_action
+
+logger = logging.getLogger(__name__)
+
+
+def build_reply(
+    ticket: PendingRequest,
+    session: Session[LoadedModel],
+    result: Act | Exception,
+    contract: Contract | None,
+    limit: int = DEFAULT_LIMITS.reply_bytes,
+    policy: Mapping[str, Any] = MappingProxyType({}),
+) -> Reply:
+    """Build the reply to an act request, and count the step of its session if the result is valid.
+
+    Args:
+        ticket: The act request.
+        session: Its session.
+        result: The policy's result, or the error that it raised.
+        contract: The policy's contract, if it has one; the action is checked against it.
+        limit: Largest size of action and info together, bytes.
+        policy: Version of the weights that acted, for the info, unless the policy itself names one (as a proxy does).
+
+    Returns:
+        The reply; with an error if the policy raised one, or if its result is invalid or too large.
+    """
+    request_id = ticket.request.request_id
+    try:
+        if isinstance(result, Exception):
+            raise result
+        if not isinstance(result, Act):
+            raise PolicyFailed(f"act: the policy returned {type(result).__name__}, want an Act")
+        if (size := getattr(result.action, "nbytes", 0)) > limit:  # before it is copied and checked
+            raise PolicyFailed(_too_large("action", size, limit))
+        act = Act(check_action(result.action, contract), bool(result.done), result.info)
+        if act.action.nbytes > limit:  # the policy may return a list of numbers, which has no `nbytes`
+            raise PolicyFailed(_too_large("action", act.action.nbytes, limit))
+        if act.info:
+            require_serializable(act.info, limit - act.action.nbytes)
+        act.info = {**policy, **act.info}
+    except Exception as error:  # noqa: BLE001 - becomes the reply
+        return Reply(request_id, error=public_error(error, ticket))
+    session.steps += 1
+    return Reply(request_id, act=act, step=session.steps)
+
+
+def public_error(error: Exception, ticket: PendingRequest) -> VLAgentsError:
+    """Return the error for the caller; details of an error that the policy raised are only logged."""
+    if isinstance(error, VLAgentsError):
+        return error
+    request = ticket.request
+    logger.error(
+        "%s failed (session %s, request %s)", request.op, ticket.session_id, request.request_id, exc_info=error
+    )
+    return PolicyFailed(
+        f"{request.op}: the policy raised {type(error).__name__}; "
+        f"the server's log has the details under request id {request.request_id or '(none)'}"
+    )
+
+
+def timing(arrived: float, call: PolicyCall) -> dict[str, Any]:
+    """Return the stages of a request that the engine measures, ms: the wait for the policy's call, and the call."""
+    return {"queue_ms": (call.began - arrived) * 1e3, "inference_ms": (call.ended - call.began) * 1e3}
+
+
+def require_serializable(info: dict[str, Any], limit: int = DEFAULT_LIMITS.reply_bytes) -> None:
+    """Check that the info of a reply can be sent, so that an invalid one only fails the session's own request.
+
+    Arrays are not copied. An info of more than `limit` bytes, or of more values than the client accepts, is refused,
+    since other replies would wait while it is sent.
+
+    Raises:
+        PolicyFailed: The info cannot be encoded, or is too large.
+    """
+    try:
+        _BoundedWriter(limit).value(info)
+    except InvalidInput as error:
+        raise PolicyFailed(f"the policy's answer cannot be sent: {error}") from error
+
+
+class _BoundedWriter(ValueWriter):
+    """Encodes values within the limits that clients accept."""
+
+    def __init__(self, limit: int) -> None:
+        super().__init__()
+        self._limit = limit
+        self._bytes = self._values = self._depth = 0
+
+    def value(self, value: Any) -> Any:
+        """See `ValueWriter`; raises `MessageTooLarge` before a value is copied that exceeds the limits."""
+        self._values += 1
+        if self._values > DEFAULT_LIMITS.items:
+            raise MessageTooLarge(f"info: more than {DEFAULT_LIMITS.items} values; send arrays instead of lists")
+        if value is None or isinstance(value, (int, float)):
+            return value  # first: the abstract classes below take five times as long
+        if isinstance(value, (np.ndarray, memoryview)):
+            self._bytes += value.nbytes
+        elif isinstance(value, (str, bytes, bytearray)):
+            self._bytes += len(value)
+        elif isinstance(value, (Mapping, Sequence)):
+            return self._nested(value)
+        if self._bytes > self._limit:
+            raise MessageTooLarge(_too_large("info", self._bytes, self._limit))
+        return super().value(value)
+
+    def _nested(self, value: Any) -> Any:
+        if self._depth >= DEFAULT_LIMITS.depth:
+            raise MessageTooLarge(f"info: nested deeper than {DEFAULT_LIMITS.depth}; flatten it")
+        self._depth += 1
+        written = super().value(value)
+        self._depth -= 1
+        return written
+
+
+def _too_large(what: str, got: int, limit: int) -> str:
+    return f"{what}: got {got} bytes, want {limit} at most (`limits.reply_bytes`); return less"

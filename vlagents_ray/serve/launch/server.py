@@ -1,0 +1,321 @@
+"""Start Ray and Serve here, or use a running cluster, and serve a deployment for the length of a context.
+
+A server on its own Ray has HAProxy in front of its replicas if the binary is installed, with files and ports that no
+other server on the machine uses. HAProxy is the only part of it that may listen on the network.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import logging
+import os
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ray.serve.schema import ServeDeploySchema
+
+from vlagents_ray.errors import ConfigError, PolicyUnavailable
+from vlagents_ray.ray_tools.local_servers import announce
+from vlagents_ray.ray_tools.private import (
+    build_app,
+    end_controller,
+    forget_serve,
+    gpus_here,
+    long_polls,
+    node_of_this_process,
+    proxy_timeout_s,
+    start_serve,
+)
+from vlagents_ray.ray_tools.session import joined, unless_lost
+from vlagents_ray.serve.access.api_keys import require_access, warn_of_plain_http
+from vlagents_ray.serve.access.tls import Tls
+from vlagents_ray.serve.config.deployment import AccessArgs, ServerArgs
+from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH, with_gateways_at, with_replicas_on
+from vlagents_ray.serve.launch.haproxy import PublicListener, wait_for_haproxy
+from vlagents_ray.serve.launch.private_cluster import own_ray
+from vlagents_ray.serve.launch.readiness import wait_until_ready
+from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK, free_port, keep
+
+__all__ = ["Server", "free_port", "running_server", "spread_over_gpus"]
+
+log = logging.getLogger(__name__)
+
+_START_S, _GROW_S = 600.0, 3600.0  # time for a policy to get ready: here; on a cluster that may add a machine first
+_SHUTDOWN_S = 30.0
+_END_S = 0.1  # period at which a replica that ends checks for remaining requests; Serve's own is 2 s
+# Keys of a deployment file, and of an application in it, that Serve does not have to apply.
+_OUR_KEYS = {"applications", "http_options", "proxy_location"}
+_OUR_APP_KEYS = {"name", "route_prefix", "import_path", "args"}
+
+
+@dataclass(frozen=True, slots=True)
+class Server:
+    """A running server."""
+
+    url: str  # http(s)://host:port
+    apps: Mapping[str, str] = field(default_factory=dict)  # URL of each application
+
+
+@contextlib.contextmanager
+def running_server(
+    config: ServeDeploySchema,
+    *,
+    host: str = "127.0.0.1",
+    port: int = 0,
+    address: str | None = None,
+    num_cpus: int | None = None,
+    show_logs: bool = False,
+    timeout_s: float | None = None,
+    keys_file: Path | None = None,
+    insecure: bool = False,
+    plain_http: bool = False,
+    tls: Tls | None = None,
+    ingress: bool = True,
+) -> Iterator[Server]:
+    """Serve `config` for the length of the context, and stop on exit what was started here.
+
+    `port` 0 selects a free port. `address` names a running Ray cluster (or is "auto"); without it a local cluster is
+    started, unless this process is connected to one. `timeout_s` defaults to 600 s, with an `address` to 3600 s.
+    `keys_file`, `insecure` and `plain_http` replace those of `access` in the applications' args; unless `host` is a
+    loopback address, one of the first two must be set somewhere. Without `ingress` a Ray that is started here serves
+    only its own processes, at `serve://APP`, and nothing over HTTP, which makes start and end faster.
+    Raises `ConfigError` if the deployment fails, `PolicyUnavailable` if it takes too long.
+    """
+    config = with_gateways_at(config, host)
+    config = _access(config, keys_file, insecure, plain_http)
+    if address is None:  # otherwise each replica checks and warns on its own machine
+        _require_access(config, host, insecure)
+        _warn_of_plain_http(config, host, tls)
+    if tls is not None:
+        tls.check()
+    for app in _our_apps(config):
+        keep(*(one.port for one in ServerArgs(**app.args).dialects.gateways().values()))
+    port = port or free_port(host)
+    import ray
+    from ray import serve
+
+    own = address is None and not ray.is_initialized()
+    if own:
+        _require_gpus(config, gpus_here())
+    with contextlib.ExitStack() as stack:
+        ingress = ingress or not own or len(_our_apps(config)) < len(config.applications)
+        http = stack.enter_context(_ray(address, host, port, tls, num_cpus, show_logs, ingress))
+        location = "Disabled" if not ingress else "HeadOnly" if address is None else "EveryNode"
+        client, proxies = start_serve(http, location)
+        if running := sorted(serve.status().applications):
+            raise ConfigError(
+                f"Serve runs {running} on this cluster already; use their URL (serve://{running[0]} inside the "
+                f"cluster), or `serve deploy` one file that holds those and yours"
+            )
+        stack.push(unless_lost(lambda: _shutdown(client)))
+        _require_gpus(config)
+        remind = functools.partial(_missing_gpus, config)
+        _deploy(client, config, own=own, ends_at_once=not ingress)
+        url = f"{'http' if tls is None else 'https'}://{LOOPBACK if host == EVERYWHERE else host}:{port}"
+        paths = {app.name: (app.route_prefix or "").rstrip("/") for app in config.applications}
+        if timeout_s is None:
+            timeout_s = _START_S if address is None else _GROW_S
+        deadline = time.monotonic() + timeout_s
+        inside = _internal_url(http)
+        ours = {app.name for app in _our_apps(config)}
+        urls = {name: inside + path if ingress else None for name, path in paths.items()}
+        _wait_for_proxies(proxies)
+        wait_until_ready(serve, urls, ours, deadline, remind)
+        if ingress and address is None and (stats_port := os.environ.get("RAY_SERVE_HAPROXY_STATS_PORT")):
+            wait_for_haproxy(serve, paths, int(stats_port), deadline)
+        if own and ingress:
+            announce(url, paths, ray.get_runtime_context().gcs_address)
+        yield Server(url, {name: url + path for name, path in paths.items()})
+
+
+def _access(config: ServeDeploySchema, keys_file: Path | None, insecure: bool, plain_http: bool) -> ServeDeploySchema:
+    """Return the deployment with the access settings of the command line, if there are any."""
+    if keys_file is not None and insecure:
+        raise ConfigError("keys and insecure exclude each other; keep one")
+    changed = config.model_copy(deep=True)
+    for app in _our_apps(changed):
+        access = dict(app.args.get("access") or {})
+        if keys_file is not None or insecure:  # either one replaces both settings of the file
+            access |= {"insecure": insecure, "keys_file": None if keys_file is None else str(keys_file.absolute())}
+        if plain_http:
+            access["plain_http"] = True
+        if access:
+            app.args["access"] = access
+    return changed
+
+
+def _deploy(client: Any, config: ServeDeploySchema, *, own: bool, ends_at_once: bool) -> None:
+    """Deploy the applications, without waiting for them.
+
+    Serve starts a process for a deployment file, which imports the server once more. On our `own` Ray, applications of
+    this package are built here instead, unless their file has settings that Serve must apply: such a file may also be
+    deployed again, and Serve would replace all replicas of an application that it did not build.
+    `ends_at_once` ends replicas without a wait for requests: their clients have ended before.
+    """
+    from vlagents_ray.serve.replica.app import build
+
+    stated = [app.model_dump(exclude_defaults=True).keys() for app in config.applications]
+    ours = len(_our_apps(config)) == len(config.applications)
+    if not (own and ours and config.model_fields_set <= _OUR_KEYS and all(keys <= _OUR_APP_KEYS for keys in stated)):
+        client.deploy_apps(config)
+        return
+    changes = {"graceful_shutdown_wait_loop_s": _END_S} if ends_at_once else {}
+    built = []
+    for app in config.applications:
+        one = build_app(build(ServerArgs(**app.args)), name=app.name, route_prefix=app.route_prefix)
+        one.deployments[:] = [part.options(**changes) for part in one.deployments]
+        built.append(one)
+    client.deploy_applications(built, wait_for_ingress_deployment_creation=False, wait_for_applications_running=False)
+
+
+def _require_gpus(config: ServeDeploySchema, here: float | None = None) -> None:
+    """Raise `ConfigError` if the replicas need more GPUs than a Ray started here has: they would wait for ever.
+
+    `here` is the number of GPUs that a Ray to be started will find. A cluster that others started may grow: there the
+    lack is a warning, which is repeated while the replicas wait.
+    """
+    node = node_of_this_process()
+    if here is None and (node is None or not node.is_head()):
+        return
+    if (missing := _missing_gpus(config, here)) is not None:
+        raise ConfigError(f"{missing}; where there are more, see `vlagents-ray doctor`")
+
+
+def _missing_gpus(config: ServeDeploySchema, here: float | None = None) -> str | None:
+    """Return a sentence about the GPUs that this machine, or the running cluster, lacks; None if it has enough."""
+    import ray
+
+    wanted = {app.name: _gpus(ServerArgs(**app.args)) for app in _our_apps(config)}
+    there = ray.cluster_resources().get("GPU", 0.0) if here is None else here
+    if sum(wanted.values()) <= there:
+        return None
+    node = node_of_this_process()
+    where = "this cluster" if here is None and (node is None or not node.is_head()) else "this machine"
+    return (
+        f"resources.num_gpus: the replicas of {wanted} want {sum(wanted.values()):g} GPUs, {where} has {there:g}; "
+        f"want less (0 runs on the CPU), or add a machine that has them"
+    )
+
+
+def _gpus(args: ServerArgs) -> float:
+    """Return the number of GPUs that the initial replicas need together."""
+    replicas = args.replicas or 1
+    if args.autoscaling is not None:
+        replicas = max(args.autoscaling.min_replicas, args.autoscaling.initial_replicas or 0)
+    return replicas * args.resources.num_gpus
+
+
+def _our_apps(config: ServeDeploySchema) -> list[Any]:
+    return [app for app in config.applications if app.import_path == IMPORT_PATH]
+
+
+def _require_access(config: ServeDeploySchema, host: str, insecure: bool) -> None:
+    """Raise `ConfigError` if an application accepts other machines without keys, or its keys cannot be read."""
+    ours = _our_apps(config)
+    for app in config.applications:  # applications of others require no keys
+        access = AccessArgs(**app.args.get("access", {})) if app in ours else AccessArgs(insecure=insecure)
+        require_access(host, access.keys() if app in ours else None, access.insecure)
+
+
+def _warn_of_plain_http(config: ServeDeploySchema, host: str, tls: Tls | None) -> None:
+    stated = [AccessArgs(**app.args.get("access", {})) for app in _our_apps(config)]
+    if tls is None and any(access.keys() is not None and not access.plain_http for access in stated):
+        warn_of_plain_http(host)
+
+
+@contextlib.contextmanager
+def _ray(
+    address: str | None,
+    host: str,
+    port: int,
+    tls: Tls | None,
+    num_cpus: int | None,
+    show_logs: bool,
+    ingress: bool,
+) -> Iterator[dict[str, Any]]:
+    """Connect to a Ray or start one; yield Serve's options for its host, port and certificate."""
+    import ray
+
+    if not ray.is_initialized() and address is None:
+        with own_ray(host, port, tls=tls, num_cpus=num_cpus, show_logs=show_logs, ingress=ingress) as listener:
+            yield _serve_address(listener, host, port, tls)
+        return
+    if tls is not None:
+        raise ConfigError(
+            "TLS on a cluster that runs already: end it before Serve, in the cluster's load balancer, or name "
+            "ssl_certfile and ssl_keyfile under http_options in the deployment file"
+        )
+    bare = host in (LOOPBACK, "localhost", EVERYWHERE)
+    if os.environ.get("RAY_SERVE_ENABLE_HA_PROXY") == "1" and address is None and not bare:
+        raise ConfigError(
+            f"host {host}: with HAProxy Serve would find no replica at a single address; "
+            f"use {EVERYWHERE} (or {LOOPBACK}), or leave ray.init() to this function"
+        )
+    with joined(address, log_to_driver=show_logs):
+        yield {"host": host, "port": port}
+
+
+def _wait_for_proxies(proxies: list[Any]) -> None:
+    """Wait until each of the proxies listens; raise the error of one that cannot."""
+    import ray
+
+    timeout_s = proxy_timeout_s()
+    try:
+        ray.get(proxies, timeout=timeout_s)
+    except ray.exceptions.GetTimeoutError as error:
+        raise PolicyUnavailable(f"Serve's proxies do not listen within {timeout_s:g} s") from error
+
+
+def spread_over_gpus(parts: Mapping[str, ServeDeploySchema], *, kept: float = 0.0) -> dict[str, ServeDeploySchema]:
+    """Return deployments that share the GPUs of the connected cluster equally, except for `kept` GPUs."""
+    import ray
+
+    share = max(0.0, ray.cluster_resources().get("GPU", 0.0) - kept) / len(parts)
+    return {name: with_replicas_on(part, share) for name, part in parts.items()}
+
+
+def _serve_address(listener: PublicListener | None, host: str, port: int, tls: Tls | None) -> dict[str, Any]:
+    """Return Serve's own host, port and certificate."""
+    if listener is not None:
+        return {"host": LOOPBACK, "port": listener.inside}
+    if tls is None:
+        return {"host": host, "port": port}
+    if tls.client_ca is not None:
+        raise ConfigError("TLS with certificates of clients needs HAProxy: pip install 'vlagents-ray[serve]'")
+    return {"host": host, "port": port, "ssl_certfile": str(tls.certificate), "ssl_keyfile": str(tls.key)}
+
+
+def _internal_url(http: Mapping[str, Any]) -> str:
+    """Return Serve's own URL, for a process on its node."""
+    scheme = "https" if http.get("ssl_certfile") else "http"
+    return f"{scheme}://{LOOPBACK if http['host'] == EVERYWHERE else http['host']}:{http['port']}"
+
+
+def _stop_long_polls(client: Any) -> None:
+    """Stop long polling of the controller: Ray would report a call in progress at its end as a failed task."""
+    for poll in long_polls(client):
+        poll.stop()
+
+
+def _shutdown(client: Any) -> None:
+    """End Serve, so that replicas drain and HAProxy stops, like `serve.shutdown`, but without its error message.
+
+    The controller ends itself during this call, which Ray would report as a failed task that will be
+    retried.
+    """
+    import ray
+
+    _stop_long_polls(client)
+    client.shutdown_cached_handles()
+    last = end_controller(client)
+    try:
+        ray.get(last, timeout=_SHUTDOWN_S)
+    except ray.exceptions.RayActorError:
+        pass
+    except ray.exceptions.GetTimeoutError:
+        log.warning("Serve has not ended within %g s; nobody waits for it any longer", _SHUTDOWN_S)
+    forget_serve(client)

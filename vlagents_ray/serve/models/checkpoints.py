@@ -1,0 +1,92 @@
+"""The checkpoints that a deployment offers, and the choice of a session among them. It loads nothing.
+
+A policy's settings name its checkpoint, and optionally a training step of it (`checkpoint: /runs/a/{step}`,
+`checkpoint_step: 20000`). A session chooses among the checkpoints in the deployment file; it never names a path.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from vlagents_ray.errors import UnknownCheckpoint
+from vlagents_ray.interface import Agent
+from vlagents_ray.policies.base.checkpoint import at_step
+from vlagents_ray.serve.queue.checkpoint_choice import DEFAULT, CheckpointChoice
+
+CHOICE, STEP = "checkpoint", "checkpoint_step"  # options of a reset, and settings of a policy
+
+
+class Checkpoints:
+    """The deployment's own settings, the choices that may replace some of them, and the factory of agents."""
+
+    def __init__(
+        self,
+        make: Callable[[Mapping[str, Any]], Agent],
+        config: Mapping[str, Any] | None = None,
+        choices: Mapping[str, Mapping[str, Any]] | None = None,
+        *,
+        steps: bool = False,
+        loaded: int = 2,
+    ) -> None:
+        """Create the checkpoints of a deployment.
+
+        Args:
+            make: Creates an agent from settings, without loading anything.
+            config: The deployment's own settings.
+            choices: Settings by the name of each choice; they replace some of the deployment's own.
+            steps: Whether a session may choose the training step.
+            loaded: Largest number of checkpoints in memory at once.
+        """
+        self.make = make
+        self.config = dict(config or {})
+        self.limit = loaded
+        self._choices = {name: dict(settings) for name, settings in (choices or {}).items()}
+        self._steps = steps
+
+    def split_options(self, options: Mapping[str, Any]) -> tuple[CheckpointChoice, dict[str, Any]]:
+        """Split the options of a reset into the chosen checkpoint and the options for the policy.
+
+        Raises:
+            UnknownCheckpoint: The deployment does not offer the chosen checkpoint or step.
+        """
+        rest = dict(options)
+        choice, step = rest.pop(CHOICE, None), rest.pop(STEP, None)
+        if choice is not None and (not isinstance(choice, str) or choice not in self._choices):
+            raise UnknownCheckpoint(f"{CHOICE}: got {choice!r}, want {self._offered()}")
+        if step is not None:
+            if not self._steps:
+                raise UnknownCheckpoint(f"{STEP}: got {step!r}; this deployment offers {self._offered()}")
+            if isinstance(step, bool) or not isinstance(step, int) or step < 0:
+                raise UnknownCheckpoint(f"{STEP}: got {step!r}, want a number of training steps, such as 20000")
+        return CheckpointChoice(choice, step), rest
+
+    def settings(self, choice: CheckpointChoice, config: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the settings of an agent for that choice, based on the deployment's own settings `config`."""
+        chosen = {} if choice.name is None else self._choices[choice.name]
+        return {**config, **chosen, **({} if choice.step is None else {STEP: choice.step})}
+
+    def examples(self) -> list[CheckpointChoice]:
+        """Return one example of each choice: the deployment's own, every named one, and a step if steps are offered."""
+        return [DEFAULT, *map(CheckpointChoice, self._choices), *([CheckpointChoice(step=0)] if self._steps else [])]
+
+    def describe(self, config: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the available choices, for the metadata."""
+        choices = {name: resolved(self.settings(CheckpointChoice(name), config)) for name in self._choices}
+        return {"choices": choices, "steps": self._steps, "limit": self.limit}
+
+    def offers(self, choice: CheckpointChoice, settings: Mapping[str, Any], config: Mapping[str, Any]) -> bool:
+        """Return whether the deployment offers that choice, and it results in these settings."""
+        known = choice.name is None or choice.name in self._choices
+        return known and (choice.step is None or self._steps) and self.settings(choice, config) == settings
+
+    def _offered(self) -> str:
+        offered = [f"one of {sorted(self._choices)}"] if self._choices else []
+        offered += [f"a {STEP}"] if self._steps else []
+        return " or ".join([*offered, "none, for its own"]) if offered else "none but its own"
+
+
+def resolved(settings: Mapping[str, Any]) -> str | None:
+    """Return the checkpoint that the settings name, with the step filled in."""
+    checkpoint, step = settings.get(CHOICE), settings.get(STEP)
+    return at_step(checkpoint, step) if isinstance(checkpoint, str) else checkpoint

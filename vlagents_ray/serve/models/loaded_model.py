@@ -1,0 +1,189 @@
+"""One checkpoint in memory: loading it, and releasing its memory."""
+
+from __future__ import annotations
+
+import gc
+import json
+import logging
+import sys
+import threading
+import time
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from vlagents_ray.contract import Contract, require_match
+from vlagents_ray.errors import UnknownSession
+from vlagents_ray.interface import Agent
+from vlagents_ray.policies.base.checkpoint import used_checkpoints
+from vlagents_ray.policies.base.checkpoint_files import weights_of
+from vlagents_ray.protocol.messages import Request
+from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray.serve.models.checkpoints import Checkpoints, resolved
+from vlagents_ray.serve.models.padding import Padding
+from vlagents_ray.serve.queue.call_limits import LOAD, PolicyCall, PolicyCalls
+from vlagents_ray.serve.queue.checkpoint_choice import CheckpointChoice
+from vlagents_ray.serve.weights.versions import DIGITS, ModelWeights
+from vlagents_ray.validation import check_observation
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(slots=True, eq=False)
+class LoadedModel:
+    """A loaded agent, and the data that its sessions share."""
+
+    choice: CheckpointChoice  # the choice for which it was loaded first
+    settings: dict[str, Any]
+    key: str  # `key_of(settings)`
+    agent: Agent
+    contract: Contract | None
+    copies: AgentCopies
+    padding: Padding
+    weights: dict[str, str | None] | None  # digest and revision, see `Agent.weights_id`
+    version: tuple[str, str]  # equal in replicas that can take over each other's sessions of this model
+    calls: PolicyCalls  # running calls of the replica, including those of this agent
+    parameters: ModelWeights  # versions of the weights
+    busy: threading.Lock  # lock held while its agent runs, or is being closed
+    since: float = field(default_factory=time.monotonic)  # time at which it was loaded, s
+    sessions: int = 0  # number of sessions that hold it
+    closed: bool = False
+    _calls_by_kind: dict[tuple[str, Hashable], PolicyCall] = field(default_factory=dict)
+
+    @property
+    def checkpoint(self) -> str | None:
+        """Name of the checkpoint, as its sessions see it."""
+        return resolved(self.settings) or self.choice.name
+
+    @property
+    def identity(self) -> dict[str, str]:
+        """Checkpoint and digest of the loaded weights, for the info of a reset."""
+        known = {"checkpoint": self.checkpoint, "weights": None if self.weights is None else self.weights["digest"]}
+        return {name: value for name, value in known.items() if value is not None}
+
+    def check(self, request: Request) -> None:
+        """Raise an error if the request does not match the model's contract."""
+        if request.contract is not None:
+            require_match(self.contract, Contract.from_json(request.contract))
+        for obs in (*request.history, request.obs):
+            if obs is not None:
+                check_observation(obs, self.contract)
+
+    def require_open(self) -> None:
+        """Raise `UnknownSession` if the model and its sessions were closed while the caller waited for `busy`."""
+        if self.closed:
+            raise UnknownSession(f"{self.choice} has just been unloaded for another; reset the session")
+
+    def call(self, op: str, kind: Hashable = None) -> PolicyCall:
+        """Return a context for calls of the agent, which detects one that does not return.
+
+        Calls of one `op` and `kind` take similarly long, and two threads never make them at once.
+        """
+        call = self._calls_by_kind.get((op, kind))
+        if call is None:
+            call = self._calls_by_kind[op, kind] = PolicyCall(self.calls, op)
+        return call
+
+    def close(self, wait_s: float = -1.0) -> None:
+        """Close the agent after the running batch. Its memory is freed when no reference to it remains.
+
+        If the batch is still running after `wait_s` (-1: no limit), the agent stays open until this process ends.
+        """
+        if not self.busy.acquire(timeout=wait_s):
+            logger.error("%s: still busy after %g s; it is left as it is", self.choice, wait_s)
+            return
+        try:
+            self.closed = True
+            with self.call("close"):
+                _close_agent(self.agent)
+        finally:
+            self.busy.release()
+
+
+class Loader:
+    """Loads models from settings."""
+
+    def __init__(
+        self,
+        source: Checkpoints,
+        version: str,
+        batch_sizes: Sequence[int],
+        check: Callable[[Contract | None], None],
+        calls: PolicyCalls,
+    ) -> None:
+        """Create the loader; see `Engine` for the arguments."""
+        self._source = source
+        self._version = version
+        self._batch_sizes = batch_sizes
+        self._check = check
+        self._calls = calls
+
+    def load(self, choice: CheckpointChoice, settings: dict[str, Any], agent: Agent | None = None) -> LoadedModel:
+        """Load a model into `agent`, by default a new one; the agent is closed if it cannot be served.
+
+        Args:
+            choice: The choice for which the model is loaded.
+            settings: Settings of the agent.
+            agent: An agent created from these settings, but not initialized yet.
+
+        Raises:
+            BaseException: Any error of the agent's initialization, or of the deployment's check of its contract.
+        """
+        with PolicyCall(self._calls, LOAD):
+            return self._load(choice, settings, agent)
+
+    def _load(self, choice: CheckpointChoice, settings: dict[str, Any], agent: Agent | None) -> LoadedModel:
+        agent = agent or self._source.make(settings)
+        try:
+            with used_checkpoints() as found:
+                agent.initialize()
+            weights = agent.weights_id or weights_of(found)
+            contract = agent.contract
+            self._check(contract)
+            copies = AgentCopies(agent)
+            copies.make()  # an agent that cannot be copied must fail now, not at the first reset
+        except BaseException:
+            _close_agent(agent)
+            raise
+        padding = Padding(self._batch_sizes, copies.make)
+        version = (self.version(settings), f"{copies.fingerprint} {weights['digest'] if weights else ''}")
+        if weights is not None:
+            logger.info("weights: %s, revision: %s", weights["digest"], weights["revision"])
+        busy = threading.Lock()
+        digest = ((weights or {}).get("digest") or "").rpartition(":")[2][:DIGITS]
+        parameters = ModelWeights(agent, busy, digest, version)
+        key, calls = key_of(settings), self._calls
+        return LoadedModel(
+            choice, settings, key, agent, contract, copies, padding, weights, version, calls, parameters, busy
+        )
+
+    def version(self, settings: Mapping[str, Any]) -> str:
+        """Return the version of the policy with these settings."""
+        return f"{self._version} {key_of(settings)}"
+
+
+def key_of(settings: Mapping[str, Any]) -> str:
+    """Return a key that is equal for equal settings."""
+    return json.dumps(settings, sort_keys=True)
+
+
+def free_memory() -> None:
+    """Free memory at once: agents often contain reference cycles, and torch caches the GPU memory that it allocated."""
+    gc.collect()
+    torch = sys.modules.get("torch")
+    if torch is not None and torch.cuda.is_initialized():
+        torch.cuda.empty_cache()
+
+
+def _close_agent(agent: Agent) -> None:
+    try:
+        agent.close()
+    except Exception:
+        logger.exception("%s: could not be closed", type(agent).__name__)
+
+
+def synchronise() -> None:
+    """Wait for the GPU to finish, so that `inference_ms` includes its work."""
+    torch = sys.modules.get("torch")
+    if torch is not None and torch.cuda.is_initialized():
+        torch.cuda.synchronize()

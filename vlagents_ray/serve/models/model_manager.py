@@ -1,0 +1,295 @@
+"""The checkpoints that a replica holds in memory: loaded on demand, and evicted when another needs the memory.
+
+The first checkpoint is loaded on the policy's thread. A loading thread then loads and evicts the others, one at a time,
+while sessions of loaded checkpoints act. `vlagents_ray.serve.models.model_cache` decides which one is next.
+
+A deployment's own settings can change (`ModelManager.configure`): the new checkpoint is loaded beside the old one. New
+episodes then use the new checkpoint, and the old one is evicted when its last episode has ended.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from vlagents_ray.contract import Contract
+from vlagents_ray.errors import PolicyUnavailable, UnknownSession, VLAgentsError
+from vlagents_ray.interface import Agent
+from vlagents_ray.serve.models.checkpoints import Checkpoints
+from vlagents_ray.serve.models.loaded_model import (
+    LoadedModel,
+    Loader,
+    free_memory,
+    key_of,
+)
+from vlagents_ray.serve.models.model_cache import (
+    DueCallbacks,
+    EvictTask,
+    LoadTask,
+    ModelCache,
+    OnLoaded,
+    Waiter,
+)
+from vlagents_ray.serve.queue.checkpoint_choice import DEFAULT, CheckpointChoice
+from vlagents_ray.serve.sessions import Session, SessionTable
+from vlagents_ray.serve.weights.versions import ModelWeights
+
+logger = logging.getLogger(__name__)
+
+_CHECK_S = 1.0  # interval of the checks whether waiting callers are still there
+_CLOSE_S = 10.0  # longest wait for the loading thread, and for the running batch of each model
+
+
+class ModelManager:
+    """The models of a replica. Thread-safe; it releases its lock before it calls other components."""
+
+    def __init__(self, source: Checkpoints, loader: Loader, sessions: SessionTable[LoadedModel]) -> None:
+        """Manage models from `loader` for `sessions`; a model's sessions are closed when it is evicted at once."""
+        self.contract: Contract | None = None  # contract of the deployment's own model that was loaded last
+        self.weights: dict[str, str | None] | None = None  # weights of the deployment's own model that was loaded last
+        self._source = source
+        self._loader = loader
+        self._sessions = sessions
+        self._first: Agent | None = None
+        self._fingerprint = ""
+        self._cache = ModelCache(source)
+        self._begun = self._loaded = self._closed = False
+        self._changed = threading.Condition()
+        self._thread = threading.Thread(target=self._loop, name="checkpoints", daemon=True)
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """The deployment's own settings in effect."""
+        return self._cache.config
+
+    def configure(self, config: Mapping[str, Any]) -> None:
+        """Set the deployment's own settings: the first call sets the initial ones, a later one starts a swap."""
+        with self._changed:
+            if not self._begun:
+                self._begun, self._cache.config, self._first = True, dict(config), self._source.make(config)
+            else:
+                self._cache.next = None if config == self.config else dict(config)
+                self._cache.failure = None
+                self._wake()
+
+    def start(self) -> None:
+        """Load the deployment's own checkpoint on the calling thread; raises an error if it cannot be served."""
+        self._begun = True
+        first, self._first = self._first, None
+        model = self._loader.load(DEFAULT, self.config, first)
+        with self._changed:
+            self._cache.loaded[model.key] = model
+            self._set_own_model(model)
+            self._loaded = True
+            if self._cache.next is not None:
+                self._wake()
+
+    def close(self) -> None:
+        """Unload all models; waiting sessions get `PolicyUnavailable`."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+        if self._thread.ident is not None:
+            self._thread.join(_CLOSE_S)
+        with self._changed:
+            waiting, self._cache.waiting = self._cache.waiting, []
+            loaded, self._cache.loaded = self._cache.loaded, {}
+        _run_callbacks([(waiter.on_loaded, _stopping()) for waiter in waiting])
+        for model in loaded.values():
+            model.close(_CLOSE_S)
+
+    def check_health(self) -> None:
+        """Raise the error of the first loaded agent whose health check fails."""
+        with self._changed:
+            loaded = list(self._cache.loaded.values())
+        for model in loaded:
+            model.agent.check_health()
+
+    @property
+    def version(self) -> tuple[str, str]:
+        """Version that is equal in replicas of the same policy with equal settings of the deployment."""
+        return self._loader.version(self.config), self._fingerprint
+
+    @property
+    def own_weights(self) -> ModelWeights:
+        """Versions of the weights of the deployment's own model; raises `PolicyUnavailable` before it is loaded."""
+        with self._changed:
+            model = self._cache.find(DEFAULT)
+        if model is None:
+            raise PolicyUnavailable("the policy is loading; try again")
+        return model.parameters
+
+    def describe(self) -> dict[str, Any]:
+        """Return the available choices, the loaded checkpoints and the state of the last swap, for the metadata."""
+        with self._changed:
+            return self._cache.describe()
+
+    def loaded(self, choice: CheckpointChoice) -> LoadedModel | None:
+        """Return the model with which an episode of that choice would begin now, or None if it is not loaded."""
+        with self._changed:
+            return self._cache.find(choice)
+
+    def hold(
+        self,
+        session: Session[LoadedModel],
+        choice: CheckpointChoice,
+        on_loaded: OnLoaded,
+        is_abandoned: Callable[[], bool] = lambda: False,
+    ) -> LoadedModel | None:
+        """Return the model for a session's next episode, which the session holds until its next call or its end.
+
+        Args:
+            session: The session; it releases the model that it held before.
+            choice: The chosen checkpoint.
+            on_loaded: Called if the model has to be loaded or waited for: with None once the session holds it, or with
+                the error.
+            is_abandoned: Returns whether the caller no longer waits.
+
+        Returns:
+            The model, or None if it has to be loaded or waited for.
+        """
+        with self._changed:
+            self._require_open()
+            self._release_model(session)
+            model = self._cache.free(choice, follows=session.follows)
+            if model is not None and not session.over:
+                return self._cache.assign(session, model)
+            self._cache.waiting.append(Waiter(session, choice, on_loaded, is_abandoned))
+            self._wake()
+            return None
+
+    def adopt(
+        self, session: Session[LoadedModel], choice: CheckpointChoice, settings: Mapping[str, Any], timeout_s: float
+    ) -> LoadedModel:
+        """Return the model for a session from another replica.
+
+        If the deployment offers that model, it is loaded, unless that takes longer than `timeout_s`.
+
+        Raises:
+            UnknownSession: The session cannot continue here.
+        """
+        with self._changed:
+            self._require_open()
+            model = self._cache.loaded.get(key_of(settings))
+            if model is not None:
+                return self._cache.assign(session, model)
+            if timeout_s <= 0 or not self._cache.offers(choice, settings):
+                raise UnknownSession(f"session {session.id!r}: {choice} is not loaded here; reset it")
+        done = threading.Event()
+        errors: list[VLAgentsError] = []
+
+        def on_loaded(error: VLAgentsError | None) -> None:
+            errors.extend([] if error is None else [error])
+            done.set()
+
+        if self.hold(session, choice, on_loaded) is None:
+            done.wait(timeout_s)
+        if session.model is None:
+            raise errors[0] if errors else UnknownSession(f"session {session.id!r}: {choice} takes long; reset it")
+        return session.model
+
+    def release_model(self, session: Session[LoadedModel]) -> None:
+        """Release the model of a session that has no episode."""
+        with self._changed:
+            self._release_model(session)
+
+    def release(self, session: Session[LoadedModel]) -> None:
+        """Release the model of a session that has ended."""
+        with self._changed:
+            session.over = True
+            self._release_model(session)
+
+    def _require_open(self) -> None:
+        if self._closed:
+            raise _stopping()
+
+    def _wake(self) -> None:
+        """Wake the loading thread up to check for work; the first call after `start` starts the thread."""
+        if self._thread.ident is None and self._loaded and not self._closed:
+            self._thread.start()
+        self._changed.notify_all()
+
+    def _release_model(self, session: Session[LoadedModel]) -> None:
+        if self._cache.release_model(session):
+            self._changed.notify_all()
+
+    def _set_own_model(self, model: LoadedModel) -> None:
+        self.contract, self._fingerprint = model.contract, model.version[1]
+        self.weights = model.weights
+
+    def _loop(self) -> None:
+        while (task := self._next_task()) is not None:
+            try:
+                if isinstance(task, LoadTask):
+                    self._load(task)
+                elif isinstance(task, EvictTask):
+                    self._unload(task)
+                else:
+                    _run_callbacks(task)
+            except Exception:
+                logger.exception("the checkpoints' thread goes on")
+
+    def _next_task(self) -> LoadTask | EvictTask | DueCallbacks | None:
+        """Wait for the next task, or for callbacks that are due, and return them; None after `close`."""
+        with self._changed:
+            while not self._closed:
+                if (model := self._cache.swap()) is not None:
+                    self._set_own_model(model)
+                    logger.info("new episodes begin with %s", model.checkpoint)
+                if due := self._cache.pop_due():  # before `plan`, which might evict a model that was just loaded
+                    return due
+                draining = self._cache.draining
+                if (task := self._cache.plan()) is not None:
+                    return task
+                if self._cache.draining == draining:
+                    self._changed.wait(_CHECK_S if self._cache.waiting else None)
+        return None
+
+    def _load(self, task: LoadTask) -> None:
+        begun = time.monotonic()
+        try:
+            model = self._loader.load(task.choice, task.settings)
+        except BaseException as error:
+            logger.exception("%s did not load", task.choice)
+            failure = f"{task.choice} did not load: {type(error).__name__}; the server's log says why"
+            with self._changed:
+                due = self._cache.failed(task.settings, failure)
+        else:
+            logger.info("%s: loaded %s in %.1f s", task.choice, model.checkpoint, time.monotonic() - begun)
+            with self._changed:
+                if not self._closed:
+                    self._cache.loaded[model.key] = model
+                    return
+            model.close()
+            return
+        _run_callbacks(due)
+        free_memory()
+
+    def _unload(self, task: EvictTask) -> None:
+        with self._changed:
+            model = self._cache.loaded[task.key]
+        if task.at_once:
+            logger.info("there is room for one checkpoint: its sessions end, for the next")
+            self._sessions.close_those_of(model)
+        with self._changed:
+            if task.at_once and model.sessions:  # a session from another replica holds it, but is in no table yet
+                self._changed.wait(_CHECK_S)
+            if model.sessions:  # a session still holds it, or took it meanwhile
+                return
+            del self._cache.loaded[task.key]
+        logger.info("%s: unloading %s", model.choice, model.checkpoint)
+        model.close()
+        del model
+        free_memory()
+
+
+def _stopping() -> PolicyUnavailable:
+    return PolicyUnavailable("the replica is stopping; connect again")
+
+
+def _run_callbacks(due: DueCallbacks) -> None:
+    for on_loaded, error in due:
+        on_loaded(error)

@@ -1,0 +1,136 @@
+"""The child process of a replica, which runs a policy whose packages, or Python, the replica cannot have.
+
+    python -m vlagents_ray.serve.python_env.child_main
+
+It needs the light install and pydantic, not Ray. The first line of its standard input is `Settings`, as JSON. When the
+policy is loaded, it writes one line of JSON with the contract and the address of its `ShmServer`, through which all
+requests go; if the policy does not load, the line holds the error. A further byte of input lets it close the policy and
+end. The end of its input, or the death of its parent, ends it at once.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import logging
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+from vlagents_ray.contract import Contract
+from vlagents_ray.errors import ConfigError, PolicyFailed, VLAgentsError
+from vlagents_ray.interface import Agent
+from vlagents_ray.policies.wrapper import build_agent
+from vlagents_ray.protocol.messages import INNER_OPS, Limits
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.endpoints.local.shm import ShmServer
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.queue.call_limits import CallLimits
+
+_PR_SET_PDEATHSIG = 1
+# The replica checks requests, removes idle sessions and detects calls that take too long, so the child does not.
+_NO_LIMITS = Limits(**dict.fromkeys([limit.name for limit in fields(Limits)], 2**40))
+_NEVER_S = 1e6
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """The settings that a replica sends to its child."""
+
+    policy: str
+    config: dict[str, Any]
+    batch: int  # maximum number of observations in one forward pass
+    version: str  # version of the deployment: sessions move between equal versions only
+    wrappers: Sequence[Any] = ()  # wrappers of the policy, as in a deployment file
+
+
+def examine(policy: str, config: dict[str, Any], wrappers: Sequence[Any] = ()) -> dict[str, Any]:
+    """Build the policy without loading it, and return its contract, if it states one already, or the error.
+
+    Returns:
+        `{"contract": ...}`, as JSON values or None, or `{"code": ..., "error": ...}`.
+    """
+    try:
+        agent = build_agent(policy, config, wrappers)
+    except VLAgentsError as error:
+        return {"code": error.code, "error": str(error)}
+    except Exception as error:  # noqa: BLE001 - a policy may raise any error when it is built
+        return {"code": ConfigError.code, "error": f"policy {policy}: {type(error).__name__}: {error}"}
+    contract = unloaded_contract(agent)
+    return {"contract": None if contract is None else contract.to_json()}
+
+
+def unloaded_contract(agent: Agent) -> Contract | None:
+    """Return the contract of a policy that is not loaded; None if it cannot state one yet."""
+    try:
+        return agent.contract
+    except Exception:  # noqa: BLE001 - a policy may raise any error before `initialize`
+        return None
+
+
+def run() -> None:
+    """Run the policy until the replica ends it, or has ended itself."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    answers = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)  # anything printed goes to the replica's log
+    logging.basicConfig(level=logging.INFO, format="%(levelname)s %(name)s: %(message)s")
+    settings = Settings(**json.loads(_line()))
+    over = threading.Event()
+    threading.Thread(target=_wait_for_the_end, args=[over.set], daemon=True).start()
+
+    def answer(said: dict[str, Any]) -> None:
+        print(json.dumps(said), file=answers, flush=True)
+
+    try:
+        agent = build_agent(settings.policy, settings.config, settings.wrappers)
+        engine = Engine(
+            agent,
+            max_batch_size=settings.batch,
+            session_limit=sys.maxsize,
+            session_idle_s=_NEVER_S,
+            version=settings.version,
+            limits=CallLimits(load_s=_NEVER_S),
+            reply_bytes=Limits().body_bytes,  # the replica applies its own limit
+            in_flight_bytes=_NO_LIMITS.in_flight_bytes,
+        )
+        server = ShmServer(engine, _NO_LIMITS, NoKey.INSIDE, INNER_OPS)
+        server.open()
+        engine.start()
+    except Exception as error:
+        logging.getLogger(__name__).exception("the policy did not load")
+        cause = error.__cause__ if isinstance(error, PolicyFailed) else error  # the policy's own error
+        answer({"error": f"{type(cause).__name__}: {cause}"})
+        sys.exit(1)
+    contract = None if engine.contract is None else engine.contract.to_json()
+    answer({"local": asdict(server.address), "contract": contract, "weights": engine.models.weights})
+    over.wait()
+    engine.close()
+    server.close()
+
+
+def _line() -> bytes:
+    """Read the first line of the standard input, and no byte after it."""
+    line = b""
+    while not line.endswith(b"\n"):
+        byte = os.read(0, 1)
+        if not byte:
+            sys.exit(1)
+        line += byte
+    return line
+
+
+def _wait_for_the_end(end: Callable[[], None]) -> None:
+    if not os.read(0, 1):
+        os._exit(1)
+    end()
+    os.read(0, 1)  # the end of the input: the replica waits no longer
+    os._exit(1)
+
+
+if __name__ == "__main__":
+    run()

@@ -1,0 +1,209 @@
+"""Virtual environments, created with uv, for policies that need one and for the benchmark's peers."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import json
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import vlagents_ray
+from vlagents_ray.errors import ConfigError, MissingDependency
+from vlagents_ray.policies.base import import_fixes
+
+Progress = Callable[[str], None]
+
+_US = "vlagents-ray"
+_FIXES = "vlagents_ray_import_fixes"  # a module and a .pth file in the environments created here
+_SHOWN = 2000  # last characters of uv's output that an error quotes
+_MINOR = "import sys; print('%d.%d' % sys.version_info[:2])"
+_CUDA = re.compile(r"^ \+ ((?:nvidia|cuda)-\S+)", re.MULTILINE)
+# pip's variables for package sources, and uv's, which take precedence.
+_PIP_VARIABLES = {
+    "PIP_INDEX_URL": "UV_DEFAULT_INDEX",
+    "PIP_EXTRA_INDEX_URL": "UV_INDEX",
+    "PIP_FIND_LINKS": "UV_FIND_LINKS",
+}
+
+
+def python_in(folder: Path) -> Path:
+    """Return the path of the Python of the environment in `folder`."""
+    return folder / "bin" / "python"
+
+
+def create(folder: Path, python: str | None = None, progress: Progress = lambda _: None) -> Path:
+    """Create an empty environment in `folder`, unless there is one.
+
+    Args:
+        folder: The folder of the environment.
+        python: A version or the path of an interpreter; by default that of this process.
+        progress: Gets a line about each step.
+
+    Returns:
+        The path of its Python.
+
+    Raises:
+        ConfigError: The folder holds something else, or uv cannot create the environment.
+    """
+    found = python_in(folder)
+    if found.exists():
+        return found
+    if folder.exists() and any(folder.iterdir()):
+        raise ConfigError(f"{folder}: is there and holds no Python environment; name another folder")
+    progress(f"making {folder} with Python {python or platform.python_version()}")
+    _uv(["venv", "--quiet", "--python", python or sys.executable, str(folder)])
+    return found
+
+
+def install(python: Path, wanted: Sequence[str]) -> None:
+    """Install `wanted`, arguments of `uv pip install`, for `python`; raise `ConfigError` with uv's output otherwise."""
+    _uv(["pip", "install", "--quiet", "--python", str(python), *wanted])
+
+
+def make_environment(
+    requirements: Path,
+    folder: Path,
+    *,
+    more: Sequence[Path] = (),
+    python: str | None = None,
+    light: bool = False,
+    progress: Progress = lambda _: None,
+) -> Path:
+    """Create an environment for a policy, with this same package in it.
+
+    On a machine without an NVIDIA GPU it gets the version of torch of this environment, and the replacements for other
+    requirements in `NAME.cpu.txt`, in the folder of `requirements`.
+
+    Args:
+        requirements: The requirements file of the policy.
+        folder: The folder of the environment.
+        more: Further requirements files.
+        python: See `create`.
+        light: Whether to leave out Ray, for a child process; always so for another Python minor version, in which no
+            replica can run.
+        progress: Gets a line about each step.
+
+    Returns:
+        The path of its Python.
+
+    Raises:
+        ConfigError: A file does not exist, uv fails, or a CUDA build would be installed without an NVIDIA GPU.
+    """
+    files = [requirements, *more]
+    for file in files:
+        if not file.is_file():
+            raise ConfigError(f"no such file: got {str(file)!r}, want a requirements file")
+    made = create(folder, python, progress)
+    if not light and _minor(made) != _minor(Path(sys.executable)):
+        progress(
+            f"Python {_minor(made)} is not this one's {_minor(Path(sys.executable))}: without Ray, for a child process"
+        )
+        light = True
+    wanted = [*_ourselves(light), *(word for file in files for word in ("--requirement", str(file)))]
+    with tempfile.TemporaryDirectory() as scratch:
+        if not _has_gpu():
+            for override in _overrides(requirements, Path(scratch)):
+                wanted += ["--override", str(override)]
+            _require_no_cuda(made, wanted)
+        progress(f"installing {_US} {importlib.metadata.version(_US)} and {requirements}")
+        install(made, wanted)
+    _install_import_fixes(made)
+    return made
+
+
+def _ourselves(light: bool) -> list[str]:
+    """Return uv's arguments for this package as it is installed here, with the same Ray, or pydantic if `light`."""
+    extra = "" if light else "[serve]"
+    source = Path(vlagents_ray.__file__).parents[1]
+    direct = importlib.metadata.distribution(_US).read_text("direct_url.json")
+    if (source / "pyproject.toml").is_file():
+        us = ["--editable", f"{source}{extra}"]
+    elif direct is not None:
+        us = [f"{_US}{extra} @ {json.loads(direct)['url']}"]
+    else:
+        us = [f"{_US}{extra}=={importlib.metadata.version(_US)}"]
+    if not light:
+        return [*us, f"ray=={importlib.metadata.version('ray')}"]
+    needed = importlib.metadata.requires(_US) or []
+    return [*us, *(one.partition(";")[0].strip() for one in needed if one.startswith("pydantic"))]
+
+
+def _overrides(requirements: Path, scratch: Path) -> list[Path]:
+    """Return files with replacements of requirements for a machine without a GPU."""
+    found = []
+    theirs = requirements.with_suffix(f".cpu{requirements.suffix}")
+    if theirs.is_file():
+        found.append(theirs)
+    try:
+        torch = importlib.metadata.version("torch")
+    except importlib.metadata.PackageNotFoundError:
+        return found
+    if not found or not re.search(r"(?mi)^torch\b(?!-)", theirs.read_text()):
+        ours = scratch / "torch.txt"
+        ours.write_text(f"torch=={torch}\n")
+        found.append(ours)
+    return found
+
+
+def _require_no_cuda(python: Path, wanted: Sequence[str]) -> None:
+    plan = _uv(["pip", "install", "--dry-run", "--python", str(python), *wanted])
+    if found := _CUDA.findall(plan):
+        raise ConfigError(
+            f"stopped before downloading several GB: the requirements bring CUDA packages ({', '.join(found[:3])}, …), "
+            f"but this machine shows no NVIDIA GPU; name CPU builds in a file NAME.cpu.txt beside NAME.txt, and where "
+            f"they are with PIP_FIND_LINKS or PIP_INDEX_URL"
+        )
+
+
+def _install_import_fixes(python: Path) -> None:
+    """Install import fixes, with which torchvision and LeRobot load although their wheels do not fit this machine."""
+    folder = Path(_said_by(python, "import sysconfig; print(sysconfig.get_path('purelib'))"))
+    shutil.copyfile(str(import_fixes.__file__), folder / f"{_FIXES}.py")
+    (folder / f"{_FIXES}.pth").write_text(f"import {_FIXES}; {_FIXES}.install()\n")
+
+
+def _has_gpu() -> bool:
+    return any(Path("/dev").glob("nvidia[0-9]*"))
+
+
+def _minor(python: Path) -> str:
+    return _said_by(python, _MINOR)
+
+
+def _said_by(python: Path, program: str) -> str:
+    command = [str(python), "-c", program]
+    return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()  # noqa: S603
+
+
+def _uv(arguments: Sequence[str]) -> str:
+    """Run uv and return its error output, in which it reports its work."""
+    if importlib.util.find_spec("uv") is not None:
+        command = [sys.executable, "-m", "uv"]
+    else:
+        beside = f"{Path(sys.executable).parent}{os.pathsep}{os.environ.get('PATH', '')}"
+        binary = shutil.which("uv", path=beside)
+        if binary is None:
+            raise MissingDependency("'uv' is not installed; pip install 'vlagents-ray[serve]'")
+        command = [binary]
+    done = subprocess.run(  # noqa: S603 - uv, as installed with this package
+        [*command, *arguments], capture_output=True, text=True, check=False, env={**_places(), **os.environ}
+    )
+    if done.returncode != 0:
+        raise ConfigError(f"uv {arguments[0]} failed:\n{done.stderr.strip()[-_SHOWN:]}")
+    return done.stderr
+
+
+def _places() -> dict[str, str]:
+    """Return pip's package sources as variables of uv."""
+    places = {uv: os.environ[pip] for pip, uv in _PIP_VARIABLES.items() if pip in os.environ}
+    if "UV_FIND_LINKS" in places:
+        places["UV_FIND_LINKS"] = ",".join(places["UV_FIND_LINKS"].split())
+    return places

@@ -1,0 +1,178 @@
+"""Checks of a virtual environment: whether it has an interpreter, its packages, and whether the policy builds there."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import os
+import platform
+import subprocess
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from vlagents_ray.contract import Contract
+from vlagents_ray.errors import ConfigError, from_code
+from vlagents_ray.serve.config.python_env import EnvironmentArgs
+
+__all__ = ["EnvironmentProbe", "check_policy", "probe", "with_process"]
+
+_PACKAGES = ("ray", "numpy", "vlagents-ray")
+_TIMEOUT_S = 120.0  # imports from a network drive without a cache are slow
+OLDEST = (3, 10)
+# The program must run in any file that the path names, an old Python included; imports may print before the last line.
+_PROBE = """
+import json, sys
+found = {"python": "%d.%d.%d" % sys.version_info[:3]}
+if sys.version_info >= (3, 10):
+    from importlib.metadata import PackageNotFoundError, version
+    for name in sys.argv[1:]:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            pass
+    settings = json.load(sys.stdin)
+    if settings["policy"] is not None and found.get("vlagents-ray") == settings["version"]:
+        from vlagents_ray.serve.python_env.child_main import examine
+        found["policy"] = examine(**settings["policy"])
+print()
+print("VLA" + json.dumps(found))
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class EnvironmentProbe:
+    """The answer of an interpreter."""
+
+    python: str  # path of the interpreter
+    versions: dict[str, str]  # versions of "python", "ray", "numpy", "vlagents-ray"; only those installed are included
+    policy: dict[str, Any] | None = None  # result of `child_main.examine`, if it was requested
+
+    def hosts_replicas(self) -> str | None:
+        """Return the reason why a replica of this process's cluster cannot run there; None if it can."""
+        ours, theirs = platform.python_version(), self.versions["python"]
+        if _minor(ours) != _minor(theirs):
+            return f"it is Python {theirs}, the cluster's is {ours}"
+        cluster, there = importlib.metadata.version("ray"), self.versions.get("ray")
+        return (
+            None if there == cluster else f"it has {f'Ray {there}' if there else 'no Ray'}, the cluster has {cluster}"
+        )
+
+
+def probe(
+    python: str, policy: dict[str, Any] | None = None, env_vars: Mapping[str, str] | None = None
+) -> EnvironmentProbe:
+    """Start the interpreter once, to get its versions and optionally to build a policy.
+
+    Args:
+        python: The path of the interpreter.
+        policy: The arguments of `child_main.examine`; None to build no policy.
+        env_vars: Further environment variables of the process.
+
+    Raises:
+        ConfigError: No policy of this server can run in the interpreter.
+    """
+    if not Path(python).is_file():
+        inside = Path(python) / "bin" / "python"
+        cure = f"did you mean {inside}?" if inside.is_file() else f"make one with `{_making(python)}`"
+        raise ConfigError(f"environment.python: no such file, got {python!r}, want an interpreter; {cure}")
+    version = importlib.metadata.version("vlagents-ray")
+    settings = {"policy": policy, "version": version}
+    said = _run_probe(python, json.dumps(settings), env_vars or {})
+    examined = said.pop("policy", None)
+    found = EnvironmentProbe(python, said, examined)
+    if _minor(said["python"]) < OLDEST:
+        oldest = ".".join(map(str, OLDEST))
+        raise ConfigError(f"environment.python: {python} is Python {said['python']}, want {oldest} or newer")
+    theirs = said.get("vlagents-ray")
+    if theirs != version:
+        raise ConfigError(
+            f"environment.python: {python} has {f'vlagents-ray {theirs}' if theirs else 'no vlagents-ray'}, want "
+            f"{version} as here; install it there, or make the environment with `{_making(python)}`"
+        )
+    return found
+
+
+def _making(python: str) -> str:
+    """Return the command that makes the environment of an interpreter: .venv-NAME is that of requirements/NAME.txt."""
+    folder = Path(python).parent.parent
+    prefix, _, name = folder.name.partition(".venv-")
+    if prefix or not name:
+        return "vlagents-ray env make REQUIREMENTS"
+    return f"vlagents-ray env make requirements/{name}.txt --into {folder}"
+
+
+def with_process(environment: EnvironmentArgs) -> EnvironmentArgs:
+    """Return the settings with `process` "auto" decided; raise `ConfigError` if the policy cannot run as stated."""
+    if environment.python is None:
+        return environment
+    return environment.model_copy(update={"process": _process(environment, probe(environment.python))})
+
+
+def check_policy(
+    environment: EnvironmentArgs, policy: str, config: dict[str, Any], wrappers: Sequence[Any] = ()
+) -> Contract | None:
+    """Build the policy in its environment, as a replica will, and return its contract.
+
+    Args:
+        environment: The settings of the environment, which must name an interpreter.
+        policy: The policy's name.
+        config: The policy's settings.
+        wrappers: The policy's wrappers.
+
+    Returns:
+        The contract; None if the policy states none before it is loaded.
+
+    Raises:
+        ConfigError: The policy cannot be built there, or the environment cannot be used.
+    """
+    if environment.python is None:
+        raise ConfigError("environment: names no interpreter to ask")
+    asked = {"policy": policy, "config": dict(config), "wrappers": list(wrappers)}
+    found = probe(environment.python, asked, environment.env_vars)
+    _process(environment, found)
+    said = found.policy or {}
+    if "error" in said:
+        raise from_code(said["code"], f"in {environment.python}: {said['error']}")
+    contract = said.get("contract")
+    return None if contract is None else Contract.from_json(contract)
+
+
+def _process(environment: EnvironmentArgs, found: EnvironmentProbe) -> Literal["replica", "child"]:
+    if environment.process == "child":
+        return "child"
+    obstacle = found.hosts_replicas()
+    if obstacle is not None and environment.process == "replica":
+        raise ConfigError(
+            f"environment.process: got 'replica', which cannot run in {environment.python}: {obstacle}; "
+            f"use process 'child' (or 'auto'), or make the environment anew with `vlagents-ray env make`"
+        )
+    return "child" if obstacle else "replica"
+
+
+def _minor(version: str) -> tuple[int, ...]:
+    return tuple(map(int, version.split(".")[:2]))
+
+
+def _run_probe(python: str, settings: str, env_vars: Mapping[str, str]) -> dict[str, Any]:
+    try:
+        done = subprocess.run(  # noqa: S603 - the deployment's own interpreter
+            [python, "-c", _PROBE, *_PACKAGES],
+            input=settings,  # not as an argument, which every user of the machine could read
+            capture_output=True,
+            text=True,
+            timeout=_TIMEOUT_S,
+            check=False,
+            env={**os.environ, **env_vars},
+        )
+    except (OSError, subprocess.TimeoutExpired) as error:
+        raise ConfigError(
+            f"environment.python: {python!r} is no Python interpreter that runs here ({error})"
+        ) from error
+    last = done.stdout.strip().rpartition("\n")[2]
+    if not last.startswith("VLA{"):
+        words = (done.stderr or done.stdout).strip()[-500:] or "it said nothing"
+        raise ConfigError(f"environment.python: {python!r} is no Python interpreter, or a broken one: {words}")
+    answer: dict[str, Any] = json.loads(last[3:])
+    return answer

@@ -1,0 +1,149 @@
+"""Decides whether a batch waits briefly for sessions about to send their next request; uses no threads or clocks.
+
+The simulations of a group that was answered together send their next requests within about a millisecond. Without a
+wait, the first request would start a batch alone, and the others would wait for it. From then on the group would be
+split into two batches, each of which waits for the other. So the first request waits for the others, under these
+conditions:
+
+- The queue only waits for sessions of the last batch whose recent return time is about the time that has passed since
+  that batch. It does not wait again for a session that was late before that session has returned in time once.
+- The wait is at most `patience` times the duration of the last batch. It is also at most the time that one batch saves
+  over two: the fixed cost of a batch, estimated from the durations of the last batches.
+- No robot's request waits, the waiting requests do not fill the batch already, and the wait endangers no deadline.
+
+So a lone session does not wait for others, and a robot never waits. The queue does not wait for robots either.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+
+from vlagents_ray.serve.queue.fair_queue import FairQueue, PendingRequest, Rank
+
+_KEPT = 0.95  # factor by which the weight of a batch decreases with each later batch
+_SPREAD = 0.01  # variance of the batch sizes below which the fixed cost cannot be estimated
+_NEWEST = 0.25  # weight of the last batch in the mean duration of batches
+SLOW_S = 0.002  # a shorter batch ends before a wait could pay off, or another thread could wake up
+
+
+class _AnsweredBatch:
+    """The simulations of a batch, and the recent return time of each, s; None where that is unknown.
+
+    The return time of a session is the time from an answer to its next request.
+    """
+
+    def __init__(self, batch: Sequence[PendingRequest]) -> None:
+        self.returns = {
+            ticket.session_id: ticket.return_s
+            for ticket in batch
+            if ticket.rank is Rank.SIMULATION and ticket.request.op in ("act", "reset")
+        }
+        self.lone = batch[0].session_id if len(batch) == 1 else ""
+        self.acts = len(batch) if all(ticket.request.op == "act" for ticket in batch) else 0
+        self.ended = math.inf  # s
+
+
+class BatchCost:
+    """A weighted linear fit of the durations of batches over their sizes; older batches have less weight."""
+
+    def __init__(self) -> None:
+        self._sums = (0.0, 0.0, 0.0, 0.0, 0.0)
+
+    def add(self, size: int, duration: float) -> None:
+        """Add a batch of `size` observations that took `duration` s."""
+        new = (1.0, size, duration, size * size, size * duration)
+        self._sums = tuple(_KEPT * old + one for old, one in zip(self._sums, new, strict=True))  # type: ignore[assignment]
+
+    def fixed_s(self) -> float:
+        """Return the fixed cost of a batch, s; `inf` until batches of different sizes were added."""
+        count, size, duration, squares, products = self._sums
+        spread = count * squares - size * size
+        if spread <= _SPREAD * count * count:
+            return math.inf
+        return (duration * squares - size * products) / spread
+
+
+class BatchWindow:
+    """Decides on the wait from the last two batches. Not thread-safe: its callers must hold one lock.
+
+    Args:
+        patience: Longest wait, as a multiple of the duration of the last batch.
+        size: Largest number of requests in a batch.
+        is_open: Returns whether a session still exists.
+    """
+
+    def __init__(self, patience: float, size: int, is_open: Callable[[str], bool]) -> None:
+        self._patience = patience
+        self._size = size
+        self._is_open = is_open
+        self._no_batch = _AnsweredBatch(())
+        self._last = self._previous = self._no_batch
+        self._duration = 0.0  # duration of the last batch, s
+        self._mean_s = 0.0  # mean duration of recent batches, s
+        self.slow = False  # whether batches take longer than `SLOW_S`; if not, the window keeps no records
+        self._cost = BatchCost()
+        self._missing: set[str] = set()
+        self._until = 0.0
+
+    def record_start(self, batch: Sequence[PendingRequest]) -> None:
+        """Record that a batch begins."""
+        self._previous, self._last = self._last, _AnsweredBatch(batch) if self.slow else self._no_batch
+
+    def record_end(self, now: float, duration: float) -> None:
+        """Record that the batch ended at `now`, s, after `duration` s."""
+        self._mean_s += _NEWEST * (duration - self._mean_s)
+        self.slow = self._mean_s > SLOW_S
+        self._last.ended, self._duration = now, duration
+        if self._last.acts:
+            self._cost.add(self._last.acts, duration)
+
+    @property
+    def alone(self) -> bool:
+        """Whether the last two batches were for one and the same session, or the last one if no other is known."""
+        return self._last.lone != "" and (self._previous is self._no_batch or self._previous.lone == self._last.lone)
+
+    def record_arrival(self, ticket: PendingRequest) -> None:
+        """Estimate the return time of the session that sent the request.
+
+        The estimate rises to a longer time at once, and falls to a shorter one by half the difference.
+        """
+        for answered in (self._last, self._previous):
+            if ticket.session_id in answered.returns:
+                usual = answered.returns.pop(ticket.session_id)
+                took = max(0.0, ticket.arrived - answered.ended)
+                ticket.return_s = took if usual is None or took > usual else (took + usual) / 2
+                return
+
+    def wait_s(self, now: float, waiting: FairQueue) -> float:
+        """Return how long the free policy may wait for further requests, s; every `put` then calls `ends_wait`."""
+        bound = min(self._patience * self._duration, self._cost.fixed_s())
+        if bound <= 0 or not self.slow or waiting.depth[Rank.ROBOT] or waiting.sessions >= self._size:
+            return 0.0
+        self._missing = {
+            session_id
+            for session_id, return_s in self._last.returns.items()
+            if return_s is not None
+            and abs(self._last.ended + return_s - now) <= bound
+            and session_id not in waiting
+            and self._is_open(session_id)
+        }
+        self._until = now + bound
+        if not self._missing or any(self._risks_deadline(ticket) for ticket in waiting.heads()):
+            return 0.0
+        return bound
+
+    def ends_wait(self, ticket: PendingRequest, waiting: FairQueue) -> bool:
+        """Return whether the wait ends with the arrival of this request."""
+        self._missing.discard(ticket.session_id)
+        return (
+            not self._missing
+            or ticket.rank is Rank.ROBOT
+            or waiting.sessions >= self._size
+            or self._risks_deadline(ticket)
+        )
+
+    def _risks_deadline(self, ticket: PendingRequest) -> bool:
+        """Return whether the deadline may pass if the policy waits, and then takes as long as for the last batch."""
+        deadline_ms = ticket.request.deadline_ms
+        return deadline_ms is not None and ticket.arrived + deadline_ms / 1e3 < self._until + self._duration

@@ -1,0 +1,97 @@
+"""Running calls into a policy, and whether one of them exceeds its time limit.
+
+A deadlocked driver, or a policy that waits for an event that never occurs, keeps its thread alive. Only the time since
+the call began distinguishes it from a policy that is computing. A policy that compiles takes long for its first few
+calls, so these calls and loading have longer limits.
+"""
+
+from __future__ import annotations
+
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+
+_WARM_UP_CALLS = 2  # per kind of call: the first one compiles, and the second one compiles for dynamic sizes
+_MULTIPLE = 10  # limit of a call, as a multiple of the longest call of its kind so far
+LOAD = "load"
+
+
+@dataclass(frozen=True, slots=True)
+class CallLimits:
+    """Time limits for calls of the policy, s."""
+
+    act_s: float = 60.0  # limit of a call; ten times the longest call of its kind so far if that is more
+    warm_up_s: float = 600.0  # limit of each of the first two calls of a kind
+    load_s: float = 3600.0  # limit for loading a checkpoint
+
+
+class PolicyCall:
+    """Context manager around the calls of one kind, on one thread at a time; measures their durations."""
+
+    __slots__ = ("_calls", "_count", "_longest_s", "_thread", "began", "ended", "op")
+
+    def __init__(self, calls: PolicyCalls, op: str) -> None:
+        self.op = op
+        self._calls = calls
+        self.began = self.ended = 0.0  # times of the last call, s of `PolicyCalls.clock`; for the calling thread only
+        self._thread = 0
+        self._count = 0
+        self._longest_s = 0.0  # longest call; of the warm-up calls only the shortest counts
+
+    def __enter__(self) -> PolicyCall:
+        self._thread = threading.get_ident()
+        self.began = self._calls.clock()
+        self._calls.under_way.add(self)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._calls.under_way.discard(self)
+        self.ended = self._calls.clock()
+        took_s = self.ended - self.began
+        self._count += 1
+        if self._count == _WARM_UP_CALLS:
+            self._longest_s = min(self._longest_s, took_s)
+        elif took_s > self._longest_s:
+            self._longest_s = took_s
+
+    @property
+    def limit_s(self) -> float:
+        """Time limit of the running call or, if none runs, of the next one, s."""
+        limits = self._calls.limits
+        if self.op == LOAD:
+            return limits.load_s
+        if self._count < _WARM_UP_CALLS:
+            return max(limits.act_s, limits.warm_up_s)
+        return max(limits.act_s, _MULTIPLE * self._longest_s)
+
+    @property
+    def lasted_s(self) -> float:
+        """Time since the running call began, s."""
+        return self._calls.clock() - self.began
+
+    def describe(self) -> str:
+        """Return a sentence with the operation, the time that it has taken so far, and its limit."""
+        return (
+            f"the policy has not returned from {self.op!r} for {self.lasted_s:.3g} s; its limit is {self.limit_s:.3g} s"
+        )
+
+    def stack(self) -> str:
+        """Return the stack trace of the calling thread; empty if that thread has ended."""
+        frame = sys._current_frames().get(self._thread)
+        return "" if frame is None else "".join(traceback.format_stack(frame))
+
+
+class PolicyCalls:
+    """The running calls into all policies of a replica, on all threads."""
+
+    def __init__(self, limits: CallLimits | None = None, clock: Callable[[], float] = time.perf_counter) -> None:
+        self.limits = limits or CallLimits()
+        self.clock = clock
+        self.under_way: set[PolicyCall] = set()
+
+    def overdue(self) -> PolicyCall | None:
+        """Return a running call that has exceeded its limit, or None."""
+        return next((call for call in tuple(self.under_way) if call.lasted_s > call.limit_s), None)

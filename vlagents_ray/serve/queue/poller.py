@@ -1,0 +1,142 @@
+"""The poller of the policy's thread: the files that it watches, and the thread that polls while the policy runs.
+
+The policy's thread waits on file descriptors, so that a local client's socket can be one of them: a request then
+reaches the policy without a thread switch. While a batch runs that takes milliseconds, a reader thread polls instead,
+and decodes the next batch. Callbacks run on either thread, never on both at once.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import select
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import Protocol
+
+logger = logging.getLogger(__name__)
+
+
+class HasFileno(Protocol):
+    """A file that a selector can wait for, such as a socket or a pipe."""
+
+    def fileno(self) -> int:
+        """Return the file descriptor."""
+        ...
+
+
+class Poller:
+    """Watches files and a wake-up pipe. One thread owns the poller, and lends it to a reader thread at times."""
+
+    def __init__(self) -> None:
+        self._poll = select.epoll()  # not `selectors`, whose event objects cost as much as the transport of a request
+        self._ready: dict[int, Callable[[], None]] = {}  # callbacks by descriptor
+        self._wake_read, self._wake_write = os.pipe()
+        os.set_blocking(self._wake_read, False)
+        os.set_blocking(self._wake_write, False)
+        self._watch(self._wake_read, self._run_scheduled)
+        self._reader: threading.Thread | None = None  # started for slow policies only
+        self._lent = threading.Event()  # set while the reader thread may poll
+        self._callback_lock = threading.Lock()  # held while the reader runs callbacks
+        self._closed = False
+        self._scheduled: deque[Callable[[], None]] = deque()
+
+    def watch(self, file: HasFileno, ready: Callable[[], None]) -> None:
+        """Call `ready` whenever `file` can be read. Called before the owner's first `poll`, or in a callback."""
+        self._watch(file.fileno(), ready)
+
+    def unwatch(self, file: HasFileno) -> None:
+        """Stop watching `file`. Called in a callback, before the file is closed."""
+        del self._ready[file.fileno()]
+        self._poll.unregister(file)
+
+    def call_soon(self, call: Callable[[], None]) -> None:
+        """Schedule `call` to run as a callback; ignored after `close`. May be called on any thread."""
+        if not self._closed:
+            self._scheduled.append(call)
+            self.wake()
+
+    def wake(self) -> None:
+        """End the current `poll`, or the next one. May be called on any thread."""
+        with contextlib.suppress(BlockingIOError):  # the pipe is full, so that a wake-up is pending already
+            os.write(self._wake_write, b"x")
+
+    def poll(self, timeout_s: float) -> bool:
+        """Wait at most `timeout_s` for watched files or a wake-up call, and run the callbacks of all that are ready.
+
+        Returns:
+            False if there was no event.
+        """
+        events = self._poll.poll(timeout_s)
+        if events:
+            self._call(events)
+        return bool(events)
+
+    def hand_to_reader(self) -> None:
+        """Let the reader thread poll until `reclaim`; the owner must not poll meanwhile."""
+        if self._reader is None:
+            self._reader = threading.Thread(target=self._read, name="policy-reader", daemon=True)
+            self._reader.start()
+        self._lent.set()
+
+    def reclaim(self) -> None:
+        """Take the poller back from the reader thread, after the callback that it is running."""
+        if self._lent.is_set():
+            self._lent.clear()
+            with self._callback_lock:
+                pass
+
+    def close(self) -> None:
+        """End the reader thread and close all descriptors. Called when the owner has ended, or by the owner itself."""
+        self._closed = True
+        if self._reader is not None:
+            self.wake()
+            self._lent.set()
+            self._reader.join()
+        self._poll.close()
+        os.close(self._wake_read)
+        os.close(self._wake_write)
+
+    def _read(self) -> None:
+        # The reader polls the epoll's own descriptor: two threads inside one epoll would take each other's wake-ups.
+        # Events that occur after the owner's `reclaim` are left to the owner: the reader waits until it is lent again.
+        outside = select.poll()
+        outside.register(self._poll, select.POLLIN)
+        while True:
+            self._lent.wait()
+            if self._closed:
+                return
+            outside.poll()
+            with self._callback_lock:
+                if self._lent.is_set() and not self._closed:
+                    self._call(self._poll.poll(0), lent=True)
+
+    def _watch(self, descriptor: int, ready: Callable[[], None]) -> None:
+        self._poll.register(descriptor, select.EPOLLIN)
+        self._ready[descriptor] = ready
+
+    def _call(self, events: list[tuple[int, int]], lent: bool = False) -> None:
+        for descriptor, _ in events:
+            if lent and not self._lent.is_set():
+                return  # the epoll is level-triggered: the owner's next poll reports the remaining events
+            ready = self._ready.get(descriptor)
+            if ready is None:
+                continue  # an earlier callback of this loop has unwatched it
+            try:
+                ready()
+            except Exception:
+                logger.exception("the callback of a watched file failed")
+                if self._ready.pop(descriptor, None) is not None:
+                    with contextlib.suppress(OSError):  # it may be closed already
+                        self._poll.unregister(descriptor)
+
+    def _run_scheduled(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            os.read(self._wake_read, 4096)
+        while self._scheduled:
+            try:
+                self._scheduled.popleft()()
+            except Exception:
+                logger.exception("a scheduled callback failed")

@@ -1,0 +1,158 @@
+"""Prometheus metrics of a replica, through Ray: at the metrics port of its node, with the prefix `ray_`.
+
+| series | kind | tags |
+|---|---|---|
+| `vlagents_requests` | counter | op, transport, class, code ("ok", an error's code, "disconnected") |
+| `vlagents_latency_ms` | histogram | op, transport, class; on the server, successful requests |
+| `vlagents_stage_ms` | histogram | stage (decode, queue, inference, encode), transport; successful acts |
+| `vlagents_batch_size` | histogram | observations in one forward pass |
+| `vlagents_padding_rows` | counter | rows that filled batches up to a fixed size |
+| `vlagents_queue_depth` | gauge | class; requests that wait now |
+| `vlagents_sessions` | gauge | transport; sessions that are held |
+| `vlagents_utilisation` | gauge | share of the last second in which the policy's thread was busy |
+| `vlagents_policy_version` | gauge | newest version of the weights; 0 is the checkpoint that was loaded |
+| `vlagents_weight_push_ms` | histogram | from new weights at the replica that received them until all act with them |
+| `vlagents_hung_calls` | counter | op; calls of the policy that took longer than `limits` allow |
+| `vlagents_keys_unreadable_s` | gauge | time since which the file of API keys cannot be read; 0 if it can |
+
+All series have the tags `application`, `deployment`, `replica` and `policy`. Transport is `shm`, `plasma`, `websocket`,
+`http` or `handle`, class is `robot` or `simulation`. Counters are exact; a histogram takes a random sample of up to 100
+values per second for each kind of request and for the batches.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Iterable, Iterator
+from typing import Any, TypeVar
+
+from ray import serve
+from ray.util.metrics import Counter, Gauge, Histogram
+
+from vlagents_ray.serve.access.api_keys import Keys
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.metrics_buffer import STAGES, Collected, LoadMeter
+
+logger = logging.getLogger(__name__)
+
+PERIOD_S = 1.0
+_SLICE_S = 50e-6
+_PAUSE_S = 300e-6
+_MS = [0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0, 10_000.0]
+_SIZES = [1.0, 2.0, 4.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 128.0, 256.0]
+_TRANSPORTS = ("shm", "plasma", "websocket", "http", "handle")
+
+T = TypeVar("T")
+
+
+class Exporter:
+    """Exports an engine's stats to Ray once a second, on a separate thread, until `close`."""
+
+    def __init__(self, engine: Engine, tags: dict[str, str], keys: Keys | None = None) -> None:
+        """Create the series.
+
+        Args:
+            engine: The engine whose stats are exported.
+            tags: The tags of every series: application, deployment, replica, policy.
+            keys: The API keys of the server; None if it has none.
+        """
+        common = tuple(tags)
+
+        def make(kind: Any, name: str, text: str, *own: str, **options: Any) -> Any:
+            metric = kind(f"vlagents_{name}", description=text, tag_keys=(*common, *own), **options)
+            return metric.set_default_tags(tags)
+
+        self._engine = engine
+        self._requests = make(Counter, "requests", "Requests answered.", "op", "transport", "class", "code")
+        self._latency = make(
+            Histogram, "latency_ms", "Server time of a request.", "op", "transport", "class", boundaries=_MS
+        )
+        self._stage = make(Histogram, "stage_ms", "Time of an act by stage.", "stage", "transport", boundaries=_MS)
+        self._batch = make(Histogram, "batch_size", "Observations in one forward pass.", boundaries=_SIZES)
+        self._padding = make(Counter, "padding_rows", "Rows that filled batches up to a fixed size.")
+        self._depth = make(Gauge, "queue_depth", "Requests that wait.", "class")
+        self._sessions = make(Gauge, "sessions", "Sessions that are held.", "transport")
+        self._utilisation = make(Gauge, "utilisation", "Busy share of the policy's thread.")
+        self._version = make(Gauge, "policy_version", "Newest version of the weights.")
+        self._pushes = make(Histogram, "weight_push_ms", "Time until all replicas act with weights.", boundaries=_MS)
+        self._hung = make(Counter, "hung_calls", "Calls of the policy over their time limit.", "op")
+        self._unreadable = make(Gauge, "keys_unreadable_s", "Time in which the key file could not be read.")
+        self._keys = keys
+        self._meter = LoadMeter(engine.queue)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._loop, name="metrics", daemon=True)
+
+    def start(self) -> None:
+        """Let the engine record its stats, and start to export them."""
+        self._engine.stats.enable()
+        self._thread.start()
+
+    def close(self) -> None:
+        """Export the remaining stats and end the thread."""
+        self._stop.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+
+    def _loop(self) -> None:
+        stopped = False
+        while not stopped:
+            stopped = self._stop.wait(PERIOD_S)
+            try:
+                self.export()
+            except Exception:
+                logger.exception("metrics were not exported")
+
+    def export(self) -> None:
+        """Export the stats since the last call."""
+        self._export_collected(self._engine.stats.collect())
+        for rank, depth in self._engine.queue.depth_by_rank().items():
+            self._depth.set(depth, {"class": rank.name.lower()})
+        sessions = self._engine.sessions.by_transport()
+        for transport in _TRANSPORTS:
+            self._sessions.set(sessions.get(transport, 0), {"transport": transport})
+        self._utilisation.set(self._meter.read().utilisation)
+        for took_ms in self._engine.weights.collect_pushes_ms():
+            self._pushes.observe(took_ms)
+        self._version.set(self._engine.weights.number)
+        self._unreadable.set(0.0 if self._keys is None else self._keys.unreadable_s)
+
+    def _export_collected(self, collected: Collected) -> None:
+        for (op, transport, kind, code), sample in collected.requests.items():
+            what = {"op": op, "transport": transport, "class": kind}
+            self._requests.inc(sample.seen, {**what, "code": code})
+            if code != "ok":
+                continue
+            for total_ms, *stages in _in_slices(sample.values):
+                self._latency.observe(total_ms, what)
+                if op == "act":
+                    for stage, stage_ms in zip(STAGES, stages, strict=True):
+                        self._stage.observe(stage_ms, {"stage": stage, "transport": transport})
+        for observations in _in_slices(collected.batches.values):
+            self._batch.observe(observations)
+        for op, calls in collected.hung.items():
+            self._hung.inc(calls, {"op": op})
+        if collected.padding:
+            self._padding.inc(collected.padding)
+
+
+def _in_slices(values: Iterable[T]) -> Iterator[T]:
+    """Yield each value, with pauses, so that the policy thread never waits long for the interpreter's lock."""
+    until = time.perf_counter() + _SLICE_S
+    for value in values:
+        yield value
+        if time.perf_counter() > until:
+            time.sleep(_PAUSE_S)
+            until = time.perf_counter() + _SLICE_S
+
+
+def tags_of(policy: str) -> dict[str, str]:
+    """Return the tags of Serve's own metrics and the policy's name."""
+    context = serve.get_replica_context()
+    return {
+        "application": context.app_name,
+        "deployment": context.deployment,
+        "replica": context.replica_tag,
+        "policy": policy,
+    }

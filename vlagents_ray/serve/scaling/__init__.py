@@ -1,0 +1,1 @@
+"""Several replicas: autoscaling, the choice of a replica for each session, and moves of sessions between them."""

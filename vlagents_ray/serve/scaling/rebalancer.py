@@ -1,0 +1,157 @@
+"""Balances sessions over the replicas: new sessions go to the least loaded one, and surplus sessions are moved.
+
+A connection over shared memory, plasma, a WebSocket or a Serve handle stays at its replica for as long as it lasts, so
+that a new replica would not relieve the others. Therefore each replica compares its number of sessions with the others'
+every few seconds. If it holds clearly more than its share, it asks some connections to reconnect. Their sessions then
+move as they do when a replica stops (`vlagents_ray.serve.scaling.session_migration`). The load balancer's hash decides
+on the replica of HTTP sessions.
+"""
+
+from __future__ import annotations
+
+import logging
+import random
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, Protocol
+
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.scaling.replica_selection import (
+    ClientLocation,
+    ReplicaLoad,
+    choose_connections,
+    choose_replica,
+    excess_sessions,
+)
+
+logger = logging.getLogger(__name__)
+
+PERIOD_S = 3.0  # interval of the comparisons
+MOVABLE = ("shm", "plasma", "websocket", "handle")  # transports whose connections can be asked to reconnect
+_EXPECTED_S = 3.0  # time after which a client that was sent here is no longer expected
+_SETTLE_S = 6.0  # time for which a connection counts as leaving after it was asked to reconnect
+_RECONNECT_S = 20.0  # shortest time between two requests to reconnect on one connection
+_ACTIVE_S = 30.0  # time since its last request for which a session is active; only replies can ask it to reconnect
+_AT_ONCE = 32  # largest number of sessions to send away after one comparison
+
+
+class Siblings(Protocol):
+    """The other replicas of the application: `vlagents_ray.serve.scaling.sibling_replicas.SiblingReplicas`."""
+
+    def loads(self) -> list[ReplicaLoad]:
+        """Return the loads of the replicas that answer at once."""
+        ...
+
+    def announce_client(self, replica: str) -> Any:
+        """Announce a client to that replica; return a reference to its answer, without waiting for it."""
+        ...
+
+
+class Rebalancer:
+    """Compares the sessions of one replica with those of the others, and places new clients."""
+
+    def __init__(self, engine: Engine, siblings: Siblings, own_load: Callable[[int], ReplicaLoad]) -> None:
+        """Balance the sessions of `engine` with those of `siblings`; `own_load` makes a load of a session count."""
+        self._engine = engine
+        self._siblings = siblings
+        self._own_load = own_load
+        self._expected: deque[float] = deque()  # times at which clients were sent here that have no session yet
+        self._opened = 0
+        self._others: list[ReplicaLoad] = []
+        self._asked_at = float("-inf")  # time at which the others were asked for their loads
+        self._uneven = False  # whether the last comparison found too many sessions here
+        self._lock = threading.Lock()
+        self._placer = ThreadPoolExecutor(1, thread_name_prefix="balance")  # one thread, which places clients in turn
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._loop, name="rebalance", daemon=True)
+
+    def start(self) -> None:
+        """Start the periodic comparisons."""
+        self._thread.start()
+
+    def close(self) -> None:
+        """Stop the comparisons."""
+        self._stop.set()
+        self._placer.shutdown(wait=False, cancel_futures=True)
+
+    def load(self) -> ReplicaLoad:
+        """Return the current load of this replica, including the clients that were sent here."""
+        with self._lock:
+            opened = self._engine.sessions.opened
+            arrived, self._opened = opened - self._opened, opened
+            oldest = time.monotonic() - _EXPECTED_S
+            while self._expected and (arrived > 0 or self._expected[0] < oldest):
+                self._expected.popleft()
+                arrived -= 1
+            return self._own_load(len(self._engine.sessions) + len(self._expected))
+
+    def expect_client(self) -> None:
+        """Record that a client was sent here."""
+        self.load()
+        with self._lock:
+            self._expected.append(time.monotonic())
+
+    def place(self, *places: ClientLocation) -> Future[Any]:
+        """Choose the replica for a new client, and announce the client there.
+
+        Args:
+            *places: Locations of the client in order of preference; the first one that any replica suits is used.
+
+        Returns:
+            A future of the result of `Siblings.announce_client`; of None if the client stays here.
+        """
+        return self._placer.submit(self._place, places, time.monotonic())
+
+    def _place(self, places: Sequence[ClientLocation], arrived: float) -> Any:
+        if arrived > self._asked_at:  # clients that arrived while the others were being asked use those answers
+            try:
+                self._others = self._siblings.loads()
+            except Exception:  # errors of the other replicas must not keep a client from connecting
+                logger.exception("the other replicas could not be asked")
+                self._others = []
+            self._asked_at = time.monotonic()
+        mine = self.load()
+        loads = [mine, *self._others]
+        random.shuffle(loads)  # so that the choice among equally loaded replicas is random
+        chosen = next((found for place in places if (found := choose_replica(loads, place))), None)
+        if chosen is None:
+            return None
+        if chosen is mine:
+            self.expect_client()
+            return None
+        chosen.sessions += 1  # valid until that replica is asked again
+        return self._siblings.announce_client(chosen.replica)
+
+    def _loop(self) -> None:
+        while not self._stop.wait(random.uniform(0.8, 1.2) * PERIOD_S):
+            try:
+                self.compare()
+            except Exception:
+                logger.exception("sessions were not compared")
+
+    def compare(self) -> None:
+        """Compare the loads, and mark connections to drain if there were too many sessions here twice in a row."""
+        drain_list, sessions = self._engine.drain_list, self._engine.sessions
+        drain_list.forget_older(_RECONNECT_S)
+        sessions.drop_idle()
+        mine = self.load()
+        too_many = 0
+        active = sessions.by_connection(MOVABLE, _ACTIVE_S)
+        asked = drain_list.asked_within(_SETTLE_S)
+        if mine.sessions > 1 and mine.accepts:  # a single session is never too many
+            others = [load for load in self._siblings.loads() if load.accepts]
+            if others and all(load.version == mine.version for load in others):
+                gone = sum(count for group, count in active.items() if group in asked)
+                too_many = excess_sessions(mine.sessions, [load.sessions for load in others], gone)
+        if too_many <= 0 or not self._uneven:
+            drain_list.mark(set())
+        else:
+            lately = drain_list.asked_within(_RECONNECT_S)
+            groups = [group for group in active if group not in lately]
+            chosen = choose_connections([active[group] for group in groups], min(too_many, _AT_ONCE))
+            drain_list.mark({groups[index] for index in chosen})
+            logger.info("%d sessions, %d more than a fair share: sending some away", mine.sessions, too_many)
+        self._uneven = too_many > 0

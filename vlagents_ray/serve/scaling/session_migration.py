@@ -1,0 +1,308 @@
+"""Migration of sessions, when a replica stops or the load balancer sends a session's request to another replica.
+
+A replica that gets a request for an unknown session asks the other replicas for it, and continues the session in
+exactly the same state, including instruction, history and random generator. A replica that stops gives its remaining
+sessions to the others.
+
+A move never duplicates or loses a session. It has three steps, of which only the second one changes a session:
+
+1. The new replica creates a copy that cannot act yet.
+2. The old replica releases the session, if that is still in the state of the copy.
+3. The copy becomes the session.
+
+A late or repeated message finds the session in another state (`Version`), and has no effect. The copy waits without a
+time limit until the old replica has answered the second step or has ended; all other calls may time out. If a fault
+leaves several copies, the newest one is the session.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+import threading
+import uuid
+from collections import Counter
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any, TypeVar
+
+from vlagents_ray.errors import VLAgentsError
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.scaling.held_sessions import (
+    ARRIVAL_S,
+    EXPORT_S,
+    ON_ITS_WAY_S,
+    HeldSessions,
+    InThread,
+    Peer,
+    PeerEnded,
+    PeerUnreachable,
+)
+from vlagents_ray.serve.sessions import Version
+
+logger = logging.getLogger(__name__)
+
+_PENDING = 4096  # largest number of concurrent searches of a caller; further requests get `UnknownSession` at once
+_ANSWER_S = 3.0  # time limit for another replica's answer; a replica that still loads does not answer
+_OTHERS_S = 0.3  # time limit for the remaining answers, once a replica has answered that it holds the session
+_SILENT_S = 3.0  # time for which a replica that did not answer is not asked again
+_ATTEMPTS = 5  # number of repeated attempts after which a search is given up, if `ARRIVAL_S` has passed, too
+_LOAD_S = 60.0  # time limit for loading the checkpoint of a fetched session
+_BATCH_S = 0.002  # time for which searches are collected into one question
+_GATHER_S = 0.02  # time for which begun episodes are collected into one announcement
+_AT_ONCE = 16  # largest number of sessions that are handed over, or unpickled, at a time
+
+T = TypeVar("T")
+
+Peers = Callable[[], Awaitable[Sequence[Peer]]]
+_Answers = dict[Peer, "asyncio.Task[dict[str, Version] | None]"]  # each replica's answer with the sessions it holds
+
+
+class SessionMigrator:
+    """Finds sessions at other replicas, takes them over, and gives away those of this replica.
+
+    `held` answers the calls of the other replicas. All work runs on the replica's event loop; `fetch` and `announce`
+    may be called on any thread.
+    """
+
+    def __init__(
+        self,
+        peers: Peers,
+        loop: asyncio.AbstractEventLoop,
+        in_thread: InThread | None = None,
+    ) -> None:
+        """Create the migrator of one replica.
+
+        Args:
+            peers: Returns the other replicas.
+            loop: The replica's event loop.
+            in_thread: Runs a call that takes long (unpickling, loading a checkpoint) on another thread; by default on
+                threads for that purpose only.
+        """
+        self._peers = peers
+        self._threads = ThreadPoolExecutor(_AT_ONCE, thread_name_prefix="session-migration")
+        self._in_thread = in_thread or partial(loop.run_in_executor, self._threads)
+        self._loop = loop
+        self._closed = False
+        self._lock = threading.Lock()
+        self._callbacks: dict[str, list[Callable[[], None]]] = {}  # callbacks by session, until its search is over
+        self._next_query: dict[str, asyncio.Future[_Answers]] = {}  # sessions of the next question
+        self._callers: Counter[str] = Counter()  # number of running searches by caller
+        self._unannounced: dict[str, int] = {}  # steps of begun episodes that are not announced yet, by session
+        self._silent: dict[str, float] = {}  # time until which a silent replica is not asked, by its name
+        self._tasks: set[asyncio.Task[Any]] = set()
+
+    def start(self, engine: Engine) -> None:
+        """Set the engine whose sessions move; this migrator is its `finder`."""
+        self._engine = engine
+        self.held = HeldSessions(engine, self._loop, self._in_thread, self._spawn)
+
+    def fetch(self, session_id: str, then: Callable[[], None], caller: str = "") -> bool:
+        """Fetch a session from another replica.
+
+        Args:
+            session_id: Id of the session.
+            then: Called once the session is here or was not found.
+            caller: Owner of the search; the number of concurrent searches per caller is limited.
+
+        Returns:
+            False if `then` will not be called, since `caller` has too many searches or the migrator is closed.
+        """
+        with self._lock:
+            if self._closed or self._callers[caller] >= _PENDING:
+                return False
+            self._callers[caller] += 1
+
+            def finished() -> None:
+                with self._lock:
+                    self._callers[caller] -= 1
+                    if not self._callers[caller]:
+                        del self._callers[caller]
+                then()
+
+            if session_id in self._callbacks:
+                self._callbacks[session_id].append(finished)
+                return True
+            self._callbacks[session_id] = [finished]
+        self._loop.call_soon_threadsafe(lambda: self._spawn(self._search(session_id)))
+        return True
+
+    def announce(self, session_id: str, step: int) -> None:
+        """Announce to the other replicas that the session began an episode here at that step, so theirs are older."""
+        with self._lock:
+            self._unannounced[session_id] = step
+            if len(self._unannounced) > 1:
+                return
+        self._loop.call_soon_threadsafe(lambda: self._loop.call_later(_GATHER_S, self._announce_all))
+
+    async def hand_over(self) -> int:
+        """Give all sessions to other replicas, since this one stops, and close the queue.
+
+        Returns:
+            The number of sessions that other replicas took over.
+        """
+        slots = asyncio.Semaphore(_AT_ONCE)
+
+        async def transfer(session_id: str, peers: Sequence[Peer]) -> bool:
+            async with slots:
+                return await self.held.send_to_peer(session_id, peers)
+
+        taken, tried = 0, set[tuple[str, Version]]()
+        while True:
+            here = sorted(self._engine.sessions.versions().items() - tried)
+            if not here and not self._callbacks:
+                break
+            tried.update(here)
+            peers = await self._responsive_first() if here else []
+            orders = [peers[i:] + peers[:i] for i in range(max(1, len(peers)))]  # round-robin over the replicas
+            transfers = [transfer(session_id, orders[i % len(orders)]) for i, (session_id, _) in enumerate(here)]
+            taken += sum(await asyncio.gather(*transfers))
+            if not here:  # sessions are still being fetched for earlier requests
+                await asyncio.sleep(ON_ITS_WAY_S)
+        self._closed = True
+        self._engine.queue.close(0.0)  # later requests are refused, so that clients send them to the new replica
+        return taken
+
+    async def _responsive_first(self) -> list[Peer]:
+        """Return the other replicas; those that do not answer at once are last."""
+        answers = {peer: self._spawn(self._query_peer(peer, [])) for peer in await self._peers()}
+        if answers:
+            await asyncio.wait(answers.values(), timeout=_OTHERS_S)
+        return sorted(answers, key=lambda peer: not answers[peer].done() or answers[peer].result() is None)
+
+    async def close(self) -> None:
+        """Cancel all running tasks, and accept no further searches."""
+        self._closed = True
+        for task in list(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        self._threads.shutdown(wait=False, cancel_futures=True)
+
+    async def _search(self, session_id: str) -> None:
+        misses = 0  # consecutive attempts that found no holder; after the second, the session is not moving either
+        try:
+            begun = self._loop.time()
+            for attempt in itertools.count():
+                if attempt:
+                    await asyncio.sleep(ON_ITS_WAY_S)
+                    if self._engine.sessions.held([session_id]):  # another replica has given it to this one
+                        break
+                await self.held.wait_until_left(session_id)
+                holders = await self._holders(session_id, await self._answers(session_id))
+                for version, peer in holders[1:]:
+                    if version < holders[0][0]:
+                        self._spawn(self._answer(peer.drop_older({session_id: holders[0][0][0]})))
+                if holders and await self._move(session_id, holders[0][1]):
+                    break
+                misses = 0 if holders or self.held.is_leaving(session_id) else misses + 1
+                if misses == 2 or (attempt >= _ATTEMPTS and self._loop.time() > begun + ARRIVAL_S):
+                    break
+        except VLAgentsError as error:
+            logger.warning("session %s: %s", session_id, error)
+        except Exception:
+            logger.exception("session %s: could not be fetched", session_id)
+        finally:
+            self._finish(session_id)
+
+    async def _move(self, session_id: str, peer: Peer) -> bool:
+        """Move the session from that replica to this one; False if its state there has changed meanwhile."""
+        state = await self._answer(peer.copy(session_id), EXPORT_S)
+        if state is None:
+            return False
+        arriving = await self._in_thread(self._engine.transfer.prepare, session_id, state, _LOAD_S)
+        version = state["steps"], state["moves"]
+        release = self._spawn(self._answer(peer.release(session_id, version, uuid.uuid4().hex)))
+        while not (await asyncio.wait([release], timeout=_ANSWER_S))[0]:
+            if await self._query_peer(peer, []) is None:  # it hangs: only the copy still waits
+                self._finish(session_id)
+        if not release.result():
+            self._engine.transfer.discard(arriving)
+            return False
+        self._engine.transfer.enter(arriving)
+        logger.info(
+            "session %s: fetched from another replica, after %d acts", session_id, state["steps"] - state["first"]
+        )
+        return True
+
+    def _answers(self, session_id: str) -> asyncio.Future[_Answers]:
+        """Return a future of the other replicas' answers to one question about all sessions that are searched now."""
+        answers: asyncio.Future[_Answers] = self._loop.create_future()
+        if not self._next_query:
+            self._loop.call_later(_BATCH_S, lambda: self._spawn(self._ask_all()))
+        self._next_query[session_id] = answers
+        return answers
+
+    async def _ask_all(self) -> None:
+        query, self._next_query = self._next_query, {}
+        now = self._loop.time()
+        self._silent = {name: until for name, until in self._silent.items() if until > now}
+        answers: _Answers = {}
+        try:
+            asked = [peer for peer in await self._peers() if peer.name not in self._silent]
+            answers = {peer: self._spawn(self._query_peer(peer, list(query))) for peer in asked}
+        finally:
+            for each in query.values():
+                each.set_result(answers)
+
+    async def _query_peer(self, peer: Peer, session_ids: Sequence[str]) -> dict[str, Version] | None:
+        """Return that replica's answer; None if it does not answer in time."""
+        try:
+            return await asyncio.wait_for(peer.held(session_ids), _ANSWER_S)
+        except Exception as error:  # noqa: BLE001 - an error of one replica must not stop the search at the others
+            logger.info("another replica does not answer: %r", error)
+            self._silent[peer.name] = self._loop.time() + _SILENT_S
+            return None
+
+    async def _holders(self, session_id: str, answers: _Answers) -> list[tuple[Version, Peer]]:
+        """Return the replicas that have the session, with its version there, the newest version first."""
+        of = {task: peer for peer, task in answers.items()}
+        found: list[tuple[Version, Peer]] = []
+        waiting = set(of)
+        until = self._loop.time() + _ANSWER_S
+        while waiting:
+            left_s = max(0.0, until - self._loop.time())
+            completed, waiting = await asyncio.wait(waiting, timeout=left_s, return_when=asyncio.FIRST_COMPLETED)
+            if not completed:
+                break
+            for task in completed:
+                if session_id in (said := task.result() or {}):
+                    step, moves = said[session_id]
+                    found.append(((step, moves), of[task]))
+                    until = min(until, self._loop.time() + _OTHERS_S)
+        return sorted(found, key=lambda one: one[0], reverse=True)
+
+    @staticmethod
+    async def _answer(asked: Coroutine[Any, Any, T], timeout_s: float | None = None) -> T | None:
+        """Return another replica's answer; None if that is unknown."""
+        try:
+            return await asyncio.wait_for(asked, timeout_s)
+        except (PeerEnded, PeerUnreachable, asyncio.TimeoutError) as error:
+            logger.info("another replica does not answer: %r", error)
+            return None
+
+    def _announce_all(self) -> None:
+        with self._lock:
+            begun, self._unannounced = self._unannounced, {}
+        if not self._closed:
+            self._spawn(self._drop_older_at_peers(begun))
+
+    async def _drop_older_at_peers(self, steps: dict[str, int]) -> None:
+        for peer in await self._peers():
+            self._spawn(self._answer(peer.drop_older(steps)))
+
+    def _finish(self, session_id: str) -> None:
+        with self._lock:
+            callbacks = self._callbacks.pop(session_id, [])
+        for then in callbacks:
+            try:
+                then()
+            except Exception:
+                logger.exception("session %s: its request could not go on", session_id)
+
+    def _spawn(self, work: Coroutine[Any, Any, Any]) -> asyncio.Task[Any]:
+        task = self._loop.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        return task

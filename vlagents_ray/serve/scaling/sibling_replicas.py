@@ -1,0 +1,159 @@
+"""The other replicas of the same Serve application, called as actors."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
+
+import ray
+from ray import serve
+
+from vlagents_ray.client.transports.serve_handle import call_replica
+from vlagents_ray.errors import VLAgentsError
+from vlagents_ray.serve.scaling.held_sessions import HeldSessions, Peer, PeerEnded, PeerUnreachable
+from vlagents_ray.serve.scaling.replica_selection import ReplicaLoad
+from vlagents_ray.serve.scaling.weight_push import Values, WeightsReplica
+from vlagents_ray.serve.weights.updates import HeldVersion, NewestVersion, PushOptions
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+logger = logging.getLogger(__name__)
+
+_NAMESPACE = "serve"
+_ANSWER_S = 3.0  # default time limit for an answer; a replica that still loads does not answer
+_TRANSFER_S = 600.0  # time limit for an answer that weights are sent with
+_QUICK_S = 0.3  # time limit for an answer while a client waits to connect
+_SILENT_S = 3.0  # time for which a replica that did not answer is not asked for its load again
+
+
+class SiblingApi(Protocol):
+    """The actor methods that the replicas of an application call at each other."""
+
+    async def load(self) -> ReplicaLoad:
+        """Return the replica's load, for comparison with that of others."""
+        ...
+
+    async def expect_client(self) -> tuple[dict[str, Any], Any]:
+        """Expect a client that is sent here; return the metadata for the client, and the actor."""
+        ...
+
+    async def peer(self, method: str, *args: Any) -> Any:
+        """Call the method of that name in `PEER_METHODS`, for moving sessions, and return its result."""
+        ...
+
+
+class _Replica(Peer):
+    def __init__(self, name: str, actor: Any) -> None:
+        self.name = name
+        self._actor = actor
+
+    async def ask(
+        self, method: Callable[Concatenate[HeldSessions, P], Awaitable[T]], *args: P.args, **kwargs: P.kwargs
+    ) -> T:
+        try:
+            found: T = await call_replica(self._actor, SiblingApi.peer, method.__name__, *args)
+        except ray.exceptions.ActorDiedError as error:
+            raise PeerEnded(str(error)) from error
+        except ray.exceptions.RayError as error:  # the network is partitioned, or the server has another version
+            raise PeerUnreachable(str(error)) from error
+        return found
+
+
+class _WeightsOf:
+    """A replica among those of a push: `vlagents_ray.serve.scaling.weight_push.WeightsReplica`."""
+
+    def __init__(self, name: str, actor: Any) -> None:
+        self.name = name
+        self._actor = actor
+
+    async def newest_weights(self) -> NewestVersion:
+        newest: NewestVersion = await self._ask(_ANSWER_S, WeightsReplica.newest_weights)
+        return newest
+
+    async def stage_weights(self, number: int, values: Values, options: PushOptions) -> str:
+        digest: str = await self._ask(_TRANSFER_S, WeightsReplica.stage_weights, number, values, options)
+        return digest
+
+    async def commit_weights(self, number: int, options: PushOptions) -> None:
+        await self._ask(_ANSWER_S, WeightsReplica.commit_weights, number, options)
+
+    async def drop_weights(self, number: int) -> None:
+        await self._ask(_ANSWER_S, WeightsReplica.drop_weights, number)
+
+    async def held_weights(self) -> list[HeldVersion]:
+        held: list[HeldVersion] = await self._ask(_TRANSFER_S, WeightsReplica.held_weights)
+        return held
+
+    async def _ask(self, limit_s: float, method: Callable[..., Awaitable[Any]], *args: Any) -> Any:
+        try:
+            return await asyncio.wait_for(call_replica(self._actor, method, *args), limit_s)
+        except ray.exceptions.ActorDiedError as error:
+            raise PeerEnded(str(error)) from error
+        except ray.exceptions.RayTaskError as error:  # the replica itself raised it
+            raise error.cause if isinstance(error.cause, VLAgentsError) else PeerUnreachable(str(error)) from error
+        except (ray.exceptions.RayError, TimeoutError, asyncio.TimeoutError) as error:
+            raise PeerUnreachable(str(error) or f"no answer within {limit_s:g} s") from error
+
+
+class SiblingReplicas:
+    """Calls the other replicas of the application; each call looks them up again, since their set changes."""
+
+    def __init__(self) -> None:
+        context = serve.get_replica_context()
+        self._prefix = f"SERVE_REPLICA::{context.app_name}#{context.deployment}#"
+        self.own_name = context.replica_id.to_full_id_str()
+        self._silent: dict[str, float] = {}  # time until which a silent replica is not asked, by its name
+
+    async def others(self) -> list[_Replica]:
+        """Return all other replicas, for moving sessions."""
+        return await asyncio.to_thread(lambda: [_Replica(name, actor) for name, actor in self._actors()])
+
+    async def other_weights(self) -> list[_WeightsOf]:
+        """Return all other replicas, for pushes of weights."""
+        return await asyncio.to_thread(lambda: [_WeightsOf(name, actor) for name, actor in self._actors()])
+
+    def loads(self) -> list[ReplicaLoad]:
+        """Return the loads of the replicas that answer within 0.3 s."""
+        now = time.monotonic()
+        self._silent = {name: until for name, until in self._silent.items() if until > now}
+        responsive = [(name, actor) for name, actor in self._actors() if name not in self._silent]
+        asked = {call_replica(actor, SiblingApi.load): name for name, actor in responsive}
+        if not asked:
+            return []
+        ready, late = ray.wait(list(asked), num_returns=len(asked), timeout=_QUICK_S)
+        for reference in late:
+            self._silent[asked[reference]] = now + _SILENT_S
+        return [load for reference in ready if (load := _result(reference)) is not None]
+
+    def announce_client(self, replica: str) -> Any:
+        """Announce a client to another replica; return the reference for `answer`, or None if that replica ended."""
+        try:
+            return call_replica(ray.get_actor(replica, namespace=_NAMESPACE), SiblingApi.expect_client)
+        except ValueError:  # the replica has ended meanwhile
+            return None
+
+    @staticmethod
+    def answer(reference: Any) -> Any:
+        """Wait for the other replica's answer to the client; None if it does not answer within 0.3 s."""
+        return _result(reference, _QUICK_S)
+
+    def _actors(self) -> Iterator[tuple[str, Any]]:
+        for entry in ray.util.list_named_actors(all_namespaces=True):
+            name = entry["name"]
+            if entry["namespace"] == _NAMESPACE and name.startswith(self._prefix) and name != self.own_name:
+                try:
+                    yield name, ray.get_actor(name, namespace=_NAMESPACE)
+                except ValueError:  # the replica has ended meanwhile
+                    continue
+
+
+def _result(reference: Any, timeout_s: float = _ANSWER_S) -> Any:
+    try:
+        return ray.get(reference, timeout=timeout_s)
+    except (ray.exceptions.RayError, TimeoutError) as error:
+        logger.info("another replica does not answer: %s", error)
+        return None

@@ -1,0 +1,226 @@
+"""New weights for all replicas of an application: every replica holds a version before any acts with it.
+
+The replica that receives a push coordinates it. It stages the version at all replicas, and commits it only if all of
+them hold it; otherwise it drops it again, and nothing has changed. A replica that starts later, or that has missed a
+commit, takes the versions of the others (`WeightPusher.catch_up`). If the coordinator dies between the phases, the
+replicas drop what they have staged by themselves; if it dies among the commits, those that missed theirs catch up.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
+from typing import Any, Protocol, TypeVar
+
+from vlagents_ray.errors import InvalidWeights, PolicyUnavailable, VLAgentsError
+from vlagents_ray.serve.scaling.held_sessions import PeerEnded, PeerUnreachable
+from vlagents_ray.serve.weights.updates import HeldVersion, NewestVersion, PushOptions, PushResult, WeightUpdates
+
+T = TypeVar("T")
+
+Values = Mapping[str, Any] | list[Awaitable[Mapping[str, Any]]]
+"""Values by name, or a list of one reference to them in Ray's object store, which each replica reads in place."""
+
+logger = logging.getLogger(__name__)
+
+_ATTEMPTS = 3  # at the commit of a replica that cannot be reached
+
+
+class WeightsReplica(Protocol):
+    """A replica as a push sees it. Its methods raise `PeerEnded` and `PeerUnreachable` beside their own errors."""
+
+    @property
+    def name(self) -> str:
+        """Name of the replica, for messages."""
+        ...
+
+    async def newest_weights(self) -> NewestVersion:
+        """Return the newest version that acts."""
+        ...
+
+    async def stage_weights(self, number: int, values: Values, options: PushOptions) -> str:
+        """Check and hold a version, and return the fingerprint of what is held."""
+        ...
+
+    async def commit_weights(self, number: int, options: PushOptions) -> None:
+        """Act with the staged version."""
+        ...
+
+    async def drop_weights(self, number: int) -> None:
+        """Drop the staged version."""
+        ...
+
+    async def held_weights(self) -> list[HeldVersion]:
+        """Return the pushed versions that new episodes act with, for a replica that lacks them."""
+        ...
+
+
+class OwnWeights:
+    """This replica among those of a push."""
+
+    def __init__(self, name: str, updates: WeightUpdates) -> None:
+        """Let pushes update the weights of this replica's engine."""
+        self._name = name
+        self._updates = updates
+
+    @property
+    def name(self) -> str:
+        """Name of the replica, for messages."""
+        return self._name
+
+    def pushed(self, took_ms: float) -> None:
+        """Note the duration of a push that this replica coordinated."""
+        self._updates.pushed(took_ms)
+
+    async def newest_weights(self) -> NewestVersion:
+        """Return the newest version that acts."""
+        return self._updates.newest
+
+    async def stage_weights(self, number: int, values: Values, options: PushOptions) -> str:
+        """Check and hold a version on another thread, since that takes long, and return its fingerprint."""
+        named = values if isinstance(values, Mapping) else await values[0]
+        return await asyncio.to_thread(self._updates.stage, number, named, options)
+
+    async def commit_weights(self, number: int, options: PushOptions) -> None:
+        """Act with the staged version."""
+        self._updates.commit(number, options)
+
+    async def drop_weights(self, number: int) -> None:
+        """Drop the staged version."""
+        self._updates.drop(number)
+
+    async def held_weights(self) -> list[HeldVersion]:
+        """Return the pushed versions that new episodes act with, for a replica that lacks them."""
+        return await asyncio.to_thread(self._updates.held)
+
+
+class WeightPusher:
+    """Pushes new weights to all replicas, on the event loop of one of them."""
+
+    def __init__(self, own: OwnWeights, others: Callable[[], Awaitable[Sequence[WeightsReplica]]]) -> None:
+        """Push to the `own` replica and to the `others`, which are looked up for each push."""
+        self._own = own
+        self._others = others
+        self._pushing = asyncio.Lock()
+        self._known: set[str] = set()  # names of replicas that have answered
+
+    async def push(self, values: Values, options: PushOptions) -> PushResult:
+        """Let all replicas act with new weights.
+
+        Args:
+            values: The values: numpy arrays, as `vlagents_ray.weights.trainable.portable` returns them.
+            options: When sessions change, and what is allowed.
+
+        Returns:
+            The version, and the replicas that act with it.
+
+        Raises:
+            VLAgentsError: A replica refused the version. None acts with it.
+            PolicyUnavailable: A replica cannot be reached. None acts with the version.
+        """
+        begun = time.perf_counter()
+        async with self._pushing:
+            newest = {self._own: await self._own.newest_weights(), **await self._loaded(await self._others())}
+            if len({one.model for one in newest.values()}) > 1:
+                raise PolicyUnavailable("weights: the replicas are changing their checkpoint; push again in a while")
+            number = max(one.number for one in newest.values()) + 1
+            staged: dict[WeightsReplica, str] = {}
+
+            async def stage(replica: WeightsReplica) -> None:
+                staged[replica] = await replica.stage_weights(number, values, options)
+
+            try:
+                await self._all(newest, stage)
+                if len(found := set(staged.values())) > 1:
+                    raise InvalidWeights(
+                        f"weights: the replicas hold different values, {sorted(found)}; push them again"
+                    )
+            except BaseException:
+                # Where staging failed, another push may have staged a version of the same number.
+                await asyncio.gather(*(one.drop_weights(number) for one in staged), return_exceptions=True)
+                raise
+            done = await asyncio.gather(*(self._commit(replica, number, options) for replica in staged))
+            self._own.pushed(1e3 * (time.perf_counter() - begun))
+            acting = sorted(replica.name for replica, acts in zip(staged, done, strict=True) if acts)
+            return PushResult(number, staged[self._own], tuple(acting))
+
+    async def catch_up(self) -> int:
+        """Take the newest versions of the other replicas, if they are newer; return the own newest one after that.
+
+        A replica calls this before it is ready, and regularly, since it may have missed a commit.
+        """
+        async with self._pushing:
+            own = best = await self._own.newest_weights()
+            source = None
+            for replica in await self._others():
+                try:
+                    newest = await replica.newest_weights()
+                except (PeerEnded, PeerUnreachable, VLAgentsError):  # it knows no better than this one
+                    continue
+                if newest.number > best.number and newest.model == own.model:
+                    best, source = newest, replica
+            if source is None:
+                return own.number
+            for version in await source.held_weights():
+                if version.number > own.number:
+                    options = PushOptions(allow_same=True, pin=version.pinned)
+                    await self._own.stage_weights(version.number, version.values, options)
+                    await self._own.commit_weights(version.number, options)
+            logger.info("took version %d of the weights from %s", best.number, source.name)
+            return (await self._own.newest_weights()).number
+
+    async def _commit(self, replica: WeightsReplica, number: int, options: PushOptions) -> bool:
+        """Commit at one replica, and return whether it acts with the version; otherwise it will catch up."""
+        for _ in range(_ATTEMPTS):
+            try:
+                await replica.commit_weights(number, options)
+            except PeerEnded:
+                return False
+            except PeerUnreachable as error:
+                logger.warning("version %d of the weights: %s has not committed: %s", number, replica.name, error)
+            else:
+                return True
+        return False
+
+    async def _loaded(self, replicas: Sequence[WeightsReplica]) -> dict[WeightsReplica, NewestVersion]:
+        """Return the newest versions of the replicas that have loaded their policy; the others will catch up.
+
+        A replica does not answer while it loads. One that has answered before has loaded, and cannot be reached.
+        """
+        found: dict[WeightsReplica, NewestVersion] = {}
+        answers = await asyncio.gather(*(one.newest_weights() for one in replicas), return_exceptions=True)
+        for replica, answer in zip(replicas, answers, strict=True):
+            if isinstance(answer, NewestVersion):
+                found[replica] = answer
+            elif isinstance(answer, PeerUnreachable) and replica.name in self._known:
+                raise _unreachable(replica) from answer
+            elif not isinstance(answer, PeerEnded | PeerUnreachable | PolicyUnavailable):
+                raise answer
+        self._known = {replica.name for replica in found}
+        return found
+
+    @staticmethod
+    async def _all(
+        replicas: Iterable[WeightsReplica], call: Callable[[WeightsReplica], Awaitable[T]]
+    ) -> dict[WeightsReplica, T]:
+        """Call all replicas, and return the results of those that have not ended; raises the first error after all."""
+        replicas = list(replicas)
+        results = await asyncio.gather(*map(call, replicas), return_exceptions=True)
+        found: dict[WeightsReplica, T] = {}
+        for replica, result in zip(replicas, results, strict=True):
+            if isinstance(result, PeerUnreachable):
+                raise _unreachable(replica) from result
+            if isinstance(result, BaseException):
+                if not isinstance(result, PeerEnded):
+                    raise result
+            else:
+                found[replica] = result
+        return found
+
+
+def _unreachable(replica: WeightsReplica) -> PolicyUnavailable:
+    return PolicyUnavailable(
+        f"weights: replica {replica.name} cannot be reached, so that nothing was changed; push again"
+    )

@@ -1,0 +1,268 @@
+"""The versions of one model's weights: which are held, which one its agent has now, and which one a session acts with.
+
+Version 0 is the checkpoint that was loaded. A learner stages a version, which is checked and held but does not act, and
+commits it later, once all replicas hold it. Nothing is copied or loaded at the commit: before a batch, a reset or an
+observation, the policy's thread makes the version of these sessions the agent's own (`ModelWeights.use`), which takes
+no time if it is that already. A version is freed when no session acts with it and it is neither the newest nor pinned.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, Protocol
+from weakref import WeakValueDictionary
+
+from vlagents_ray.errors import NotTrainable, Overloaded, UnknownSession, WeightsNotStaged
+from vlagents_ray.interface import POLICY, Agent
+from vlagents_ray.weights.check import fingerprint, fitted, require_fit
+from vlagents_ray.weights.safetensors import ValueSpec
+from vlagents_ray.weights.trainable import is_copied, own_copy, portable
+
+DIGITS = 16  # of a fingerprint, hexadecimal
+STAGED_S = 60.0  # time for which a staged version waits for its commit, s
+
+PushMode = Literal["keep", "next_episode", "wait"]
+"""When a session changes to a new version: between two of its acts; at its next reset; or once the episodes of all
+sessions have ended, until when resets wait."""
+
+
+class WeightsVersion:
+    """One version of a model's weights."""
+
+    __slots__ = ("__weakref__", "fingerprint", "info", "number", "values")
+
+    def __init__(self, number: int, digest: str, values: dict[str, Any] | None) -> None:
+        self.number = number
+        self.fingerprint = digest
+        self.values = values  # by name; None if the agent alone holds them
+        self.info = {POLICY: {"version": number, "fingerprint": digest}}  # for the info of each act
+
+    def describe(self) -> dict[str, Any]:
+        """Return number and fingerprint, for the metadata."""
+        return dict(self.info[POLICY])
+
+
+class FollowingSession(Protocol):
+    """What the versions need of a session."""
+
+    weights: WeightsVersion | None  # with which it acts; None without an episode
+    follows: bool  # whether it takes the newest version, otherwise the pinned one
+
+
+@dataclass(frozen=True, slots=True)
+class _Commit:
+    number: int
+    sessions: Callable[[], Iterable[FollowingSession]]
+    pin: bool
+
+
+class ModelWeights:
+    """The versions of one model. Thread-safe, but for `use`, which runs on the policy's thread."""
+
+    def __init__(self, agent: Agent, busy: threading.Lock, digest: str = "", model: tuple[str, str] = ("", "")) -> None:
+        """Take the weights of an initialized agent as version 0.
+
+        Args:
+            agent: The agent, which acts with one version at a time.
+            busy: The lock that is held while the agent runs.
+            digest: The fingerprint for an agent that names no parameters, whose files may be known.
+            model: What is equal in replicas that loaded the same checkpoint with the same settings.
+        """
+        self.model = model
+        self._agent, self._busy = agent, busy
+        self._lock = threading.Lock()
+        try:
+            values: dict[str, Any] | None = agent.parameters()
+        except NotTrainable as error:
+            self._refusal: NotTrainable | None = error
+            first, self._in_place = WeightsVersion(0, digest, None), False
+        else:
+            self._refusal = None
+            # An agent of its own ways may copy as well, so that references to old values do not last.
+            self._in_place = type(agent).load_parameters is not Agent.load_parameters or is_copied(values or {})
+            first = WeightsVersion(0, fingerprint(values or {}), None if self._in_place else values)
+        self.newest = self.pinned = first
+        self._staged: WeightsVersion | None = None
+        self._timer: threading.Timer | None = None
+        self._waiting: _Commit | None = None  # of the staged version, once the running episodes have ended
+        self._live: WeightsVersion | None = first  # which the agent has; None if it could not be loaded
+        self._alive = WeakValueDictionary({0: first})
+
+    def begin(self, session: FollowingSession, *, follows: bool) -> WeightsVersion:
+        """Let a session act with the newest or the pinned version in its next episode, and return that version."""
+        with self._lock:
+            session.follows = follows
+            session.weights = version = self.newest if follows else self.pinned
+            return version
+
+    def find(self, number: int, digest: str) -> WeightsVersion:
+        """Return the version of a session from another replica; raises `UnknownSession` if it is not held here."""
+        version = self._alive.get(number)
+        if version is None or version.fingerprint != digest or version is self._staged:
+            raise UnknownSession(f"version {number} of the weights ({digest}) is not held here; reset the session")
+        return version
+
+    def use(self, version: WeightsVersion) -> None:
+        """Make a version the agent's own. Called with `busy` held, on the policy's thread."""
+        if version is self._live:
+            return
+        live, self._live = self._live, None
+        if self._in_place and live is not None and live.values is None:
+            live.values = self._copies()
+        if version.values is not None:  # otherwise the agent still has them: a copy of them failed
+            self._agent.load_parameters(version.values)
+        self._live = version
+        if self._in_place:
+            version.values = None
+
+    def require_fit(self, announced: Mapping[str, ValueSpec], *, partial: bool = False) -> None:
+        """Check values before they arrive.
+
+        Args:
+            announced: Their types and shapes, by name.
+            partial: Whether names may be missing.
+
+        Raises:
+            NotTrainable: The agent names no parameters.
+            InvalidWeights: They do not fit.
+        """
+        if self._refusal is not None:
+            raise self._refusal
+        held = self.newest.values
+        if held is None:
+            with self._busy:
+                held = self._agent.parameters()
+        require_fit(held, announced, partial=partial)
+
+    def stage(self, number: int, pushed: Mapping[str, Any], *, partial: bool = False, allow_same: bool = False) -> str:
+        """Check a new version and hold it, without acting with it; return its fingerprint.
+
+        It is dropped unless it is committed within a minute, since its learner may have died.
+
+        Args:
+            number: The number of the version, above that of the newest one.
+            pushed: Its values, by name.
+            partial: Whether values of missing names are those of the newest version.
+            allow_same: Whether all values may equal those of the newest version.
+
+        Raises:
+            NotTrainable: The agent names no parameters.
+            Overloaded: Another version is staged, or the number is not above that of the newest version.
+            InvalidWeights: The values do not fit.
+            UnchangedWeights: The values equal those of the newest version.
+        """
+        if self._refusal is not None:
+            raise self._refusal
+        placeholder = WeightsVersion(number, "", None)
+        with self._lock:
+            newest = self.newest
+            if number <= newest.number:
+                raise Overloaded(
+                    f"weights: got version {number}, want one above {newest.number}, the newest here: another push was "
+                    f"faster; push again"
+                )
+            if self._staged is not None:
+                raise Overloaded(
+                    "weights: another push is under way, or waits for the end of episodes; push again when it is over"
+                )
+            self._staged = placeholder
+        try:
+            values = fitted(self._values(newest), pushed, partial=partial, allow_same=allow_same)
+            staged = WeightsVersion(number, fingerprint(values), values)
+        except BaseException:
+            self.drop(number)
+            raise
+        with self._lock:
+            if self._staged is not placeholder:
+                raise WeightsNotStaged(f"weights: version {number} was dropped while it was checked; push it again")
+            self._staged = staged
+            self._timer = threading.Timer(STAGED_S, self.drop, (number,))
+            self._timer.daemon = True
+            self._timer.start()
+        return staged.fingerprint
+
+    def commit(
+        self, number: int, mode: PushMode, sessions: Callable[[], Iterable[FollowingSession]], *, pin: bool = False
+    ) -> None:
+        """Act with a staged version from now on. A commit of the newest version does nothing, so it can be repeated.
+
+        Args:
+            number: The number of the version.
+            mode: When sessions that follow change to it.
+            sessions: Returns the sessions of the replica, without a lock.
+            pin: Whether sessions that do not follow also get it, at their next reset.
+
+        Raises:
+            WeightsNotStaged: It is neither staged nor the newest.
+        """
+        with self._lock:
+            if self.newest.number == number or (self._waiting is not None and self._waiting.number == number):
+                return
+            if self._staged is None or self._staged.number != number or self._staged.values is None:
+                raise WeightsNotStaged(
+                    f"weights: version {number} is not staged here; push it again, and commit within {STAGED_S:g} s"
+                )
+            self._stop_timer()
+            self._waiting = _Commit(number, sessions, pin)
+            if mode != "wait":
+                self._finish(self._waiting)
+            if mode == "keep":
+                for session in self._running(sessions):
+                    session.weights = self.newest
+        self.settle()
+
+    def settle(self) -> bool:
+        """Finish a commit that waits for the end of all episodes, if they have ended; return whether none waits."""
+        if self._waiting is None:
+            return True
+        with self._lock:
+            if self._waiting is not None and not self._running(self._waiting.sessions):
+                self._finish(self._waiting)
+            return self._waiting is None
+
+    def _finish(self, commit: _Commit) -> None:
+        if self._staged is not None:
+            self.newest = self._alive[commit.number] = self._staged
+        if commit.pin:
+            self.pinned = self.newest
+        self._forget_staged()
+
+    def _running(self, sessions: Callable[[], Iterable[FollowingSession]]) -> list[FollowingSession]:
+        """Return the sessions that follow and have an episode with a version of this model."""
+        return [
+            session
+            for session in sessions()
+            if session.follows
+            and (weights := session.weights) is not None
+            and self._alive.get(weights.number) is weights
+        ]
+
+    def drop(self, number: int) -> None:
+        """Drop a staged version; the last committed one stays."""
+        with self._lock:
+            if self._staged is not None and self._staged.number == number:
+                self._forget_staged()
+
+    def portable_values(self, version: WeightsVersion) -> dict[str, Any]:
+        """Return the values of a version as numpy arrays, for another process."""
+        return {name: portable(value) for name, value in self._values(version).items()}
+
+    def _forget_staged(self) -> None:
+        self._staged = self._waiting = None
+        self._stop_timer()
+
+    def _stop_timer(self) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+
+    def _values(self, version: WeightsVersion) -> dict[str, Any]:
+        if (values := version.values) is not None:
+            return values
+        with self._busy:  # otherwise another version could become the agent's own meanwhile
+            return self._copies() if version.values is None else version.values
+
+    def _copies(self) -> dict[str, Any]:
+        return {name: own_copy(value) for name, value in self._agent.parameters().items()}

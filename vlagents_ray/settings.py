@@ -1,0 +1,130 @@
+"""Error messages for wrong settings, with the known settings and the one that was probably meant."""
+
+from __future__ import annotations
+
+import inspect
+import numbers
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from types import UnionType
+from typing import Any, Union, get_args, get_origin, get_type_hints
+
+import numpy as np
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.naming import did_you_mean
+
+# The types of the values that a plain type allows: also numpy's, and whole numbers for a float, as YAML reads 1 as int.
+_PLAIN: dict[type, tuple[type, ...]] = {
+    bool: (bool, np.bool_),
+    int: (numbers.Integral,),
+    float: (numbers.Real,),
+    str: (str,),
+    type(None): (type(None),),
+}
+
+
+def require_arguments(what: str, function: Callable[..., Any], given: Mapping[str, Any]) -> None:
+    """Raise `ConfigError` unless a function takes these keyword arguments.
+
+    The type of a value is compared with its parameter's annotation, or with the default if there is no annotation. Only
+    numbers, strings, booleans and None are compared; values of other types are left to the function.
+
+    Args:
+        what: The object that the function makes, for the message.
+        function: The function or class that will be called.
+        given: The keyword arguments.
+    """
+    signature = inspect.signature(function)
+    try:
+        signature.bind(**given)
+    except TypeError as error:
+        takes = [name for name in signature.parameters if name != "self"]
+        unknown = (name for name in given if name not in takes)
+        meant = next(filter(None, (did_you_mean(name, takes) for name in unknown)), "")
+        raise ConfigError(f"{what}: {error}; it takes {sorted(takes)}{meant}") from error
+    annotations = _annotations(function)
+    for name, value in given.items():
+        parameter = signature.parameters.get(name)
+        if parameter is None or value is parameter.default:  # a value for **kwargs, or the default itself
+            continue
+        kinds = _kinds(annotations[name]) if name in annotations else _kinds_of_default(parameter.default)
+        if kinds and not any(_is(value, kind) for kind in kinds):
+            wanted = " or ".join("None" if kind is type(None) else kind.__name__ for kind in kinds)
+            raise ConfigError(f"{what}: {name}: got {value!r}, want {wanted}")
+
+
+def _annotations(function: Callable[..., Any]) -> Mapping[str, Any]:
+    """Return the annotations of the parameters; an empty mapping if they name types that cannot be found."""
+    annotated = function.__init__ if isinstance(function, type) else function  # type: ignore[misc]
+    try:
+        return get_type_hints(annotated)
+    except (NameError, TypeError, AttributeError):
+        return {}
+
+
+def _kinds(annotation: Any) -> list[type]:
+    """List the plain types that an annotation allows; empty if it allows any other type."""
+    kinds = list(get_args(annotation)) if get_origin(annotation) in (Union, UnionType) else [annotation]
+    return kinds if all(isinstance(kind, type) and kind in _PLAIN for kind in kinds) else []
+
+
+def _kinds_of_default(default: Any) -> list[type]:
+    """List the plain types for a parameter without annotation; the default 1 allows 0.5 as well."""
+    if isinstance(default, (int, float)) and not isinstance(default, bool):
+        return [float]
+    return [type(default)] if isinstance(default, (bool, str)) else []
+
+
+def _is(value: Any, kind: type) -> bool:
+    """Whether a value is of a plain type; a boolean does not count as a number."""
+    return isinstance(value, _PLAIN[kind]) and (kind is bool or not isinstance(value, bool))
+
+
+def wrong_settings(error: ValueError, model: type | None = None) -> str:
+    """Return the message of an error about settings.
+
+    Args:
+        error: An error; if it is pydantic's, the message has a line for each wrong setting, without the values, which
+            may be secrets.
+        model: The pydantic model of the settings, whose fields are listed if one is unknown.
+
+    Returns:
+        The message.
+    """
+    listed: Callable[[], Sequence[Mapping[str, Any]]] | None = getattr(error, "errors", None)
+    if listed is None:
+        return str(error)
+    lines = [_sentence(item, model) for item in listed()]
+    return lines[0] if len(lines) == 1 else "\n" + "\n".join(f"- {line}" for line in lines)
+
+
+def _sentence(item: Mapping[str, Any], model: type | None) -> str:
+    where = ".".join(map(str, item["loc"]))
+    message = str(item["msg"]).removeprefix("Value error, ")
+    if item["type"] == "extra_forbidden":
+        takes = sorted(_fields(model, item["loc"][:-1]))
+        message = "there is no such setting"
+        if takes:
+            message += f"; want one of {takes}{did_you_mean(str(item['loc'][-1]), takes)}"
+    return f"{where}: {message}" if where else message
+
+
+def _fields(model: type | None, place: Iterable[Any]) -> Mapping[str, Any]:
+    """Return the fields at a place below `model`; empty if they cannot be determined."""
+    for name in place:
+        field = _of(model).get(name)
+        model = None if field is None else next(filter(_of, _parts(field.annotation)), None)
+    return _of(model)
+
+
+def _of(model: type | None) -> Mapping[str, Any]:
+    """The fields of a model; of one whose fields are registered names, those."""
+    registered: Callable[[], Mapping[str, Any]] | None = getattr(model, "registered_fields", None)
+    return getattr(model, "model_fields", {}) if registered is None else registered()
+
+
+def _parts(annotation: Any) -> Iterator[Any]:
+    """Yield a type and its arguments, recursively: `Batch` of `Batch | None`."""
+    yield annotation
+    for one in get_args(annotation):
+        yield from _parts(one)

@@ -1,0 +1,1 @@
+"""The trainable parameters of a policy by name: reading, checking and replacing them."""

@@ -1,0 +1,128 @@
+"""Whether pushed values fit the ones that a policy holds, and a digest of what it holds."""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import InvalidWeights, UnchangedWeights
+from vlagents_ray.weights.trainable import converted, dtype_name, is_array
+
+_SHOWN = 5  # faults in a message
+_SAMPLED = 1024  # most elements of each value that the fingerprint covers
+_KINDS = (("float", "bfloat"), ("int", "uint"), ("bool",), ("complex",))
+
+
+def fitted(
+    held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: bool = False, allow_same: bool = False
+) -> dict[str, Any]:
+    """Return the complete values of the new version, converted to the types and devices of those held.
+
+    Args:
+        held: The values that the policy has now, by name.
+        pushed: The new values, by name: numpy or JAX arrays or torch tensors, on any device.
+        partial: Whether names may be missing, whose values stay, as in a push of adapters alone.
+        allow_same: Whether all values may equal those held.
+
+    Returns:
+        The values of all names; those of missing names are the objects held.
+
+    Raises:
+        InvalidWeights: A name is unknown or missing, or a value has another shape or kind of type, or is not finite.
+        UnchangedWeights: All values equal those held, and `allow_same` is not set.
+    """
+    require_fit(held, pushed, partial=partial)
+    new = {name: converted(value, held[name]) for name, value in pushed.items()}
+    _refuse([f"{name!r}: got NaN or infinite values, want finite ones" for name in new if not _is_finite(new[name])])
+    if not allow_same and all(_is_equal(value, held[name]) for name, value in new.items()):
+        raise UnchangedWeights(
+            f"weights: all {len(new)} values equal those that the policy holds; push what the optimizer changes, "
+            f"or allow it with allow_same=True"
+        )
+    return {name: new.get(name, value) for name, value in held.items()}
+
+
+def require_fit(held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: bool = False) -> None:
+    """Raise `InvalidWeights` if a name is unknown or missing, or a value has another shape or kind of type.
+
+    Args:
+        held: The values that the policy has now, by name.
+        pushed: The new values, or their `vlagents_ray.weights.safetensors.ValueSpec`.
+        partial: Whether names may be missing.
+    """
+    faults = [f"{name!r}: unknown, want one of the policy's {len(held)} names" for name in pushed if name not in held]
+    if not partial:
+        faults += [f"{name!r}: missing; push it, or set partial=True" for name in held if name not in pushed]
+    elif not pushed:
+        faults += ["no value: push at least one"]
+    faults += [fault for name in pushed if name in held and (fault := _misfit(name, pushed[name], held[name]))]
+    _refuse(faults)
+
+
+def fingerprint(named: Mapping[str, Any]) -> str:
+    """Return a digest of 16 hexadecimal characters over names, shapes, types and at most 1024 elements of each value.
+
+    Args:
+        named: Values by name, on any device.
+    """
+    found = hashlib.blake2b(digest_size=8)
+    for name in sorted(named):
+        value = named[name]
+        found.update(f"{name} {dtype_name(value)} {tuple(value.shape)}\n".encode())
+        found.update(_sampled_bytes(value))
+    return found.hexdigest()
+
+
+def _refuse(faults: list[str]) -> None:
+    if faults:
+        more = f"; and {len(faults) - _SHOWN} more" if len(faults) > _SHOWN else ""
+        raise InvalidWeights(f"weights, of which nothing was changed: {'; '.join(faults[:_SHOWN])}{more}")
+
+
+def _misfit(name: str, pushed: Any, held: Any) -> str | None:
+    if not is_array(pushed):
+        return f"{name!r}: got {type(pushed).__name__}, want an array"
+    if tuple(pushed.shape) != tuple(held.shape):
+        return f"{name!r}: got shape {tuple(pushed.shape)}, want {tuple(held.shape)}"
+    if _kind(dtype_name(pushed)) != _kind(dtype_name(held)):
+        return f"{name!r}: got {dtype_name(pushed)}, want {dtype_name(held)}"
+    return None
+
+
+def _kind(dtype: str) -> Any:
+    """Return what is equal for types of one kind: precisions are converted, kinds are not."""
+    return next((kind for kind in _KINDS if dtype.startswith(kind)), dtype)
+
+
+def _is_finite(value: Any) -> bool:
+    if not dtype_name(value).startswith(("float", "bfloat", "complex")) or not _size(value):
+        return True
+    if isinstance(value, np.ndarray):
+        with np.errstate(over="ignore", invalid="ignore"):
+            # Minimum and maximum need no array of booleans, which would take a quarter of the value's memory.
+            return bool(np.isfinite(value.min()) and np.isfinite(value.max()))
+    torch = sys.modules.get("torch")
+    library = torch if torch is not None and isinstance(value, torch.Tensor) else sys.modules["jax"].numpy
+    return bool(library.isfinite(value).all())
+
+
+def _is_equal(new: Any, held: Any) -> bool:
+    if isinstance(new, np.ndarray):
+        return np.array_equal(new, held)
+    return bool((new == held).all())
+
+
+def _size(value: Any) -> int:
+    return int(np.prod(value.shape, dtype=np.int64))
+
+
+def _sampled_bytes(value: Any) -> bytes:
+    flat = value.reshape(-1)[:: max(1, -(-_size(value) // _SAMPLED))]
+    torch = sys.modules.get("torch")
+    if torch is not None and isinstance(flat, torch.Tensor):
+        flat = flat.detach().contiguous().cpu().view(torch.uint8).numpy()
+    return np.ascontiguousarray(flat).tobytes()

@@ -1,0 +1,195 @@
+"""The safetensors format: a header in JSON, with type, shape and place of each value, and then their bytes.
+
+It holds numbers only, so that reading it executes nothing. A reader checks the whole header before it allocates memory
+for any value. See https://huggingface.co/docs/safetensors for the format.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import struct
+from collections import deque
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import InvalidWeights, MalformedMessage
+
+MESSAGE_BYTES = 2**22  # longest message with weights: a header (some 40,000 values), or a part of their bytes
+PART_BYTES = 2**20  # of a part that is sent: while a replica takes a longer one, its acts wait for Python's lock
+_LENGTH = struct.Struct("<Q")
+_NAME_LENGTH = 512  # characters
+_DIMENSIONS = 32  # as in the oldest supported numpy
+_DIGITS = 15  # of a number in the header
+_METADATA = "__metadata__"  # the one name that is not a value's
+_TYPES = {
+    "BOOL": np.dtype(np.bool_),
+    "BF16": np.dtype("V2"),  # see `vlagents_ray.weights.trainable.portable`
+    **{f"F{8 * size}": np.dtype(f"<f{size}") for size in (2, 4, 8)},
+    **{f"I{8 * size}": np.dtype(f"<i{size}") for size in (1, 2, 4, 8)},
+    **{f"U{8 * size}": np.dtype(f"<u{size}") for size in (1, 2, 4, 8)},
+}
+_CODES = {dtype: code for code, dtype in _TYPES.items()}
+
+
+@dataclass(frozen=True, slots=True)
+class ValueSpec:
+    """Type and shape of one value, which takes the bytes after those of the one before."""
+
+    dtype: np.dtype[Any]
+    shape: tuple[int, ...]
+
+    @property
+    def size(self) -> int:
+        """Number of bytes."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+
+def header_of(named: Mapping[str, np.ndarray]) -> bytes:
+    """Return the beginning of a file with these values, before their bytes.
+
+    Raises:
+        InvalidWeights: A value has a type that the format does not have.
+    """
+    document, begin = {}, 0
+    for name, value in named.items():
+        if value.dtype not in _CODES:
+            raise InvalidWeights(f"{name!r}: got {value.dtype}, want one of {', '.join(sorted(_TYPES))}")
+        end = begin + value.nbytes
+        document[name] = {"dtype": _CODES[value.dtype], "shape": list(value.shape), "data_offsets": [begin, end]}
+        begin = end
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 8)
+    return _LENGTH.pack(len(text)) + text
+
+
+def parts_of(named: Mapping[str, np.ndarray], length: int = PART_BYTES) -> Iterator[bytes]:
+    """Return the bytes of the values, in the order of the header, in parts of that length; the last may be shorter."""
+    part = bytearray()
+    for value in named.values():
+        data = memoryview(np.ascontiguousarray(value).reshape(-1).view(np.uint8).data)
+        while data:
+            taken = data[: length - len(part)]
+            part += taken
+            data = data[len(taken) :]
+            if len(part) == length:
+                yield bytes(part)
+                part.clear()
+    if part:
+        yield bytes(part)
+
+
+def read_header(data: bytes) -> dict[str, ValueSpec]:
+    """Return the values that a header announces, by name, in the order of their bytes.
+
+    Args:
+        data: A header and nothing after it, as `header_of` returns it.
+
+    Raises:
+        MalformedMessage: It is no header, or is too long, or its places leave gaps, overlap or do not fit the shapes.
+    """
+    announced = _LENGTH.unpack_from(data)[0] if len(data) >= _LENGTH.size else -1
+    if announced != len(data) - _LENGTH.size or len(data) > MESSAGE_BYTES:
+        raise MalformedMessage(
+            f"safetensors: got {len(data)} bytes that announce a header of {announced}, want 8 bytes with the length "
+            f"of the header, and the header, at most {MESSAGE_BYTES} together"
+        )
+    try:
+        document = json.loads(data[_LENGTH.size :], parse_int=_whole, object_pairs_hook=_without_doubles)
+    except (ValueError, RecursionError) as error:
+        raise MalformedMessage(f"safetensors: the header is no JSON document ({error})") from error
+    if not isinstance(document, dict):
+        raise MalformedMessage(f"safetensors: got {type(document).__name__}, want an object with a value for each name")
+    document.pop(_METADATA, None)
+    placed = sorted((*_read_value(name, entry), name) for name, entry in document.items())
+    specs, at = {}, 0
+    for begin, end, code, shape, name in placed:
+        spec = ValueSpec(_TYPES[code], shape)
+        if begin != at or end - begin != spec.size:
+            raise MalformedMessage(
+                f"safetensors: {name!r}: got bytes {begin} to {end}, want {at} to {at + spec.size} for {code} of shape "
+                f"{list(shape)}"
+            )
+        specs[name], at = spec, end
+    return specs
+
+
+def _read_value(name: str, entry: Any) -> tuple[int, int, str, tuple[int, ...]]:
+    if len(name) > _NAME_LENGTH:
+        raise MalformedMessage(f"safetensors: got a name of {len(name)} characters, the limit is {_NAME_LENGTH}")
+    if not isinstance(entry, dict) or entry.keys() != {"dtype", "shape", "data_offsets"}:
+        raise MalformedMessage(f"safetensors: {name!r}: want 'dtype', 'shape' and 'data_offsets'")
+    code, shape, offsets = entry["dtype"], entry["shape"], entry["data_offsets"]
+    if not isinstance(code, str) or code not in _TYPES:
+        raise MalformedMessage(f"safetensors: {name!r}: got type {str(code)[:20]!r}, want one of {', '.join(_TYPES)}")
+    if not _are_whole(shape) or len(shape) > _DIMENSIONS:
+        raise MalformedMessage(f"safetensors: {name!r}: shape: want at most {_DIMENSIONS} whole numbers")
+    if not _are_whole(offsets) or len(offsets) != 2:
+        raise MalformedMessage(f"safetensors: {name!r}: data_offsets: want two whole numbers")
+    return offsets[0], offsets[1], code, tuple(shape)
+
+
+def _are_whole(numbers: Any) -> bool:
+    return isinstance(numbers, list) and all(type(number) is int and number >= 0 for number in numbers)
+
+
+def _whole(text: str) -> int:
+    if len(text) > _DIGITS:
+        raise ValueError(f"a number of {len(text)} digits")
+    return int(text)
+
+
+def _without_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) != len(pairs):
+        raise ValueError("a name stands there twice")
+    return found
+
+
+class ValuesReader:
+    """Values whose bytes arrive in parts. The memory of a value is allocated when its first byte has arrived."""
+
+    def __init__(self, specs: Mapping[str, ValueSpec]) -> None:
+        """Read the values that a header announces, see `read_header`."""
+        self._left = deque(specs.items())
+        self._values: dict[str, np.ndarray] = {}
+        self._room = np.empty(0, np.uint8)  # of the value that is being read
+        self.received = 0  # bytes
+        self.size = sum(spec.size for spec in specs.values())  # bytes
+
+    def add(self, part: bytes) -> None:
+        """Take the next bytes; raises `MalformedMessage` if there are more than the header announced."""
+        if self.received + len(part) > self.size:
+            raise MalformedMessage(
+                f"safetensors: got {self.received + len(part)} bytes of values, the header announced {self.size}"
+            )
+        self.received += len(part)
+        data = np.frombuffer(part, np.uint8)
+        while data.size:
+            if not self._room.size:
+                self._begin_next()
+            length = min(data.size, self._room.size)
+            self._room[:length] = data[:length]
+            self._room, data = self._room[length:], data[length:]
+
+    def values(self) -> Mapping[str, np.ndarray]:
+        """Return the values, which nobody can write into, once all bytes have arrived.
+
+        Raises:
+            MalformedMessage: A truth value is neither 0 nor 1.
+        """
+        while self._left:
+            self._begin_next()  # one without elements
+        for name, value in self._values.items():
+            if value.dtype == np.bool_ and value.size and value.view(np.uint8).max() > 1:
+                raise MalformedMessage(f"safetensors: {name!r}: got other bytes than 0 and 1 for truth values")
+            value.flags.writeable = False
+        return self._values
+
+    def _begin_next(self) -> None:
+        name, spec = self._left.popleft()
+        value = self._values[name] = np.empty(spec.shape, spec.dtype)
+        self._room = value.reshape(-1).view(np.uint8)

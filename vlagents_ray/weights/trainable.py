@@ -1,0 +1,175 @@
+"""The named values of a trainable object: a torch module, or dicts and lists of numpy or JAX arrays, nested at will.
+
+A value's name in a torch module is that in its `state_dict`; in nested dicts it is the keys, joined with "/". Torch and
+JAX are never imported here: an object of theirs exists only where they have been imported.
+"""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import NotTrainable
+
+_BFLOAT16 = np.dtype("V2")
+
+
+def named_values(trainable: Any) -> dict[str, Any]:
+    """Return references to the values of a trainable object, by name.
+
+    Args:
+        trainable: A torch module, or nested dicts and lists of arrays.
+
+    Raises:
+        NotTrainable: It is neither.
+    """
+    if _is_module(trainable):
+        # A module may add state of its own that is no tensor (`get_extra_state`), which a learner does not train.
+        return {name: value for name, value in trainable.state_dict().items() if is_array(value)}
+    return {name: container[key] for name, container, key in _leaves(trainable)}
+
+
+def set_values(trainable: Any, named: Mapping[str, Any]) -> None:
+    """Replace values of a trainable object; names that are not in `named` keep theirs.
+
+    Values on a GPU are copied to where the old ones are, since a CUDA graph may have recorded these addresses. All
+    others are replaced by reference, which takes no time and no memory; so nobody may write into `named` afterwards.
+
+    Args:
+        trainable: A torch module, or nested dicts and lists of arrays.
+        named: The new values, of the shapes, types and devices of the old ones.
+    """
+    if _is_module(trainable):
+        _set_tensors(trainable, named)
+        return
+    for name, container, key in list(_leaves(trainable)):
+        if name in named:
+            container[key] = named[name]
+
+
+def is_copied(trainable: Any) -> bool:
+    """Return whether `set_values` copies into the memory of the old values, so that references to these change."""
+    return any(_is_tensor(value) and value.device.type != "cpu" for value in named_values(trainable).values())
+
+
+def portable(value: Any) -> np.ndarray:
+    """Return a value as a numpy array that every process can read, without a copy where it is on the CPU.
+
+    A bfloat16, which numpy does not have, becomes two bytes of type `V2`; `converted` and `dtype_name` know them.
+    """
+    if _is_tensor(value):
+        value = value.detach().cpu().contiguous()
+        if dtype_name(value) == "bfloat16":
+            value = value.view(sys.modules["torch"].int16)
+            return np.asarray(value).view(_BFLOAT16)
+    array = np.asarray(value)
+    return array.view(_BFLOAT16) if array.dtype.kind == "V" else array
+
+
+def own_copy(value: Any) -> Any:
+    """Return a copy of a value that nobody else writes into."""
+    if _is_tensor(value):
+        return value.detach().clone()
+    return np.array(value) if isinstance(value, np.ndarray) else value  # JAX arrays never change
+
+
+def converted(value: Any, held: Any) -> Any:
+    """Return `value` as the type, precision and device of `held`, in memory that nobody else writes into.
+
+    Read-only numpy arrays that own read-only memory, such as Ray's objects, are not copied where `held` is on the CPU.
+
+    Args:
+        value: A numpy or JAX array or a torch tensor of the same shape and kind as `held`.
+        held: The value in the place of which it will be.
+    """
+    if _is_tensor(held):
+        torch = sys.modules["torch"]
+        if _is_tensor(value):
+            copied = value.detach().to(held.device, held.dtype)
+            return copied.clone() if copied.data_ptr() == value.data_ptr() else copied
+        array = _unchanging(np.asarray(value))
+        is_bfloat16 = array.dtype.kind == "V"
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message=".*not writ", category=UserWarning)  # nothing here writes into it
+            tensor = torch.from_numpy(array.view(np.int16) if is_bfloat16 else array)
+        return (tensor.view(torch.bfloat16) if is_bfloat16 else tensor).to(held.device, held.dtype)
+    array = _to_numpy(value)
+    if isinstance(held, np.ndarray):
+        array = _unchanging(array) if array.dtype == held.dtype else array.astype(held.dtype)
+        array.flags.writeable = False
+        return array
+    return sys.modules["jax"].device_put(array.astype(held.dtype), held.sharding)
+
+
+def dtype_name(value: Any) -> str:
+    """Return the name of a value's type without that of its library: "float32", "bfloat16", …."""
+    return "bfloat16" if value.dtype == _BFLOAT16 else str(value.dtype).rpartition(".")[2]
+
+
+def is_array(value: Any) -> bool:
+    """Return whether a value is an array or a tensor."""
+    return hasattr(value, "shape") and hasattr(value, "dtype")
+
+
+def _set_tensors(module: Any, named: Mapping[str, Any]) -> None:
+    torch = sys.modules["torch"]
+    held = {
+        **dict(module.named_buffers(remove_duplicate=False)),
+        **dict(module.named_parameters(remove_duplicate=False)),
+    }
+    with torch.no_grad():
+        for name, alias in module.state_dict().items():
+            if name not in named:
+                continue
+            if name in held and alias.device.type == "cpu":
+                held[name].data = named[name]
+            else:
+                alias.copy_(named[name])
+
+
+def _leaves(tree: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Yield name, container and key of each array."""
+    if not isinstance(tree, dict | list):
+        at = f" at {path.rstrip('/')!r}" if path else ""
+        raise NotTrainable(
+            f"trainable{at}: got {type(tree).__name__}, want a torch module, or dicts and lists of arrays; "
+            f"or define parameters() and load_parameters()"
+        )
+    for key, value in tree.items() if isinstance(tree, dict) else enumerate(tree):
+        if is_array(value):
+            yield f"{path}{key}", tree, key
+        else:
+            yield from _leaves(value, f"{path}{key}/")
+
+
+def _unchanging(array: np.ndarray) -> np.ndarray:
+    """Return the array, or a copy if its memory can be written into."""
+    array = np.asarray(array, order="C")
+    owner: Any = array
+    while isinstance(owner, np.ndarray):
+        if owner.flags.writeable:
+            return array.copy()
+        owner = owner.base
+    return array.view() if owner is None or memoryview(owner).readonly else array.copy()
+
+
+def _to_numpy(value: Any) -> np.ndarray:
+    """Return an array of a type that numpy has: a bfloat16 is the upper half of a float32."""
+    array = portable(value)
+    if array.dtype != _BFLOAT16:
+        return array
+    return (array.view(np.uint16).astype(np.uint32) << 16).view(np.float32)
+
+
+def _is_tensor(value: Any) -> bool:
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(value, torch.Tensor)
+
+
+def _is_module(value: Any) -> bool:
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(value, torch.nn.Module)
