@@ -17,42 +17,47 @@ from vlagents_ray.serve.scaling.router import SessionRouter, _NoReplica
 PROXY, REPLICA = DeploymentHandleSource.PROXY, DeploymentHandleSource.REPLICA
 
 
-@pytest.fixture
-def waits(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Serve's own choice, which takes 0.3 s; what became of it."""
+def choose(
+    source: DeploymentHandleSource,
+    replicas: list[str],
+    wait_s: float,
+    monkeypatch: pytest.MonkeyPatch,
+    *,
+    choice_s: float,
+) -> tuple[Any, list[str]]:
+    """What a proxy's wait of `wait_s` gives where Serve's own choice takes `choice_s`; what became of that choice."""
     became: list[str] = []
 
-    async def choose(self: Any, request: Any, *, is_retry: bool) -> str:
+    async def serves_own(self: Any, request: Any, *, is_retry: bool) -> str:
         try:
-            await asyncio.sleep(0.3)
+            await asyncio.sleep(choice_s)
         except asyncio.CancelledError:
             became.append("cancelled")
             raise
         return "a replica"
 
-    monkeypatch.setattr(ConsistentHashRouter, "_choose_replica_for_request", choose)
-    return became
-
-
-def choose(source: DeploymentHandleSource, replicas: list[str], wait_s: float, monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setattr(router, "_WAIT_S", wait_s)
+    monkeypatch.setattr(ConsistentHashRouter, "_choose_replica_for_request", serves_own)
     one = SessionRouter.__new__(SessionRouter)
     one._handle_source, one._replicas = source, replicas
     one._deployment_id = SimpleNamespace(app_name="app")
 
     async def chosen() -> Any:
-        found = await one._choose_replica_for_request(SimpleNamespace())
-        await asyncio.sleep(0)
-        return found
+        try:
+            return await one._choose_replica_for_request(SimpleNamespace())
+        except _NoReplica as refused:
+            return refused
+        finally:
+            await asyncio.sleep(0)
 
-    return asyncio.run(chosen())
+    return asyncio.run(chosen()), became
 
 
-def test_a_proxy_answers_503_and_forgets_the_request(waits: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(_NoReplica, match="no replica of application 'app' runs") as refused:
-        choose(PROXY, [], 0.01, monkeypatch)
-    assert waits == ["cancelled"]
-    status = get_http_response_status(refused.value, None, "1")
+def test_a_proxy_answers_503_and_forgets_the_request(monkeypatch: pytest.MonkeyPatch) -> None:
+    refused, choice = choose(PROXY, [], 0.01, monkeypatch, choice_s=3600)
+    assert "no replica of application 'app' runs" in str(refused)
+    assert choice == ["cancelled"]
+    status = get_http_response_status(refused, None, "1")
     assert (status.code, status.headers) == (503, [(b"retry-after", b"1")])
 
 
@@ -63,8 +68,6 @@ def test_others_wait_and_so_does_who_waits_for_a_replica_that_is_busy(
     source: DeploymentHandleSource,
     replicas: list[str],
     wait_s: float,
-    waits: list[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    assert choose(source, replicas, wait_s, monkeypatch) == "a replica"
-    assert waits == []
+    assert choose(source, replicas, wait_s, monkeypatch, choice_s=0.1) == ("a replica", [])
