@@ -43,12 +43,13 @@ def plan(**changed: Any) -> PolicyPlan:
 
 
 def test_larger_batches_give_more_actions_bare_and_behind_the_queue() -> None:
-    found = measure_policy(plan())
+    found = measure_policy(plan(rounds=5))
     one, four = found["batches"]
     assert (one["batch"], four["batch"]) == (1, 4)
     for way in ("bare", "queued"):
-        assert four[way]["actions_per_s"] > 1.5 * one[way]["actions_per_s"]
-        assert len(one["rounds"][way]) == 2
+        best_of_one, best_of_four = (max(r["actions_per_s"] for r in size["rounds"][way]) for size in (one, four))
+        assert best_of_four > 1.5 * best_of_one  # the best, as a busy machine slows down some rounds
+        assert len(one["rounds"][way]) == 5
     assert one["bare"]["actions_per_s"] < 1000 / 11  # a sleep is never shorter than it was asked to be
     assert one["queued"]["round_trip_ms"] > 11
     assert one["queued"]["mean_batch"] == pytest.approx(1)

@@ -53,6 +53,15 @@ def test_one_that_fits_is_sent() -> None:
     assert (reply.error, session.steps) == (None, 1)
 
 
+def test_no_info_may_be_said_with_none() -> None:
+    session = Session("s")
+    ticket = PendingRequest("s", Request("act", Obs()), lambda _: None)
+    act = Act(np.zeros(1), info=None)  # type: ignore[arg-type]
+    reply = build_reply(ticket, session, act, None, LIMIT, {"policy": {"version": 1}})
+    assert reply.act is not None
+    assert reply.act.info == {"policy": {"version": 1}}
+
+
 def test_nothing_of_what_is_too_large_is_copied_or_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(responses, "check_action", lambda *_: pytest.fail("looked at"))
     monkeypatch.setattr(np, "ascontiguousarray", lambda *_: pytest.fail("copied"))
