@@ -201,14 +201,16 @@ def test_an_idle_connection_takes_no_cpu(agent: RemoteAgent) -> None:
     assert used_s() - before < 0.5
 
 
-def test_a_late_reply_is_discarded(transport: PlasmaTransport) -> None:
+def test_a_late_reply_is_discarded(transport: PlasmaTransport, tmp_path: Path) -> None:
+    gate = tmp_path / "gate"
     transport.connect(30)
-    assert transport.call([Request("reset", frame(), request_id="r")], 10)[0].error is None
+    assert transport.call([Request("reset", frame(), request_id="r")], 60)[0].error is None
     with pytest.raises(DeadlineExceeded):
-        transport.call([Request("act", frame(pixel=1, sleep_s=0.5), request_id="late")], 0.05)
+        transport.call([Request("act", frame(pixel=1, gate=str(gate)), request_id="late")], 0.05)
     with pytest.raises(DeadlineExceeded):  # its channel still holds the first
         transport.call([Request("act", frame(pixel=2), request_id="too-soon")], 0.05)
-    [reply] = transport.call([Request("act", frame(pixel=3), request_id="now")], 10)
+    gate.touch()
+    [reply] = transport.call([Request("act", frame(pixel=3), request_id="now")], 60)
     assert (reply.request_id, reply.act and reply.act.action.tolist()) == ("now", [3])
 
 
@@ -260,7 +262,7 @@ def test_an_env_actor_that_dies_while_it_writes_costs_its_channel_and_nothing_el
 
 def test_faults_are_answered_and_harm_nobody(agent: RemoteAgent, transport: PlasmaTransport) -> None:
     transport.connect(30)
-    transport.call([Request("reset", frame(), request_id="r")], 10)
+    transport.call([Request("reset", frame(), request_id="r")], 60)
     connection, key = transport._open(1), transport._channel.binary()
     free = PlasmaAddress.REQUEST.pack(os.urandom(28), 0)
     for message, said in (
@@ -269,7 +271,7 @@ def test_faults_are_answered_and_harm_nobody(agent: RemoteAgent, transport: Plas
         (free, "lease"),
     ):
         connection.send(message)
-        unix_messages._wait(connection, select.POLLIN, time.monotonic() + 10)
+        unix_messages._wait(connection, select.POLLIN, time.monotonic() + 60)
         [reply] = transport._receive(connection)
         error = reply.error
         assert isinstance(error, MalformedMessage)
@@ -317,7 +319,7 @@ def test_a_killed_replica_is_noticed_and_the_next_one_serves() -> None:
     begun = time.monotonic()
     with pytest.raises(ConnectionLost):
         agent.act(frame())
-    assert time.monotonic() - begun < 10
+    assert time.monotonic() - begun < 25, "only after its time limit"
 
     def again() -> bool:
         try:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 import psutil
-from eval_fakes import ToZero
+from eval_fakes import ToZero, wait_for
 
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
@@ -160,14 +160,15 @@ class Accountant(Agent):
 
 
 class Echo(Agent):
-    """Answers with what it was sent, and with what its process holds."""
+    """Answers with what it was sent, and with what its process holds; if a `gate` is named, when that file exists."""
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
         self.instruction = instruction
         return {"pid": os.getpid()}
 
     def act(self, obs: Obs) -> Act:
-        time.sleep(obs.info.get("sleep_s", 0.0))
+        if (gate := obs.info.get("gate")) is not None:
+            wait_for(Path(gate).exists)
         info = {
             "instruction": self.instruction,
             "echo": obs.info.get("echo"),
@@ -210,7 +211,7 @@ class Witness(Agent):
 class Mirror(Agent):
     """Says whose observation it was: a pixel, the first state's sum, acts so far, the instruction's number.
 
-    A white picture takes it two seconds.
+    A white picture takes it two seconds, or, if the instruction begins with a path, until that file exists.
     """
 
     contract = Contract(instruction=True, action=ActionSpec(dim=7, gripper_open=1.0, gripper_closed=0.0))
@@ -220,14 +221,18 @@ class Mirror(Agent):
         self.slow_s = slow_s
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict:
-        self.number, self.acts = float(instruction.split()[-1]), 0
+        self.gate, self.number, self.acts = Path(instruction.split()[0]), float(instruction.split()[-1]), 0
         return {"pid": os.getpid()}
 
     def act(self, obs: Obs) -> Act:
         if obs.info.get("unnorm_key") == "broken":
             raise RuntimeError("/no/path/of/ours")
         pixel = float(obs.cameras["front"][-1, -1, -1])
-        time.sleep(2.0 if obs.cameras["front"].min() == 255 else self.slow_s)
+        white = obs.cameras["front"].min() == 255
+        if white and self.gate.is_absolute():
+            wait_for(self.gate.exists)
+        else:
+            time.sleep(2.0 if white else self.slow_s)
         self.acts += 1
         total = float(next(iter(obs.state.values())).sum()) if obs.state else 0.0
         row = [pixel, total, self.acts, self.number, 0.0, 0.0, 0.0 if obs.gripper is None else obs.gripper]
