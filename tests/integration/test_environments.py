@@ -147,5 +147,5 @@ def test_a_killed_replica_takes_its_child_along(served: Served) -> None:
     with RemoteAgent(served.server.apps["apart"], timeout_s=120) as agent:
         first = agent.reset(observation(), "a task")
         os.kill(first["parent"], signal.SIGKILL)
-        wait_for(lambda: ended(first["pid"]), 1)
+        wait_for(lambda: ended(first["pid"]))
         assert agent.act(observation()).info["pid"] != first["pid"]

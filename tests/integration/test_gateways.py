@@ -19,6 +19,7 @@ from eval_fakes import wait_for
 from gr00t_client import PolicyClient
 from peer_environment import peers_python
 from peer_versions import package
+from virtual_environments import ended
 
 from tests.integration.conftest import SUPPORT, serving
 from vlagents_ray.bench.line_process import LineProcess
@@ -166,7 +167,7 @@ def test_clients_go_on_when_the_replica_behind_the_gateway_dies(ports: Ports) ->
         pid = before[0][4]["pid"]
         client.ping()
         os.kill(pid, signal.SIGKILL)
-        wait_for(lambda: not Path(f"/proc/{pid}").exists() or "Z" in Path(f"/proc/{pid}/stat").read_text().split()[2])
+        wait_for(lambda: ended(pid))
         [after] = robot.say(**wish)
         assert after[0][4]["pid"] != pid
         assert after[0][4]["resumed"] is True

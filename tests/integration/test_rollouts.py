@@ -39,9 +39,16 @@ def served(version: Path) -> Iterator[Server]:
 @pytest.fixture
 def expected(version: Path) -> Any:
     """The transitions of 8 episodes of the policy in this process, one after the other."""
-    version.write_text("3")
+    write(version, 3)
     with without_ray(rollouts), Rollouts(LINE, partial(Stochastic, str(version)), **GROUPS) as found:
         return without_key(found.collect(8))
+
+
+def write(version: Path, number: int) -> None:
+    """Name the version, at once: a policy that acts meanwhile reads the old number or the new one."""
+    part = version.with_suffix(".part")
+    part.write_text(str(number))
+    part.rename(version)
 
 
 def without_key(table: Any) -> Any:
@@ -84,10 +91,10 @@ def test_a_worker_killed_with_several_episodes_costs_no_transition_and_doubles_n
 
 
 def test_episodes_of_weights_that_a_learner_has_replaced_are_played_again(served: Server, version: Path) -> None:
-    version.write_text("1")
+    write(version, 1)
     with Rollouts(LINE, "serve://Stochastic", workers=2, num_envs=2) as found:
         first = next(found)
-        version.write_text("2")
+        write(version, 2)
         found.version = 2
         rest = list(itertools.islice(found, 5))
     assert [set(batch.column("version").to_pylist()) for batch in (first, *rest)] == [{1}] + [{2}] * 5
@@ -96,7 +103,7 @@ def test_episodes_of_weights_that_a_learner_has_replaced_are_played_again(served
 
 
 def test_what_the_policy_does_not_offer_ends_the_rollouts_at_once(served: Server, version: Path) -> None:
-    version.write_text("1")
+    write(version, 1)
     with (
         Rollouts(LINE, served.url, want=["logprob", "entropy"]) as found,
         pytest.raises(NotOffered, match=r"\['entropy'\], want some of \['logprob', 'value'\]"),
