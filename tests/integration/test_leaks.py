@@ -6,10 +6,12 @@ import gc
 import itertools
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 
 import numpy as np
 import psutil
 import pytest
+from eval_fakes import wait_for
 
 from tests.integration.conftest import serving
 from vlagents_ray import Obs, RemoteAgent
@@ -21,6 +23,7 @@ from vlagents_ray.serve.launch.server import Server
 SESSIONS: dict[TransportName, int] = {"shm": 6400, "websocket": 1200, "http": 1200, "handle": 600, "plasma": 600}
 MIB = 2**20
 ROUNDS = 4
+MOST = {"descriptors": 2, "threads": 2, "maps": 1, "own descriptors": 2, "own threads": 2}  # that may be left
 
 
 @pytest.fixture(scope="module")
@@ -56,14 +59,19 @@ def test_sessions_opened_and_closed_leave_nothing(server: Server, transport: Tra
         after = session(count=True)
         gc.collect()
         resident.append((after["resident"], me.memory_info().rss))
-    grown = {name: after[name] - before[name] for name in before}
-    own = (me.num_fds() - mine[0], me.num_threads() - mine[1], me.memory_info().rss - mine[2])
-    print(f"{transport}: {number} sessions: the server's growth {grown}, the client's {own}; resident: {resident}")
-    assert grown["descriptors"] <= 2
-    assert grown["threads"] <= 2
-    assert grown["maps"] <= 1
-    assert own[0] <= 2
-    assert own[1] <= 2
+    grown: dict[str, int] = {}
+
+    def settled() -> bool:
+        """Whether what the last sessions held is given back; the server's threads do that in their own time."""
+        now = session(count=True)
+        grown.update({name: now[name] - before[name] for name in before})
+        grown.update({"own descriptors": me.num_fds() - mine[0], "own threads": me.num_threads() - mine[1]})
+        return all(grown[name] <= limit for name, limit in MOST.items())
+
+    with suppress(TimeoutError):
+        wait_for(settled)
+    print(f"{transport}: {number} sessions: the growth {grown}; resident: {resident}")
+    assert {name: grown[name] for name, limit in MOST.items() if grown[name] > limit} == {}
     for sizes in zip(*resident, strict=True):  # what stays of each session grows in every round, an arena in one
         assert min(b - a for a, b in itertools.pairwise(sizes)) < 4 * MIB / ROUNDS
         assert sizes[-1] - sizes[0] < 4 * 4 * MIB
