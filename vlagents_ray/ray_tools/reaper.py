@@ -22,7 +22,7 @@ from pathlib import Path
 MARK = "VLAGENTS_RAY_CLUSTER"  # in the environment of every process of the cluster
 _GRACE_S = 3.0  # for Ray to end by itself
 _ORDERLY = b"."
-_SWEEPS = 20
+_SWEEPS = 200  # 10 s at least: on a busy machine a process that is killed takes a while to end
 _QUIET_SWEEPS = 3  # consecutive sweeps without a find; a process has no environment while it starts a program
 
 
