@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Iterator
 
@@ -14,6 +15,7 @@ from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.client.transports.codec_selection import (
     CodecChoice,
     LinkSpeed,
+    coding_cost,
     fastest,
     measure,
 )
@@ -106,6 +108,12 @@ def test_what_is_fastest_over_the_link_is_chosen(bandwidth: float, auto: object,
     assert fastest(CAMERAS, CANDIDATES[1:], found, link.send) == exact
 
 
+def test_a_codec_costs_no_time_that_other_processes_take(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = itertools.count()  # a second passes between any two looks at it
+    monkeypatch.setattr("vlagents_ray.client.transports.codec_selection.time.perf_counter", lambda: float(next(clock)))
+    assert coding_cost(CAMERAS, JPEG)[1] < 0.5
+
+
 def test_a_message_over_the_limit_is_never_chosen() -> None:
     link = Simulated(2e-4, 1e11)
     assert fastest(CAMERAS, CANDIDATES, LinkSpeed(2e-4, 1e11), link.send, most_bytes=250_000) == JPEG
@@ -170,7 +178,6 @@ def test_a_network_gets_jpeg_unless_pixels_must_arrive_as_they_are(rate: str, tr
 
 def test_the_choice_is_the_fastest_of_all_over_a_true_link() -> None:
     with network_links.shaped("100mbit") as url, RemoteAgent(url, transport="websocket") as chooser:
-        chooser.reset(OBS, "look")
         taken: dict[str, list[float]] = {"raw": [], "lossless": [], "jpeg": []}
         agents = {codec: RemoteAgent(url, transport="websocket", codec=codec) for codec in taken}
         for agent in agents.values():
@@ -182,5 +189,10 @@ def test_the_choice_is_the_fastest_of_all_over_a_true_link() -> None:
                 taken[codec].append(time.perf_counter() - begun)
         for agent in agents.values():
             agent.close()
-        assert chooser.codec is not None
-        assert chooser.codec.name == min(taken, key=lambda codec: np.median(taken[codec]))
+        best = min(taken, key=lambda codec: np.median(taken[codec]))
+        chosen = []
+        for _ in range(5):  # a machine that is busy for a moment misleads one
+            chooser.close()
+            chooser.reset(OBS, "look")
+            chosen.append(chooser.codec and chooser.codec.name)
+        assert chosen.count(best) >= 3, (chosen, taken)
