@@ -49,7 +49,7 @@ def served() -> Iterator[Served]:
             assert server.stdout.readline() == "ready\n"
             yield Served(cluster, robot)
             server.stdin.close()
-            server.wait(60)
+            server.wait(180)
 
 
 def test_workers_fill_the_replicas_node_first_and_reach_it_without_a_copy_then_spill(

@@ -27,17 +27,17 @@ def gone() -> bool:
 @pytest.mark.slow
 def test_replicas_come_from_none_and_go_to_none_and_no_step_fails() -> None:
     with serving("noop", config={"base_ms": 40}, batch={"max_size": 1}, autoscaling=FROM_NONE) as server:
-        wait_for(gone, 60)
+        wait_for(gone)
         stop = threading.Event()
         with ThreadPoolExecutor(4) as pool:
             robots = [pool.submit(act_until, server.url, way, stop) for way in 2 * WAYS]
             try:
-                wait_for(lambda: replicas() == 2 or any(robot.done() for robot in robots), 60)
+                wait_for(lambda: replicas() == 2 or any(robot.done() for robot in robots))
             finally:
                 stop.set()
             assert min(robot.result() for robot in robots) > 0
-        wait_for(gone, 60)
+        wait_for(gone)
         for way in WAYS:
-            with RemoteAgent(server.url, transport=way) as late:
+            with RemoteAgent(server.url, transport=way, connect_timeout_s=120) as late:
                 late.reset(Obs(), "after the quiet")
                 assert late.act(Obs()).action.shape == (7,)

@@ -62,6 +62,13 @@ def redeploy(folder: Path, replicas: int = 1, **user_config: Any) -> None:
     client.deploy_apps(deployed(folder, num_replicas=replicas, user_config=user_config))
 
 
+def states() -> dict[str, int]:
+    """Replicas by what they do."""
+    from ray import serve
+
+    return dict(serve.status().applications["Stored"].deployments["Policy"].replica_states)
+
+
 def metadata(server: Server) -> dict[str, Any]:
     with RemoteAgent(server.url, transport="http") as agent:
         return agent.metadata
@@ -78,7 +85,7 @@ def fresh(server: Server, folder: Path) -> Server:
     for marker in folder.glob("*.*"):
         marker.unlink()
     redeploy(folder)
-    wait_for(lambda: own(server, folder) == "1", 60)
+    wait_for(lambda: states() == {"RUNNING": 1} and own(server, folder) == "1")
     return server
 
 
@@ -166,38 +173,38 @@ def test_a_slow_load_keeps_nobody_waiting_and_the_least_recently_used_goes(fresh
     held.touch()
     robot = Robot(RemoteAgent(fresh.url, transport="websocket"))
     slow = Robot(RemoteAgent(fresh.url, transport="http"), checkpoint_step=5)
-    wait_for((folder / "5.begun").exists, 30)
+    wait_for((folder / "5.begun").exists)
     before = len(robot.rows)
-    wait_for(lambda: len(robot.rows) > before + 500 or robot.failure is not None, 30)
+    wait_for(lambda: len(robot.rows) > before + 500 or robot.failure is not None)
     assert slow.rows == []
     held.unlink()
-    wait_for(lambda: len(slow.rows) > 50, 30)
+    wait_for(lambda: len(slow.rows) > 50)
     assert {row[:2] for row in robot.end()} == {("1", 1.0)}
     assert {row[:2] for row in slow.end()} == {("5", 5.0)}
     with RemoteAgent(fresh.url) as agent:
         agent.reset(Obs(), "x", checkpoint_step=6)
-        wait_for(lambda: (folder / "1.closed").exists() or (folder / "5.closed").exists(), 30)
+        wait_for(lambda: (folder / "1.closed").exists() or (folder / "5.closed").exists())
 
 
 def test_a_redeploy_swaps_under_load_without_a_failed_step(fresh: Server, folder: Path) -> None:
     """Each step of each episode is answered by the checkpoint that its reset was told, and no replica restarts."""
     robots = [Robot(RemoteAgent(url(fresh, t).replace("Reacher", "Stored"), transport=t)) for t in TRANSPORTS]
     pid = _pid(fresh)
-    wait_for(lambda: all(len(robot.rows) > 100 for robot in robots), 30)
+    wait_for(lambda: all(len(robot.rows) > 100 for robot in robots))
     (folder / "2.held").touch()
     redeploy(folder, checkpoint_step=2)
-    wait_for((folder / "2.begun").exists, 60)
+    wait_for((folder / "2.begun").exists)
     counts = [len(robot.rows) for robot in robots]
-    wait_for(lambda: all(len(r.rows) > count + 100 for r, count in zip(robots, counts, strict=True)), 30)
+    wait_for(lambda: all(len(r.rows) > count + 100 for r, count in zip(robots, counts, strict=True)))
     assert metadata(fresh)["checkpoints"]["swap"] == {"state": "loading", "checkpoint": str(folder / "2")}
     (folder / "2.held").unlink()
-    wait_for(lambda: all(r.failure is not None or (r.rows and r.rows[-1][0] == "2") for r in robots), 30)
+    wait_for(lambda: all(r.failure is not None or (r.rows and r.rows[-1][0] == "2") for r in robots))
     for robot in robots:
         rows = robot.end()
         assert {row[:2] for row in rows} == {("1", 1.0), ("2", 2.0)}
         assert [row[2] for row in rows] == [i % 20 + 1 for i in range(len(rows))]
         assert robot.resumed == 0
-    wait_for((folder / "1.closed").exists, 30)
+    wait_for((folder / "1.closed").exists)
     assert _pid(fresh) == pid
 
 
@@ -208,20 +215,20 @@ def _pid(server: Server) -> int:
 
 def test_a_redeploy_of_what_does_not_load_leaves_the_old_one_and_says_why(fresh: Server, folder: Path) -> None:
     robot = Robot(RemoteAgent(fresh.url))
-    wait_for(lambda: len(robot.rows) > 50, 30)
+    wait_for(lambda: len(robot.rows) > 50)
     redeploy(folder, checkpoint_step=77)
-    wait_for(lambda: (metadata(fresh)["checkpoints"]["swap"] or {}).get("state") == "failed", 60)
+    wait_for(lambda: (metadata(fresh)["checkpoints"]["swap"] or {}).get("state") == "failed")
     assert "FileNotFoundError" in metadata(fresh)["checkpoints"]["swap"]["error"]
     redeploy(folder, checkpoint_step=1, scales=3)  # an unknown setting
-    wait_for(lambda: "ConfigError" in (metadata(fresh)["checkpoints"]["swap"] or {}).get("error", ""), 60)
+    wait_for(lambda: "ConfigError" in (metadata(fresh)["checkpoints"]["swap"] or {}).get("error", ""))
     count = len(robot.rows)
-    wait_for(lambda: len(robot.rows) > count + 50, 30)
+    wait_for(lambda: len(robot.rows) > count + 50)
     assert {row[:2] for row in robot.end()} == {("1", 1.0)}
 
 
 def test_any_other_setting_is_swapped_too(fresh: Server, folder: Path) -> None:
     redeploy(folder, scale=10.0)
-    wait_for(lambda: metadata(fresh)["config"].get("scale") == 10.0, 60)
+    wait_for(lambda: metadata(fresh)["config"].get("scale") == 10.0)
     with RemoteAgent(fresh.url) as agent:
         agent.reset(Obs(), "x")
         assert told(agent) == [10, 1]
@@ -239,10 +246,10 @@ def test_every_replica_swaps_and_new_ones_begin_with_what_was_swapped_to(fresh: 
                 found.setdefault(pid, set()).add(float(agent.act(Obs()).action[0]))
         return found
 
-    wait_for(lambda: len(numbers()) == 2, 60)
-    wait_for(lambda: list(numbers().values()) == [{4.0}] * 2, 60)
+    wait_for(lambda: len(numbers()) == 2)
+    wait_for(lambda: list(numbers().values()) == [{4.0}] * 2)
     redeploy(folder, replicas=2, checkpoint_step=5)
-    wait_for(lambda: list(numbers().values()) == [{5.0}] * 2, 60)
+    wait_for(lambda: list(numbers().values()) == [{5.0}] * 2)
 
 
 def test_an_evaluation_says_by_which_checkpoint(fresh: Server, folder: Path, tmp_path: Path) -> None:

@@ -38,7 +38,7 @@ from vlagents_ray.serve.dialects.vla_eval import codec as vla_eval_codec
 from vlagents_ray.serve.launch.server import Server
 
 FRAMES = int(os.environ.get("VLAGENTS_FUZZ_FRAMES", "2800"))
-ANSWER_S = 30.0
+ANSWER_S = 60.0
 EVERY = 100  # messages; then a right one
 PICTURE = np.full((8, 8, 3), 9, np.uint8)
 OBS = Obs({"front": PICTURE}, 0.5, {"joints": np.ones(3, np.float32)}, {"note": "x", "list": [1, 2.5]})
@@ -233,7 +233,7 @@ def wait_for_answer(target: Target, socket: ClientConnection) -> bytes | str:
 def opened(target: Target, server: Server) -> Iterator[ClientConnection]:
     url = server.url.replace("http://", "ws://") + target.path
     if not target.path:
-        own = httpx.get(f"{server.url}/v1/metadata").json()["stream"]
+        own = httpx.get(f"{server.url}/v1/metadata", timeout=ANSWER_S).json()["stream"]
         url = f"ws://127.0.0.1:{own['port']}{own['path']}"
     with connect(url, compression=None, ping_interval=None, open_timeout=ANSWER_S) as socket:
         if target.greeting:

@@ -21,7 +21,7 @@ from vlagents_ray import DeadlineExceeded, Obs, PolicyUnavailable, RemoteAgent
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.serve.launch.server import Server
 
-ACT_S = 3
+CALL_S, ACT_S = 5, 6  # a replica that stands still for 3 s is not a hung one
 INSIDE: list[TransportName] = ["handle", "plasma"]
 OUTSIDE: list[TransportName] = ["shm", "websocket", "http"]
 
@@ -66,8 +66,8 @@ def persist(agent: RemoteAgent, left: int) -> None:
 @pytest.mark.parametrize("how", ["sleep", "lock"])
 def test_its_sessions_go_on_elsewhere_the_cause_is_told_and_it_is_replaced(how: str, server: Server) -> None:
     """One that keeps the interpreter's lock ("lock") can say nothing itself: clients and Serve notice its silence."""
-    made = [RemoteAgent("serve://Hanging", transport=one, timeout_s=2) for one in INSIDE * 3]
-    made += [RemoteAgent(server.url, transport=one, timeout_s=2) for one in OUTSIDE * 3]
+    made = [RemoteAgent("serve://Hanging", transport=one, timeout_s=CALL_S) for one in INSIDE * 3]
+    made += [RemoteAgent(server.url, transport=one, timeout_s=CALL_S) for one in OUTSIDE * 3]
     for agent in made:
         agent.reset(Obs())
     at = {agent: agent.act(Obs()).info["pid"] for agent in made}
@@ -80,23 +80,23 @@ def test_its_sessions_go_on_elsewhere_the_cause_is_told_and_it_is_replaced(how: 
     threads = [threading.Thread(target=persist, args=(agent, hung), daemon=True) for agent in hit]
     for thread in threads:
         thread.start()
-    wait_for(lambda: not any(thread.is_alive() for thread in threads), 60)
+    wait_for(lambda: not any(thread.is_alive() for thread in threads))
     print(f"{how}: {len(hit)} sessions were there; the last acted elsewhere after {time.monotonic() - begun:.1f} s")
     if how == "sleep":
-        wait_for(lambda: hung_calls() == [("act", "1.0")], 30)
-        wait_for(lambda: f"has not returned from 'act' for {ACT_S}" in logged(), 30)
+        wait_for(lambda: hung_calls() == [("act", "1.0")])
+        wait_for(lambda: f"has not returned from 'act' for {ACT_S}" in logged())
         assert "threading.Event().wait()" in logged(), "the log does not say where it hangs"
     else:
         place = f'served_agents.py", line {line_of("sleep(10_000)")} in act'
-        wait_for(lambda: place in logged(), 30)
+        wait_for(lambda: place in logged())
 
     def replaced() -> bool:
         with RemoteAgent(server.url, transport="http") as agent:
             return agent.reset(Obs())["pid"] not in first
 
-    wait_for(replaced, 90)
+    wait_for(replaced, 240)
     print(f"{how}: replaced after {time.monotonic() - begun:.1f} s")
-    wait_for(lambda: not psutil.pid_exists(hung), 90)
+    wait_for(lambda: not psutil.pid_exists(hung), 240)
     print(f"{how}: its process ended after {time.monotonic() - begun:.1f} s")
     for agent in made:
         agent.close()

@@ -72,7 +72,7 @@ def test_a_replica_that_starts_later_has_the_weights_of_the_others(server: Serve
     weights = Publisher("serve://Trainable")
     version = weights.push(gain(7))
     client.deploy_apps(deployed(3))
-    wait_for(lambda: running() == 3, 60)
+    wait_for(lambda: running() == 3)
     assert weights.acknowledged(version) == 3
 
 

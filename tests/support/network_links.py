@@ -70,7 +70,7 @@ def _server(host: str, prefix: list[str]) -> Iterator[str]:
             yield f"http://{host}:{process.stdout.readline().strip()}"
         finally:
             process.terminate()
-            process.wait(10)
+            process.wait(60)
 
 
 def _do(*command: str) -> None:

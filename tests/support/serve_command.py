@@ -17,7 +17,7 @@ from readme_blocks import ENV
 
 from vlagents_ray.serve.ports import free_port
 
-START_S, STOP_S = 180, 60
+START_S, STOP_S = 180, 180
 
 
 def free_address() -> str:
