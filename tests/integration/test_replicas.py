@@ -56,7 +56,7 @@ def check(agents: list[RemoteAgent], pids: list[int], steps: int) -> None:
 
 
 def test_http_sessions_stay_on_their_replica(server: Server) -> None:
-    agents = [RemoteAgent(server.url, transport="http") for _ in range(12)]
+    agents = [RemoteAgent(server.url, transport="http") for _ in range(30)]  # hashes of so many leave no replica out
     check(agents, spread(agents), 20)
     for agent in agents:
         agent.close()
