@@ -228,7 +228,7 @@ def test_connections_leave_nothing(agent: RemoteAgent) -> None:
     # listens while a batch of several sessions is slow.
     wait_for(lambda: held(agent)[1] <= before[1][1] + 2)
     wait_for(lambda: held(agent)[0] <= before[1][0] + 2)
-    wait_for(lambda: objects() <= before[0] + 1)  # two at once, where the end of one came after the beginning of the next
+    wait_for(lambda: objects() <= before[0] + 1)  # two at once, where one ended after the next began
 
 
 def test_killed_env_actors_leave_nothing(agent: RemoteAgent) -> None:
