@@ -121,6 +121,19 @@ def test_an_empty_loop_measures_the_machine() -> None:
     assert told["ticks"] + told["missed"] == 40
 
 
+def test_an_empty_loop_that_is_held_up_at_its_end_misses_no_ticks_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    wait = Pacer.wait
+
+    def held_up(self: Pacer) -> int:
+        if self.ticks == 3:
+            time.sleep(0.3)
+        return wait(self)
+
+    monkeypatch.setattr(Pacer, "wait", held_up)
+    told = empty_loop(HZ, 0.2)
+    assert told["ticks"] + told["missed"] == 40
+
+
 @pytest.mark.parametrize("frozen", [False, True])
 def test_the_process_is_left_as_it_was(*, frozen: bool) -> None:
     def settings() -> tuple[object, ...]:
