@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from eval_fakes import wait_for
 from in_process_replicas import Replicas
+from manual_clock import Clock
 
 from vlagents_ray import (
     Act,
@@ -154,7 +155,7 @@ def test_without_an_action_in_time_the_safe_one_is_given_and_says_so(playing: Pl
     play(player, range(HORIZON))
     begun = time.monotonic()
     act = player.act(obs(HORIZON))
-    assert time.monotonic() - begun < 5  # and the policy's answer never comes
+    assert time.monotonic() - begun < 25  # and the policy's answer never comes
     assert act.action.tolist() == pytest.approx([0.5, 0.5])
     assert "waiting" in act.info["safe"]
     assert act.info["silent_s"] > 0
@@ -181,7 +182,7 @@ def test_a_deadline_is_kept_in_every_mode(playing: Playing) -> None:
         play(player, range(1))
         begun = time.monotonic()
         assert "safe" in player.act(obs(1)).info
-        assert 0.02 <= time.monotonic() - begun < 5
+        assert 0.02 <= time.monotonic() - begun < 25
         agent.gate.release(100)
 
 
@@ -230,10 +231,11 @@ def test_rows_beyond_the_horizon_are_never_executed(playing: Playing) -> None:
 def test_rows_of_an_observation_from_before_the_loop_hung_are_not_executed(
     playing: Playing, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    clock = Clock()
+    monkeypatch.setattr("vlagents_ray.chunking.player.time.monotonic", clock)
     agent, player = playing(Counting(gated=True), mode="async", max_age_s=0.5)
     assert play(player, range(2)) == [0, 0.1]
-    now = time.monotonic()
-    monkeypatch.setattr("vlagents_ray.chunking.player.time.monotonic", lambda: now + 1.0)
+    clock.now = 1.0
     assert "older than max_age_s" in player.act(obs(2)).info["safe"]
     let(agent, player)  # the answer to tick 1, as old
     assert "older than max_age_s" in player.act(obs(3)).info["safe"]
@@ -521,7 +523,6 @@ class Continuing(Agent):
         left, delay = obs.info.get(LEFTOVER), obs.info.get(DELAY, 0)
         frozen = left[: delay + 1] if left is not None else np.zeros((1, 1), np.float32)
         more = frozen[-1] + 0.1 * np.arange(1, 60 - len(frozen) + 1)[:, np.newaxis]
-        time.sleep(0.02)
         return Act(np.concatenate([frozen, more]).astype(np.float32))
 
 
@@ -531,12 +532,15 @@ def test_real_time_chunking_over_the_wire_joins_chunks_without_a_jump(real_time:
     player = ChunkPlayer(served.agent(), mode="async", real_time_chunking=real_time)
     player.reset(Obs())
     actions, chunks = [], set()
-    for _ in range(60):
+    asker = player._asker
+    assert asker is not None
+    for tick in range(60):
+        if tick % 10 == 9:  # no answer takes longer, however busy the machine is
+            wait_for(lambda: asker._job is None)
         act = player.act(Obs())
         assert "safe" not in act.info
         actions.append(float(act.action[0]))
         chunks.add(act.info["chunk"])
-        time.sleep(0.005)  # the control period
     player.close()
     served.close()
     assert len(chunks) > 3

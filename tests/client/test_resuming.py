@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
@@ -25,10 +24,32 @@ from vlagents_ray import (
     PolicyUnavailable,
     UnknownSession,
 )
-from vlagents_ray.client import connection
+from vlagents_ray.client import connection, session
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import NoReplica
 from vlagents_ray.serve.scaling import session_migration
+
+
+class Clock:
+    """Time that passes in a pause, or when the test says so."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += seconds
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """The client's."""
+    clock = Clock()
+    for module in (connection, session):
+        monkeypatch.setattr(module, "time", clock)
+    return clock
 
 
 class Window(Agent):
@@ -160,7 +181,7 @@ def test_a_session_that_did_not_begin_again_in_time_says_so_with_the_next_act(
 
 
 def test_an_act_without_time_to_begin_again_exceeds_its_deadline_and_asks_for_no_reset(
-    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch, clock: Clock
 ) -> None:
     """Another replica has looked for the session until the deadline, and says then that it is unknown."""
     served = replicas(2)
@@ -173,21 +194,20 @@ def test_an_act_without_time_to_begin_again_exceeds_its_deadline_and_asks_for_no
         replies = call(self, requests, timeout_s)
         if late and isinstance(replies[0].error, UnknownSession):
             late.pop()
-            time.sleep(timeout_s)
+            clock.now += timeout_s
         return replies
 
     monkeypatch.setattr(InProcess, "call", unknown)
-    agent._connection.timeout_s = 1.0
+    agent._connection.timeout_s = 30.0
     with pytest.raises(DeadlineExceeded, match="the next act does"):
         agent.act(obs(2))
     assert not late
-    agent._connection.timeout_s = 30.0
     assert agent.act(obs(3)).info["resumed"]
     agent.close()
 
 
 def test_an_act_for_which_little_time_is_left_is_not_sent_again(
-    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch, clock: Clock
 ) -> None:
     """It would arrive, and be executed, when its caller has given up."""
     served = replicas(2)
@@ -200,15 +220,14 @@ def test_an_act_for_which_little_time_is_left_is_not_sent_again(
         sent.append(requests[0].op)
         replies = call(self, requests, timeout_s)
         if requests[0].op == "reset" and len(sent) < 4:
-            time.sleep(0.9 * timeout_s)
+            clock.now += 0.99 * timeout_s
         return replies
 
     monkeypatch.setattr(InProcess, "call", slow_reset)
-    agent._connection.timeout_s = 1.0
+    agent._connection.timeout_s = 30.0
     with pytest.raises(DeadlineExceeded, match="did not begin again"):
         agent.act(obs(2))
     assert sent == ["act", "act", "reset"]
-    agent._connection.timeout_s = 30.0
     act = agent.act(obs(3))
     assert (act.info["resumed"], act.info["instruction"], act.info["acts"]) == (True, "stack", 1)
     agent.close()
@@ -278,7 +297,9 @@ def test_when_nobody_lives_the_loss_is_raised_in_time_and_a_later_act_goes_on(
     agent.close()
 
 
-def test_a_server_that_stops_and_starts_again_is_waited_for(replicas: Callable[[int], Replicas]) -> None:
+def test_a_server_that_stops_and_starts_again_is_waited_for(
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch, clock: Clock
+) -> None:
     served = replicas(1)
     agent = served.agent()
     agent.reset(obs(1), "stack")
@@ -289,7 +310,12 @@ def test_a_server_that_stops_and_starts_again_is_waited_for(replicas: Callable[[
     with pytest.raises(PolicyUnavailable, match="gone"):
         agent.act(obs(3))
     served.dead.clear()
-    threading.Timer(0.1, lambda: setattr(served, "stopping", False)).start()
+
+    def sleep(seconds: float) -> None:
+        clock.now += seconds
+        served.stopping = clock.now < 2.0
+
+    monkeypatch.setattr(clock, "sleep", sleep)
     agent._connection.timeout_s = 30.0
     assert agent.act(obs(4)).action.tolist() == [1, 2, 4]
     agent.close()
@@ -378,16 +404,24 @@ def test_one_session_that_fails_leaves_its_neighbours_alone(replicas: Callable[[
 
 
 def test_a_replica_that_has_fallen_silent_is_left(
-    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch, clock: Clock
 ) -> None:
-    monkeypatch.setattr(connection, "SILENT_S", 0.5)
     monkeypatch.setattr(session_migration, "_ANSWER_S", 0.2)
     served = replicas(2)
+    call = InProcess.call
+
+    def silent(self: InProcess, requests: Any, timeout_s: float) -> Any:
+        if self._number not in served.frozen:
+            return call(self, requests, 30.0)
+        clock.now += timeout_s
+        raise DeadlineExceeded("no answer")
+
+    monkeypatch.setattr(InProcess, "call", silent)
     agent = served.agent()
     agent.reset(obs(1), "stack")
     agent.act(obs(2))
     served.frozen.add(0)
-    agent._connection.timeout_s = 0.2
+    agent._connection.timeout_s = 0.4 * connection.SILENT_S
     failed = 0
     for _ in range(50):
         try:
@@ -395,7 +429,7 @@ def test_a_replica_that_has_fallen_silent_is_left(
             break
         except DeadlineExceeded:
             failed += 1
-    assert failed >= 3  # one late answer says nothing yet
+    assert failed == 3  # one late answer says nothing yet
     assert act.info["resumed"]
     assert act.action.tolist() == [1, 2, 3]
     assert "resumed" not in agent.act(obs(4)).info
@@ -403,19 +437,28 @@ def test_a_replica_that_has_fallen_silent_is_left(
 
 
 def test_a_replica_that_is_only_slow_keeps_the_session_or_gives_it_on(
-    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch, clock: Clock
 ) -> None:
-    monkeypatch.setattr(connection, "SILENT_S", 0.5)
+    call, slow = InProcess.call, False
+
+    def too_late(self: InProcess, requests: Any, timeout_s: float) -> Any:
+        if not slow:
+            return call(self, requests, timeout_s)
+        clock.now += connection.SILENT_S
+        return call(self, requests, 0.1)  # of the 30 s in which it may act on it
+
+    monkeypatch.setattr(InProcess, "call", too_late)
     for number, prefer in ((1, 0), (2, 1)):  # it goes to the same one again, or to another one
         served = replicas(number)
         agent = served.agent()
         agent.reset(obs(1), "stack")
         served.prefer = prefer
-        agent._connection.timeout_s = 0.6
+        agent._connection.timeout_s = 30.0
         model = next(iter(served.engines[0].models._cache.loaded.values()))
+        slow = True
         with model.busy, pytest.raises(DeadlineExceeded):
-            agent.act(obs(2))  # which is being acted on
-        agent._connection.timeout_s = 10.0
+            agent.act(obs(2))  # which is acted on later
+        slow = False
         act = agent.act(obs(3))
         assert "resumed" not in act.info
         assert act.info["acts"] == 2

@@ -108,12 +108,15 @@ def test_what_is_cut_short_is_told(write: Write, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("write", KINDS)
 def test_it_is_so_with_a_trainer_that_writes_at_the_same_time(write: Write, tmp_path: Path) -> None:
-    going, written = threading.Semaphore(0), threading.Event()
+    going = threading.Semaphore(0)
+    list(write(tmp_path / "elsewhere" / "000200"))
 
     def train() -> None:
         for _ in write(tmp_path / "000200"):
             going.acquire()
-        written.set()
+
+    def content(folder: Path) -> dict[Path, bytes]:
+        return {path.relative_to(folder): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
     trainer = threading.Thread(target=train)
     trainer.start()
@@ -123,7 +126,7 @@ def test_it_is_so_with_a_trainer_that_writes_at_the_same_time(write: Write, tmp_
     def found() -> bool:
         going.release()
         steps = watcher.scan(time.monotonic())
-        whole_when_found.extend([written.is_set()] * len(steps))
+        whole_when_found.extend(content(tmp_path / "000200") == content(tmp_path / "elsewhere/000200") for _ in steps)
         return bool(steps)
 
     wait_for(found)

@@ -75,7 +75,7 @@ class TestOnACluster:
         [
             ("raise", "the simulator exploded"),
             ("exit", f"the worker on {socket.gethostname()} died"),
-            ("hang", "env step after 3 steps took longer than 3 s"),
+            ("hang", "env step after 3 steps took longer than 8 s"),
             ("freeze", "no sign of life"),
         ],
     )
@@ -84,7 +84,7 @@ class TestOnACluster:
     ) -> None:
         impatient(monkeypatch)
         trouble = {"folder": str(tmp_path), "trouble": {kind: [2]}}
-        settings = config(env_options=trouble, env_timeout_s=3, make_timeout_s=20)
+        settings = config(env_options=trouble, env_timeout_s=8, make_timeout_s=120)
         summary = evaluate(settings, agent_factory=ToZero)
         undisturbed = config(out=tmp_path / "undisturbed")
         evaluate(undisturbed, agent_factory=ToZero)
@@ -117,11 +117,11 @@ class TestOnACluster:
         self, config: Config, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         impatient(monkeypatch)
-        settings = config(episodes=1, retries=0, policy_timeout_s=0.5)
+        settings = config(episodes=1, retries=0, policy_timeout_s=4)
         summary = evaluate(settings, agent_factory=Silent)
         assert (summary.total.episodes, summary.total.infra_failures) == (0, 1)
         ((text,),) = query(settings, "SELECT error FROM episodes")
-        assert "policy act after 0 steps took longer than 0.5 s" in text
+        assert "policy act after 0 steps took longer than 4 s" in text
 
     def test_lost_episodes_have_no_success_and_are_played_on_resume(self, config: Config) -> None:
         summary = evaluate(config(retries=1), agent_factory=functools.partial(ToZero, lost_on=4))
@@ -218,7 +218,7 @@ class TestOnACluster:
         self, config: Config, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         monkeypatch.setattr(pool, "CLOSE_S", 0.5)
-        base = config(workers=1, cpus_per_worker=3, place_timeout_s=30)
+        base = config(workers=1, cpus_per_worker=3, place_timeout_s=120)
         suites = [
             SuiteConfig(envs=[CLINGING], episodes=2),
             SuiteConfig(envs=[LINE], episodes=1, worker=base.worker.model_copy(update={"threads": 2})),

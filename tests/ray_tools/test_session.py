@@ -98,7 +98,7 @@ def test_a_machine_that_is_slow_to_start_ray_gets_another_attempt(
     with joined("local", num_cpus=1, include_dashboard=False):
         assert ray.get(ray.put(5)) == 5
         assert len(ray.nodes()) == 1
-    assert asked.read_text() == "xx"
+    assert asked.read_text() in ("xx", "xxx")  # the third where the machine is as slow as that by itself
     assert "attempt 2 of 3" in caplog.text
     assert re.search("Ray's daemon: .*Timed out waiting for file .*agent", caplog.text)
     _, left = psutil.wait_procs(set(psutil.Process().children(recursive=True)) - before, 30)

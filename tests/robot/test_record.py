@@ -189,7 +189,7 @@ def test_a_full_disk_costs_its_episode_and_no_later_one(tmp_path: Path) -> None:
             for i in range(100):
                 camera = noise.integers(0, 255, (2 * SIDE, 2 * SIDE, 3), np.uint8)
                 recorder.add(Obs({"front": camera}), action(i), tick=i)
-        wait_for(lambda: recorder._queue.empty() or not recorder._thread.is_alive())
+        wait_for(lambda: recorder.error is not None)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     with recorder.episode("stack"):

@@ -44,7 +44,7 @@ from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
 
 BASE = urlsplit("http://127.0.0.1")
-SLOW_S, IDLE_S = 0.4, 1.5
+SLOW_S, IDLE_S = 0.4, 3.0  # where a test is about those; others hold though this process stands still
 
 
 class Seen(list[str | None]):
@@ -67,7 +67,7 @@ class Witness(Agent):
 
     def act(self, obs: Obs) -> Act:
         self.acting.set()
-        self.hold.wait(10)
+        self.hold.wait(60)
         return Act(np.zeros(2, np.float32))
 
 
@@ -97,11 +97,11 @@ def shown(token: str | None) -> dict[str, str]:
 
 
 @contextlib.contextmanager
-def replica(*, keyed: bool = True) -> Iterator[Replica]:
+def replica(*, keyed: bool = True, slow_s: float = 60.0, idle_s: float = 60.0) -> Iterator[Replica]:
     known, policy = ChangingKeys(), Witness()
     engine = Engine(policy, session_limit=8)
     admit = (lambda token: known.keys.check(token, "app")) if keyed else NoKey.OPEN
-    own = WebSocketServer(engine, Limits(), "127.0.0.1", None, admit, slow_s=SLOW_S, idle_s=IDLE_S)
+    own = WebSocketServer(engine, Limits(), "127.0.0.1", None, admit, slow_s=slow_s, idle_s=idle_s)
     near = ShmServer(engine, Limits(), admit)
     own.open()
     near.open()
@@ -129,6 +129,13 @@ def keyed() -> Iterator[Replica]:
         yield one
 
 
+@pytest.fixture
+def impatient() -> Iterator[Replica]:
+    """Cuts off who is silent."""
+    with replica(slow_s=SLOW_S, idle_s=IDLE_S) as one:
+        yield one
+
+
 def handshake(path: str, *headers: str) -> bytes:
     lines = [f"GET {path} HTTP/1.1", "Host: 127.0.0.1", "Upgrade: websocket", "Connection: Upgrade"]
     lines += [f"Sec-WebSocket-Key: {base64.b64encode(os.urandom(16)).decode()}", "Sec-WebSocket-Version: 13", *headers]
@@ -145,10 +152,10 @@ RESET = frame(encode_request(Request("reset", Obs(), "move to the human", sessio
 
 
 def answer(port: int, *segments: bytes) -> bytes:
-    """All that the server says until it hangs up, or for a second."""
+    """All that the server says until it hangs up."""
     said = b""
     with socket.create_connection(("127.0.0.1", port)) as attacker, contextlib.suppress(OSError):
-        attacker.settimeout(1.0)
+        attacker.settimeout(60)
         for segment in segments:
             attacker.sendall(segment)
         while more := attacker.recv(65536):
@@ -227,14 +234,15 @@ def half(payload: int) -> bytes:
     return bytes([0x82, 0x80 | 127]) + struct.pack(">Q", payload) + b"\0\0\0\0" + b"\0" * (payload // 2)
 
 
-def test_half_a_message_is_not_waited_for(keyed: Replica) -> None:
-    token = keyed.known.add("arm")
-    good, bad = keyed.stream(token), keyed.stream(token)
-    bad._socket.sendall(half(2**20))
-    wait_for(lambda: len(keyed.own._clients) == 1)
-    assert sum(len(client._protocol.reader.buffer) for client in keyed.own._clients) == 0
-    good.send(bytes_probe(100), 5)
-    assert good.recv(5)
+def test_half_a_message_is_not_waited_for() -> None:
+    with replica(slow_s=SLOW_S) as keyed:
+        token = keyed.known.add("arm")
+        good, bad = keyed.stream(token), keyed.stream(token)
+        bad._socket.sendall(half(2**20))
+        wait_for(lambda: len(keyed.own._clients) == 1)
+        assert sum(len(client._protocol.reader.buffer) for client in keyed.own._clients) == 0
+        good.send(bytes_probe(100), 5)
+        assert good.recv(5)
 
 
 @pytest.mark.parametrize("first", [b"", b"GET / HTTP/1.1\r\nHost: x\r\n"])
@@ -248,33 +256,33 @@ def test_who_does_not_say_what_he_wants_is_cut_off(keyed: Replica, first: bytes,
         each.close()
 
 
-def test_a_silent_connection_ends_and_one_that_is_used_does_not(keyed: Replica) -> None:
-    token = keyed.known.add("arm")
-    silent, used = keyed.stream(token), keyed.stream(token)
+def test_a_silent_connection_ends_and_one_that_is_used_does_not(impatient: Replica) -> None:
+    token = impatient.known.add("arm")
+    silent, used = impatient.stream(token), impatient.stream(token)
     begun = time.monotonic()
-    while len(keyed.own._clients) > 1 or time.monotonic() - begun < 1.5 * IDLE_S:
+    while len(impatient.own._clients) > 1 or time.monotonic() - begun < 1.5 * IDLE_S:
         used.send(bytes_probe(100), 5)
         assert used.recv(5)
         time.sleep(0.02)
-        assert time.monotonic() - begun < 20
+        assert time.monotonic() - begun < 60
     with pytest.raises((ConnectionClosed, OSError), match="silent"):
         listen_to_the_end(silent)
 
 
-def test_nobody_is_cut_off_because_the_policy_takes_long(keyed: Replica) -> None:
+def test_nobody_is_cut_off_because_the_policy_takes_long(impatient: Replica) -> None:
     """It is the server then that does not read."""
-    token = keyed.known.add("arm")
-    other, waiting = keyed.stream(token), keyed.stream(token)
+    token = impatient.known.add("arm")
+    other, waiting = impatient.stream(token), impatient.stream(token)
     for client in (other, waiting):
         client.send(encode_request(Request("reset", Obs())), 5)
         client.recv(5)
-    keyed.policy.hold.clear()
+    impatient.policy.hold.clear()
     other.send(encode_request(Request("act", Obs())), 5)
-    assert keyed.policy.acting.wait(5)
+    assert impatient.policy.acting.wait(5)
     message = frame(encode_request(Request("act", Obs(info={"much": bytes(20_000)}))))
     waiting._socket.sendall(message)
     time.sleep(1.5 * IDLE_S)
-    keyed.policy.hold.set()
+    impatient.policy.hold.set()
     for client in (other, waiting):
         assert decode_reply(client.recv(5)).error is None
 
@@ -344,8 +352,9 @@ def test_a_local_client_shows_its_key_soon(keyed: Replica, monkeypatch: pytest.M
     monkeypatch.setattr(local, "_KEY_S", 0.3)
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as silent:
         silent.connect(f"\0{keyed.local.address.socket}")
-        silent.settimeout(5)
+        silent.settimeout(60)
         assert silent.recv(100) == b""
+    monkeypatch.setattr(local, "_KEY_S", 3.0)
     wrong = keyed.shm("wrong")
     assert isinstance(wrong.call([Request("reset", Obs())], 5)[0].error, Unauthorized)
     wait_for(lambda: not keyed.local._clients)

@@ -319,4 +319,4 @@ def at_rest(replica: KeyedReplica) -> None:
     """Nobody is connected any more."""
     wait_for(lambda: not replica.own._clients and not replica.local._clients)
     wait_for(lambda: not any(thread.name.startswith("vlagents 127") for thread in threading.enumerate()))
-    assert not replica.known.keys._held
+    wait_for(lambda: not replica.known.keys._held)

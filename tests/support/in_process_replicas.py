@@ -59,7 +59,7 @@ class Replicas:
         """A client of them."""
         agent = RemoteAgent("http://127.0.0.1:9", **options)
         another = partial(InProcess, self) if options.get("resume", True) else None
-        agent._connection = Connection(agent.url, InProcess(self), CodecChoice("raw"), 5.0, 5.0, another)
+        agent._connection = Connection(agent.url, InProcess(self), CodecChoice("raw"), 30.0, 30.0, another)
         return agent
 
     def close(self) -> None:

@@ -103,8 +103,10 @@ def empty_loop(hz: float, seconds: float, *, real_time: bool = False) -> dict[st
     with undisturbed(real_time=real_time):
         pacer = Pacer(hz)
         ticks = pacer.ticks_in(seconds)
-        while pacer.wait() < ticks - 1:
+        while (tick := pacer.wait()) < ticks - 1:
             pass
+        if tick >= ticks:
+            pacer.forget(ticks)
     return jitter(pacer.late_s, pacer.missed, pacer.ticks)
 
 

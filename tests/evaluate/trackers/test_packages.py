@@ -6,13 +6,14 @@ import json
 import logging
 import struct
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import psutil
 import pytest
-from eval_fakes import LINE
+from eval_fakes import LINE, wait_for
 from in_process_evaluation import play
 
 from vlagents_ray.evaluate import EvalConfig, Results
@@ -53,7 +54,15 @@ def _no_service_left() -> Iterator[None]:
     import wandb
 
     wandb.teardown()
-    assert not [child for child in psutil.Process().children() if "wandb" in child.name()]
+    wait_for(lambda: not wandb_processes())
+
+
+def wandb_processes() -> list[str]:
+    found = []
+    for child in psutil.Process().children():
+        with suppress(psutil.NoSuchProcess):
+            found.append(child.name())
+    return [name for name in found if "wandb" in name]
 
 
 def test_wandb_keeps_curves_videos_config_and_code(

@@ -289,7 +289,10 @@ def test_a_websocket_that_never_reads_its_replies_ends_with_its_sessions_alone(e
 
     with endpoint.agent("lab", "websocket") as bystander:
         bystander.reset(Obs(), "x")
-        before = set(endpoint.engine.sessions.ids())
+
+        def deaf_ones() -> list[str]:
+            return [name for name in endpoint.engine.sessions.ids() if name.startswith("ending/")]
+
         deaf = socket.create_connection(("127.0.0.1", endpoint.port), timeout=30)
         with connect(
             endpoint.url.replace("http", "ws") + "/v1/stream",
@@ -300,10 +303,11 @@ def test_a_websocket_that_never_reads_its_replies_ends_with_its_sessions_alone(e
             close_timeout=1,
         ) as stream:
             stream.send(encode_request(Request("reset", Obs())))
-            wait_for(lambda: set(endpoint.engine.sessions.ids()) > before)
-            for _ in range(30):
-                stream.send(encode_request(Request("act", Obs(info={"bytes": 2**20}))))
-            wait_for(lambda: set(endpoint.engine.sessions.ids()) == before)
+            wait_for(deaf_ones)
+            with contextlib.suppress(ConnectionClosed):  # before the last is sent, on a busy machine
+                for _ in range(30):
+                    stream.send(encode_request(Request("act", Obs(info={"bytes": 2**20}))))
+            wait_for(lambda: not deaf_ones())
             bystander.act(Obs())
             with contextlib.suppress(OSError):
                 deaf.shutdown(socket.SHUT_RDWR)
@@ -318,9 +322,10 @@ def test_a_websocket_that_stays_silent_or_sends_half_a_message_is_cut_off() -> N
                 b"GET /v1/stream HTTP/1.1\r\nhost: x\r\nconnection: upgrade\r\nupgrade: websocket\r\n"
                 b"sec-websocket-version: 13\r\nsec-websocket-key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
             )
-            assert half.recv(4096).startswith(b"HTTP/1.1 101")
+            accepted, _, early = half.recv(4096).partition(b"\r\n\r\n")
+            assert accepted.startswith(b"HTTP/1.1 101")
             half.sendall(b"\x82\xfe\x00\x7e" + bytes(8))  # of a masked frame of 126 bytes, the first 4
-            assert half.recv(4096)[0] == 0x88  # the server closes
+            assert (early or half.recv(4096))[0] == 0x88  # the server closes
         with (
             connect(f"ws://127.0.0.1:{port}/v1/stream", ping_interval=None, close_timeout=1) as silent,
             pytest.raises(ConnectionClosed, match="silent"),

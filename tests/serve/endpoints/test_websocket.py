@@ -7,6 +7,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -155,8 +156,9 @@ def test_a_client_that_takes_no_replies_holds_up_nobody(
     for client in (slow, other):
         ask(client, "reset")
     frame = encode_request(Request("act", Obs({"front": np.zeros((2, 2, 3), np.uint8)}, info={"bytes": 3_000_000})))
-    for _ in range(4):
-        slow.send(frame, 5)
+    with suppress(ConnectionClosed, OSError):  # cut off before the last is sent, on a busy machine
+        for _ in range(4):
+            slow.send(frame, 5)
     for pixel in range(50):
         act = ask(other, "act", pixel).act
         assert act is not None

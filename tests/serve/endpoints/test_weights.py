@@ -234,12 +234,14 @@ def test_a_push_that_dies_half_way_leaves_nothing_behind(serving: Serving) -> No
 
 
 def test_a_learner_that_is_silent_is_not_waited_for(serving: Serving) -> None:
-    server = serving(slow_s=0.2)
-    with opened(server) as socket:
-        assert answer(socket, header_of(gains(1))) == {"received": 0}
-        refused = read_error(json.loads(socket.recv(30)))
-        assert isinstance(refused, MalformedMessage)
-        assert "no part within 0.2 s" in str(refused)
+    server, header = serving(slow_s=0.2), header_of(gains(1))
+    for _ in range(20):
+        with opened(server) as socket:
+            if answer(socket, header) == {"received": 0}:  # else this machine was too slow for the header, too
+                refused = read_error(json.loads(socket.recv(30)))
+                break
+    assert isinstance(refused, MalformedMessage)
+    assert "no part within 0.2 s" in str(refused)
     server = serving()
     assert Publisher(server.url).push(gains(1)) == 1
 

@@ -6,12 +6,14 @@ import gc
 import json
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 import pytest
+from eval_fakes import wait_for
 from starlette.testclient import TestClient
 
 from vlagents_ray.client.transports.local.shm import ShmTransport
@@ -41,10 +43,13 @@ OBS = Obs({"front": np.random.default_rng(0).integers(0, 255, (64, 64, 3), np.ui
 
 
 class Large(Agent):
-    """Answers with much to encode; sleeps as long as it is told."""
+    """Answers with much to encode; waits for the gate where it is told to."""
+
+    gate = threading.Event()
 
     def act(self, obs: Obs) -> Act:
-        time.sleep(obs.info.get("sleep", 0.0))
+        if obs.info.get("wait"):
+            self.gate.wait(60)
         if obs.info.get("fail"):
             raise RuntimeError("no")
         return Act(np.zeros((50, 7)), info={"list": list(range(5000)), "text": "ünïcode"})
@@ -123,9 +128,18 @@ def test_what_was_answered_is_recorded_with_its_code(client: TestClient, engine:
     with client.websocket_connect("/v1/stream") as socket:
         socket.send_bytes(b"garbage")
         socket.receive_bytes()
-    collected = engine.stats.collect()
-    assert collected.batches.values == [1, 1]
-    assert {kind: sample.seen for kind, sample in collected.requests.items()} == {
+    batches: list[int] = []
+    requests: Counter[Any] = Counter()
+
+    def are_all_recorded() -> bool:  # some of it just after the answer
+        collected = engine.stats.collect()
+        batches.extend(collected.batches.values)
+        requests.update({kind: sample.seen for kind, sample in collected.requests.items()})
+        return len(batches) >= 2 and requests.total() >= 6
+
+    wait_for(are_all_recorded)
+    assert batches == [1, 1]
+    assert requests == {
         ("act", "http", "robot", "unknown_session"): 1,
         ("reset", "http", "robot", "ok"): 1,
         ("act", "http", "robot", "ok"): 1,
@@ -210,17 +224,18 @@ def test_load_is_the_busy_share_and_the_mean_queue(engine: Engine) -> None:
     quiet = meter.read()
     assert quiet.utilisation < 0.2
     assert quiet.waiting == 0
-    busy = threading.Event()
-    engine.submit("a", Request("act", Obs(info={"sleep": 0.4})), lambda _: answered.release() and None)
-    while engine.queue.depth():  # until it is in its batch
-        time.sleep(0.001)
+    Large.gate.clear()
+    engine.submit("a", Request("act", Obs(info={"wait": True})), lambda _: answered.release() and None)
+    wait_for(lambda: engine.queue.depth() == 0)  # it is in its batch
     for name in ("b", "c"):
-        engine.submit(name, Request("act", Obs()), lambda _: busy.wait(10) and answered.release() and None)
-    assert answered.acquire(timeout=10)
+        engine.submit(name, Request("act", Obs()), lambda _: answered.release() and None)
+    meter.read()
+    time.sleep(0.2)
     loaded = meter.read()
-    busy.set()
-    assert loaded.utilisation > 0.5
-    assert 0.5 < loaded.waiting <= 2.0
+    Large.gate.set()
+    assert all(answered.acquire(timeout=60) for _ in range(3))
+    assert loaded.utilisation > 0.99
+    assert loaded.waiting == pytest.approx(2.0, rel=0.05)
 
 
 def test_recording_costs_a_request_little() -> None:
@@ -236,6 +251,12 @@ def test_recording_costs_a_request_little() -> None:
             times.append(time.perf_counter() - begun)
         return sorted(times)[1000]
 
-    recorded = median(lambda: stats.handled(KIND, (1.0, 0.1, 0.2, 0.3, 0.4)))
-    encoded = median(lambda: RequestTrace(stats, "shm").frame([Reply("x", Act(np.zeros(7)))]))
+    rounds = [
+        (
+            median(lambda: stats.handled(KIND, (1.0, 0.1, 0.2, 0.3, 0.4))),
+            median(lambda: RequestTrace(stats, "shm").frame([Reply("x", Act(np.zeros(7)))])),
+        )
+        for _ in range(5)
+    ]
+    recorded, encoded = map(min, zip(*rounds, strict=True))
     assert recorded < encoded / 2

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 
 import pytest
+from eval_fakes import wait_for
 
 from vlagents_ray.errors import DeadlineExceeded, PolicyFailed, PolicyUnavailable
 from vlagents_ray.protocol.messages import Reply, Request
@@ -163,6 +164,7 @@ def test_closing_answers_everyone(harness: Callable[..., Harness]) -> None:
     h.put("waiting")
     closer = threading.Thread(target=h.queue.close)
     closer.start()
+    wait_for(lambda: h.queue._closed)
     h.finish("first", "waiting")
     closer.join(5)
     assert isinstance(h.replies["waiting"].error, PolicyUnavailable)
@@ -235,7 +237,8 @@ def test_the_queue_costs_a_lone_request_little() -> None:
         there.release()
         back.acquire()
 
-    bare_s, queued_s = median(bare), median(through_queue)
+    rounds = [(median(bare), median(through_queue)) for _ in range(5)]
+    bare_s, queued_s = map(min, zip(*rounds, strict=True))
     stop.set()
     bare()
     thread.join(5)

@@ -122,10 +122,10 @@ def test_messages_are_heard_beside_a_batch_and_never_on_two_threads_at_once(slow
 
 
 def test_nobody_listens_beside_a_lone_session(slow: Callable[..., Slow]) -> None:
-    one = slow()
+    one, before = slow(), threading.enumerate()
     one.queue.start()
     one.learn("robot")
-    assert "policy-reader" not in {thread.name for thread in threading.enumerate()}
+    assert "policy-reader" not in {thread.name for thread in threading.enumerate() if thread not in before}
 
 
 def test_a_callback_may_end_its_watch_beside_a_batch(slow: Callable[..., Slow]) -> None:
@@ -175,6 +175,7 @@ def test_answers_come_while_the_next_batch_runs_and_when_the_queue_closes(slow: 
     one.put("e", "f")
     closer = threading.Thread(target=one.queue.close)
     closer.start()
+    wait_for(lambda: one.queue._closed)
     one.open.set()
     closer.join(5)
     assert one.called("answer c", "answer d", "error e", "error f")

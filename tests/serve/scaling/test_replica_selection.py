@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from dataclasses import replace
 
@@ -116,11 +117,12 @@ class Beside:
     """Neighbours that hold what they are told to hold; counts how often they were asked."""
 
     def __init__(self, *loads: ReplicaLoad) -> None:
-        self.held, self.asked, self.slow_s = list(loads), 0, 0.0
+        self.held, self.asked, self.answer = list(loads), 0, threading.Event()
+        self.answer.set()
 
     def loads(self) -> list[ReplicaLoad]:
         self.asked += 1
-        time.sleep(self.slow_s)
+        assert self.answer.wait(60)
         return [replace(one) for one in self.held]
 
     def announce_client(self, replica: str) -> str:
@@ -135,9 +137,10 @@ def balance(engine: Engine, *beside: ReplicaLoad) -> tuple[Rebalancer, Beside]:
 def test_clients_that_come_at_once_are_spread_evenly() -> None:
     engine = Engine(Counting())
     mine, neighbours = balance(engine, load("b", 3), load("c", 0))
-    neighbours.slow_s = 0.2
+    neighbours.answer.clear()
     waiting = [mine.place(ClientLocation()) for _ in range(15)]
-    places = [one.result(5) for one in waiting]
+    neighbours.answer.set()
+    places = [one.result(60) for one in waiting]
     assert {name: places.count(name) for name in (None, "b", "c")} == {None: 6, "b": 3, "c": 6}
     assert mine.load().sessions == 6
     assert neighbours.asked == 1

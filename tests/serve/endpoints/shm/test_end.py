@@ -45,7 +45,7 @@ class Gated(Agent):
 
 def call(transport: ShmTransport, op: Op, instruction: str | None = None) -> Reply:
     one = Request(op, Obs({}), instruction, request_id=os.urandom(8).hex())
-    [reply] = transport.call([one], 5)
+    [reply] = transport.call([one], 60)
     return reply
 
 
@@ -64,15 +64,15 @@ def test_a_client_that_ends_while_its_batch_runs_harms_nobody() -> None:
         thread = threading.Thread(target=_act_to_the_end, args=(asking,))
         thread.start()
         try:
-            assert Gated.busy.wait(5)
+            assert Gated.busy.wait(60)
             if ending:
                 asking._socket.shutdown(socket.SHUT_RDWR)  # type: ignore[union-attr]
-                wait_for(lambda: len(engine.sessions) == 1, 30)  # while the batch is under way
+                wait_for(lambda: len(engine.sessions) == 1, 50)  # while the batch is under way
             else:
                 time.sleep(0.02)
         finally:
             Gated.gate.set()
-            thread.join(5)
+            thread.join(60)
     act = call(other, "act").act
     assert act is not None
     assert act.info.pop("policy")["version"] == 0

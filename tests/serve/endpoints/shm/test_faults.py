@@ -95,8 +95,7 @@ def test_descriptors_that_a_message_brings_are_all_closed(served: tuple[Engine, 
         odd.connect(f"\0{served[1].address.socket}")
         socket.send_fds(odd, [message], [file.fileno()] * 2)
         odd.recv(1000)  # an error, or the end
-    wait_for(lambda: not served[1]._clients)
-    assert not descriptors() - before
+    wait_for(lambda: not served[1]._clients and not descriptors() - before)
 
 
 def test_faults_are_answered_and_harm_nobody(served: tuple[Engine, ShmServer]) -> None:
@@ -202,8 +201,8 @@ def test_what_could_not_be_sent_keeps_no_memory() -> None:
         deaf.bind(f"\0{name}")
         deaf.listen(1)
         transport = ShmTransport({"socket": name, "boot_id": ""})
-        busy = [-1, 0]
-        while busy[-1] > busy[-2]:  # sent, and given up
+        busy = [0]
+        while len(busy) <= 20 or busy[-1] > busy[-20]:  # sent, or its time was over before, and given up
             with pytest.raises(DeadlineExceeded):
                 call(transport, request("act", size=8), 0.001)
             busy.append(sum(memory.busy for memory in transport._memories))
