@@ -162,6 +162,7 @@ def test_a_good_observation_passes() -> None:
         (replace(OBS, cameras={**OBS.cameras, "front": np.zeros((64, 64, 3), np.uint8)}), InvalidObservation),
         (replace(OBS, cameras={**OBS.cameras, "front": np.zeros((224, 224, 3), np.float32)}), InvalidObservation),
         (replace(OBS, cameras={**OBS.cameras, "front": np.zeros((3, 224, 224), np.uint8)}), InvalidObservation),
+        (replace(OBS, cameras={**OBS.cameras, "unknown": np.zeros((0, 4, 3), np.uint8)}), InvalidObservation),
     ],
 )
 def test_each_bad_observation_has_its_error(obs: Obs, error: type[Exception]) -> None:

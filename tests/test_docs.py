@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import re
 import runpy
+from dataclasses import fields
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from page_commands import PAGES, commands, read_as_typed
@@ -14,8 +16,11 @@ from vlagents_ray.cli.evaluation.command import read_run
 from vlagents_ray.envs import metaworld
 from vlagents_ray.envs.benchmark_protocol import BenchmarkProtocol
 from vlagents_ray.envs.gymnasium_registry import known
-from vlagents_ray.errors import BY_CODE, VLAgentsError
+from vlagents_ray.errors import BY_CODE, Overloaded, VLAgentsError
 from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.interface import Act
+from vlagents_ray.protocol import frame_layout, frames, json_messages, messages, observations
+from vlagents_ray.protocol.messages import Limits, Reply
 from vlagents_ray.serve.config.python_env import EnvironmentArgs
 
 ROOT = Path(__file__).parents[1]
@@ -124,6 +129,30 @@ def test_troubleshooting_has_every_error_with_its_status_and_a_cure(code: str, e
 
 def test_troubleshooting_has_no_error_that_is_gone() -> None:
     assert set(re.findall(r"^\| `(\w+)` \| \d+ \|", _read("troubleshooting.md"), re.MULTILINE)) == set(BY_CODE)
+
+
+PROTOCOL = (DOCS / "protocol.md").read_text()
+
+
+def test_the_protocol_has_every_key_header_limit_and_type() -> None:
+    keys = {*frames._REQUEST_KEYS, *json_messages._KEYS, *observations._OBS_KEYS}
+    reply = Reply("r", Act(np.zeros(1, np.float32)), step=1, draining=True, timing={"queue_ms": 1.0})
+    failed = Reply("r", error=Overloaded("full"))
+    for one in (reply, failed):
+        header, _ = frame_layout.unpack(frames.encode_replies([one, one]), Limits())
+        keys |= header.keys() | header["replies"][0].keys()
+        keys |= header["replies"][0].get("act", {}).keys() | header["replies"][0].get("error", {}).keys()
+    keys |= {name for name in dir(messages) if name.endswith("_HEADER")}
+    names = {getattr(messages, key, key) for key in keys} - {messages.MACHINE_HEADER}
+    types = {np.dtype(code).newbyteorder("<").str.replace("|", "\\|") for code in "?bhiqBHIQefd"}
+    names |= types | {field.name for field in fields(Limits)} - {"reply_bytes", "in_flight_bytes"}
+    assert {name for name in names if f"`{name}`" not in PROTOCOL and f'"{name}"' not in PROTOCOL} == set()
+
+
+@pytest.mark.parametrize("name", ["pixels", "state_values", "text", "requests", "history"])
+def test_the_protocol_states_the_limits_that_hold(name: str) -> None:
+    rows = [line for line in PROTOCOL.splitlines() if line.startswith(f"| `{name}` |")]
+    assert any(f" {getattr(Limits(), name):,} " in row for row in rows)
 
 
 def test_the_figures_of_the_readme_are_the_measured_ones() -> None:

@@ -26,6 +26,8 @@ def check_observation(obs: Obs, contract: Contract | None) -> None:
     for name, image in obs.cameras.items():
         if not isinstance(image, np.ndarray) or image.ndim != 3 or image.shape[2] != 3 or image.dtype != _UINT8:
             raise InvalidObservation(f"camera {name!r}: got {_describe(image)}, want (H, W, 3) uint8 RGB")
+        if not image.size:
+            raise InvalidObservation(f"camera {name!r}: got {_describe(image)}, want one pixel at least")
     if "" in obs.cameras or "" in obs.state:
         raise InvalidObservation("observation: got a camera or state without a name (''), want a name for each")
     for name, part in obs.state.items():

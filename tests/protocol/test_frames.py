@@ -49,7 +49,7 @@ arrays = hnp.arrays(
     dtype=st.sampled_from([np.dtype(t) for t in ("?", "u1", "i2", "i4", "i8", "f2", "f4", "f8")]),
     shape=hnp.array_shapes(min_dims=0, max_dims=3, max_side=5),
 )
-leaves = st.none() | st.booleans() | st.integers(-(2**53), 2**53) | st.floats(allow_nan=False) | st.text(max_size=10)
+leaves = st.none() | st.booleans() | st.integers(-(2**53), 2**53) | st.floats() | st.text(max_size=10)
 infos = st.dictionaries(
     names,
     st.recursive(
@@ -79,7 +79,7 @@ def same(a: object, b: object) -> bool:
         return isinstance(b, dict) and a.keys() == b.keys() and all(same(a[k], b[k]) for k in a)
     if isinstance(a, (list, tuple)):
         return isinstance(b, (list, tuple)) and len(a) == len(b) and all(map(same, a, b))
-    return type(a) is type(b) and a == b
+    return type(a) is type(b) and (a == b or repr(a) == repr(b) == "nan")  # which equals nothing
 
 
 @given(observations, st.none() | st.text(max_size=20), infos)
@@ -100,6 +100,42 @@ def test_a_reply_comes_back_as_it_was(action: np.ndarray, done: bool, info: dict
     assert same(action, got.act.action)
     assert (got.request_id, got.act.done, got.timing) == ("r1", done, {"queue_ms": 0.5})
     assert same(info, got.act.info)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf"), np.float32("nan")])
+def test_the_header_is_json_for_every_parser_though_a_policy_says_nan(value: float) -> None:
+    frame = encode_reply(Reply("r1", Act(np.zeros(2, np.float32), info={"loss": [value]})))
+    header = frame[8 : 8 + struct.unpack("<I", frame[4:8])[0]]
+    json.loads(header, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
+    got = decode_reply(frame).act
+    assert got is not None
+    assert same(got.info["loss"], [float(value)])
+
+
+def test_a_step_is_text_since_some_parsers_round_it() -> None:
+    step = 2**61 + 1
+    for frame in (encode_request(Request("act", Obs(), step=step)), encode_reply(Reply("r1", info={}, step=step))):
+        assert json.loads(frame[8 : 8 + struct.unpack("<I", frame[4:8])[0]])["step"] == str(step)
+        assert (decode_request(frame) if b'"op"' in frame else decode_reply(frame)).step == step
+    for said in (3, "3"):
+        assert decode_request(b"".join(pack({"op": "act", "obs": {}, "step": said}, []))).step == 3
+    for wrong in ("x", "-1", "1.5", "\u00b2", "1" * 99, 2.0, -1, True, []):
+        with pytest.raises(MalformedMessage, match="step"):
+            decode_request(b"".join(pack({"op": "act", "obs": {}, "step": wrong}, [])))
+
+
+def test_a_number_that_is_none_of_three_is_malformed() -> None:
+    for name in ("NaN", "1.5", "infinity", 3):
+        header = {"op": "act", "obs": {"info": {"x": {"$": ["float", name]}}}}
+        with pytest.raises(MalformedMessage, match="reference"):
+            decode_request(b"".join(pack(header, [])))
+
+
+def test_half_of_a_surrogate_pair_is_malformed() -> None:
+    whole = {"op": "reset", "obs": {}, "instruction": "\U0001f916"}
+    assert decode_request(b"".join(pack(whole, []))).instruction == "\U0001f916"
+    with pytest.raises(MalformedMessage, match="surrogates"):
+        decode_request(b"".join(pack(whole | {"instruction": "\ud83e"}, [])))
 
 
 def test_an_error_comes_back_as_its_own_class() -> None:

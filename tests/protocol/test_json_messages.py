@@ -47,6 +47,9 @@ def test_a_request_is_read_from_json_and_images() -> None:
         ("{", {}, MalformedMessage),
         ("[]", {}, MalformedMessage),
         ("[" * 100_000, {}, MalformedMessage),
+        ('{"instruction": "\\ud800"}', {}, MalformedMessage),
+        ('{"state": {"\\udfff": [1]}}', {}, MalformedMessage),
+        (b'{"instruction": "\xed\xa0\x80"}', {}, MalformedMessage),
         ('{"instructions": "x"}', {}, MalformedMessage),
         ('{"cameras": {}}', {}, MalformedMessage),
         ('{"state": {"joints": {"x": 1}}}', {}, MalformedMessage),
@@ -57,7 +60,7 @@ def test_a_request_is_read_from_json_and_images() -> None:
         ("{}", {str(i): b"" for i in range(99)}, MessageTooLarge),
     ],
 )
-def test_each_fault_has_its_error(text: str, images: dict, error: type[Exception]) -> None:
+def test_each_fault_has_its_error(text: str | bytes, images: dict, error: type[Exception]) -> None:
     with pytest.raises(error):
         request_from_parts("act", text, images, Budget(Limits()))
 
@@ -68,6 +71,13 @@ def test_a_reply_becomes_plain_json() -> None:
     assert document["action"] == [[0, 0, 0], [0, 0, 0]]
     assert document["done"] is True
     assert document["info"] == {"array": [0, 1], "bytes": "YWJj", "scalar": 0.5, "deep": [{"x": [0.0]}]}
+
+
+def test_a_number_that_json_does_not_have_becomes_none() -> None:
+    nan, inf = float("nan"), float("inf")
+    info = {"loss": nan, "scalar": np.float32(inf), "list": [1.0, -inf], "array": np.array([[1, nan], [inf, 2]])}
+    document = reply_to_json(Reply("r", Act(np.zeros(3, np.float32), info=info)))
+    assert document["info"] == {"loss": None, "scalar": None, "list": [1, None], "array": [[1, None], [None, 2]]}
 
 
 def test_a_problem_names_its_stable_code() -> None:

@@ -38,6 +38,7 @@ import vlagents_ray
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.direct_websocket import Stream
 from vlagents_ray.client.transports.local.shm import ShmTransport
+from vlagents_ray.client.transports.probe import bytes_probe, is_answer
 from vlagents_ray.errors import DeadlineExceeded, MessageTooLarge, Overloaded, TooManyRequests, VLAgentsError
 from vlagents_ray.images import codecs, jpeg_png
 from vlagents_ray.images.codecs import decode_files
@@ -224,6 +225,16 @@ def test_a_refused_body_that_is_long_is_not_read(replica: KeyedReplica) -> None:
 
 def test_every_way_in_is_tried() -> None:
     assert CARRY.keys() | NOTHING_TO_DECODE | NO_KEY == WAYS.keys()
+
+
+@pytest.mark.parametrize("path", ["/v1/stream", "own"])
+def test_a_probe_through_a_websocket_counts_for_the_rate(replica: KeyedReplica, path: str) -> None:
+    def read(data: Any) -> str:
+        return "answered" if is_answer(data) else _read_reply(data)
+
+    attempt = over_websocket(path, lambda _: bytes_probe(100), read)
+    assert attempt(replica.visitor("right"), "after") == "answered"
+    assert attempt(replica.visitor("over its rate"), "after") == "429"
 
 
 @pytest.mark.parametrize(("way", "number"), [(way, n) for way, tries in CARRY.items() for n in range(len(tries))])

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Callable
 from typing import Any
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge
@@ -61,12 +62,7 @@ def unpack(data: Buffer, limits: Limits) -> tuple[dict[str, Any], list[Buffer]]:
     at = _PREFIX.size + length
     if at > len(view):
         raise MalformedMessage(f"frame: ends inside its header ({len(view)} of {at} bytes); it was truncated")
-    text = bytes(view[_PREFIX.size : at])
-    require_few_values(text)
-    try:
-        header = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise MalformedMessage(f"frame: the header is not JSON ({error})") from error
+    header = parse_json(bytes(view[_PREFIX.size : at]), "frame: the header is")
     lengths = header.get("blobs") if isinstance(header, dict) else None
     if not isinstance(lengths, list) or not all(type(n) is int and n >= 0 for n in lengths):
         raise MalformedMessage("frame: the header has no list 'blobs' of lengths")
@@ -82,7 +78,30 @@ def unpack(data: Buffer, limits: Limits) -> tuple[dict[str, Any], list[Buffer]]:
     return header, blobs
 
 
-def require_few_values(text: bytes | str) -> None:
+def parse_json(text: bytes | str, what: str, pairs: Callable[[list[tuple[str, Any]]], Any] | None = None) -> Any:
+    """Return the value of a JSON text of the network.
+
+    Args:
+        text: The text; bytes are UTF-8.
+        what: The beginning of the error message, such as "obs:".
+        pairs: Makes the value of an object from its keys and values; a `ValueError` of it is a `MalformedMessage`.
+
+    Raises:
+        MalformedMessage: It is not JSON, or has characters that no text can have: halves of surrogate pairs.
+        MessageTooLarge: It would need far more memory and time to read than its length suggests.
+    """
+    _require_few_values(text)
+    try:
+        decoded = text if isinstance(text, str) else text.decode("utf-8-sig")
+        value = json.loads(decoded, object_pairs_hook=pairs)
+        if "\\u" in decoded:
+            json.dumps(value, ensure_ascii=False).encode()  # raises an error for half of a pair
+    except (ValueError, RecursionError) as error:
+        raise MalformedMessage(f"{what} not JSON ({error})") from error
+    return value
+
+
+def _require_few_values(text: bytes | str) -> None:
     """Raise `MessageTooLarge` for JSON that would need far more memory and time to read than its length suggests."""
     if len(text) <= _SHORT:
         return

@@ -88,6 +88,8 @@ def _write_request(request: Request, writer: ValueWriter, codec: ImageCodec) -> 
     for name, default in _OPTIONAL.items():
         if (value := getattr(request, name)) != default:
             node[name] = value
+    if request.step is not None:
+        node["step"] = str(request.step)
     return node
 
 
@@ -143,10 +145,16 @@ def _read_request(node: dict[str, Any], reader: ValueReader, limits: Limits, ops
             kwargs=reader.value(node.get("kwargs") or {}),
             contract=node.get("contract"),
             history=[read_obs(one, reader, limits) for one in history],
-            **{name: node.get(name, default) for name, default in _OPTIONAL.items()},
+            **{name: node.get(name, default) for name, default in _OPTIONAL.items()} | {"step": _step(node)},
         ),
         limits,
     )
+
+
+def _step(node: dict[str, Any]) -> Any:
+    """Return the step of a request or reply, which is text, since some parsers of JSON round numbers over 2**53."""
+    step = node.get("step")
+    return int(step) if isinstance(step, str) and step.isascii() and step.isdecimal() and len(step) < 20 else step
 
 
 def check_request(request: Request, limits: Limits) -> Request:
@@ -223,7 +231,7 @@ def _write_reply(reply: Reply, writer: ValueWriter) -> dict[str, Any]:
     if reply.info is not None:
         node["info"] = writer.value(reply.info)
     if reply.step is not None:
-        node["step"] = reply.step
+        node["step"] = str(reply.step)
     if reply.draining:
         node["draining"] = True
     return node
@@ -246,7 +254,7 @@ def decode_replies(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> list[Reply]
 def _read_reply(node: dict[str, Any], reader: ValueReader) -> Reply:
     reply = Reply(
         request_id=str(node.get("request_id", "")),
-        step=node.get("step"),
+        step=_step(node),
         draining=bool(node.get("draining")),
         timing=node.get("timing") or {},
     )

@@ -7,7 +7,7 @@ camera is a separate file. Arrays in a reply become lists.
 from __future__ import annotations
 
 import base64
-import json
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -15,7 +15,7 @@ import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, VLAgentsError
 from vlagents_ray.protocol.budget import Budget
-from vlagents_ray.protocol.frame_layout import require_few_values
+from vlagents_ray.protocol.frame_layout import parse_json
 from vlagents_ray.protocol.frames import check_request, describe_error
 from vlagents_ray.protocol.messages import Op, Reply, Request
 from vlagents_ray.protocol.observations import read_obs
@@ -33,11 +33,7 @@ def request_from_parts(op: Op, text: str | bytes, images: Mapping[str, bytes], b
     """
     limits = budget.limits
     budget.begin(op)
-    require_few_values(text)
-    try:
-        document = json.loads(text, object_pairs_hook=_distinct)
-    except (ValueError, RecursionError) as error:
-        raise MalformedMessage(f"obs: not JSON ({error})") from error
+    document = parse_json(text, "obs:", _distinct)
     if not isinstance(document, dict):
         raise MalformedMessage(f"obs: got {type(document).__name__}, want an object")
     unknown = document.keys() - _KEYS
@@ -98,15 +94,19 @@ def problem(error: VLAgentsError, request_id: str = "") -> dict[str, Any]:
 
 
 def plain_values(value: Any) -> Any:
-    """Convert a value to JSON's types, without any of numpy: arrays become lists, bytes become base64."""
+    """Convert a value to JSON's types, without any of numpy: arrays become lists, bytes become base64, and NaN and
+    infinity, which JSON does not have, become None.
+    """
     if isinstance(value, Mapping):
         return {key: plain_values(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
         return [plain_values(item) for item in value]
     if isinstance(value, np.ndarray):
-        return value.tolist()
+        return value.tolist() if value.dtype.kind != "f" or np.isfinite(value).all() else plain_values(value.tolist())
     if isinstance(value, np.generic):
-        return value.item()
+        return plain_values(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
     if isinstance(value, (bytes, bytearray, memoryview)):
         return base64.b64encode(value).decode()
     return value

@@ -1,11 +1,12 @@
 """Nested values (None, bool, numbers, text, bytes, arrays, lists, dicts) <-> JSON plus binary blobs.
 
 Values that JSON cannot express become `{"$": [kind, blob index, ...]}`: `["nd", i, dtype, shape]` an array, `["img",
-i]` a JPEG or PNG file, `["bin", i]` bytes.
+i]` a JPEG or PNG file, `["bin", i]` bytes; `["float", "nan"]`, "inf" and "-inf" need no blob.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -42,11 +43,11 @@ class ValueWriter:
         if value is None or isinstance(value, (bool, str, int)):
             return value
         if isinstance(value, float):
-            return value
+            return value if math.isfinite(value) else {"$": ["float", str(float(value))]}
         if isinstance(value, np.ndarray):
             return self.array(value)
         if isinstance(value, np.generic):
-            return value.item() if value.dtype.kind in "biuf" else self.array(np.asarray(value))
+            return self.value(value.item()) if value.dtype.kind in "biuf" else self.array(np.asarray(value))
         if isinstance(value, (bytes, bytearray, memoryview)):
             self.blobs.append(bytes(value))
             return {"$": ["bin", len(self.blobs) - 1]}
@@ -107,7 +108,7 @@ class ValueReader:
         return node
 
     def blob(self, node: Any) -> Any:
-        """Return the array, image or bytes that `{"$": [...]}` refers to."""
+        """Return the array, image, bytes or number that `{"$": [...]}` refers to."""
         reference = _reference(node)
         if not reference or len(node) != 1:
             raise MalformedMessage(f"reference: got {str(node)[:80]}, want {{'$': [kind, blob, ...]}}")
@@ -120,7 +121,9 @@ class ValueReader:
             return self._image(rest[0])
         if kind == "bin" and len(rest) == 1:
             return self._bytes_of(rest[0])
-        raise MalformedMessage(f"reference: got {str(reference)[:80]}, want 'nd', 'img' or 'bin'")
+        if kind == "float" and rest in (["nan"], ["inf"], ["-inf"]):
+            return float(rest[0])
+        raise MalformedMessage(f"reference: got {str(reference)[:80]}, want 'nd', 'img', 'bin' or 'float'")
 
     def _image(self, index: Any) -> np.ndarray:
         data = self._get(index)

@@ -45,6 +45,8 @@ class Mean(Agent):
     def act(self, obs: Obs) -> Act:
         if obs.info.get("fail"):
             raise RuntimeError("no")
+        if obs.info.get("odd"):
+            return Act(np.zeros(5), info={"loss": np.inf, "text": "\ud800"})
         action = [*obs.cameras["front"].mean((0, 1)), *obs.state["joints"]]
         return Act(np.array(action), info={"instruction": self.instruction, "array": np.arange(2)})
 
@@ -53,7 +55,8 @@ class Mean(Agent):
 def client() -> Iterator[TestClient]:
     engine = Engine(Mean())
     engine.start()
-    inside = build_http_app(engine, lambda: {"policy": "mean", "version": "0", "protocol": 1}, LIMITS)
+    metadata = {"policy": "mean", "version": "0", "protocol": 1, "config": {"clip": float("inf")}}
+    inside = build_http_app(engine, lambda: metadata, LIMITS)
     with TestClient(AccessMiddleware(inside, None, "app")) as client:
         yield client
     engine.close()
@@ -102,6 +105,14 @@ def test_png_is_lossless(client: TestClient) -> None:
     post(client, "reset", files={"cameras.front": file.getvalue()})
     document = post(client, "act", files={"cameras.front": file.getvalue()}).json()
     np.testing.assert_allclose(document["action"][:3], IMAGE.mean((0, 1)), rtol=1e-6)
+
+
+def test_what_json_cannot_hold_in_the_info_of_a_policy_costs_no_action(client: TestClient) -> None:
+    post(client, "reset")
+    answer = post(client, "act", {**GOOD, "info": {"odd": True}})
+    assert answer.status_code == 200, answer.text
+    assert answer.json()["action"] == [0] * 5
+    assert answer.json()["info"]["loss"] is None
 
 
 MULTIPART = {"x-session-id": "robot-1", "content-type": "multipart/form-data; boundary=b"}
@@ -184,7 +195,8 @@ def test_close_ends_the_session(client: TestClient) -> None:
 
 def test_health_metadata_and_docs(client: TestClient) -> None:
     assert client.get("/healthz").text == "OK\n"
-    assert client.get("/v1/metadata").json()["policy"] == "mean"
+    metadata = client.get("/v1/metadata").json()
+    assert (metadata["policy"], metadata["config"]) == ("mean", {"clip": None})
     page = client.get("/docs")
     assert "/v1/reset" in page.text
     assert "missing_camera" in page.text
@@ -201,11 +213,16 @@ def test_health_is_503_until_the_policy_is_loaded() -> None:
 
 
 NAN, HUGE = float("nan"), 10**400
-_IHDR = b"IHDR" + struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0)
-_IDAT = b"IDAT" + zlib.compress(b"few")
-HUGE_PNG = b"\x89PNG\r\n\x1a\n" + b"".join(
-    struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) for chunk in (_IHDR, _IDAT)
-)
+
+
+def png_of(side: int, pixels: bytes) -> bytes:
+    chunks = (b"IHDR" + struct.pack(">IIBBBBB", side, side, 8, 2, 0, 0, 0), b"IDAT" + zlib.compress(pixels), b"IEND")
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(chunk) - 4) + chunk + struct.pack(">I", zlib.crc32(chunk)) for chunk in chunks
+    )
+
+
+HUGE_PNG, EMPTY_PNG = png_of(60_000, b"few"), png_of(0, b"")
 HUGE_JPEG = bytearray(JPEG)
 _SOF = HUGE_JPEG.index(b"\xff\xc0")
 HUGE_JPEG[_SOF + 5 : _SOF + 9] = struct.pack(">HH", 65_000, 65_000)
@@ -217,6 +234,7 @@ FAULTS: list[tuple[dict[str, Any], int, str]] = [
     *[({"files": {"cameras.front": JPEG[:cut]}}, 400, "malformed") for cut in range(0, len(JPEG) - 2, len(JPEG) // 20)],
     *[({"content": FRAME[: len(FRAME) * i // 20], "headers": FRAMED}, 400, "malformed") for i in range(20)],
     *[({"obs": text}, 400, "malformed") for text in ("", "{", "null", "[1]", "nan", "[" * 9999, '{"a": 1}', "\xff")],
+    *[({"obs": json.dumps({**GOOD, "info": {text: text}})}, 400, "malformed") for text in ("\ud800", "a\udfff")],
     *[({"obs": {**GOOD, key: 1}}, 400, "malformed") for key in ("camera", "images", "prompt", "session", "x" * 999)],
     *[({"obs": {**GOOD, "state": {"joints": x}}}, 422, "invalid_observation")
       for x in ([NAN, 0], [float("inf"), 0], [1], [1, 2, 3], [[1, 2]], ["1", "2"], [None, 1], [True, 1], [HUGE, 1], 1)],
@@ -232,6 +250,7 @@ FAULTS: list[tuple[dict[str, Any], int, str]] = [
     ({"files": {"cameras.front": b""}}, 400, "malformed"),
     ({"files": {"cameras.front": bytes(HUGE_JPEG)}}, 413, "too_large"),
     ({"files": {"cameras.front": HUGE_PNG}}, 413, "too_large"),
+    ({"files": {"cameras.front": EMPTY_PNG}}, 422, "invalid_observation"),
     ({"files": {"cameras.front": encode_jpeg(np.zeros((65, 65, 3), np.uint8))}}, 413, "too_large"),
     ({"files": {"cameras.front": JPEG, "image": JPEG}}, 400, "malformed"),
     ({"files": {f"cameras.{i}": JPEG for i in range(30)}}, 400, "malformed"),

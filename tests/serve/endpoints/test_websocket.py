@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import socket
 import threading
@@ -37,6 +38,7 @@ from vlagents_ray.protocol.messages import (
 )
 from vlagents_ray.serve.access.api_keys import Keys, NoKey
 from vlagents_ray.serve.access.key_store import new_key
+from vlagents_ray.serve.endpoints import websocket_connection
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
 
@@ -136,16 +138,38 @@ def test_what_is_too_long_or_in_pieces_ends_the_connection_that_sent_it_alone(
     url = f"ws://127.0.0.1:{endpoint.address.port}{endpoint.address.path}"
 
     def send() -> None:
-        with connect(url, compression=None) as client:
-            client.send([b"a", b"b"] if fragments else bytes(STREAM_BYTES + 1))
-            client.recv(5)
+        if fragments:
+            with connect(url, compression=None) as client:
+                client.send([b"a", b"b"])
+                client.recv(5)
+        with contextlib.closing(stream(endpoint)) as late:  # reads nothing before it has sent everything
+            late.send(bytes(STREAM_BYTES + 9 * 2**20), 5)
+            late.recv(5)
 
-    with pytest.raises(ConnectionClosed):
+    with pytest.raises((ConnectionClosed, ConnectionResetError), match="1003" if fragments else "1009"):  # says why
         send()
+    wait_for(lambda: len(endpoint._clients) == 1)
     act = ask(other, "act", 7).act
     assert act is not None
     assert act.action.tolist() == [7]
     other.close()
+
+
+@pytest.mark.parametrize("floods", [True, False])
+def test_who_stays_after_a_wrong_message_is_cut_off(
+    endpoint: WebSocketServer, floods: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(websocket_connection, "_HANDSHAKE_S", 1e9 if floods else 0.2)
+    endpoint._limits = Limits(body_bytes=1_000_000)
+    client = stream(endpoint)
+    ask(client, "reset")
+    client._socket.sendall(b"\x82\xff" + (2**40).to_bytes(8, "big") + bytes(4))  # a message of a TB begins
+    if floods:
+        client._socket.settimeout(5)
+        with pytest.raises(OSError, match=r"reset|pipe"):
+            client._socket.sendall(bytes(1_000_000_000))
+    wait_for(lambda: not endpoint._clients and not len(endpoint._engine.sessions))
+    client._socket.close()
 
 
 def test_a_client_that_takes_no_replies_holds_up_nobody(

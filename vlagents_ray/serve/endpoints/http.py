@@ -30,6 +30,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from vlagents_ray.client.transports.probe import answer, is_probe, read_probe
 from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, UnknownApp, VLAgentsError
 from vlagents_ray.protocol.frames import CONTENT_TYPE, encode_replies
+from vlagents_ray.protocol.json_messages import plain_values
 from vlagents_ray.protocol.messages import (
     MACHINE_HEADER,
     OPS,
@@ -124,8 +125,8 @@ class _HttpEndpoint:
     async def show_metadata(self, http: HttpRequest) -> Response:
         machine = http.headers.get(MACHINE_HEADER)
         if machine and self._machine_metadata is not None and self._engine.ready:
-            return JSONResponse(await self._machine_metadata(machine))
-        return self._when_ready(http, lambda: JSONResponse(self._metadata()))
+            return JSONResponse(plain_values(await self._machine_metadata(machine)))
+        return self._when_ready(http, lambda: JSONResponse(plain_values(self._metadata())))
 
     async def docs(self, http: HttpRequest) -> Response:
         return self._when_ready(http, lambda: HTMLResponse(docs_page(self._metadata())))

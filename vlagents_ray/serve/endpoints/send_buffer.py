@@ -26,12 +26,16 @@ class SendBuffer:
         self._limit = limit
         self._unsent = bytearray()
         self._slow = False  # whether a thread sends the rest
-        self._closed = False
+        self._closed = self._last = False
 
-    def send(self, data: bytes) -> None:
-        """Send as many bytes as the connection takes now; a thread sends the rest later."""
+    def send(self, data: bytes, *, last: bool = False) -> None:
+        """Send as many bytes as the connection takes now; a thread sends the rest later.
+
+        After the `last` bytes the client reads the end of the connection, which stays open for reading.
+        """
         if self._closed:
             return
+        self._last = self._last or last
         self._unsent += data
         if not self._slow:
             self._send_now()
@@ -54,6 +58,9 @@ class SendBuffer:
             logger.info("client: %s", error)
             sent = len(self._unsent)
         del self._unsent[:sent]
+        if self._last and not self._unsent:
+            with contextlib.suppress(OSError):
+                self._connection.shutdown(socket.SHUT_WR)
 
     def _send_rest(self) -> None:
         poller = select.poll()

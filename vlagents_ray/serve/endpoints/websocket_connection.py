@@ -1,7 +1,4 @@
-"""One WebSocket connection at a replica's own port, from its handshake to its end.
-
-See `vlagents_ray.serve.endpoints.websocket`.
-"""
+"""One WebSocket connection at a replica's own port, from its handshake to its end: see `websocket` beside it."""
 
 from __future__ import annotations
 
@@ -78,12 +75,11 @@ class WebSocketConnection:
         self._paused = False  # not polled until some of its messages are answered
         self._decoding = self._throttled = False  # not polled until a frame is decoded, or the key under its rate again
         self._frames: deque[tuple[Frame, float]] = deque()  # received but unprocessed frames and their arrival times, s
-        self._unanswered = 0
-        self._unanswered_bytes = 0  # includes the decoded images
+        self._unanswered = self._unanswered_bytes = 0  # messages; bytes with the decoded images
         self._messages = 0  # number received so far
         self._ending = False  # `end` was called; bytes that arrive now are ignored
-        # Used by `overdue` alone: the count of messages at its last call, the time since which that has not changed
-        # (s), and the time since which a part of the next message has been here (s).
+        self._discarded = 0  # bytes that arrived after a wrong message, which nobody reads
+        # Of `overdue` alone: messages at its last call, since when so many, since when a part of the next is here (s).
         self._seen, self._quiet_since, self._part_since = 0, time.monotonic(), float("inf")
 
     def ready(self) -> None:
@@ -104,8 +100,12 @@ class WebSocketConnection:
         except OSError as error:
             logger.info("stream client: %s", error)
             data = b""
-        if self._ending or (self._sender is None and not data):
+        if closing := self._protocol.state is State.CLOSING:
+            self._discarded += len(data)
+        if self._ending or self._discarded > self._limits.body_bytes or not (data or (self._sender and not closing)):
             self.disconnect()
+            return
+        if closing:  # bytes left unread would reset the connection before the client reads the close code
             return
         if self._sender is None:
             self._head += data
@@ -135,11 +135,11 @@ class WebSocketConnection:
                 self._messages += 1
                 self._frames.append((event, self._arrived))
         self._process_frames()
-        if not data or self._protocol.state in (State.CLOSING, State.CLOSED):
+        if not data or self._protocol.state is State.CLOSED or self._protocol.close_rcvd is not None:
             self.disconnect()
             return
         with self._sending:
-            self._paused = self._is_backlogged()
+            self._paused = self._is_backlogged() and self._protocol.state is State.OPEN
         if self._paused or self._must_wait:
             self._stop_polling()
 
@@ -193,8 +193,8 @@ class WebSocketConnection:
         elif self._part_since > now:
             self._part_since = now
         cause: tuple[int, str] | None = None
-        if self._sender is None and now - self._quiet_since > _HANDSHAKE_S:
-            cause = _POLICY_VIOLATION, "no handshake"
+        if self._protocol.state is not State.OPEN and now - self._quiet_since > _HANDSHAKE_S:
+            cause = _POLICY_VIOLATION, "no handshake" if self._sender is None else "open long after a wrong message"
         elif now - self._part_since > self._slow_s:
             cause = _POLICY_VIOLATION, f"a message took longer than {self._slow_s:g} s"
         elif now - self._quiet_since > self._idle_s:
@@ -323,8 +323,7 @@ class WebSocketConnection:
             self._unanswered -= 1
             self._unanswered_bytes -= size
             resume = self._paused and not self._is_backlogged()
-            if resume:
-                self._paused = False
+            self._paused = self._paused and not resume
         if resume:
             self._engine.queue.call_soon(self._resume_polling)
         self._send(trace.frame(replies))
@@ -337,7 +336,8 @@ class WebSocketConnection:
 
     def _flush(self) -> None:
         """Send the bytes that the protocol has produced; the caller holds the lock."""
-        self._out.send(b"".join(self._protocol.data_to_send()))
+        pieces = self._protocol.data_to_send()
+        self._out.send(b"".join(pieces), last=b"" in pieces)
 
 
 class _Message(NamedTuple):
