@@ -12,7 +12,7 @@ from vlagents_ray.evaluate.results.reader import CellResults, Results, synchrono
 from vlagents_ray.evaluate.results.statistics import Pairs, difference_interval, holm
 
 # Those of a cell's settings that are the policy's, in which compared cells may differ. All others are the env's.
-OF_POLICY = frozenset({"policy", "policy_config", "policy_options", "checkpoint", "execute", "codec"})
+OF_POLICY = frozenset({"policy", "policy_config", "policy_options", "checkpoint", "pushed_weights", "execute", "codec"})
 ALL = "all"
 
 Strata = dict[str, Pairs]  # by env
