@@ -38,7 +38,7 @@ def test_it_is_one_worker_without_ray_whatever_the_plan_says(config: Config) -> 
 
 
 def test_it_goes_on_with_what_has_no_result(config: Config) -> None:
-    evaluate(config(), agent_factory=ToZero, in_process=True, only=(2, 0))
+    evaluate(config(), agent_factory=ToZero, in_process=True, only=(2, 2))
     with pytest.raises(ConfigError, match="already has results"):
         evaluate(config(), agent_factory=ToZero, in_process=True)
     summary = evaluate(config(resume=True), agent_factory=ToZero, in_process=True)
