@@ -149,6 +149,6 @@ class _EvaluatedSession(Agent):
         copies = [session._copy for session in sessions if isinstance(session, _EvaluatedSession)]
         named = {POLICY: self._pushed.model_dump()}
         return [
-            act if isinstance(act, Exception) else replace(act, info={**act.info, **named})
+            act if isinstance(act, Exception) else replace(act, info={**(act.info or {}), **named})
             for act in self._trained.act_batch(obs, copies)
         ]
