@@ -91,10 +91,12 @@ def comparisons(results: Results, which: Sequence[tuple[str, str]]) -> list[Comp
     return [Comparison(a, b, tuple(lines[i]), totals[i]) for i, (a, b) in enumerate(which)]
 
 
-def comparable(results: Results) -> tuple[list[tuple[str, str]], list[str]]:
-    """The pairs of policy ids that `compare` accepts, each once, and the reason for each that it refuses."""
+def comparable(
+    results: Results, which: Sequence[tuple[str, str]] | None = None
+) -> tuple[list[tuple[str, str]], list[str]]:
+    """The pairs of policy ids that `compare` accepts, and the reason for each that it refuses; by default of all."""
     pairs, reasons = [], []
-    for a, b in itertools.combinations(results.contenders, 2):
+    for a, b in itertools.combinations(results.contenders, 2) if which is None else which:
         try:
             _by_suite(results, a, b)
         except ConfigError as error:
