@@ -15,6 +15,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.config import PushedWeights
 from vlagents_ray.evaluate.replay import compare, find
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.interface import Act, Obs
@@ -138,6 +139,15 @@ def test_the_settings_are_those_of_the_run_and_of_that_cell_alone(config: Config
     [cell] = cells(alone)
     assert (cell.env, cell.step, cell.fingerprint) == (OTHER_LINE, 20, recorded.cell.cell)
     assert (alone.workers, alone.out) == (1, tmp_path / "again")
+
+
+def test_pushed_weights_are_asked_for_again(config: Config, tmp_path: Path) -> None:
+    pushed = PushedWeights(version=3, fingerprint="of a test")
+    policy = config().policies[0].model_copy(update={"pushed_weights": pushed})
+    results = play(config(episodes=1).model_copy(update={"policies": [policy]}))
+    recorded = find(results, f"{LINE}#0")
+    [cell] = cells(recorded.config(tmp_path / "again"))
+    assert (cell.contender, cell.fingerprint) == ("policy@3", recorded.cell.cell)
 
 
 def test_a_policy_that_was_served_for_the_run_is_served_again_and_a_server_is_asked_again(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from eval_fakes import EVERY, LINE, OTHER_LINE, Line, SevenLine, ToZero
 from flat_config import flat_config
-from in_process_pool import InProcessPool, without_ray
+from in_process_pool import without_ray
 from in_process_replicas import Replicas
 
 from vlagents_ray.envs.batch import BatchEnv, SequentialBatch
@@ -17,12 +17,13 @@ from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.jobs import Job, plan
 from vlagents_ray.evaluate.workers import rollout
+from vlagents_ray.evaluate.workers.in_process import InProcessWorkers
 from vlagents_ray.evaluate.workers.rollout import Report
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.learn import Rollouts, arrays, rollouts
 
 
-class Workers(InProcessPool):
+class Workers(InProcessWorkers):
     """As many as there are to be, of which the last one is the first to answer."""
 
     dying = 0  # this many answers are those of workers that died
@@ -36,6 +37,8 @@ class Workers(InProcessPool):
         self._config = config
 
     def wait(self, _timeout_s: float) -> Iterator[tuple[Job, Report]]:
+        for worker in self._workers:
+            worker.starting = None
         busy = [worker for worker in reversed(self._workers) if worker.jobs]
         for worker in busy[:1]:  # the others play on
             jobs, worker.jobs = worker.jobs, ()

@@ -299,3 +299,16 @@ class Hesitant(Scripted):
         dice = np.array([session.rng.random() for session in sessions])  # type: ignore[attr-defined]
         actions[dice < 0.4, :3] = 0.0
         return [Act(row) for row in actions]
+
+
+class Proportional(ToZero):
+    """Steps to zero with a gain that a learner trains."""
+
+    trainable = "tree"
+
+    def initialize(self) -> None:
+        self.tree = {"gain": np.ones(1, np.float32)}
+
+    def act(self, obs: Obs) -> Act:
+        act = super().act(obs)
+        return Act(act.action * self.tree["gain"])

@@ -39,7 +39,7 @@ class Recorded:
         config = EvalConfig.model_validate(run.config)
         where = (self.cell.contender, self.cell.suite, self.cell.env)
         cell = next(one for one in cells(config) if one.name == where)
-        given = cell.policy.model_dump() | {"steps": [] if cell.step is None else [cell.step]}
+        given = cell.policy.model_dump() | {"steps": [cell.step] if cell.policy.steps else []}
         if cell.policy.source is None:
             given |= {"config": {}}  # the server has its own configuration, and reports it again
         else:

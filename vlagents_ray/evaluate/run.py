@@ -33,8 +33,10 @@ from vlagents_ray.evaluate.trackers import TrackerFeed
 from vlagents_ray.evaluate.workers.agents import AgentFactory, agents
 from vlagents_ray.evaluate.workers.cluster import ray_cluster, unused_gpus
 from vlagents_ray.evaluate.workers.dispatch import FailedAttempts, dispatch
+from vlagents_ray.evaluate.workers.in_process import InProcessWorkers
 from vlagents_ray.evaluate.workers.pool import WorkerPool
 from vlagents_ray.evaluate.workers.rollout import Report
+from vlagents_ray.evaluate.workers.worker import Workers
 from vlagents_ray.interface import Agent
 from vlagents_ray.ray_tools.signals import stop_signals
 
@@ -68,6 +70,7 @@ def evaluate(
     config: EvalConfig,
     *,
     agent_factory: Callable[[], Agent] | None = None,
+    in_process: bool = False,
     progress: Progress | None = None,
     only: tuple[int, int] | None = None,
     end_at: float | None = None,
@@ -82,6 +85,7 @@ def evaluate(
     Args:
         config: The policies, the envs, and the folder of results.
         agent_factory: Called in each worker to make its agent, in place of a connection to the policy's `url`.
+        in_process: Play in this process, without Ray: one worker, to which neither `workers` nor the time limits apply.
         progress: Shows how far the evaluation is (`progress_for`); by default nothing is shown.
         only: (number, seed) of the one episode of each env that is played; by default all are.
         end_at: A time in seconds since 1970. No episode begins that would not end by then, judged by earlier ones.
@@ -105,7 +109,7 @@ def evaluate(
             save_diffs(config.out, driver_code().values())
         try:
             with tracking:
-                run = _Run(config, store, progress or SilentProgress(), tracking, only, end_at)
+                run = _Run(config, store, progress or SilentProgress(), tracking, only, end_at, in_process)
                 state, summary = run.play(factory)
         except BaseException:
             with contextlib.suppress(StorageFailed):  # of the same disk, it may be: what went wrong first is told
@@ -148,13 +152,15 @@ class _Run:
         tracking: TrackerFeed,
         only: tuple[int, int] | None,
         end_at: float | None,
+        in_process: bool,
     ) -> None:
         self._config = config
         self._store = store
         self._progress = progress
         self._tracking = tracking
         self._attempts = FailedAttempts(config)
-        self._checked_gpus = False  # when an env first drew
+        self._in_process = in_process
+        self._checked_gpus = in_process  # when an env first drew
         earlier = {cell.cell: cell for cell in Results.load(config.out).cells}
         self._recorded = {cell: rate_of([results], "success_once") for cell, results in earlier.items()}
         self._stopping: dict[str, Stopping] = {}
@@ -179,10 +185,10 @@ class _Run:
         """
         if not len(self._queue):
             return "complete", _conclude(self._config, self._store, "complete")
-        with ray_cluster(self._config), stop_signals() as stop:
+        with contextlib.nullcontext() if self._in_process else ray_cluster(self._config), stop_signals() as stop:
             self._progress.begin(self._store.cells, self._recorded, len(self._queue))
             try:
-                with WorkerPool(self._config, factory) as pool:
+                with (InProcessWorkers if self._in_process else WorkerPool)(self._config, factory) as pool:
                     while not stop.is_set() and not self._deadline.is_over and self._has_more(pool):
                         self._poll_pool(pool)
                     state = OutOfTime.why if len(self._queue) or pool.busy else "complete"
@@ -194,10 +200,10 @@ class _Run:
             finally:
                 self._progress.end()
 
-    def _has_more(self, pool: WorkerPool) -> bool:
+    def _has_more(self, pool: Workers) -> bool:
         return pool.busy or (len(self._queue) > 0 and self._deadline.leaves_room)
 
-    def _poll_pool(self, pool: WorkerPool) -> None:
+    def _poll_pool(self, pool: Workers) -> None:
         if self._deadline.leaves_room:
             dispatch(pool, self._queue, self._deadline.begin)
         for job, report in pool.wait(POLL_S):

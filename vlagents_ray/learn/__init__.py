@@ -1,6 +1,7 @@
-"""Learning with served policies: new weights for them, transitions as columns, environments as Gymnasium has them.
+"""Learning with served policies: new weights, evaluations while they are trained, transitions, vector environments.
 
-All but `Publisher` needs the extra "learn" (pyarrow, gymnasium). Modules are loaded when their names are first used.
+All but `Publisher` and `TrainingEvaluation` needs the extra "learn" (pyarrow, gymnasium). Modules are loaded when their
+names are first used.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ if TYPE_CHECKING:
     from vlagents_ray.learn.columns import arrays
     from vlagents_ray.learn.publisher import Publisher
     from vlagents_ray.learn.rollouts import Rollouts, RolloutStats
+    from vlagents_ray.learn.training_evaluation import TrainingEvaluation
     from vlagents_ray.learn.vector_env import BatchVectorEnv, as_vector_env
 
 _LATE = {
@@ -19,11 +21,20 @@ _LATE = {
     "Publisher": "publisher",
     "RolloutStats": "rollouts",
     "Rollouts": "rollouts",
+    "TrainingEvaluation": "training_evaluation",
     "arrays": "columns",
     "as_vector_env": "vector_env",
 }
 
-__all__ = ["BatchVectorEnv", "Publisher", "RolloutStats", "Rollouts", "arrays", "as_vector_env"]
+__all__ = [
+    "BatchVectorEnv",
+    "Publisher",
+    "RolloutStats",
+    "Rollouts",
+    "TrainingEvaluation",
+    "arrays",
+    "as_vector_env",
+]
 
 
 def __getattr__(name: str) -> Any:

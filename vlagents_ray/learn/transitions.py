@@ -10,6 +10,7 @@ import numpy as np
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts, EpisodeRecorder
 from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.episode.stats import version_of
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.interface import BEHAVIOUR, WANT, Act, Obs
 from vlagents_ray.learn.columns import EXTRA, FINAL, at_the_end, constant, tensors, words
@@ -60,9 +61,9 @@ class TransitionRecorder(EpisodeRecorder):
         for name, part in seen.items():
             self._seen[name].add(part)
 
-    def add_act(self, act: Act) -> None:
+    def add_act(self, act: Act, ticks_waited: int = 0) -> None:
         self._acts += 1
-        self._version = version_of(act)
+        self._version = version_of(act) or 0
         self._source = str(act.info.get("source", "policy"))
         stated = act.info.get(BEHAVIOUR, {})
         if lacking := [name for name in self._want if name not in stated]:
@@ -126,12 +127,6 @@ class _Rows:
 
     def all(self) -> np.ndarray:
         return self._rows[: self._number]
-
-
-def version_of(act: Act) -> int:
-    """Return the version of the weights that chose an action; 0 if the policy names none."""
-    said = act.info.get("policy")
-    return int(said.get("version", 0)) if isinstance(said, Mapping) else 0
 
 
 def _by_row(stated: Any, rows: int, name: str) -> list[float]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -49,6 +50,20 @@ def set_values(trainable: Any, named: Mapping[str, Any]) -> None:
     for name, container, key in list(_leaves(trainable)):
         if name in named:
             container[key] = named[name]
+
+
+@contextmanager
+def evaluation_mode(trainable: Any) -> Iterator[None]:
+    """Within this a torch module evaluates: no dropout, no statistics of batches. Each part returns to its own mode."""
+    parts = list(trainable.modules()) if _is_module(trainable) else []
+    modes = [part.training for part in parts]
+    try:
+        for part in parts:
+            part.training = False
+        yield
+    finally:
+        for part, mode in zip(parts, modes, strict=True):
+            part.training = mode
 
 
 def is_copied(trainable: Any) -> bool:

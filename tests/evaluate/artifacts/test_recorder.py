@@ -6,20 +6,21 @@ import hashlib
 import io
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import av
 import numpy as np
 import pytest
-from eval_fakes import LINE
+from eval_fakes import LINE, ToZero
 from in_process_evaluation import play
 
 from vlagents_ray.errors import ConfigError, EnvFailed
-from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.evaluate import ClockConfig, EvalConfig
 from vlagents_ray.evaluate.artifacts.recorder import Recording
-from vlagents_ray.evaluate.artifacts.trajectory import Trajectory, TrajectoryRecorder, videos_of
+from vlagents_ray.evaluate.artifacts.trajectory import NO_VERSION, Trajectory, TrajectoryRecorder, videos_of
 from vlagents_ray.evaluate.artifacts.video import VideoRecorder
-from vlagents_ray.interface import HIGH_RES, Obs
+from vlagents_ray.interface import HIGH_RES, Act, Agent, Obs
 
 Config = Callable[..., EvalConfig]
 CAMERA = {"camera": [32, 32]}
@@ -72,6 +73,51 @@ def test_a_trajectory_has_what_the_policy_saw_and_a_video_the_view_for_people(co
         recorder.add(obs)
         footage = recorder.finish()
     assert (height(footage.shown["front"]), height(footage.seen["front"])) == (64, 32)
+
+
+class Pushed(ToZero):
+    """Answers with chunks of two rows, each of a further version of the weights."""
+
+    def __init__(self) -> None:
+        super().__init__(chunk=2)
+        self.version = 0
+
+    def act(self, obs: Obs) -> Act:
+        self.version += 1
+        return replace(super().act(obs), info={"policy": {"version": self.version, "fingerprint": "of a test"}})
+
+
+def versions(config: EvalConfig, make: Callable[[], Agent]) -> list[int]:
+    """Of the weights that chose the actions of the only episode."""
+    results = play(config, make)
+    found = Trajectory.load(results.out / str(results.cells[0].episodes[0].trajectory)).versions
+    assert found is not None
+    assert found.dtype == np.int64
+    return list(map(int, found))
+
+
+def test_a_trajectory_names_the_weights_that_chose_each_action(config: Config, tmp_path: Path) -> None:
+    recorded = config(episodes=1, record="all")
+    assert versions(recorded, Pushed) == [1, 1, 2, 2, 3, 3, 4, 4, 5, 5]
+    assert versions(config(episodes=1, record="all", out=tmp_path / "none"), ToZero) == [NO_VERSION] * 10
+
+
+def test_what_is_executed_until_an_answer_comes_is_of_the_weights_before_it(config: Config) -> None:
+    [suite] = config().suites
+    late = ClockConfig(latency=0.1, meanwhile="hold", align=False, neutral=[0.0])  # one step at 10 Hz
+    settings = config(episodes=1, record="all").model_copy(
+        update={"suites": [suite.model_copy(update={"clock": late, "episodes": 1})]}
+    )
+    assert versions(settings, Pushed) == [NO_VERSION, 1, 1, 1, 2, 2, 2, 3, 3, 3]
+
+
+def test_an_older_trajectory_names_no_versions(tmp_path: Path) -> None:
+    recorder = TrajectoryRecorder()
+    for _ in range(2):
+        recorder.add_observation(Obs(state={"position": np.zeros(1, np.float32)}))
+    recorder.add_action(np.zeros(1, np.float32), 0.0, False)
+    (tmp_path / "old.npz").write_bytes(replace(recorder.finish(), versions=None).to_bytes())
+    assert Trajectory.load(tmp_path / "old.npz").versions is None
 
 
 def height(video: bytes) -> int:

@@ -6,6 +6,7 @@ import errno
 import json
 import weakref
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import av
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
-from eval_fakes import LINE, OTHER_LINE
+from eval_fakes import LINE, OTHER_LINE, ToZero
 from in_process_evaluation import play
 from scipy.spatial.transform import Rotation
 from wrist_roll_env import ROLLER, TILTED_ROLLER, Roller, Turner
@@ -24,6 +25,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
 from vlagents_ray.evaluate.exports import to_lerobot
+from vlagents_ray.interface import Act, Obs
 from vlagents_ray.policies.scripted import Scripted
 from vlagents_ray.robot.dataset import Dataset
 from vlagents_ray.robot.episode import Finished
@@ -202,6 +204,29 @@ def test_an_episode_ends_where_nothing_moves_any_more_after_it_was_solved(config
     assert first["next.done"] == [False] * 6 + [True]
     assert first["next.success"][-1]
     assert len(second["action"]) == Roller.max_steps, "it was not solved"
+
+
+class Pushed(ToZero):
+    """Acts with further weights at each step."""
+
+    def act(self, obs: Obs) -> Act:
+        self.acts = getattr(self, "acts", 2) + 1
+        return replace(super().act(obs), info={"policy": {"version": self.acts, "fingerprint": "of a test"}})
+
+
+def test_a_frame_names_the_weights_that_chose_its_action(config: Config, tmp_path: Path) -> None:
+    results = play(config(episodes=2, record="all"), Pushed)
+    [first, second] = results.cells[0].episodes
+    old = results.out / str(second.trajectory)
+    old.write_bytes(replace(Trajectory.load(old), versions=None).to_bytes())
+    to_lerobot(results, tmp_path / "d")
+    assert info(tmp_path / "d")["features"]["policy_version"]["dtype"] == "int64"
+    assert rows(tmp_path / "d", 0)["policy_version"] == list(range(3, 13))
+    assert rows(tmp_path / "d", 1)["policy_version"] == [-1] * 10, "of a file that names none"
+    assert first.result.policy_version == 12
+    others = play(config(episodes=1, record="all", out=tmp_path / "others"))
+    to_lerobot(others, tmp_path / "none")
+    assert "policy_version" not in info(tmp_path / "none")["features"]
 
 
 def test_angles_are_written_without_jumps_and_info_says_about_what(config: Config, tmp_path: Path) -> None:

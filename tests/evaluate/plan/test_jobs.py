@@ -50,6 +50,20 @@ def test_a_further_seed_is_a_further_set_of_episodes(config: Config) -> None:
     assert [(key.episode, key.seed) for key in found] == [(0, 0), (1, 1), (0, 100), (1, 101)]
 
 
+def test_pushed_weights_are_a_checkpoint_and_part_of_the_key(config: Config) -> None:
+    usual = config(episodes=2)
+
+    def pushed(fingerprint: str) -> EvalConfig:
+        given = usual.policies[0].model_dump() | {"pushed_weights": {"version": 3, "fingerprint": fingerprint}}
+        return usual.model_copy(update={"policies": [PolicyConfig.model_validate(given)]})
+
+    [cell] = cells(pushed("a"))
+    assert (cell.contender, cell.policy_options) == ("policy@3", {}), "the policy is asked for no checkpoint"
+    assert len({str(key) for one in (usual, pushed("a"), pushed("b")) for key in keys(one)}) == 6
+    with pytest.raises(ValueError, match="got steps and pushed_weights, want one of them"):
+        PolicyConfig.model_validate({"steps": [1], "pushed_weights": {"version": 1, "fingerprint": "a"}})
+
+
 def test_a_sweep_plays_checkpoint_by_checkpoint(config: Config) -> None:
     jobs = plan(cells(config(envs=[LINE, OTHER_LINE], episodes=1, steps=[10, 20])))
     assert [(job.cell.contender, job.key.env) for job in jobs] == [

@@ -12,6 +12,7 @@ import numpy as np
 from vlagents_ray.evaluate.artifacts.trajectory import TrajectoryRecorder, save_trajectory
 from vlagents_ray.evaluate.artifacts.video import Footage, VideoRecorder, save_videos
 from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.episode.stats import version_of
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import EpisodeChoice, EvalConfig
 from vlagents_ray.interface import Act, Obs
@@ -43,8 +44,8 @@ class EpisodeRecorder:
     def add_observation(self, obs: Obs) -> None:
         """Add an observation, beginning with that of the reset."""
 
-    def add_act(self, act: Act) -> None:
-        """Add an answer of the policy; some or all rows of its action are executed next."""
+    def add_act(self, act: Act, ticks_waited: int = 0) -> None:
+        """Add an answer of the policy; some or all rows of its action are executed after `ticks_waited` other ones."""
 
     def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
         """Add an executed action, (D,), with its reward and success; its next observation was added before."""
@@ -82,6 +83,10 @@ class Recording(EpisodeRecorder):
             self._video.add(replace(obs, info={}))  # without the views for people
         if self._wants_trajectory != "none":
             self._trajectory.add_observation(obs)
+
+    def add_act(self, act: Act, ticks_waited: int = 0) -> None:
+        if self._wants_trajectory != "none":
+            self._trajectory.add_version(version_of(act), ticks_waited)
 
     def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
         if self._wants_trajectory != "none":

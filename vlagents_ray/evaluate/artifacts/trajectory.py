@@ -27,6 +27,7 @@ from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.interface import Obs
 from vlagents_ray.naming import distinct
 
+NO_VERSION = -1  # of a policy that names none, and of steps before its first answer in real-time mode
 _STATE = "state/"
 
 
@@ -43,14 +44,15 @@ class Trajectory:
     state: dict[str, np.ndarray]  # (T + 1, D) float32, in the contract's units
     gripper: np.ndarray | None  # (T + 1,) float32 in [0, 1], 1 = open
     cameras: tuple[str, ...]
+    versions: np.ndarray | None = None  # (T,) int64, of the weights that chose each action; NO_VERSION where none did
 
     def to_bytes(self) -> bytes:
         """Encode the trajectory as an .npz file, in which nothing is pickled."""
         arrays: dict[str, Any] = {"cameras": np.array(self.cameras, str)}
         arrays |= {"actions": self.actions, "rewards": self.rewards, "success": self.success}
         arrays |= {_STATE + part: values for part, values in self.state.items()}
-        if self.gripper is not None:
-            arrays["gripper"] = self.gripper
+        optional = {"gripper": self.gripper, "versions": self.versions}
+        arrays |= {name: values for name, values in optional.items() if values is not None}
         file = io.BytesIO()
         np.savez_compressed(file, **arrays)
         return file.getvalue()
@@ -67,9 +69,9 @@ class Trajectory:
             # Opened here: np.load leaves the file of a broken archive open.
             with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
                 state = {name.removeprefix(_STATE): file[name] for name in file.files if name.startswith(_STATE)}
-                gripper = file["gripper"] if "gripper" in file.files else None
+                gripper, versions = (file[name] if name in file.files else None for name in ("gripper", "versions"))
                 cameras = tuple(map(str, file["cameras"]))
-                return cls(file["actions"], file["rewards"], file["success"], state, gripper, cameras)
+                return cls(file["actions"], file["rewards"], file["success"], state, gripper, cameras, versions)
         except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise ConfigError(f"{path}: cannot be read as a trajectory ({error})") from error
 
@@ -84,6 +86,9 @@ class TrajectoryRecorder:
         self._rewards: list[float] = []
         self._success: list[bool] = []
         self._cameras: tuple[str, ...] = ()
+        self._version = NO_VERSION
+        self._versions: list[int] = []
+        self._next: tuple[int, int] = (0, NO_VERSION)  # steps until the next version, and that version
 
     def add_observation(self, obs: Obs) -> None:
         """Add an observation. Raises `EnvFailed` if its parts differ from those of the first."""
@@ -96,8 +101,17 @@ class TrajectoryRecorder:
         self._seen.append(state)
         self._grippers.append(obs.gripper)
 
+    def add_version(self, version: int | None, after: int) -> None:
+        """Add the version of the weights that chose the actions which follow `after` further ones; None if unknown."""
+        self._next = after, NO_VERSION if version is None else version
+
     def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
         """Add the action, (D,), that was executed after the last observation, with its reward and success."""
+        after, version = self._next
+        if after == 0:
+            self._version = version
+        self._next = after - 1, version
+        self._versions.append(self._version)
         self._actions.append(np.array(action, np.float32))
         self._rewards.append(reward)
         self._success.append(success)
@@ -111,6 +125,7 @@ class TrajectoryRecorder:
             {part: np.stack([state[part] for state in self._seen]) for part in self._seen[0]},
             None if self._grippers[0] is None else np.array(self._grippers, np.float32),
             self._cameras,
+            np.array(self._versions, np.int64),
         )
 
 

@@ -35,7 +35,7 @@ Phase = Literal["idle", "connect", "make", "env reset", "policy reset", "policy 
 Outcome = EpisodeResult | VLAgentsError
 Watch = Callable[[Phase, int], None]  # called with the phase that begins and the number of steps so far
 Record = Callable[[int, Obs], None]  # called with the number of the episode and each of its observations
-Acted = Callable[[int, Act], None]  # the same, and each answer of the policy
+Acted = Callable[[int, Act, int], None]  # the same, each answer of the policy, and how many steps it came after
 Executed = Callable[[int, np.ndarray, float, bool], None]  # the same, each action, (D,), its reward, and success
 
 _ACTING, _STEPPING = policy_side("act"), env_side("step")  # entered at each step
@@ -100,7 +100,7 @@ def run_episodes(
     record: Record = lambda _i, _obs: None,
     images: bool = True,
     request_info: Mapping[str, Any] | None = None,
-    acted: Acted = lambda _i, _act: None,
+    acted: Acted = lambda _i, _act, _ticks_waited: None,
     executed: Executed = lambda _i, _action, _reward, _success: None,
 ) -> list[Outcome]:
     """Play the episodes `keys` together, at most `env.num_envs`, each with its own session.
@@ -123,7 +123,8 @@ def run_episodes(
         images: Whether `record` needs the images of every step. If not, the environments may leave out those between
             two requests to the policy.
         request_info: Added to the `Obs.info` of every request to the policy.
-        acted: Called with every answer of the policy, before its rows are executed.
+        acted: Called with every answer of the policy, before its rows are executed, and with the number of steps that
+            are executed first, in real-time mode, since it came late.
         executed: Called with every action that was executed.
 
     Returns:
@@ -214,8 +215,9 @@ class _Episode:
                 latency_s = self._executor.latency_s(seconds)
                 self.stats.acted(answer, seconds, latency_s)
             rows = Act(check_action(answer.action, contract)).rows()
-            acted(self.number, answer)
-            self.ticks.extend(self._executor.ticks(rows, latency_s or 0.0))
+            ticks = list(self._executor.ticks(rows, latency_s or 0.0))
+            acted(self.number, answer, sum(tick.waited for tick in ticks))
+            self.ticks.extend(ticks)
             self._done = answer.done
         except VLAgentsError as error:
             self.failed(error)

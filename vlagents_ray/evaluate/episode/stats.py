@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from time import perf_counter
 from typing import Any
@@ -58,9 +59,8 @@ class EpisodeStats:
         for stage, spent in act.info.get("timing", {}).items():
             if stage.endswith("_ms"):  # the batch size is among them
                 self.timing_ms.setdefault(stage, []).append(float(spent))
-        policy = act.info.get(POLICY)
-        if isinstance(policy, dict) and isinstance(version := policy.get("version"), int):
-            self.policy_version, self.policy_fingerprint = version, policy.get("fingerprint") or None
+        if (version := version_of(act)) is not None:
+            self.policy_version, self.policy_fingerprint = version, act.info[POLICY].get("fingerprint") or None
             self.first_policy_version = version if self.first_policy_version is None else self.first_policy_version
         if latency_s is not None:
             self.latency_ms.append(1e3 * latency_s)
@@ -111,6 +111,13 @@ class EpisodeStats:
             first_policy_version=self.first_policy_version,
             actions_sha256=self.actions.hexdigest(),
         )
+
+
+def version_of(act: Act) -> int | None:
+    """Return the version of the weights that chose an action; None if the policy names none."""
+    said = act.info.get(POLICY)
+    version = said.get("version") if isinstance(said, Mapping) else None
+    return int(version) if isinstance(version, int | np.integer) else None
 
 
 def _quantile(milliseconds: list[float], q: float) -> float | None:

@@ -21,7 +21,7 @@ from vlagents_ray.dataset_contract import (
 )
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.storage import link_or_copy, require_there, whole_folder
-from vlagents_ray.evaluate.artifacts.trajectory import Trajectory, videos_of
+from vlagents_ray.evaluate.artifacts.trajectory import NO_VERSION, Trajectory, videos_of
 from vlagents_ray.evaluate.artifacts.video import DEFAULT_FPS
 from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results
 from vlagents_ray.naming import did_you_mean, distinct
@@ -43,6 +43,7 @@ from vlagents_ray.robot.episode import (
 from vlagents_ray.robot.statistics import ImageStatistics, Stats
 
 GRIPPER_FEATURE = "observation.gripper"
+VERSION = "policy_version"
 # LeRobot's own names for what an action led to; `success` is that of the state after it.
 OUTCOMES = {"next.reward": "float32", "next.success": "bool", "next.done": "bool"}
 
@@ -63,7 +64,7 @@ def to_lerobot(
     A frame is what the policy saw and the action that followed: the last observation of an episode, which none
     followed, is left out. Angles and rotation vectors of the state that jump by a full turn are written about another
     centre. The dataset's contract (`vlagents_ray.dataset_contract`) names it, so that the policy's server does the
-    same.
+    same. If a policy named the version of its weights, each frame has that of its action, -1 where it is unknown.
 
     Args:
         cameras: The cameras of the dataset; by default all.
@@ -91,13 +92,14 @@ def to_lerobot(
         recorded = solved
     if path.exists() and any(path.iterdir()):
         raise ConfigError(f"{path}: is there, and not empty; export into a new folder")
+    with_versions = any(one.result.policy_version is not None for _, one in recorded)
     rates = {_fps(cell) for cell, _ in recorded}
     if len(rates) > 1:
         raise ConfigError(f"the envs run at {sorted(rates)} Hz, and a dataset has one rate; {_CURE}")
 
     def demonstrations() -> Iterator[_Demonstration]:
         for cell, episode in recorded:
-            one = _demonstration(results, cell, episode, cameras, state, cut_idle)
+            one = _demonstration(results, cell, episode, cameras, state, cut_idle, with_versions)
             if len(one.actions):  # a policy that failed before it acted leaves an empty episode, which no dataset has
                 yield one
 
@@ -135,6 +137,7 @@ class _Demonstration:
     parts: tuple[str, ...]
     state: dict[str, np.ndarray]  # (N, D) each
     gripper: np.ndarray | None  # (N,)
+    versions: np.ndarray | None  # (N,) of the weights that chose each action; None if no episode's policy named them
     videos: dict[str, Path]  # by camera
 
 
@@ -149,6 +152,7 @@ def _demonstration(
     cameras: Sequence[str] | None,
     state: Sequence[str] | None,
     cut_idle: bool,
+    with_versions: bool,
 ) -> _Demonstration:
     path = str(episode.trajectory)
     trajectory = Trajectory.load(results.file(path))
@@ -174,8 +178,15 @@ def _demonstration(
         tuple(chosen),
         {part: values[:frames] for part, values in kept.items()},
         None if gripper is None else gripper[:frames],
+        _versions(trajectory)[:frames] if with_versions else None,
         {camera: require_there(results.file(str(videos[camera]))) for camera in shown},
     )
+
+
+def _versions(trajectory: Trajectory) -> np.ndarray:
+    if trajectory.versions is None:  # an older file
+        return np.full(len(trajectory.actions), NO_VERSION, np.int64)
+    return trajectory.versions
 
 
 def _chosen(option: str, wanted: Sequence[str] | None, known: Sequence[str], env: str) -> list[str]:
@@ -273,6 +284,9 @@ def _numbers(one: _Demonstration, about: DatasetContract) -> tuple[dict[str, np.
     features[ACTION]["spec"] = one.cell.contract.get("action")
     if names:
         rows[STATE], features[STATE] = together, vector_feature(names)
+    if one.versions is not None:
+        rows[VERSION] = one.versions
+        features |= number_features({VERSION: "int64"})
     keys = distinct(one.state, without_slash)
     place = 0
     for part in one.parts:

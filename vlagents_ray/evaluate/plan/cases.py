@@ -28,7 +28,7 @@ class EvalCase:
     """A cell of the table of results: what one success rate is of."""
 
     policy: PolicyConfig
-    step: int | None  # of training, in a sweep over checkpoints
+    step: int | None  # of training, in a sweep over checkpoints; or the version of pushed weights
     suite: SuiteConfig
     env: str  # full name
     worker: WorkerConfig
@@ -46,12 +46,14 @@ class EvalCase:
     @property
     def policy_options(self) -> dict[str, Any]:
         """What is handed to every reset of the policy."""
-        return self.policy.options | ({} if self.step is None else {"checkpoint_step": self.step})
+        return self.policy.options | ({"checkpoint_step": self.step} if self.policy.steps else {})
 
     @property
     def settings(self) -> dict[str, Any]:
         """All that an episode depends on, apart from its number and seed."""
+        pushed = self.policy.pushed_weights
         return {
+            **({} if pushed is None else {"pushed_weights": pushed.model_dump()}),  # older results have no such setting
             "env": self.env,
             "env_options": self.suite.env_options,
             "reset_options": self.suite.reset_options,
@@ -101,7 +103,8 @@ def cells(config: EvalConfig) -> list[EvalCase]:
     envs = [(suite, env) for suite in config.suites for pattern in suite.envs for env in expand(pattern)]
     contenders: list[tuple[PolicyConfig, int | None]] = []
     for policy in config.policies:
-        contenders += [(policy, step) for step in policy.steps] or [(policy, None)]
+        alone = None if policy.pushed_weights is None else policy.pushed_weights.version
+        contenders += [(policy, step) for step in policy.steps] or [(policy, alone)]
     found = [
         EvalCase(policy, step, suite, env, suite.worker or config.worker)
         for policy, step in contenders

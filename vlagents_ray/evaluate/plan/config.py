@@ -48,6 +48,13 @@ class StepRange(_PlanModel):
         return range(self.first, self.last + 1, self.every)
 
 
+class PushedWeights(_PlanModel):
+    """Weights that a learner pushed, as `act.info["policy"]` names them."""
+
+    version: NonNegativeInt
+    fingerprint: str
+
+
 class PolicyConfig(_PlanModel):
     """A policy, how it is reached, and which of its checkpoints are evaluated."""
 
@@ -60,6 +67,8 @@ class PolicyConfig(_PlanModel):
     checkpoint: str | None = None  # that the server loads; each episode's result names the one it was played by
     # A sweep over checkpoints: a list, or {first, last, every}; each is chosen by the reset option `checkpoint_step`.
     steps: list[NonNegativeInt] = []
+    # That the policy acts with now; their version stands for the checkpoint. Episodes of others are refused.
+    pushed_weights: PushedWeights | None = None
     execute: PositiveInt | None = None  # rows executed of each action chunk; None = all
     # How images reach a policy over a network. JPEG changes them a little, so it has to be asked for; the others
     # do not, and "exact" takes the faster of raw and lossless, so that results never depend on the link.
@@ -79,6 +88,12 @@ class PolicyConfig(_PlanModel):
         if repeated := sorted({step for step in steps if steps.count(step) > 1}):
             raise ValueError(f"{repeated} named twice; name each step once")
         return steps
+
+    @model_validator(mode="after")
+    def _one_kind_of_checkpoints(self) -> Self:
+        if self.steps and self.pushed_weights is not None:
+            raise ValueError("got steps and pushed_weights, want one of them: each names checkpoints in the results")
+        return self
 
     @model_validator(mode="after")
     def _not_ours(self) -> Self:

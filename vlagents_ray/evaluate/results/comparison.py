@@ -12,7 +12,7 @@ from vlagents_ray.evaluate.results.reader import CellResults, Results, synchrono
 from vlagents_ray.evaluate.results.statistics import Pairs, difference_interval, holm
 
 # Those of a cell's settings that are the policy's, in which compared cells may differ. All others are the env's.
-OF_POLICY = frozenset({"policy", "policy_config", "policy_options", "checkpoint", "execute", "codec"})
+OF_POLICY = frozenset({"policy", "policy_config", "policy_options", "checkpoint", "pushed_weights", "execute", "codec"})
 ALL = "all"
 
 Strata = dict[str, Pairs]  # by env
@@ -91,10 +91,12 @@ def comparisons(results: Results, which: Sequence[tuple[str, str]]) -> list[Comp
     return [Comparison(a, b, tuple(lines[i]), totals[i]) for i, (a, b) in enumerate(which)]
 
 
-def comparable(results: Results) -> tuple[list[tuple[str, str]], list[str]]:
-    """The pairs of policy ids that `compare` accepts, each once, and the reason for each that it refuses."""
+def comparable(
+    results: Results, which: Sequence[tuple[str, str]] | None = None
+) -> tuple[list[tuple[str, str]], list[str]]:
+    """The pairs of policy ids that `compare` accepts, and the reason for each that it refuses; by default of all."""
     pairs, reasons = [], []
-    for a, b in itertools.combinations(results.contenders, 2):
+    for a, b in itertools.combinations(results.contenders, 2) if which is None else which:
         try:
             _by_suite(results, a, b)
         except ConfigError as error:

@@ -58,6 +58,7 @@ class Store:
             StorageFailed: Nothing can be written there.
         """
         self.cells = cells(config)
+        self._pushed = {cell.fingerprint: cell.policy.pushed_weights for cell in self.cells}
         self._out = config.out
         with storing(config.out):
             self._out.mkdir(parents=True, exist_ok=True)
@@ -105,8 +106,10 @@ class Store:
         """Record an episode. It replaces one that infrastructure failed; any other stays as it is.
 
         Raises `ConfigError` if it was played by another checkpoint than the episodes of its cell before, as after a
-        swap, or by other weights of the same name: a rate is that of one checkpoint.
+        swap, or by other weights of the same name or than the pushed ones of its cell: a rate is that of one
+        checkpoint.
         """
+        self._require_pushed_weights(result)
         self._require_same_checkpoint(result)
         self._require_same_weights(result)
         row = asdict(result)
@@ -126,6 +129,18 @@ class Store:
         with self._db:
             self._db.execute("DELETE FROM episodes WHERE key = ? AND status = 'infra_failed'", (row["key"],))
             insert(self._db, "episodes", row)
+
+    def _require_pushed_weights(self, result: EpisodeResult) -> None:
+        want = self._pushed.get(result.key.settings)
+        if want is None or result.policy_version is None:
+            return
+        acted = (result.first_policy_version, result.policy_version, result.policy_fingerprint)
+        if acted != (want.version, want.version, want.fingerprint):
+            raise ConfigError(
+                f"policy: {result.key} was played by versions {acted[0]} to {acted[1]} of the weights ({acted[2]}), "
+                f"want {want.version} ({want.fingerprint}); push nothing while a version is evaluated, and let the "
+                f"policy's `options` ask for no other"
+            )
 
     def _require_same_checkpoint(self, result: EpisodeResult) -> None:
         known = self._db.execute(

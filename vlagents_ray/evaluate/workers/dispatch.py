@@ -8,10 +8,10 @@ from vlagents_ray.errors import from_code
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import Job, JobQueue
-from vlagents_ray.evaluate.workers.pool import WorkerPool
+from vlagents_ray.evaluate.workers.worker import Workers
 
 
-def dispatch(pool: WorkerPool, queue: JobQueue, begin: Callable[[tuple[Job, ...]], None] = lambda _jobs: None) -> None:
+def dispatch(pool: Workers, queue: JobQueue, begin: Callable[[tuple[Job, ...]], None] = lambda _jobs: None) -> None:
     """Hand waiting jobs to idle workers, and start workers while more are needed; `begin` is called with the jobs."""
     for worker in pool.idle():
         if jobs := queue.take(worker.kind, worker.env_place, pool.working()):

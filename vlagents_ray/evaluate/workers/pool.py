@@ -27,7 +27,7 @@ from vlagents_ray.evaluate.workers.cluster import runtime_env
 from vlagents_ray.evaluate.workers.logs import tail_at
 from vlagents_ray.evaluate.workers.placement import CapacityMonitor, Placement, strategy
 from vlagents_ray.evaluate.workers.rollout import Heartbeat, Report, Rollout
-from vlagents_ray.evaluate.workers.worker import PhaseTimeouts, WorkerHandle
+from vlagents_ray.evaluate.workers.worker import PhaseTimeouts, WorkerHandle, Workers
 from vlagents_ray.ray_tools.head_monitor import HeadMonitor
 
 log = logging.getLogger(__name__)
@@ -38,7 +38,7 @@ MOST_FAILED_STARTS = 3  # in a row; workers that fail together, as with their no
 UNREACHABLE_S = 60.0  # s for which a host is not asked again after it did not return a lost worker's logs
 
 
-class WorkerPool:
+class WorkerPool(Workers):
     """Up to `config.workers` workers. Use it as a context manager: its end kills every worker.
 
     While the head of the cluster does not answer, the existing workers play on, and no others are started.
@@ -47,6 +47,7 @@ class WorkerPool:
     def __init__(
         self, config: EvalConfig, agent_factory: AgentFactory, recorder_factory: RecorderFactory = Recording
     ) -> None:
+        super().__init__()
         self._config = config
         self._recorder_factory = recorder_factory
         self._actor_class = ray.remote(concurrency_groups={"watch": 1})(Rollout)
@@ -60,11 +61,7 @@ class WorkerPool:
         self._unreachable: dict[str, float] = {}  # by host that does not answer: until when it is not asked
         self._capacity = CapacityMonitor(config)
         self._limits = PhaseTimeouts(config)
-        self._workers: list[WorkerHandle] = []
         self._leaving: list[tuple[Any, float]] = []  # actors that are ending, and since when
-
-    def __enter__(self) -> WorkerPool:
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is ClusterLost:  # nothing can kill them; Ray ends them, too, when the head is gone
@@ -77,27 +74,6 @@ class WorkerPool:
         killing.join(KILL_S)
         self._workers.clear()
         self._leaving.clear()
-
-    @property
-    def busy(self) -> bool:
-        """Whether an episode is being played."""
-        return any(worker.jobs for worker in self._workers)
-
-    def working(self) -> Counter[str]:
-        """Return the number of busy workers by place."""
-        return Counter(worker.jobs[0].cell.place for worker in self._workers if worker.jobs)
-
-    def kinds(self) -> Counter[str]:
-        """Return the number of workers by kind."""
-        return Counter(worker.kind for worker in self._workers)
-
-    def unoccupied(self) -> Counter[str]:
-        """Return the number of workers without jobs by kind; some may still be starting."""
-        return Counter(worker.kind for worker in self._workers if not worker.jobs)
-
-    def idle(self) -> list[WorkerHandle]:
-        """Return the workers that can take a job."""
-        return [worker for worker in self._workers if worker.starting is None and not worker.jobs]
 
     def free_slot(self) -> bool:
         """Return whether one more worker may start; ends an idle one if there is no room."""

@@ -17,7 +17,6 @@ from dataclasses import dataclass, field, replace
 from time import monotonic, sleep
 from typing import Any
 
-from vlagents_ray.client import RemoteAgent
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.local.plasma import this_node
 from vlagents_ray.contract import require_match
@@ -174,17 +173,18 @@ class Rollout:
             record=lambda i, obs: recordings[i].add_observation(obs),
             images=recordings[0].wants_images,
             request_info=recordings[0].request_info,
-            acted=lambda i, act: recordings[i].add_act(act),
+            acted=lambda i, *said: recordings[i].add_act(*said),
             executed=lambda i, *done: recordings[i].add_action(*done),
         )
 
     def _sessions_of(self, agent: Agent, env: BatchEnv, number: int) -> list[Agent]:
         if env.num_envs == 1:
             return [agent]
-        if not isinstance(agent, RemoteAgent):
+        sessions = getattr(agent, "sessions", None)
+        if sessions is None:
             raise ConfigError("num_envs: got more than 1 for a policy in the worker's own process; give it a `url`")
         if number > len(self._sessions):
-            self._sessions += agent.sessions(number - len(self._sessions))
+            self._sessions += sessions(number - len(self._sessions))
         return self._sessions[:number]
 
     def _set_phase(self, phase: Phase, steps: int) -> None:

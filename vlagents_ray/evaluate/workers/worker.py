@@ -1,14 +1,21 @@
-"""The driver's handle of a worker, and the time limits of a worker's phases."""
+"""The driver's handles of workers, and the time limits of a worker's phases."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from vlagents_ray.evaluate.episode.episode import Phase
+from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import EvalConfig, WorkerConfig
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.workers.rollout import Heartbeat
+from vlagents_ray.evaluate.workers.rollout import Heartbeat, Report
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 WATCH_S = 1.0  # s between two queries of a busy worker
 GRACE_S = 5.0  # s that a call past its deadline has to fail by itself
@@ -41,6 +48,60 @@ class WorkerHandle:
     def query_is_due(self, now: float) -> bool:
         """Whether it is time to query its progress."""
         return self.query is None and now - self.queried_at > WATCH_S
+
+
+class Workers(ABC):
+    """The workers of an evaluation, wherever they play. Use it as a context manager, whose end ends them."""
+
+    def __init__(self) -> None:
+        self._workers: list[WorkerHandle] = []
+
+    @property
+    def busy(self) -> bool:
+        """Whether an episode is being played."""
+        return any(worker.jobs for worker in self._workers)
+
+    def working(self) -> Counter[str]:
+        """Return the number of busy workers by place."""
+        return Counter(worker.jobs[0].cell.place for worker in self._workers if worker.jobs)
+
+    def kinds(self) -> Counter[str]:
+        """Return the number of workers by kind."""
+        return Counter(worker.kind for worker in self._workers)
+
+    def unoccupied(self) -> Counter[str]:
+        """Return the number of workers without jobs by kind; some may still be starting."""
+        return Counter(worker.kind for worker in self._workers if not worker.jobs)
+
+    def idle(self) -> list[WorkerHandle]:
+        """Return the workers that can take a job."""
+        return [worker for worker in self._workers if worker.starting is None and not worker.jobs]
+
+    @abstractmethod
+    def free_slot(self) -> bool:
+        """Return whether one more worker may start; ends an idle one if there is no room."""
+
+    @abstractmethod
+    def start(self, cell: EvalCase) -> None:
+        """Start one more worker that can play `cell`."""
+
+    @abstractmethod
+    def dispatch(self, worker: WorkerHandle, jobs: tuple[Job, ...]) -> None:
+        """Let `worker` play `jobs`, side by side."""
+
+    @abstractmethod
+    def wait(self, timeout_s: float) -> Iterator[tuple[Job, Report]]:
+        """Yield the reports that arrive within `timeout_s`, also of workers that broke."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Let idle workers close their simulators, which some need for a clean exit."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    @abstractmethod
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None: ...
 
 
 class PhaseTimeouts:

@@ -14,6 +14,7 @@ from vlagents_ray.evaluate.results.statistics.pairs import ERROR_RATE
 from vlagents_ray.evaluate.results.summary import Summary
 
 MOST_PAIRS = 15  # shown unfolded: those of six policy ids
+MOST_COMPARED = 780  # pairs, those of 40 policy ids; of more, as of a whole training's, only those asked for most
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,9 +43,10 @@ class ComparisonPart:
 
 @dataclass(frozen=True, slots=True)
 class Comparisons:
-    """Every pair of policy ids, the ones that are asked for most first."""
+    """The pairs of policy ids, the ones that are asked for most first."""
 
     parts: list[ComparisonPart]
+    left_out: int  # pairs beyond those asked for most, where there are very many
     several_timings: bool
     reasons: list[str]  # why other pairs are not compared
 
@@ -54,18 +56,21 @@ def compare_all(summary: Summary) -> Comparisons | None:
     if len(summary.results.contenders) < 2:
         return None
     reasons: list[str] = []
-    parts = []
+    parts, left_out = [], 0
     timings = by_timing(summary.results.cells)
     for timing, cells in timings.items():
         results = summary.results.among(cells)
-        pairs, why = comparable(results)
+        every = list(itertools.combinations(results.contenders, 2))
+        wanted = every if len(every) <= MOST_COMPARED else _asked_first(summary, every)
+        left_out += len(every) - len(wanted)
+        pairs, why = comparable(results, wanted)
         reasons += why
         asked = _asked_first(summary, pairs)
         found = comparisons(results, [*asked, *(one for one in _later_first(results, pairs) if one not in asked)])
         shown, folded = (found, []) if len(found) <= MOST_PAIRS else (found[: len(asked)], found[len(asked) :])
         by_suite = [[_difference(one, line) for line in one.suites] for one in shown if one.suites]
         parts.append(ComparisonPart(timing, _totals(shown), by_suite, _totals(folded)))
-    return Comparisons(parts, len(timings) > 1, reasons)
+    return Comparisons(parts, left_out, len(timings) > 1, reasons)
 
 
 def real_time_gaps(summary: Summary) -> list[Difference]:
@@ -86,7 +91,7 @@ def _difference(one: Comparison, line: Line) -> Difference:
 def _asked_first(summary: Summary, pairs: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
     """Each checkpoint against the one before it, and of the policies' best ones the best against the others."""
     cells = {cell.contender: (cell.policy, cell.step) for cell in summary.results.cells}
-    known = _later_first(summary.results, pairs)
+    known = dict.fromkeys(_later_first(summary.results, pairs))
     asked = [
         (b, a)
         for a, b in itertools.pairwise(summary.results.contenders)

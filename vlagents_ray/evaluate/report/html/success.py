@@ -172,7 +172,9 @@ def _learning_curve(title: str, cells: Sequence[CellResults]) -> LearningCurve |
         levels.append(Series(f"{policy} (no steps)", [(first, rate), (last, rate)], level=True))
     rows: list[tuple[str, float | None, Rate]] = [(line.name, None, line.points[0][1]) for line in levels]
     rows += [(line.name, step, rate) for line in lines for step, rate in line.points]
-    return LearningCurve(rate_chart([*lines, *levels], "training step", title), rows)
+    pushed = all("pushed_weights" in cell.settings for cell in cells if cell.step is not None)
+    of_axis = "version of the weights" if pushed else "training step"
+    return LearningCurve(rate_chart([*lines, *levels], of_axis, title), rows)
 
 
 def _rate(policy: str, cells: Sequence[CellResults]) -> Rate:

@@ -1,0 +1,62 @@
+"""An evaluation in the caller's process."""
+
+from __future__ import annotations
+
+import os
+import sqlite3
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from eval_fakes import LINE, OTHER_LINE, ToZero
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate import EvalConfig, Summary, evaluate
+
+Config = Callable[..., EvalConfig]
+
+
+def outcomes(summary: Summary) -> list[dict[str, Any]]:
+    return [one.result.outcome for cell in summary.results.cells for one in cell.episodes]
+
+
+def test_its_episodes_are_those_of_workers(config: Config, tmp_path: Path, cluster: None) -> None:
+    envs = {"envs": [LINE, OTHER_LINE]}
+    usual = evaluate(config(**envs, out=tmp_path / "usual"), agent_factory=ToZero)
+    here = evaluate(config(**envs), agent_factory=ToZero, in_process=True)
+    assert outcomes(here) == outcomes(usual)
+    assert {worker.pid for worker in here.results.workers} == {os.getpid()}
+    assert os.getpid() not in {worker.pid for worker in usual.results.workers}
+
+
+def test_it_is_one_worker_without_ray_whatever_the_plan_says(config: Config) -> None:
+    summary = evaluate(config(workers=4), agent_factory=ToZero, in_process=True)
+    assert (summary.state, summary.total.episodes) == ("complete", 6)
+    assert [worker.pid for worker in summary.results.workers] == [os.getpid()]
+
+
+def test_it_goes_on_with_what_has_no_result(config: Config) -> None:
+    evaluate(config(), agent_factory=ToZero, in_process=True, only=(2, 2))
+    with pytest.raises(ConfigError, match="already has results"):
+        evaluate(config(), agent_factory=ToZero, in_process=True)
+    summary = evaluate(config(resume=True), agent_factory=ToZero, in_process=True)
+    assert [one.run for cell in summary.results.cells for one in cell.episodes] == [2, 2, 1, 2, 2, 2]
+
+
+def test_a_simulator_that_breaks_is_made_again_and_its_episode_repeated(config: Config, tmp_path: Path) -> None:
+    trouble = {"folder": str(tmp_path), "trouble": {"raise": [2]}}
+    summary = evaluate(config(env_options=trouble), agent_factory=ToZero, in_process=True)
+    with closing(sqlite3.connect(summary.out / "results.db")) as db:
+        assert db.execute("SELECT episode FROM episodes WHERE attempts = 2").fetchall() == [(2,)]
+    assert len(summary.results.workers) == 2, "one for each simulator"
+    whole = evaluate(config(out=tmp_path / "whole"), agent_factory=ToZero, in_process=True)
+    assert [one["actions_sha256"] for one in outcomes(summary)] == [one["actions_sha256"] for one in outcomes(whole)]
+
+
+def test_suites_whose_workers_differ_have_their_turns(config: Config) -> None:
+    [suite] = config(episodes=2).suites
+    other = suite.model_copy(update={"envs": [OTHER_LINE], "worker": config(cpus_per_worker=2.0).worker})
+    both = config().model_copy(update={"suites": [suite, other]})
+    assert evaluate(both, agent_factory=ToZero, in_process=True).total.episodes == 4

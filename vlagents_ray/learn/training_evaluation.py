@@ -1,0 +1,154 @@
+"""Evaluations while a policy is trained, without checkpoints on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from operator import attrgetter
+from time import monotonic
+from typing import Any
+
+from vlagents_ray.client import RemoteAgent
+from vlagents_ray.contract import Contract
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate.plan.cases import require_envs
+from vlagents_ray.evaluate.plan.config import EvalConfig, PushedWeights
+from vlagents_ray.evaluate.report.progress import Progress
+from vlagents_ray.evaluate.results.database import FILE
+from vlagents_ray.evaluate.results.summary import Summary
+from vlagents_ray.evaluate.run import evaluate
+from vlagents_ray.interface import POLICY, Act, Agent, Obs
+from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray.weights.check import fingerprint
+from vlagents_ray.weights.trainable import evaluation_mode
+
+
+class TrainingEvaluation:
+    """Evaluates a policy while it is trained, in a share of the trainer's time.
+
+        plan = EvalConfig(
+            policies=[{"name": "reach"}], suites=[{"envs": ["tabletop/lift"], "episodes": 50}], out="runs/reach"
+        )
+        evaluation = TrainingEvaluation("serve://reach", plan, share=0.1)
+        for _ in range(1000):
+            version = weights.push(model.state_dict())
+            evaluation.play_if_due(version)
+
+    Results are those of `vlagents_ray.evaluate.evaluate`, with a checkpoint for each version: "reach@3". All versions
+    play the same episodes. The trainer waits meanwhile, so that nothing is pushed.
+    """
+
+    def __init__(
+        self, policy: str | Agent, plan: EvalConfig, *, share: float = 0.1, progress: Progress | None = None
+    ) -> None:
+        """Check the plan; nothing is played yet.
+
+        Args:
+            policy: The URL of the policy's server, to which the versions are pushed; or the agent that this process
+                trains. An agent's episodes are played in this process, each by a copy that shares its weights, as a
+                server makes them; those of a URL by the plan's workers.
+            plan: The suites, the folder of results, and one policy without `steps`: its name and its options. Its `url`
+                and `source` do not count.
+            share: The part of the time since now that evaluations may take, in (0, 1].
+            progress: As for `evaluate`.
+
+        Raises:
+            ConfigError: The share or the plan is wrong, or there are results and `plan.resume` is off.
+            UnknownEnv: There is no such env.
+        """
+        if not 0 < share <= 1:
+            raise ConfigError(f"share: got {share}, want a part of the trainer's time in (0, 1]")
+        if len(plan.policies) != 1 or plan.policies[0].steps:
+            raise ConfigError(f"plan: got the policies {[one.name for one in plan.policies]}, want one without steps")
+        if (plan.out / FILE).is_file() and not plan.resume:
+            raise ConfigError(f"{plan.out} already has results: set resume=True in the plan, or choose another folder")
+        require_envs(plan)
+        self._policy, self._plan = policy, plan.model_copy(update={"resume": True})
+        self._share, self._progress = share, progress
+        self._began = monotonic()
+        self._spent_s = self._last_s = 0.0
+
+    @property
+    def is_due(self) -> bool:
+        """Whether an evaluation that takes as long as the last one keeps to the share. The first is due at once."""
+        elapsed_s = monotonic() - self._began
+        return self._spent_s + self._last_s <= self._share * (elapsed_s + self._last_s)
+
+    def play_if_due(self, version: int) -> Summary | None:
+        """Evaluate the policy if that is due; None if it is not. Otherwise as `play`."""
+        return self.play(version) if self.is_due else None
+
+    def play(self, version: int) -> Summary:
+        """Evaluate the policy now, as at the end of a training. Episodes that have a result are not played again.
+
+        Args:
+            version: What `Publisher.push` returned; for an agent of this process a number that grows, such as the step
+                of training.
+
+        Returns:
+            The summary of all versions so far, of which the newest is the last of `totals`.
+
+        Raises:
+            ConfigError: The policy acts with another version, or the results of this version are of other weights, as
+                after a restart of the training.
+            NotTrainable: The agent names no parameters to train.
+            VLAgentsError: As for `evaluate`.
+        """
+        begun = monotonic()
+        try:
+            if isinstance(self._policy, Agent):
+                return self._play_here(self._policy, version)
+            return self._play_served(self._policy, version)
+        finally:
+            self._last_s = monotonic() - begun
+            self._spent_s += self._last_s
+
+    def _play_here(self, agent: Agent, version: int) -> Summary:
+        pushed = PushedWeights(version=version, fingerprint=fingerprint(agent.parameters()))
+        session = _EvaluatedSession(agent, AgentCopies(agent), pushed)
+        trained = None if agent.trainable is None else attrgetter(agent.trainable)(agent)
+        with evaluation_mode(trained):
+            return evaluate(self._of(pushed), agent_factory=lambda: session, in_process=True, progress=self._progress)
+
+    def _play_served(self, url: str, version: int) -> Summary:
+        policy = self._plan.policies[0]
+        with RemoteAgent(url, transport=policy.transport, connect_timeout_s=self._plan.connect_timeout_s) as remote:
+            newest = (remote.metadata.get("policy_version") or {}).get("newest") or {}
+        if newest.get("version") != version:
+            raise ConfigError(
+                f"version: got {version}, but the newest that {url} acts with is {newest.get('version')}; want what "
+                f"the last push returned, once `acknowledged` counts all replicas"
+            )
+        return evaluate(self._of(PushedWeights(**newest), url=url), progress=self._progress)
+
+    def _of(self, pushed: PushedWeights, url: str | None = None) -> EvalConfig:
+        policy = self._plan.policies[0].model_copy(update={"source": None, "url": url, "pushed_weights": pushed})
+        return self._plan.model_copy(update={"policies": [policy]})
+
+
+class _EvaluatedSession(Agent):
+    """A session of an agent that is trained in this process, with the weights that the agent has meanwhile."""
+
+    def __init__(self, trained: Agent, copies: AgentCopies, pushed: PushedWeights) -> None:
+        self._trained, self._copies, self._pushed = trained, copies, pushed
+        self._copy = trained
+
+    @property
+    def contract(self) -> Contract | None:
+        return self._trained.contract
+
+    def sessions(self, number: int) -> list[_EvaluatedSession]:
+        """Return further sessions, for episodes side by side."""
+        return [_EvaluatedSession(self._trained, self._copies, self._pushed) for _ in range(number)]
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self._copy = self._copies.make()
+        return self._copy.reset(obs, instruction, **kwargs)
+
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        copies = [session._copy for session in sessions if isinstance(session, _EvaluatedSession)]
+        named = {POLICY: self._pushed.model_dump()}
+        return [
+            act if isinstance(act, Exception) else replace(act, info={**(act.info or {}), **named})
+            for act in self._trained.act_batch(obs, copies)
+        ]
