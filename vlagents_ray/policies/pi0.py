@@ -20,6 +20,7 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, from_pretrained
+from vlagents_ray.policies.base.config import NoiseLevel
 from vlagents_ray.policies.base.flow import OFFERED, RandomSteps
 from vlagents_ray.policies.base.model_inputs import (
     camera_images,
@@ -50,12 +51,7 @@ class Pi0Config(ModelConfig):
     steps: int | None = Field(default=None, ge=1, description="steps of the flow; unset: the checkpoint's, usually 10")
     max_tokens: int = Field(default=48, ge=1, description="tokens of an instruction, as in training; more are refused")
     guidance: float = Field(default=5.0, gt=0, description="real-time chunking: largest weight of the old plan")
-    noise_level: float = Field(
-        default=0.0,
-        ge=0,
-        description="randomness of the flow's steps for acts of which a learner wants the log-probability, usually "
-        "0.5; 0: they are refused",
-    )
+    noise_level: NoiseLevel = 0.0
 
 
 @dataclass(frozen=True)
@@ -109,12 +105,8 @@ class Pi0(ModelPolicy):
             action=ActionSpec(dim=None if loaded is None else len(loaded.processor.actions_mean)),
             chunk=None if loaded is None else self.chunk(loaded.network.config.chunk_size),
             history=1,
-            behaviour=self.behaviour,
+            behaviour=self.offered(OFFERED if self.config.noise_level else ()),
         )
-
-    @property
-    def offered(self) -> tuple[str, ...]:
-        return OFFERED if self.config.noise_level else ()
 
     @property
     def state_dim(self) -> int | None:
@@ -168,9 +160,7 @@ class Pi0(ModelPolicy):
         with torch.inference_mode():
             velocity = self._velocity(rows)
             flow = self._follow(velocity, noise, None if guide is None else guide.to(convert), random)
-            stated = (
-                {} if random is None else random.stated(flow, self.config.execute, len(model.processor.actions_mean))
-            )
+            stated = {} if random is None else random.stated(self.config.execute, len(model.processor.actions_mean))
         return [Prediction(model.actions(one), behaviour=stated.get(i, {})) for i, one in enumerate(flow.cpu().numpy())]
 
     @property

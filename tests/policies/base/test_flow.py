@@ -38,9 +38,9 @@ def follow(rows: list[Row], level: float = LEVEL) -> tuple[Any, RandomSteps | No
 
 
 def stated(*rows: Row, execute: int | None = None, dim: int = DIM) -> dict[int, dict[str, Any]]:
-    actions, random = follow(list(rows))
+    _, random = follow(list(rows))
     assert random is not None
-    return random.stated(actions, execute, dim)
+    return random.stated(execute, dim)
 
 
 @pytest.mark.parametrize("level", [0.0, 0.5, 1.0])
@@ -90,7 +90,7 @@ def test_a_chain_begins_with_the_noise_and_ends_with_the_actions() -> None:
     rows = [row(0, "replay")]
     actions, random = follow(rows)
     assert random is not None
-    chain = random.stated(actions, None, DIM)[0]["replay"]["chain"]
+    chain = random.stated(None, DIM)[0]["replay"]["chain"]
     assert chain.shape == (STEPS + 1, HORIZON, DIM)
     np.testing.assert_array_equal(chain[0], row(0).noise(HORIZON, DIM))
     np.testing.assert_array_equal(chain[-1], actions[0])

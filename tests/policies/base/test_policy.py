@@ -124,12 +124,8 @@ class Learnt(Wobble):
     """States the sum of a chunk, and as its replay the chunk."""
 
     @property
-    def offered(self) -> tuple[str, ...]:
-        return ("logprob", "replay")
-
-    @property
     def contract(self) -> Contract:
-        return replace(super().contract, behaviour=self.behaviour)
+        return replace(super().contract, behaviour=self.offered(("logprob", "replay")))
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         drawn = [prediction for prediction in super().predict(rows) if isinstance(prediction, Prediction)]
@@ -166,7 +162,7 @@ def test_nothing_is_stated_unless_it_is_wanted() -> None:
 def test_only_whole_chunks_are_offered_to_learners() -> None:
     assert learnt().contract.behaviour == ("logprob", "replay")
     assert learnt(actions="queue").contract.behaviour is None
-    assert loaded().behaviour is None
+    assert loaded().offered(()) is None
 
 
 def test_rows_of_which_something_is_wanted_are_drawn_as_samples_are() -> None:

@@ -108,8 +108,8 @@ class RandomSteps:
         self._wants = {i: row.want for i, row in enumerate(rows) if row.want}
         self._index, self._steps, self._level = list(self._wants), shape[0], noise_level
         self._draws = convert(np.stack([rows[i].noise(*shape) for i in self._index], axis=1))  # (K, E, H, D)
-        self._chain: list[Any] = []  # noisy actions before each step
-        self._means: list[Any] = []  # after it
+        self._chain: list[Any] = []  # noisy actions (E, H, D) at first, and after each step
+        self._means: list[Any] = []  # of those after each step
 
     @classmethod
     def of(
@@ -120,29 +120,28 @@ class RandomSteps:
 
     def velocity(self, velocity: Any, actions: Any) -> Any:
         """Return the velocity (B, H, D) of the next step, which leads the wanted rows to actions that are drawn."""
-        step = len(self._chain)
-        before = actions[self._index]
+        step, before = len(self._means), actions[self._index]
         mean = step_mean(before, velocity[self._index], step, self._steps, self._level)
-        after = mean + step_std(step, self._steps, self._level) * self._draws[step]
-        self._chain.append(before)
+        drawn = mean + step_std(step, self._steps, self._level) * self._draws[step]
+        change = (before - drawn) * self._steps
+        self._chain = self._chain or [before]
+        self._chain.append(before - change / self._steps)  # rounded as the actions will be
         self._means.append(mean)
         velocity = velocity.clone()
-        velocity[self._index] = (before - after) * self._steps
+        velocity[self._index] = change
         return velocity
 
-    def stated(self, actions: Any, execute: int | None, dim: int) -> dict[int, dict[str, Any]]:
-        """Return what is wanted of rows, by their places in the batch.
+    def stated(self, execute: int | None, dim: int) -> dict[int, dict[str, Any]]:
+        """Return what is wanted of rows, by their places in the batch, after the last step.
 
         Args:
-            actions: The actions after the last step, (B, H, D).
             execute: The rows of a chunk that are used; None: all.
             dim: The numbers of a row that are used.
         """
-        chain = [*self._chain, actions[self._index]]
         stds = [step_std(step, self._steps, self._level) for step in range(self._steps)]
-        logprob = sum(map(normal_logprob, chain[1:], self._means, stds))[:, :execute, :dim].cpu().numpy()
+        logprob = sum(map(normal_logprob, self._chain[1:], self._means, stds))[:, :execute, :dim].cpu().numpy()
         entropy = chain_entropy(self._steps, self._level) * logprob[0].size
-        chains = [tensors.cpu().numpy() for tensors in chain]
+        chains = [tensors.cpu().numpy() for tensors in self._chain]
         found: dict[int, dict[str, Any]] = {}
         for place, (i, want) in enumerate(self._wants.items()):
             replay = {"chain": np.stack([one[place] for one in chains]), "noise_level": self._level}

@@ -32,7 +32,7 @@ class Row:
     info: Mapping[str, Any] = field(default_factory=dict)  # the observation's info
     # the session's memory, for families that keep more than frames
     memory: dict[str, Any] = field(default_factory=dict)
-    want: tuple[str, ...] = ()  # names of what is to be stated of the chunk, out of `ModelPolicy.offered`
+    want: tuple[str, ...] = ()  # names of what is to be stated of the chunk, out of the contract's `behaviour`
     # drawn from the distribution, as samples and chunks of which something is wanted are, and not the likeliest chunk
     sample: bool = False
 
@@ -95,15 +95,12 @@ class ModelPolicy(Agent, abc.ABC):
         """The length of the model's state vector, once loaded; for the warm-up where its parts may have any length."""
         return None
 
-    @property
-    def offered(self) -> tuple[str, ...]:
-        """The names of what the family can state of a chunk that it draws: "logprob", "value", "entropy", "replay"."""
-        return ()
+    def offered(self, names: tuple[str, ...]) -> tuple[str, ...] | None:
+        """Return, for the contract's `behaviour`, the names of what a family can state of its chunks.
 
-    @property
-    def behaviour(self) -> tuple[str, ...] | None:
-        """The `behaviour` of the contract: what is offered; None if nothing is, or acts are not whole chunks."""
-        return (self.offered if self.config.actions == "chunk" else None) or None
+        None if there are none, or if an act is not a whole chunk.
+        """
+        return names if names and self.config.actions == "chunk" else None
 
     def chunk(self, horizon: int) -> int:
         """Return, for the contract, how many of the model's `horizon` rows an `act` returns."""

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.policies.base import Row
+from vlagents_ray.policies.base import Row, shared_frames
+from vlagents_ray.policies.base.flow import RandomSteps
 from vlagents_ray.policies.lerobot.guidance import Guidance
 from vlagents_ray.registry import require
 
@@ -35,6 +36,7 @@ class Kind:
     """The default for any type: one row at a time with a seed of its session, which is slow and exact."""
 
     batched = False
+    random: RandomSteps | None = None  # of the last chunks that were drawn
 
     def __init__(self, policy: Any) -> None:
         self.policy, self.config = policy, policy.config
@@ -59,11 +61,15 @@ class Kind:
         """The number of rows that the policy executes before the next inference, by its config."""
         return min(int(getattr(self.config, "n_action_steps", self.horizon)), self.horizon)
 
+    def observations(self, rows: Sequence[Row]) -> list[int]:
+        """Return the indices of the rows whose observations `draw` needs: all, unless samples share one."""
+        return list(range(len(rows)))
+
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
         """Compute chunks in the policy's own units.
 
         Args:
-            batch: The output of the policy's pre-processor.
+            batch: The output of the policy's pre-processor, for the rows of `observations`.
             rows: The rows of the batch.
             leftovers: The leftover actions of each row, (H', D) in the same units, or None.
 
@@ -91,22 +97,35 @@ class ActPolicy(Kind):
 
 
 class Flow(Kind):
-    """SmolVLA, π0 and π0.5: flow matching from noise of the sessions, guided by their leftovers."""
+    """π0 and π0.5: flow matching from noise of the sessions, guided by their leftovers."""
 
     batched = True
+    noise_level = 0.0  # as for `RandomSteps`
 
     def __init__(self, policy: Any) -> None:
         super().__init__(policy)
         self.guidance = Guidance(policy.rtc_processor)
         policy.model.rtc_processor = self.guidance
 
+    @property
+    def flow_steps(self) -> int:
+        """The number of steps from noise to actions."""
+        return int(self.config.num_inference_steps)
+
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
         torch = require("torch")
         shape = (self.horizon, int(self.config.max_action_dim))
-        noise = np.stack([row.noise(*shape) for row in rows])
-        wanted: dict[str, Any] = {"noise": torch.from_numpy(noise).to(self.config.device)}
+
+        def convert(array: np.ndarray) -> Any:
+            return torch.from_numpy(array).to(self.config.device)
+
+        wanted: dict[str, Any] = {"noise": convert(np.stack([row.noise(*shape) for row in rows]))}
         if any(left is not None for left in leftovers):
             wanted |= self._guide(rows, leftovers, shape)
+        self.random = RandomSteps.of(rows, (self.flow_steps, *shape), self.noise_level, convert)
+        return self._follow(batch, rows, {**wanted, "execution_horizon": self.random})
+
+    def _follow(self, batch: dict[str, Any], rows: Sequence[Row], wanted: dict[str, Any]) -> Any:
         return self.policy.predict_action_chunk(batch, **wanted)
 
     def _guide(self, rows: Sequence[Row], leftovers: Sequence[Any], shape: tuple[int, int]) -> dict[str, Any]:
@@ -125,6 +144,39 @@ class Flow(Kind):
         if not getattr(self.config, "adapt_to_pi_aloha", False):
             return left
         return self.policy._pi_aloha_encode_actions_inv(left[None].clone())[0]
+
+
+class SmolVla(Flow):
+    """SmolVLA, whose images, state and instruction are encoded once for all samples of a session."""
+
+    @property
+    def flow_steps(self) -> int:
+        return int(self.config.num_steps)
+
+    def observations(self, rows: Sequence[Row]) -> list[int]:
+        return shared_frames(rows)[0]
+
+    def _follow(self, batch: dict[str, Any], rows: Sequence[Row], wanted: dict[str, Any]) -> Any:
+        firsts, owners = shared_frames(rows)
+        if len(firsts) == len(rows):
+            return super()._follow(batch, rows, wanted)
+        model = self.policy.model
+        caches: dict[int, dict[str, Any]] = {}  # by layer
+        step = model.denoise_step
+
+        def denoise_step(x_t: Any, prefix_pad_masks: Any, past_key_values: Any, timestep: Any) -> Any:
+            """Denoise the actions of all rows with what was encoded for their observations."""
+            if not caches:  # in the first of the steps
+                caches.update({layer: _indexed(kept, owners) for layer, kept in past_key_values.items()})
+            return step(
+                x_t=x_t, prefix_pad_masks=prefix_pad_masks[owners], past_key_values=caches, timestep=timestep[owners]
+            )
+
+        model.denoise_step = denoise_step
+        try:
+            return super()._follow(batch, rows, wanted)
+        finally:
+            del model.denoise_step
 
 
 class Fast(Kind):
@@ -240,11 +292,15 @@ KINDS: Mapping[str, type[Kind]] = {
     "pi05": Flow,
     "pi0_fast": Fast,
     "sac": Single,
-    "smolvla": Flow,
+    "smolvla": SmolVla,
     "tdmpc": Tdmpc,
     "vqbet": VqBet,
     "xvla": XVla,
 }
+
+
+def _indexed(tensors: Mapping[str, Any], index: list[int]) -> dict[str, Any]:
+    return {name: tensor[index] for name, tensor in tensors.items()}
 
 
 def _stacked(batch: dict[str, Any], config: Any, rows: int) -> dict[str, Any]:

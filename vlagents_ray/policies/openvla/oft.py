@@ -85,12 +85,8 @@ class OpenVLAOFT(PrismaticPolicy):
             action=self._action(),
             chunk=self.chunk(self.config.horizon),
             history=1,
-            behaviour=self.behaviour,
+            behaviour=self.offered(OFFERED if self.config.head == "tokens" else ()),
         )
-
-    @property
-    def offered(self) -> tuple[str, ...]:
-        return OFFERED if self.config.head == "tokens" else ()
 
     @property
     def state_dim(self) -> int | None:

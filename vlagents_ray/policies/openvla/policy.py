@@ -55,12 +55,8 @@ class OpenVLA(PrismaticPolicy):
             action=self._action(),
             chunk=self.chunk(1),
             history=1,
-            behaviour=self.behaviour,
+            behaviour=self.offered(OFFERED),
         )
-
-    @property
-    def offered(self) -> tuple[str, ...]:
-        return OFFERED
 
     def load(self) -> Prismatic:
         """Read the checkpoint."""
