@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from normal_steps import logprob_of_steps
 
 from tests.families.lerobot import tiny
 from tests.families.lerobot.conftest import FILTERS, Load, Made, begun, view
@@ -65,16 +66,8 @@ def test_the_log_probability_is_that_of_the_network_itself(learnt: LeRobot) -> N
     act = begun(learnt, 1).act(view(1, **{WANT: ALL, SAMPLES: 2}))
     own, found = act.info[BEHAVIOUR], act.info[DISTRIBUTION]
     chains = [own["replay"]["chain"], *found["replay"]["chain"]]
-    for chain, logprob in zip(map(torch.from_numpy, chains), [own["logprob"], *found["logprob"]], strict=True):
-        steps = len(chain) - 1
-        total = torch.zeros(chain.shape[1:])
-        for step in range(steps):
-            time, length = 1 - step / steps, 1 / steps
-            v = velocity(learnt, 1, chain[step][None], time)[0]
-            sigma = LEVEL * (time / (1 - time if step else length)) ** 0.5
-            drift = v + sigma**2 / (2 * time) * (chain[step] + (1 - time) * v)
-            normal = torch.distributions.Normal(chain[step] - length * drift, sigma * length**0.5)
-            total += normal.log_prob(chain[step + 1])
+    for chain, logprob in zip(chains, [own["logprob"], *found["logprob"]], strict=True):
+        total = logprob_of_steps(lambda noisy, time: velocity(learnt, 1, noisy, time), chain, LEVEL)
         np.testing.assert_allclose(logprob, total[: len(act.action), : tiny.ACTION], atol=SUMMED)
 
 

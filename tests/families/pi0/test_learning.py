@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from normal_steps import logprob_of_steps
 
 from tests.families.pi0 import tiny
 from tests.families.pi0.test_pi0 import BATCHED, begun, seen
@@ -67,18 +68,16 @@ def test_acts_of_which_nothing_is_wanted_are_those_without_random_steps(plain: P
 
 def test_the_log_probability_is_that_of_the_network_itself(learnt: Pi0) -> None:
     said = begun(learnt, 0).act(seen(0, **{WANT: ALL})).info[BEHAVIOUR]
-    chain, network, inputs = torch.from_numpy(said["replay"]["chain"]), learnt.model.network, encoded(learnt, 0)
-    steps = len(chain) - 1
-    total = torch.zeros(tiny.CHUNK, tiny.ACTION_DIM)
-    for step in range(steps):
-        time, length = 1 - step / steps, 1 / steps
-        with torch.no_grad():  # images, words and actions in one pass, without a cache
-            v = network(**inputs, noise=chain[step][None], timestep=torch.tensor([time])).logits[0]
-        sigma = LEVEL * (time / (1 - time if step else length)) ** 0.5
-        drift = v + sigma**2 / (2 * time) * (chain[step] + (1 - time) * v)
-        normal = torch.distributions.Normal(chain[step] - length * drift, sigma * length**0.5)
-        total += normal.log_prob(chain[step + 1])[:, : tiny.ACTION_DIM]
+    network, inputs = learnt.model.network, encoded(learnt, 0)
+
+    def velocity(noisy: Any, time: float) -> Any:
+        """The network's, of images, words and actions in one pass, without a cache."""
+        with torch.no_grad():
+            return network(**inputs, noise=noisy, timestep=torch.tensor([time])).logits
+
+    total = logprob_of_steps(velocity, said["replay"]["chain"], LEVEL)[:, : tiny.ACTION_DIM]
     np.testing.assert_allclose(said["logprob"], total, atol=SUMMED)
+    steps = len(said["replay"]["chain"]) - 1
     assert said["entropy"] == pytest.approx(normal_entropies(steps) * total.numel(), rel=1e-5)
 
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
 import pytest
+from normal_steps import logprob_of_steps
 
 from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base.flow import RandomSteps, chain_entropy, logprob_of_chain, step_mean, step_std
 
 torch = pytest.importorskip("torch")
+torch.set_num_threads(1)  # tensors this small are faster in one
 pytestmark = pytest.mark.torch
 
 STEPS, HORIZON, DIM, LEVEL = 5, 4, 3, 0.7
@@ -67,14 +68,7 @@ def test_steps_without_noise_are_those_of_the_flow() -> None:
 
 def test_the_log_probability_is_that_of_normal_steps_with_the_published_mean_and_noise() -> None:
     said = stated(row(0, "logprob", "replay"))[0]
-    chain = torch.from_numpy(said["replay"]["chain"]).double()
-    times = [1.0 - step / STEPS for step in range(STEPS + 1)]
-    total = torch.zeros(HORIZON, DIM, dtype=torch.float64)
-    for before, after, t, s in zip(chain, chain[1:], times, times[1:], strict=False):
-        v, sigma = velocity(before[None], t)[0], LEVEL * math.sqrt(t / (1 - (t if t < 1 else s)))
-        clean, noise = before - t * v, before + (1 - t) * v  # as the model estimates both
-        mean = (1 - s) * clean + (s - sigma**2 * (t - s) / (2 * t)) * noise
-        total += torch.distributions.Normal(mean, sigma * math.sqrt(t - s)).log_prob(after)
+    total = logprob_of_steps(velocity, said["replay"]["chain"], LEVEL)
     np.testing.assert_allclose(said["logprob"], total, atol=1e-3)
 
 

@@ -131,12 +131,12 @@ class RandomSteps:
         velocity[self._index] = change
         return velocity
 
-    def stated(self, execute: int | None, dim: int) -> dict[int, dict[str, Any]]:
+    def stated(self, execute: int | None, dim: int | None) -> dict[int, dict[str, Any]]:
         """Return what is wanted of rows, by their places in the batch, after the last step.
 
         Args:
             execute: The rows of a chunk that are used; None: all.
-            dim: The numbers of a row that are used.
+            dim: The numbers of a row that are used; None: all.
         """
         stds = [step_std(step, self._steps, self._level) for step in range(self._steps)]
         logprob = sum(map(normal_logprob, self._chain[1:], self._means, stds))[:, :execute, :dim].cpu().numpy()
