@@ -69,6 +69,12 @@ class ModelConfig(BaseModel, extra="forbid"):
             )
         return self
 
+    @model_validator(mode="after")
+    def _random_steps_are_not_compiled(self) -> Self:
+        if self.compile and getattr(self, "noise_level", None):
+            raise ValueError("compile and noise_level: got both, want one of them; random steps are not compiled")
+        return self
+
     @field_validator("batch_sizes")
     @classmethod
     def _ascending(cls, sizes: list[int] | None) -> list[int] | None:

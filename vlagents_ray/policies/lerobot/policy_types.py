@@ -97,7 +97,10 @@ class ActPolicy(Kind):
 
 
 class Flow(Kind):
-    """π0 and π0.5: flow matching from noise of the sessions, guided by their leftovers."""
+    """SmolVLA, π0 and π0.5: flow matching from noise of the sessions, guided by their leftovers.
+
+    What an observation is encoded to is shared by the samples of its session.
+    """
 
     batched = True
     noise_level = 0.0  # as for `RandomSteps`
@@ -110,7 +113,16 @@ class Flow(Kind):
     @property
     def flow_steps(self) -> int:
         """The number of steps from noise to actions."""
-        return int(self.config.num_inference_steps)
+        config = self.config
+        return int(config.num_steps if config.type == "smolvla" else config.num_inference_steps)
+
+    def observations(self, rows: Sequence[Row]) -> list[int]:
+        return self._shared(rows)[0]
+
+    def _shared(self, rows: Sequence[Row]) -> tuple[list[int], list[int]]:
+        """Return `shared_frames`, or each row by itself in a compiled model, which has few sizes of batches."""
+        each = list(range(len(rows)))
+        return (each, each) if self.config.compile_model else shared_frames(rows)
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
         torch = require("torch")
@@ -126,7 +138,24 @@ class Flow(Kind):
         return self._follow(batch, rows, {**wanted, "execution_horizon": self.random})
 
     def _follow(self, batch: dict[str, Any], rows: Sequence[Row], wanted: dict[str, Any]) -> Any:
-        return self.policy.predict_action_chunk(batch, **wanted)
+        firsts, owners = self._shared(rows)
+        if len(firsts) == len(rows):
+            return self.policy.predict_action_chunk(batch, **wanted)
+        model, caches = self.policy.model, list[Any]()
+        step = model.denoise_step
+
+        def denoise_step(x_t: Any, past_key_values: Any, **encoded: Any) -> Any:
+            """Denoise the actions of all rows with what was encoded for their observations."""
+            if not caches:  # in the first of the steps
+                caches.append(_indexed(past_key_values, owners))
+            each = {name: tensor[owners] for name, tensor in encoded.items()}
+            return step(x_t=x_t, past_key_values=caches[0], **each)
+
+        model.denoise_step = denoise_step
+        try:
+            return self.policy.predict_action_chunk(batch, **wanted)
+        finally:
+            del model.denoise_step
 
     def _guide(self, rows: Sequence[Row], leftovers: Sequence[Any], shape: tuple[int, int]) -> dict[str, Any]:
         torch = require("torch")
@@ -144,39 +173,6 @@ class Flow(Kind):
         if not getattr(self.config, "adapt_to_pi_aloha", False):
             return left
         return self.policy._pi_aloha_encode_actions_inv(left[None].clone())[0]
-
-
-class SmolVla(Flow):
-    """SmolVLA, whose images, state and instruction are encoded once for all samples of a session."""
-
-    @property
-    def flow_steps(self) -> int:
-        return int(self.config.num_steps)
-
-    def observations(self, rows: Sequence[Row]) -> list[int]:
-        return shared_frames(rows)[0]
-
-    def _follow(self, batch: dict[str, Any], rows: Sequence[Row], wanted: dict[str, Any]) -> Any:
-        firsts, owners = shared_frames(rows)
-        if len(firsts) == len(rows):
-            return super()._follow(batch, rows, wanted)
-        model = self.policy.model
-        caches: dict[int, dict[str, Any]] = {}  # by layer
-        step = model.denoise_step
-
-        def denoise_step(x_t: Any, prefix_pad_masks: Any, past_key_values: Any, timestep: Any) -> Any:
-            """Denoise the actions of all rows with what was encoded for their observations."""
-            if not caches:  # in the first of the steps
-                caches.update({layer: _indexed(kept, owners) for layer, kept in past_key_values.items()})
-            return step(
-                x_t=x_t, prefix_pad_masks=prefix_pad_masks[owners], past_key_values=caches, timestep=timestep[owners]
-            )
-
-        model.denoise_step = denoise_step
-        try:
-            return super()._follow(batch, rows, wanted)
-        finally:
-            del model.denoise_step
 
 
 class Fast(Kind):
@@ -292,15 +288,19 @@ KINDS: Mapping[str, type[Kind]] = {
     "pi05": Flow,
     "pi0_fast": Fast,
     "sac": Single,
-    "smolvla": SmolVla,
+    "smolvla": Flow,
     "tdmpc": Tdmpc,
     "vqbet": VqBet,
     "xvla": XVla,
 }
 
 
-def _indexed(tensors: Mapping[str, Any], index: list[int]) -> dict[str, Any]:
-    return {name: tensor[index] for name, tensor in tensors.items()}
+def _indexed(cache: Any, index: list[int]) -> Any:
+    """Return a cache of keys and values with a row for each of `index`: SmolVLA's, or one of transformers."""
+    if isinstance(cache, dict):
+        return {layer: {name: kept[index] for name, kept in both.items()} for layer, both in cache.items()}
+    cache.batch_select_indices(require("torch").tensor(index))
+    return cache
 
 
 def _stacked(batch: dict[str, Any], config: Any, rows: int) -> dict[str, Any]:

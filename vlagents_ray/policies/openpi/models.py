@@ -131,10 +131,9 @@ class JaxTokens(OpenPiModel):
 class TorchFlow(OpenPiModel):
     """openpi's PyTorch port of π0 and π0.5."""
 
-    shares = True
-
     def __init__(self, network: Any, device: Any, config: OpenPiConfig) -> None:
         self._network, self._device = network, device
+        self.shares = not config.compile  # a compiled model has few sizes of batches
         self._steps, self._limit = config.steps or _STEPS, config.guidance
         self.noise_shape: tuple[int, int] = (network.config.action_horizon, network.config.action_dim)
 
