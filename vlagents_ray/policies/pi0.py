@@ -21,7 +21,6 @@ from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, from_pretrained
 from vlagents_ray.policies.base.config import NoiseLevel
-from vlagents_ray.policies.base.flow import OFFERED, RandomSteps
 from vlagents_ray.policies.base.model_inputs import (
     camera_images,
     camera_specs,
@@ -32,6 +31,7 @@ from vlagents_ray.policies.base.model_inputs import (
     state_vector,
 )
 from vlagents_ray.policies.base.realtime import Guide
+from vlagents_ray.policies.flow import OFFERED, RandomSteps
 from vlagents_ray.registry import require
 
 CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")  # openpi's names, in the order of the image tokens

@@ -15,7 +15,7 @@ from tests.families.pi0 import tiny
 from tests.families.pi0.test_pi0 import BATCHED, begun, seen
 from vlagents_ray.interface import BEHAVIOUR, DISTRIBUTION, SAMPLES, WANT, Act
 from vlagents_ray.policies import pi0
-from vlagents_ray.policies.base.flow import logprob_of_chain
+from vlagents_ray.policies.flow import logprob_of_chain
 from vlagents_ray.policies.pi0 import Pi0
 
 ALL = ["logprob", "entropy", "replay"]

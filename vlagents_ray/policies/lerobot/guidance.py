@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from vlagents_ray.policies.base.flow import RandomSteps
+from vlagents_ray.policies.flow import RandomSteps
 
 
 class Guidance:

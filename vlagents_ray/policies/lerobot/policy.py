@@ -16,7 +16,6 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.accelerator import torch_device
-from vlagents_ray.policies.base.flow import OFFERED
 from vlagents_ray.policies.base.model_code import remote_code
 from vlagents_ray.policies.base.model_inputs import (
     GRIPPER,
@@ -26,6 +25,7 @@ from vlagents_ray.policies.base.model_inputs import (
     state_specs,
     state_vector,
 )
+from vlagents_ray.policies.flow import OFFERED
 from vlagents_ray.policies.lerobot import checkpoint
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
 from vlagents_ray.policies.lerobot.policy_types import (

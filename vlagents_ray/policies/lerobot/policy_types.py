@@ -13,7 +13,7 @@ import numpy as np
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base import Row, shared_frames
-from vlagents_ray.policies.base.flow import RandomSteps
+from vlagents_ray.policies.flow import RandomSteps
 from vlagents_ray.policies.lerobot.guidance import Guidance
 from vlagents_ray.registry import require
 

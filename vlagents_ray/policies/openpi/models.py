@@ -15,8 +15,8 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base.accelerator import jax_device, torch_device
 from vlagents_ray.policies.base.checkpoint import SavedTensors, require_loaded
-from vlagents_ray.policies.base.flow import RandomSteps
 from vlagents_ray.policies.base.realtime import Guide
+from vlagents_ray.policies.flow import RandomSteps
 from vlagents_ray.policies.openpi.config import OpenPiConfig
 from vlagents_ray.registry import require
 

@@ -14,7 +14,6 @@ from vlagents_ray.errors import ConfigError, PolicyFailed
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelPolicy, Prediction, Row, shared_frames
 from vlagents_ray.policies.base.checkpoint import STEP, find_checkpoint
-from vlagents_ray.policies.base.flow import OFFERED
 from vlagents_ray.policies.base.model_code import use_source
 from vlagents_ray.policies.base.model_inputs import (
     CLOSED,
@@ -23,6 +22,7 @@ from vlagents_ray.policies.base.model_inputs import (
     needs_gripper,
 )
 from vlagents_ray.policies.base.realtime import Guide
+from vlagents_ray.policies.flow import OFFERED
 from vlagents_ray.policies.openpi.config import OpenPiConfig
 from vlagents_ray.policies.openpi.models import OpenPiModel, load_jax, load_torch
 from vlagents_ray.policies.openpi.robots import RobotConvention, choose_robot

@@ -9,7 +9,7 @@ import pytest
 from normal_steps import logprob_of_steps
 
 from vlagents_ray.policies.base import Row
-from vlagents_ray.policies.base.flow import RandomSteps, chain_entropy, logprob_of_chain, step_mean, step_std
+from vlagents_ray.policies.flow import RandomSteps, chain_entropy, logprob_of_chain, step_mean, step_std
 
 torch = pytest.importorskip("torch")
 torch.set_num_threads(1)  # tensors this small are faster in one
