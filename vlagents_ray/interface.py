@@ -39,7 +39,9 @@ GOAL_IMAGE = "goal_image"  # (H, W, 3) uint8 RGB, for goal-conditioned policies
 DEPTH = "depth"  # {camera: (H, W) float32, metres; or uint16, millimetres}
 HIGH_RES = "high_res"  # {camera: (H, W, 3) uint8 RGB}, for recordings only; never sent to the policy
 SAMPLES = "samples"  # in an observation: the number of samples of its action distribution to return, N
-DISTRIBUTION = "distribution"  # in the Act: {"mean", "std": shaped as the action; "samples": (N, *action)} float32
+# In the Act: {"mean", "std": shaped as the action; "samples": (N, *action)} float32, and for each name of WANT what the
+# act says of every sample, with N as the first dimension.
+DISTRIBUTION = "distribution"
 WANT = "want"  # in an observation: names of what the Act is to say beside the action, out of `Contract.behaviour`
 BEHAVIOUR = "behaviour"  # in the Act: {name: number, or one for each row or token}, e.g. the action's "logprob", nats
 CAPTURED = "captured_at"  # in an observation: the time at which its first sensor was read, s since 1970 (`time.time`)

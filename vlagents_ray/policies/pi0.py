@@ -17,9 +17,10 @@ from pydantic import Field
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidObservation, PolicyFailed
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
+from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, from_pretrained
+from vlagents_ray.policies.base.config import NoiseLevel
 from vlagents_ray.policies.base.model_inputs import (
     camera_images,
     camera_specs,
@@ -30,6 +31,7 @@ from vlagents_ray.policies.base.model_inputs import (
     state_vector,
 )
 from vlagents_ray.policies.base.realtime import Guide
+from vlagents_ray.policies.flow import OFFERED, RandomSteps
 from vlagents_ray.registry import require
 
 CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")  # openpi's names, in the order of the image tokens
@@ -49,6 +51,7 @@ class Pi0Config(ModelConfig):
     steps: int | None = Field(default=None, ge=1, description="steps of the flow; unset: the checkpoint's, usually 10")
     max_tokens: int = Field(default=48, ge=1, description="tokens of an instruction, as in training; more are refused")
     guidance: float = Field(default=5.0, gt=0, description="real-time chunking: largest weight of the old plan")
+    noise_level: NoiseLevel = 0.0
 
 
 @dataclass(frozen=True)
@@ -102,6 +105,7 @@ class Pi0(ModelPolicy):
             action=ActionSpec(dim=None if loaded is None else len(loaded.processor.actions_mean)),
             chunk=None if loaded is None else self.chunk(loaded.network.config.chunk_size),
             history=1,
+            behaviour=self.offered(OFFERED if self.config.noise_level else ()),
         )
 
     @property
@@ -143,7 +147,7 @@ class Pi0(ModelPolicy):
         return images, state_vector(obs, self.state, self.state_dim)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
-        """Compute the chunks of all rows with one flow."""
+        """Compute the chunks of all rows with one flow, and the images and instructions of each observation once."""
         model, torch = self._loaded(), require("torch")
         shape = (model.network.config.chunk_size, model.network.config.max_action_dim)
 
@@ -152,9 +156,16 @@ class Pi0(ModelPolicy):
 
         noise = convert(np.stack([row.noise(*shape) for row in rows]))
         guide = Guide.of([model.planned(row) for row in rows], *shape)
+        random = RandomSteps.of(rows, (self._steps, *shape), self.config.noise_level, convert)
         with torch.inference_mode():
-            flow = self._follow(self._inputs(rows), noise, None if guide is None else guide.to(convert))
-        return [Prediction(model.actions(one)) for one in flow.cpu().numpy()]
+            velocity = self._velocity(rows)
+            flow = self._follow(velocity, noise, None if guide is None else guide.to(convert), random)
+            stated = {} if random is None else random.stated(self.config.execute, len(model.processor.actions_mean))
+        return [Prediction(model.actions(one), behaviour=stated.get(i, {})) for i, one in enumerate(flow.cpu().numpy())]
+
+    @property
+    def _steps(self) -> int:
+        return int(self.config.steps or self._loaded().network.config.num_inference_steps)
 
     def _loaded(self) -> LoadedPi0:
         if self.model is None:
@@ -183,20 +194,29 @@ class Pi0(ModelPolicy):
             for key, value in batch.items()
         }
 
-    def _follow(self, inputs: Mapping[str, Any], noise: Any, guide: Guide | None) -> Any:
+    def _velocity(self, rows: Sequence[Row]) -> Callable[[Any, float], Any]:
+        """Return the flow's velocity for the rows; what the samples of a session see is encoded once."""
+        model = self._loaded()
+        firsts, owners = shared_frames(rows)
+        inputs = self._inputs([rows[i] for i in firsts])
+        return flow_velocity(model.network, inputs, model.dtype, owners if len(firsts) < len(rows) else None)
+
+    def _follow(
+        self, velocity: Callable[[Any, float], Any], noise: Any, guide: Guide | None, random: RandomSteps | None
+    ) -> Any:
         """Integrate noise (B, H, D) to actions, in the Euler steps of `PI0ForConditionalGeneration.sample_actions`.
 
         The actions are kept in float32 between the steps, also if the model computes in another type, as in openpi.
         """
-        model = self._loaded()
-        velocity = _velocity(model.network, inputs, model.dtype)
-        steps = self.config.steps or model.network.config.num_inference_steps
+        steps = self._steps
         actions = noise
         for step in range(steps):
             time = 1.0 - step / steps
             change = velocity(actions, time)
             if guide is not None:
                 change = guide.steer(change, actions, noise, time, steps=steps, limit=self.config.guidance)
+            if random is not None:
+                change = random.velocity(change, actions)
             actions = actions - change / steps
         return actions
 
@@ -209,8 +229,20 @@ def _cameras(chosen: Mapping[str, str] | None) -> dict[str, str]:
     return {name: mapping[name] for name in known}
 
 
-def _velocity(network: Any, inputs: Mapping[str, Any], dtype: Any) -> Callable[[Any, float], Any]:
-    """Return the flow's velocity as a function of noisy actions (B, H, D) and time; inputs are encoded once."""
+def flow_velocity(
+    network: Any, inputs: Mapping[str, Any], dtype: Any, owners: Sequence[int] | None = None
+) -> Callable[[Any, float], Any]:
+    """Return the flow's velocity as a function of noisy actions (B, H, D) and time; inputs are encoded once.
+
+    Args:
+        network: The `PI0ForConditionalGeneration`.
+        inputs: Tokens, images and states of P observations, as `PI0Processor` returns them, on the network's device.
+        dtype: The type in which the network computes.
+        owners: The observation of each of the B rows; None: row i is of observation i.
+
+    Returns:
+        The function, whose result is (B, H, D) float32.
+    """
     torch = require("torch")
     mask, state = inputs["attention_mask"], inputs["state"]
     prefix = network.model.embed_prefix(inputs["input_ids"], inputs["pixel_values"], inputs["pixel_attention_mask"])
@@ -222,6 +254,10 @@ def _velocity(network: Any, inputs: Mapping[str, Any], dtype: Any) -> Callable[[
         use_cache=True,
     ).past_key_values
     length = cache.get_seq_length()
+    if owners is not None:
+        index = torch.tensor(owners, device=mask.device)
+        cache.batch_select_indices(index)
+        mask, state = mask[index], state[index]
 
     def velocity(actions: Any, time: float) -> Any:
         times = torch.full((len(actions),), time, dtype=torch.float32, device=actions.device)

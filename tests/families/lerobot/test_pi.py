@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
+from normal_steps import logprob_of_steps
 from safetensors.torch import load_file, save_file
 from transformers import PreTrainedTokenizerFast
 
@@ -21,7 +22,7 @@ from tests.families.lerobot import tiny
 from tests.families.lerobot.conftest import TASKS, begun, view
 from tests.families.lerobot.test_upstream import Theirs, draws_of
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.interface import DELAY, LEFTOVER, Act
+from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT, Act
 from vlagents_ray.policies.lerobot import LeRobot
 from vlagents_ray.testing import check_agent
 
@@ -98,6 +99,42 @@ def test_flow_matching_and_its_guidance_are_theirs(kind: str, delay: int | None,
     chunk = theirs.policy.predict_action_chunk(theirs.see(view()), **given)
     ours = begun(policy).act(view(**info)).action
     np.testing.assert_allclose(ours, theirs.after(chunk)[0].detach().numpy(), atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_random_steps_have_the_log_probability_of_the_networks_own_steps(
+    kind: str, made: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = _loaded(made(kind), noise_level=0.5)
+    network = policy.model.kind.policy.model
+    read: list[int] = []
+    alone: dict[str, Any] = {}
+    embed, step = network.embed_prefix, network.denoise_step
+
+    def counted(images: Any, *rest: Any) -> Any:
+        read.append(len(images[0]))
+        return embed(images, *rest)
+
+    def kept(**inputs: Any) -> Any:
+        alone.update(inputs)
+        return step(**inputs)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(network, "denoise_step", kept)
+        begun(policy, 1).act(view(1))
+    monkeypatch.setattr(network, "embed_prefix", counted)
+    act = begun(policy, 1).act(view(1, **{WANT: ["logprob", "replay"], SAMPLES: 2}))
+    assert read == [1]
+
+    def velocity(noisy: Any, time: float) -> Any:
+        with torch.inference_mode():
+            return step(**alone | {"x_t": noisy, "timestep": torch.tensor([time], dtype=torch.float32)})
+
+    own, found = act.info[BEHAVIOUR], act.info[DISTRIBUTION]
+    chains = [own["replay"]["chain"], *found["replay"]["chain"]]
+    for chain, logprob in zip(chains, [own["logprob"], *found["logprob"]], strict=True):
+        total = logprob_of_steps(velocity, chain, 0.5)[: len(act.action), : tiny.ACTION]
+        np.testing.assert_allclose(logprob, total, atol=5e-3)
 
 
 @pytest.mark.parametrize("kind", KINDS)

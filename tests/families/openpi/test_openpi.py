@@ -10,7 +10,7 @@ import pytest
 
 from tests.families.openpi.marks import MARKS
 from vlagents_ray import Obs
-from vlagents_ray.errors import InvalidObservation, MissingCamera
+from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera
 from vlagents_ray.interface import DELAY, LEFTOVER
 from vlagents_ray.serve.mapping.presets import presets
 from vlagents_ray.testing import check_agent
@@ -143,3 +143,10 @@ def test_what_a_row_says_after_its_end_is_dropped() -> None:
 
     tokens = np.array([[5, 1, 7, 1], [5, 6, 7, 8]])
     np.testing.assert_array_equal(JaxTokens.ended(tokens), [[5, 1, 0, 0], [5, 6, 7, 8]])
+
+
+def test_a_compiled_loop_has_no_random_steps(loaded: Any) -> None:
+    assert loaded("pi0").contract.behaviour is None
+    settings = loaded("pi0").config.model_copy(update={"noise_level": 0.5})
+    with pytest.raises(ConfigError, match=r"noise_level: got 0\.5 for a JAX checkpoint"):
+        type(loaded("pi0"))(settings).initialize()

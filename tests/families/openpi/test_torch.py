@@ -10,12 +10,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from normal_steps import logprob_of_steps
 
 from tests.families.openpi.marks import MARKS
 from tests.families.openpi.test_openpi import BATCHED, WORDS, begun, seen, theirs
-from vlagents_ray.errors import ConfigError
-from vlagents_ray.interface import DELAY, LEFTOVER
+from vlagents_ray.errors import ConfigError, InvalidObservation
+from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT
 from vlagents_ray.policies.openpi import OpenPi
+from vlagents_ray.policies.openpi import policy as openpi_policy
+from vlagents_ray.policies.openpi.models import _observation
 
 pytestmark = MARKS
 PATCHED = all(importlib.util.find_spec(name) for name in ("transformers", "transformers.models.siglip.check"))
@@ -68,6 +71,84 @@ def test_frozen_rows_come_back_as_planned(port: Path) -> None:
     again = copy.copy(policy)  # what guided one call is gone with it
     again.reset(seen("pi0", 0), WORDS[0], seed=0)
     assert np.abs(again.act(seen("pi0", 0)).action[:2] - plan[:2]).max() > 0.01
+
+
+LEVEL = 0.5
+ALL = ["logprob", "entropy", "replay"]
+
+
+@patched
+def test_the_log_probability_is_that_of_the_network_itself(port: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import torch
+
+    policy = made(port, noise_level=LEVEL)
+    assert policy.contract.behaviour == tuple(ALL)
+    act = begun(policy, "pi0", 0).act(seen("pi0", 0, **{WANT: ALL, SAMPLES: 2}))
+    network, seen_velocities = policy.model.model._network, []
+    session = begun(policy, "pi0", 0)
+    inputs = policy.model.transforms.read(session.perceive(seen("pi0", 0)), WORDS[0])
+    observation = _observation({key: _tensors(value) for key, value in inputs.items()})
+    plain = network._preprocess_observation
+    monkeypatch.setattr(network, "_preprocess_observation", lambda one, **_: plain(one, train=False))
+    hook = network.action_out_proj.register_forward_hook(lambda _module, _inputs, out: seen_velocities.append(out))
+
+    def velocity(noisy: Any, time: float) -> Any:
+        """The network's in training: noise and actions are the same, and so is what is between them."""
+        with torch.no_grad():
+            network.forward(observation, noisy, noise=noisy, time=torch.tensor([time], dtype=torch.float32))
+        return seen_velocities[-1]
+
+    own, found = act.info[BEHAVIOUR], act.info[DISTRIBUTION]
+    chains = [own["replay"]["chain"], *found["replay"]["chain"]]
+    for chain, logprob in zip(chains, [own["logprob"], *found["logprob"]], strict=True):
+        np.testing.assert_allclose(logprob, logprob_of_steps(velocity, chain, LEVEL)[:, :7], atol=5e-3)
+    hook.remove()
+
+
+def _tensors(value: Any) -> Any:
+    """Inputs of one row as a batch of one."""
+    import torch
+
+    if isinstance(value, dict):
+        return {key: _tensors(one) for key, one in value.items()}
+    return torch.from_numpy(np.array(value))[None]
+
+
+@patched
+def test_the_samples_of_an_observation_are_of_one_reading_of_it(port: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    policy, read = made(port, noise_level=LEVEL), []
+    network = policy.model.model._network
+    embed = network.embed_prefix
+
+    def counted(images: Any, *rest: Any) -> Any:
+        read.append(len(images[0]))
+        return embed(images, *rest)
+
+    monkeypatch.setattr(network, "embed_prefix", counted)
+    views = [seen("pi0", 0), seen("pi0", 1, **{SAMPLES: 8, WANT: ALL}), seen("pi0", 2)]
+
+    def acted() -> list[Any]:
+        sessions = [begun(policy, "pi0", i) for i in range(3)]
+        sessions[0].reset(views[0], "pick up the cube " * 50)  # too long, so that another row stands in for its own
+        return policy.act_batch(views, sessions)
+
+    shared = acted()
+    monkeypatch.setattr(openpi_policy, "shared_frames", lambda rows: (list(range(len(rows))),) * 2)
+    each = acted()
+    assert read == [2, 11]
+    assert isinstance(shared[0], InvalidObservation)
+    alone = begun(policy, "pi0", 1).act(views[1]).info[BEHAVIOUR]["replay"]["chain"]
+    np.testing.assert_allclose(shared[1].info[BEHAVIOUR]["replay"]["chain"], alone, atol=10 * BATCHED)
+    for one, other in zip(shared[1:], each[1:], strict=True):
+        np.testing.assert_allclose(one.action, other.action, atol=10 * BATCHED)
+    samples = [acts[1].info[DISTRIBUTION]["samples"] for acts in (shared, each)]
+    np.testing.assert_allclose(*samples, atol=10 * BATCHED)
+
+
+@patched
+def test_acts_of_which_nothing_is_wanted_are_those_without_random_steps(port: Path) -> None:
+    acts = [begun(policy, "pi0", 0).act(seen("pi0", 0)) for policy in (made(port), made(port, noise_level=LEVEL))]
+    np.testing.assert_array_equal(acts[0].action, acts[1].action)
 
 
 @patched

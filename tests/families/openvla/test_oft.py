@@ -18,8 +18,9 @@ from tests.families.openvla.conftest import LIBRARIES, WORDS, begun, seen
 from tests.families.openvla.upstream import module
 from vlagents_ray import Obs
 from vlagents_ray.errors import InvalidObservation, MissingCamera, MissingState
-from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
-from vlagents_ray.policies.openvla import preprocessing
+from vlagents_ray.interface import BEHAVIOUR, DISTRIBUTION, SAMPLES, WANT, Act
+from vlagents_ray.policies.base import Row
+from vlagents_ray.policies.openvla import oft, preprocessing
 from vlagents_ray.policies.openvla.oft import OpenVLAOFT
 from vlagents_ray.testing import check_agent
 
@@ -182,6 +183,42 @@ def test_samples_differ_where_the_model_has_a_distribution(policy: OpenVLAOFT, k
     samples = act.info[DISTRIBUTION]["samples"]
     assert samples.shape == (3, tiny.CHUNK, tiny.ACTION_DIM)
     assert len({sample.round(3).tobytes() for sample in samples}) == 3
+
+
+@pytest.mark.parametrize("kind", ["oft", "oft-tokens", "oft-diffusion"], indirect=True)
+def test_samples_share_the_images_of_their_session(
+    policy: OpenVLAOFT, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[int] = []
+    backbone = policy.model.base.network.vision_backbone
+    forward = backbone.forward
+    monkeypatch.setattr(backbone, "forward", lambda pixels: read.append(len(pixels)) or forward(pixels))
+    views = [seen(0, **{SAMPLES: 3}), seen(1)]
+    shared = policy.act_batch(views, [begun(policy, 0), begun(policy, 1)])
+    monkeypatch.setattr(oft, "shared_frames", lambda rows: (list(range(len(rows))), list(range(len(rows)))))
+    each = policy.act_batch(views, [begun(policy, 0), begun(policy, 1)])
+    assert read == [4, 10]  # of two cameras
+    for one, other in zip(shared, each, strict=True):
+        assert np.abs(one.action - other.action).max() <= SAME[kind]
+    samples = [acts[0].info[DISTRIBUTION]["samples"] for acts in (shared, each)]
+    assert np.abs(samples[0] - samples[1]).max() <= SAME[kind]
+
+
+def test_action_tokens_have_log_probabilities_and_other_heads_have_none(loaded: Callable[..., Any]) -> None:
+    assert loaded("oft").contract.behaviour is None
+    policy = loaded("oft-tokens", **SETTINGS["oft-tokens"])
+    assert policy.contract.behaviour == ("logprob", "entropy", "replay")
+    act = begun(policy, 0).act(seen(0, **{SAMPLES: 2, WANT: ["logprob", "entropy", "replay"]}))
+    said = act.info[BEHAVIOUR]
+    bins = policy.model.base.bins
+    tokens = torch.tensor(np.concatenate([said["replay"]["tokens"][None], act.info[DISTRIBUTION]["replay"]["tokens"]]))
+    session = begun(policy, 0)
+    inputs = [policy._model_input(Row((session.perceive(seen(0)),), WORDS[0], None), "bridge_orig")]
+    _, logits = policy.model.choose(inputs, [0], np.full((1, tiny.CHUNK, tiny.ACTION_DIM), np.nan))
+    want = bins.logprob(tokens, logits.expand(3, -1, -1, -1))
+    np.testing.assert_allclose(said["logprob"], want[0], atol=1e-4)
+    np.testing.assert_allclose(act.info[DISTRIBUTION]["logprob"], want[1:], atol=1e-4)
+    assert said["entropy"] == pytest.approx(bins.stated(tokens[:1], logits)[1].sum(), rel=1e-4)
 
 
 def test_regression_is_sure_of_its_only_answer(loaded: Callable[..., Any]) -> None:

@@ -16,7 +16,7 @@ from transformers import AutoTokenizer
 from tests.families.openvla.conftest import LIBRARIES, WORDS, begun, seen
 from tests.families.openvla.upstream import module
 from vlagents_ray.errors import InvalidObservation, MissingCamera
-from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
+from vlagents_ray.interface import BEHAVIOUR, DISTRIBUTION, SAMPLES, WANT, Act
 from vlagents_ray.policies.openvla import preprocessing
 from vlagents_ray.policies.openvla.policy import OpenVLA
 from vlagents_ray.testing import check_agent
@@ -131,6 +131,54 @@ def test_samples_share_their_sessions_prompt(policy: OpenVLA, monkeypatch: pytes
     monkeypatch.setattr(backbone, "forward", lambda pixels: read.append(len(pixels)) or forward(pixels))
     policy.act_batch([seen(0, **{SAMPLES: 5}), seen(1)], [begun(policy, 0), begun(policy, 1)])
     assert read == [2]
+
+
+ALL = ["logprob", "entropy", "replay"]
+
+
+def scored(policy: OpenVLA, seed: int, tokens: np.ndarray) -> torch.distributions.Categorical:
+    """The distributions over bins of each token after those before it, all in one pass of the whole sequence."""
+    model = policy.model
+    patches = model.network.projector(model.network.vision_backbone(policy.perceive(seen(seed))[None]))[0]
+    words = model.embed(model.tokens(WORDS[seed]))
+    sequence = torch.cat([words[:1], patches, words[1:], model.embed(tokens.tolist()[:-1])])
+    logits = model.network.language_model(inputs_embeds=sequence[None]).logits[0, -len(tokens) :]
+    return torch.distributions.Categorical(logits=logits[:, 32000 - 256 :][:, :256].double())
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_log_probability_is_that_of_the_tokens_in_one_pass_over_them(policy: OpenVLA, seed: int) -> None:
+    acts = policy.act_batch([seen(i, **{WANT: ALL}) for i in range(2)], [begun(policy, i) for i in range(2)])
+    said = acts[seed].info[BEHAVIOUR]
+    [tokens] = said["replay"]["tokens"]
+    with torch.no_grad():
+        categorical = scored(policy, seed, tokens)
+    np.testing.assert_allclose(said["logprob"][0], categorical.log_prob(torch.tensor(tokens) - 31744), atol=1e-4)
+    assert said["entropy"] == pytest.approx(categorical.entropy().sum().item(), abs=1e-4)
+    assert np.array_equal(acts[seed].action[0], unit(policy, tokens))
+
+
+def unit(policy: OpenVLA, tokens: np.ndarray) -> np.ndarray:
+    """The action of tokens."""
+    scale = policy.model.statistics.scale("bridge_orig")
+    return scale.restore(policy.model.bins.values(torch.tensor(tokens))).astype(np.float32)
+
+
+def test_an_act_of_which_something_is_wanted_is_drawn_and_others_are_the_likeliest(policy: OpenVLA) -> None:
+    drawn = [begun(policy, 0).act(seen(0, **{WANT: ["logprob"]})) for _ in range(2)]
+    assert np.array_equal(drawn[0].action, drawn[1].action)  # it is of the session's own generator
+    likeliest = begun(policy, 0).act(seen(0))
+    assert not np.array_equal(drawn[0].action, likeliest.action)
+    assert BEHAVIOUR not in likeliest.info
+
+
+def test_each_sample_has_its_log_probability(policy: OpenVLA) -> None:
+    found = begun(policy, 0).act(seen(0, **{SAMPLES: 3, WANT: ALL})).info[DISTRIBUTION]
+    assert found["logprob"].shape == found["samples"].shape == (3, 1, 7)
+    with torch.no_grad():
+        for (tokens,), (logprob,) in zip(found["replay"]["tokens"], found["logprob"], strict=True):
+            want = scored(policy, 0, tokens).log_prob(torch.tensor(tokens) - 31744)
+            np.testing.assert_allclose(logprob, want, atol=1e-4)
 
 
 def test_pictures_may_be_those_of_libero(loaded: Callable[..., Any]) -> None:

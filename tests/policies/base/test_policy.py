@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,8 +12,8 @@ import pytest
 from vlagents_ray import Obs
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.errors import InvalidAction, InvalidObservation, MissingState, NotReset
-from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, Act
-from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
+from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT, Act
+from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
 from vlagents_ray.policies.base.model_inputs import state_specs, state_vector
 from vlagents_ray.testing import check_agent
 
@@ -119,10 +120,76 @@ def test_samples_come_with_their_mean_and_change_no_action() -> None:
     assert np.array_equal(asked.act(at(1.0)).action, plain.act(at(1.0)).action)
 
 
+class Learnt(Wobble):
+    """States the sum of a chunk, and as its replay the chunk."""
+
+    @property
+    def contract(self) -> Contract:
+        return replace(super().contract, behaviour=self.offered(("logprob", "replay")))
+
+    def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
+        drawn = [prediction for prediction in super().predict(rows) if isinstance(prediction, Prediction)]
+        said = [{"logprob": one.actions.sum(), "replay": {"chunk": one.actions}} for one in drawn]
+        return [
+            replace(one, behaviour={name: about[name] for name in row.want})
+            for row, one, about in zip(rows, drawn, said, strict=True)
+        ]
+
+
+def learnt(**config: Any) -> Learnt:
+    policy = Learnt.from_config({"checkpoint": "none", **config})
+    policy.initialize()
+    policy.reset(at(0.0), "go", seed=0)
+    return policy
+
+
+def test_what_is_wanted_is_stated_of_the_act_and_of_each_of_its_samples() -> None:
+    act = learnt().act(at(1.0, **{WANT: ["logprob", "replay"], SAMPLES: 3}))
+    found = act.info[DISTRIBUTION]
+    assert act.info[BEHAVIOUR]["logprob"] == act.action.sum()
+    np.testing.assert_array_equal(act.info[BEHAVIOUR]["replay"]["chunk"], act.action)
+    np.testing.assert_array_equal(found["logprob"], found["samples"].sum((1, 2)))
+    np.testing.assert_array_equal(found["replay"]["chunk"], found["samples"])
+
+
+def test_nothing_is_stated_unless_it_is_wanted() -> None:
+    policy = learnt()
+    assert BEHAVIOUR not in policy.act(at(1.0)).info
+    assert BEHAVIOUR not in policy.act(at(1.0, **{WANT: []})).info
+    assert list(policy.act(at(1.0, **{WANT: ["logprob"]})).info[BEHAVIOUR]) == ["logprob"]
+
+
+def test_only_whole_chunks_are_offered_to_learners() -> None:
+    assert learnt().contract.behaviour == ("logprob", "replay")
+    assert learnt(actions="queue").contract.behaviour is None
+    assert loaded().offered(()) is None
+
+
+def test_rows_of_which_something_is_wanted_are_drawn_as_samples_are() -> None:
+    class Rows(Wobble):
+        def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
+            self.model["batches"].append([row.sample for row in rows])
+            return super().predict(rows)
+
+    policy = Rows.from_config({"checkpoint": "none"})
+    policy.initialize()
+    policy.reset(at(0.0), "go")
+    policy.act(at(0.0, **{SAMPLES: 1}))
+    policy.act(at(0.0, **{SAMPLES: 1, WANT: ["logprob"]}))
+    assert policy.model["batches"][::2] == [[False, True], [True, True]]
+
+
+def test_samples_see_what_their_session_sees() -> None:
+    rows = [Row((np.full(2, i),), "go", np.random.default_rng(i)) for i in range(2)]
+    rows += [replace(rows[0]), Row((np.full(2, 2),), "go", np.random.default_rng(2)), replace(rows[1])]
+    assert shared_frames(rows) == ([0, 1, 3], [0, 1, 0, 2, 1])
+
+
 @pytest.mark.parametrize(
     ("config", "obs", "error"),
     [
         ({}, Obs(), MissingState),
+        ({}, at(0.0, **{WANT: ["logprob"], LEFTOVER: np.zeros((2, DIM))}), InvalidObservation),
         ({}, Obs(state={"joints": np.zeros(3, np.float32)}), InvalidObservation),
         ({}, at(0.0, **{SAMPLES: -1}), InvalidObservation),
         ({"actions": "queue"}, at(0.0, **{SAMPLES: 2}), InvalidObservation),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field, field_validator, model_validator
 from typing_extensions import Self
@@ -10,6 +10,14 @@ from typing_extensions import Self
 from vlagents_ray.policies.base.checkpoint import STEP
 
 DType = Literal["auto", "float32", "bfloat16", "float16"]
+NoiseLevel = Annotated[
+    float,
+    Field(
+        ge=0,
+        description="randomness of the flow's steps in acts of which a learner wants the log-probability, usually "
+        "0.5; 0: none is offered",
+    ),
+]
 
 
 class ModelConfig(BaseModel, extra="forbid"):
@@ -59,6 +67,12 @@ class ModelConfig(BaseModel, extra="forbid"):
                 f"checkpoint {self.checkpoint!r} and checkpoint_step {self.checkpoint_step}: give both the place "
                 f"{STEP} and the step that belongs there, or neither"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _random_steps_are_not_compiled(self) -> Self:
+        if self.compile and getattr(self, "noise_level", None):
+            raise ValueError("compile and noise_level: got both, want one of them; random steps are not compiled")
         return self
 
     @field_validator("batch_sizes")

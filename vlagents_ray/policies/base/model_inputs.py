@@ -8,7 +8,7 @@ import numpy as np
 
 from vlagents_ray.contract import CameraSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, MissingState
-from vlagents_ray.interface import LEFTOVER, SAMPLES, Obs
+from vlagents_ray.interface import LEFTOVER, SAMPLES, WANT, Obs
 from vlagents_ray.policies.base.config import ModelConfig
 from vlagents_ray.registry import require
 
@@ -89,6 +89,18 @@ def wanted_samples(obs: Obs, config: ModelConfig) -> int:
             f"so set the policy's `actions` to 'chunk'"
         )
     return samples
+
+
+def wanted_behaviour(obs: Obs) -> tuple[str, ...]:
+    """Return the names of what the act is to state beside its action."""
+    if WANT not in obs.info:
+        return ()
+    if obs.info.get(LEFTOVER) is not None:
+        raise InvalidObservation(
+            f"info[{WANT!r}]: got it with {LEFTOVER!r}, want one of them; a chunk that continues a plan is not drawn "
+            f"from the policy's distribution"
+        )
+    return tuple(obs.info[WANT])
 
 
 def leftover_plan(obs: Obs, contract: Contract | None) -> np.ndarray:

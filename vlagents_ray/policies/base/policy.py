@@ -14,9 +14,9 @@ import numpy as np
 from vlagents_ray.chunking.buffer import ENSEMBLE, Chunk, ChunkBuffer
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import InvalidAction, InvalidObservation, NotReset, PolicyFailed
-from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER, Act, Agent, Obs
+from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, Act, Agent, Obs
 from vlagents_ray.policies.base.config import ModelConfig
-from vlagents_ray.policies.base.model_inputs import count_in, leftover_plan, wanted_samples
+from vlagents_ray.policies.base.model_inputs import count_in, leftover_plan, wanted_behaviour, wanted_samples
 from vlagents_ray.validation import check_action
 
 
@@ -32,7 +32,9 @@ class Row:
     info: Mapping[str, Any] = field(default_factory=dict)  # the observation's info
     # the session's memory, for families that keep more than frames
     memory: dict[str, Any] = field(default_factory=dict)
-    sample: bool = False  # drawn from the distribution, even if the session's own chunk is the likeliest one
+    want: tuple[str, ...] = ()  # names of what is to be stated of the chunk, out of the contract's `behaviour`
+    # drawn from the distribution, as samples and chunks of which something is wanted are, and not the likeliest chunk
+    sample: bool = False
 
     def noise(self, *shape: int) -> np.ndarray:
         """Draw standard normal numbers, float32, the same on every device."""
@@ -53,6 +55,7 @@ class Prediction:
     actions: np.ndarray  # (H, D) float32, in the units of the contract's action
     mean: np.ndarray | None = None  # (H, D), of the model's distribution
     std: np.ndarray | None = None  # (H, D)
+    behaviour: dict[str, Any] = field(default_factory=dict)  # a value for each name of `Row.want`
     info: dict[str, Any] = field(default_factory=dict)  # for `Act.info`
 
 
@@ -91,6 +94,13 @@ class ModelPolicy(Agent, abc.ABC):
     def state_dim(self) -> int | None:
         """The length of the model's state vector, once loaded; for the warm-up where its parts may have any length."""
         return None
+
+    def offered(self, names: tuple[str, ...]) -> tuple[str, ...] | None:
+        """Return, for the contract's `behaviour`, the names of what a family can state of its chunks.
+
+        None if there are none, or if an act is not a whole chunk.
+        """
+        return names if names and self.config.actions == "chunk" else None
 
     def chunk(self, horizon: int) -> int:
         """Return, for the contract, how many of the model's `horizon` rows an `act` returns."""
@@ -181,7 +191,7 @@ class ModelPolicy(Agent, abc.ABC):
     def _rows(self, obs: Obs, session: ModelPolicy) -> list[Row]:
         """Return the rows to compute for a session: none while actions are left, else its chunk, then its samples."""
         episode = session._begun()
-        samples = wanted_samples(obs, self.config)
+        samples, want = wanted_samples(obs, self.config), wanted_behaviour(obs)
         session.notice(obs)
         rows_left = self.config.actions == "queue" and episode.plan.next is not None
         if rows_left and self.history == 1:
@@ -197,6 +207,8 @@ class ModelPolicy(Agent, abc.ABC):
             delay=count_in(obs, DELAY),
             info=obs.info,
             memory=episode.memory,
+            want=want,
+            sample=bool(want),
         )
         if not samples:
             return [own]
@@ -211,6 +223,8 @@ class ModelPolicy(Agent, abc.ABC):
         own, *samples = found
         chunk = self._used(own.actions)  # type: ignore[union-attr]
         info: dict[str, Any] = dict(own.info)  # type: ignore[union-attr]
+        if own.behaviour:  # type: ignore[union-attr]
+            info[BEHAVIOUR] = own.behaviour  # type: ignore[union-attr]
         if samples:
             info[DISTRIBUTION] = self._distribution(own, samples)  # type: ignore[arg-type]
         if self.config.actions == "chunk":
@@ -226,11 +240,11 @@ class ModelPolicy(Agent, abc.ABC):
         """Return the rows of a chunk that are used, (execute, D)."""
         return np.ascontiguousarray(actions[: self.config.execute], dtype=np.float32)
 
-    def _distribution(self, own: Prediction, samples: list[Prediction]) -> dict[str, np.ndarray]:
+    def _distribution(self, own: Prediction, samples: list[Prediction]) -> dict[str, Any]:
         drawn = np.stack([self._used(sample.actions) for sample in samples])
         mean = drawn.mean(0) if own.mean is None else self._used(own.mean)
         std = drawn.std(0) if own.std is None else self._used(own.std)
-        return {"mean": mean, "std": std, "samples": drawn}
+        return {"mean": mean, "std": std, "samples": drawn, **_stacked([sample.behaviour for sample in samples])}
 
     def _forward(self, rows: list[Row]) -> list[Prediction | Exception]:
         """Compute all rows, in forward passes of the sizes that the config allows."""
@@ -267,3 +281,27 @@ class ModelPolicy(Agent, abc.ABC):
 def _sample(row: Row, draws: np.random.Generator) -> Row:
     """Return the row with noise and memory that are separate from the session's."""
     return replace(row, rng=draws, memory=copy.deepcopy(row.memory), sample=True)
+
+
+def shared_frames(rows: Sequence[Row]) -> tuple[list[int], list[int]]:
+    """Return which rows to encode, as the samples of a session see what its own row sees.
+
+    Returns:
+        The indices of rows with observations of their own, and for each row the place of its observations among them.
+    """
+    places: dict[int, int] = {}
+    firsts: list[int] = []
+    for i, row in enumerate(rows):
+        if id(row.frames) not in places:
+            places[id(row.frames)] = len(firsts)
+            firsts.append(i)
+    return firsts, [places[id(row.frames)] for row in rows]
+
+
+def _stacked(stated: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return one mapping for several of the same names: arrays get a first dimension, mappings are mapped alike."""
+    columns = {name: [one[name] for one in stated] for name in stated[0]}
+    return {
+        name: _stacked(values) if isinstance(values[0], Mapping) else np.stack(values)
+        for name, values in columns.items()
+    }

@@ -7,6 +7,7 @@ from typing import Any
 from pydantic import Field
 
 from vlagents_ray.policies.base import ModelConfig
+from vlagents_ray.policies.base.config import NoiseLevel
 
 
 class LeRobotConfig(ModelConfig):
@@ -35,6 +36,7 @@ class LeRobotConfig(ModelConfig):
         description="cameras of the policy that this robot does not have, which the model masks; for smolvla, pi0, "
         "pi05, pi0_fast and xvla",
     )
+    noise_level: NoiseLevel = 0.0
     trust_remote_code: bool = Field(
         default=False,
         description="run the code that the checkpoint names: processor steps that are not LeRobot's nor an installed "

@@ -11,6 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from vlagents_ray.policies.flow import RandomSteps
+
 
 class Guidance:
     """Replaces the `RTCProcessor` of a flow-matching policy of LeRobot."""
@@ -30,18 +32,19 @@ class Guidance:
         inference_delay: Any,
         time: float,
         original_denoise_step_partial: Callable[[Any], Any],
-        execution_horizon: int | None = None,
+        execution_horizon: RandomSteps | None = None,
     ) -> Any:
         """Compute the guided velocity, (B, T, D).
 
         `prev_chunk_left_over` is (B, T, D), or None for a batch without leftovers; `inference_delay` is the
-        weights, (B, T, 1), 0 for a row without one. The policy passes them by these names.
+        weights, (B, T, 1), 0 for a row without one; `execution_horizon` is the random steps of rows without a leftover,
+        or None. The policy passes them by these names.
         """
         velocity = original_denoise_step_partial(x_t)
-        if prev_chunk_left_over is None:
-            return velocity
-        end = x_t - time * velocity
-        return velocity - self._strength(time) * inference_delay * (prev_chunk_left_over - end)
+        if prev_chunk_left_over is not None:
+            end = x_t - time * velocity
+            velocity = velocity - self._strength(time) * inference_delay * (prev_chunk_left_over - end)
+        return velocity if execution_horizon is None else execution_horizon.velocity(velocity, x_t)
 
     def is_debug_enabled(self) -> bool:
         """Return False, as nothing is tracked."""

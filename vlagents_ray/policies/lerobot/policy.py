@@ -25,12 +25,14 @@ from vlagents_ray.policies.base.model_inputs import (
     state_specs,
     state_vector,
 )
+from vlagents_ray.policies.flow import OFFERED
 from vlagents_ray.policies.lerobot import checkpoint
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
 from vlagents_ray.policies.lerobot.policy_types import (
     KINDS,
     MASKING,
     RESIZING,
+    Flow,
     Kind,
 )
 from vlagents_ray.policies.lerobot.processors import Processors
@@ -87,6 +89,13 @@ class LeRobot(ModelPolicy):
         policy = checkpoint.load(folder, self.config, torch_device(self.config.device))
         settings = policy.config
         kind = KINDS.get(settings.type, Kind)(policy)
+        if isinstance(kind, Flow):
+            kind.noise_level = self.config.noise_level
+        elif self.config.noise_level:
+            raise ConfigError(
+                f"noise_level: got {self.config.noise_level} for LeRobot's {settings.type!r}, want 0, as its actions "
+                f"come out of no flow; those of {sorted(name for name in KINDS if issubclass(KINDS[name], Flow))} do"
+            )
         self.config = _with_defaults(self.config, kind)
         processors = Processors(folder, settings, self.config)
         trained = _trained(settings, processors)
@@ -106,6 +115,7 @@ class LeRobot(ModelPolicy):
             control_hz=trained.contract.control_hz,
             chunk=self.chunk(kind.horizon),
             history=kind.steps,
+            behaviour=self.offered(OFFERED if self.config.noise_level else ()),
         )
         return LoadedLeRobot(kind, processors, cameras, parts, environment, contract, trained)
 
@@ -121,10 +131,10 @@ class LeRobot(ModelPolicy):
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         """Compute the chunks, in one pass for all rows with images of one size unless the type cannot batch."""
-        chunks: dict[int, np.ndarray] = {}
+        predictions: dict[int, Prediction] = {}
         for members in self._groups(rows):
-            chunks |= zip(members, self._draw([rows[i] for i in members]), strict=True)
-        return [Prediction(chunks[i]) for i in range(len(rows))]
+            predictions |= zip(members, self._draw([rows[i] for i in members]), strict=True)
+        return [predictions[i] for i in range(len(rows))]
 
     def _groups(self, rows: Sequence[Row]) -> list[list[int]]:
         if not self.model.kind.batched:
@@ -134,15 +144,18 @@ class LeRobot(ModelPolicy):
             groups.setdefault(tuple(array.shape for array in row.frames[-1].values()), []).append(i)
         return list(groups.values())
 
-    def _draw(self, rows: list[Row]) -> np.ndarray:
-        """Compute the chunks of rows, (B, horizon, D) float32."""
+    def _draw(self, rows: list[Row]) -> list[Prediction]:
+        """Compute the chunks of rows, (horizon, D) float32."""
         torch, model = require("torch"), self.model
-        settings = model.kind.config
+        kind, settings = model.kind, model.kind.config
         leftovers = [None if row.leftover is None else model.processors.leftover(row.leftover) for row in rows]
         device = torch.device(settings.device).type
         with torch.inference_mode(), torch.autocast(device, enabled=settings.use_amp):
-            chunks = model.kind.draw(model.processors.observe(rows, model.kind.steps), rows, leftovers)
-            return np.asarray(model.processors.actions(chunks))
+            inputs = model.processors.observe([rows[i] for i in kind.observations(rows)], kind.steps)
+            chunks = np.asarray(model.processors.actions(kind.draw(inputs, rows, leftovers)))
+            dim = settings.action_feature.shape[0]
+            stated = {} if kind.random is None else kind.random.stated(self.config.execute, dim)
+        return [Prediction(chunk, behaviour=stated.get(i, {})) for i, chunk in enumerate(chunks)]
 
 
 def _with_defaults(config: LeRobotConfig, kind: Kind) -> LeRobotConfig:

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.policies.base import Row
+from vlagents_ray.policies.base import Row, shared_frames
+from vlagents_ray.policies.flow import RandomSteps
 from vlagents_ray.policies.lerobot.guidance import Guidance
 from vlagents_ray.registry import require
 
@@ -35,6 +36,7 @@ class Kind:
     """The default for any type: one row at a time with a seed of its session, which is slow and exact."""
 
     batched = False
+    random: RandomSteps | None = None  # of the last chunks that were drawn
 
     def __init__(self, policy: Any) -> None:
         self.policy, self.config = policy, policy.config
@@ -59,11 +61,15 @@ class Kind:
         """The number of rows that the policy executes before the next inference, by its config."""
         return min(int(getattr(self.config, "n_action_steps", self.horizon)), self.horizon)
 
+    def observations(self, rows: Sequence[Row]) -> list[int]:
+        """Return the indices of the rows whose observations `draw` needs: all, unless samples share one."""
+        return list(range(len(rows)))
+
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
         """Compute chunks in the policy's own units.
 
         Args:
-            batch: The output of the policy's pre-processor.
+            batch: The output of the policy's pre-processor, for the rows of `observations`.
             rows: The rows of the batch.
             leftovers: The leftover actions of each row, (H', D) in the same units, or None.
 
@@ -91,23 +97,65 @@ class ActPolicy(Kind):
 
 
 class Flow(Kind):
-    """SmolVLA, π0 and π0.5: flow matching from noise of the sessions, guided by their leftovers."""
+    """SmolVLA, π0 and π0.5: flow matching from noise of the sessions, guided by their leftovers.
+
+    What an observation is encoded to is shared by the samples of its session.
+    """
 
     batched = True
+    noise_level = 0.0  # as for `RandomSteps`
 
     def __init__(self, policy: Any) -> None:
         super().__init__(policy)
         self.guidance = Guidance(policy.rtc_processor)
         policy.model.rtc_processor = self.guidance
 
+    @property
+    def flow_steps(self) -> int:
+        """The number of steps from noise to actions."""
+        config = self.config
+        return int(config.num_steps if config.type == "smolvla" else config.num_inference_steps)
+
+    def observations(self, rows: Sequence[Row]) -> list[int]:
+        return self._shared(rows)[0]
+
+    def _shared(self, rows: Sequence[Row]) -> tuple[list[int], list[int]]:
+        """Return `shared_frames`, or each row by itself in a compiled model, which has few sizes of batches."""
+        each = list(range(len(rows)))
+        return (each, each) if self.config.compile_model else shared_frames(rows)
+
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
         torch = require("torch")
         shape = (self.horizon, int(self.config.max_action_dim))
-        noise = np.stack([row.noise(*shape) for row in rows])
-        wanted: dict[str, Any] = {"noise": torch.from_numpy(noise).to(self.config.device)}
+
+        def convert(array: np.ndarray) -> Any:
+            return torch.from_numpy(array).to(self.config.device)
+
+        wanted: dict[str, Any] = {"noise": convert(np.stack([row.noise(*shape) for row in rows]))}
         if any(left is not None for left in leftovers):
             wanted |= self._guide(rows, leftovers, shape)
-        return self.policy.predict_action_chunk(batch, **wanted)
+        self.random = RandomSteps.of(rows, (self.flow_steps, *shape), self.noise_level, convert)
+        return self._follow(batch, rows, {**wanted, "execution_horizon": self.random})
+
+    def _follow(self, batch: dict[str, Any], rows: Sequence[Row], wanted: dict[str, Any]) -> Any:
+        firsts, owners = self._shared(rows)
+        if len(firsts) == len(rows):
+            return self.policy.predict_action_chunk(batch, **wanted)
+        model, caches = self.policy.model, list[Any]()
+        step = model.denoise_step
+
+        def denoise_step(x_t: Any, past_key_values: Any, **encoded: Any) -> Any:
+            """Denoise the actions of all rows with what was encoded for their observations."""
+            if not caches:  # in the first of the steps
+                caches.append(_indexed(past_key_values, owners))
+            each = {name: tensor[owners] for name, tensor in encoded.items()}
+            return step(x_t=x_t, past_key_values=caches[0], **each)
+
+        model.denoise_step = denoise_step
+        try:
+            return self.policy.predict_action_chunk(batch, **wanted)
+        finally:
+            del model.denoise_step
 
     def _guide(self, rows: Sequence[Row], leftovers: Sequence[Any], shape: tuple[int, int]) -> dict[str, Any]:
         torch = require("torch")
@@ -245,6 +293,14 @@ KINDS: Mapping[str, type[Kind]] = {
     "vqbet": VqBet,
     "xvla": XVla,
 }
+
+
+def _indexed(cache: Any, index: list[int]) -> Any:
+    """Return a cache of keys and values with a row for each of `index`: SmolVLA's, or one of transformers."""
+    if isinstance(cache, dict):
+        return {layer: {name: kept[index] for name, kept in both.items()} for layer, both in cache.items()}
+    cache.batch_select_indices(require("torch").tensor(index))
+    return cache
 
 
 def _stacked(batch: dict[str, Any], config: Any, rows: int) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from vlagents_ray.policies.base import ModelConfig
+from vlagents_ray.policies.base.config import NoiseLevel
 from vlagents_ray.policies.openpi.robots import Layout
 
 
@@ -34,6 +35,7 @@ class OpenPiConfig(ModelConfig):
     steps: int | None = Field(default=None, ge=1, description="steps of the flow (pi0, pi0.5); unset: openpi's, 10")
     max_decoding_steps: int = Field(default=256, ge=1, description="largest number of tokens of a chunk (pi0-FAST)")
     guidance: float = Field(default=5.0, gt=0, description="real-time chunking: largest weight of the old plan")
+    noise_level: NoiseLevel = 0.0
     batch_sizes: list[int] | None = Field(
         default=None, description="the only numbers of rows to run; unset: [1, 2, 4, 8, 16] for JAX, any for PyTorch"
     )

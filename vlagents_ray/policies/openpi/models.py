@@ -5,15 +5,18 @@ from __future__ import annotations
 import abc
 import dataclasses
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base.accelerator import jax_device, torch_device
 from vlagents_ray.policies.base.checkpoint import SavedTensors, require_loaded
 from vlagents_ray.policies.base.realtime import Guide
+from vlagents_ray.policies.flow import RandomSteps
 from vlagents_ray.policies.openpi.config import OpenPiConfig
 from vlagents_ray.registry import require
 
@@ -28,10 +31,30 @@ class OpenPiModel(abc.ABC):
     """The interface of a model for the policy."""
 
     noise_shape: tuple[int, int] | None = None  # (H, action_dim) of a row's noise; None for a model without noise
+    shares = False  # whether several rows can be of one observation
 
     @abc.abstractmethod
-    def sample(self, batch: dict[str, Any], noise: np.ndarray, guide: Guide | None) -> np.ndarray:
-        """Compute actions (B, H, action_dim), or tokens (B, T), for a batch of inputs."""
+    def sample(
+        self,
+        batch: dict[str, Any],
+        noise: np.ndarray,
+        guide: Guide | None,
+        owners: Sequence[int],
+        random: RandomSteps | None,
+    ) -> np.ndarray:
+        """Compute actions (B, H, action_dim), or tokens (B, T).
+
+        Args:
+            batch: The inputs of P observations.
+            noise: That of each of the B rows.
+            guide: Of the rows, if any follows a plan.
+            owners: The observation of each row; 0, 1, … unless the model `shares`.
+            random: The result of `random_steps` for the rows.
+        """
+
+    def random_steps(self, rows: Sequence[Row], noise_level: float) -> RandomSteps | None:
+        """Return the random steps of rows of which something is wanted; None if there are none."""
+        return None
 
 
 class JaxFlow(OpenPiModel):
@@ -51,7 +74,14 @@ class JaxFlow(OpenPiModel):
         self._sample = jax.jit(sample)
         self.noise_shape = (network.action_horizon, network.action_dim)
 
-    def sample(self, batch: dict[str, Any], noise: np.ndarray, guide: Guide | None) -> np.ndarray:
+    def sample(
+        self,
+        batch: dict[str, Any],
+        noise: np.ndarray,
+        guide: Guide | None,
+        owners: Sequence[int],
+        random: RandomSteps | None,
+    ) -> np.ndarray:
         """Compute actions (B, H, action_dim) float32; a batch without plans runs the same program without guidance."""
         jax = require("jax")
         if guide is None:
@@ -76,7 +106,14 @@ class JaxTokens(OpenPiModel):
 
         self._sample = jax.jit(sample)
 
-    def sample(self, batch: dict[str, Any], noise: np.ndarray, guide: Guide | None) -> np.ndarray:
+    def sample(
+        self,
+        batch: dict[str, Any],
+        noise: np.ndarray,
+        guide: Guide | None,
+        owners: Sequence[int],
+        random: RandomSteps | None,
+    ) -> np.ndarray:
         """Decode tokens, (B, T) int32."""
         jax = require("jax")
         return self.ended(np.asarray(self._sample(self._state, jax.device_put(batch, self._device)), np.int32))
@@ -96,21 +133,25 @@ class TorchFlow(OpenPiModel):
 
     def __init__(self, network: Any, device: Any, config: OpenPiConfig) -> None:
         self._network, self._device = network, device
+        self.shares = not config.compile  # a compiled model has few sizes of batches
         self._steps, self._limit = config.steps or _STEPS, config.guidance
-        self.noise_shape = (network.config.action_horizon, network.config.action_dim)
+        self.noise_shape: tuple[int, int] = (network.config.action_horizon, network.config.action_dim)
 
-    def sample(self, batch: dict[str, Any], noise: np.ndarray, guide: Guide | None) -> np.ndarray:
+    def sample(
+        self,
+        batch: dict[str, Any],
+        noise: np.ndarray,
+        guide: Guide | None,
+        owners: Sequence[int],
+        random: RandomSteps | None,
+    ) -> np.ndarray:
         """Compute actions (B, H, action_dim) float32."""
         jax, torch = require("jax"), require("torch")
-
-        def convert(array: np.ndarray) -> Any:
-            return torch.from_numpy(np.array(array)).to(self._device, non_blocking=True)
-
-        observation = _observation(jax.tree.map(convert, batch))
-        start = convert(noise)
+        observation = _observation(jax.tree.map(self._convert, batch))
+        start = self._convert(noise)
         plain = self._network.denoise_step
-        if guide is not None:
-            self._network.denoise_step = self._steered(plain, start, guide.to(convert))
+        guide = None if guide is None else guide.to(self._convert)
+        self._network.denoise_step = self._changed(plain, start, guide, owners, random)
         try:
             with torch.inference_mode():
                 flow = self._network.sample_actions(self._device, observation, noise=start, num_steps=self._steps)
@@ -118,10 +159,30 @@ class TorchFlow(OpenPiModel):
             self._network.denoise_step = plain
         return np.asarray(flow.float().cpu().numpy())
 
-    def _steered(self, plain: Any, noise: Any, guide: Guide) -> Any:
+    def random_steps(self, rows: Sequence[Row], noise_level: float) -> RandomSteps | None:
+        return RandomSteps.of(rows, (self._steps, *self.noise_shape), noise_level, self._convert)
+
+    def _convert(self, array: np.ndarray) -> Any:
+        """Return a copy of the array as a tensor on the device."""
+        return require("torch").from_numpy(np.array(array)).to(self._device, non_blocking=True)
+
+    def _changed(
+        self, plain: Any, noise: Any, guide: Guide | None, owners: Sequence[int], random: RandomSteps | None
+    ) -> Any:
+        """Return the denoising step of all rows, with what openpi's loop encoded for their observations."""
+        if guide is None and random is None and list(owners) == list(range(len(noise))):
+            return plain
+        index = require("torch").tensor(owners, device=self._device)
+        caches: list[Any] = []
+
         def step(state: Any, masks: Any, cache: Any, actions: Any, time: Any) -> Any:
-            velocity = plain(state, masks, cache, actions, time)
-            return guide.steer(velocity, actions, noise, float(time[0]), steps=self._steps, limit=self._limit)
+            if not caches:
+                cache.batch_select_indices(index)
+                caches.append(cache)
+            velocity = plain(state[index], masks[index], cache, actions, time[index])
+            if guide is not None:
+                velocity = guide.steer(velocity, actions, noise, float(time[0]), steps=self._steps, limit=self._limit)
+            return velocity if random is None else random.velocity(velocity, actions)
 
         return step
 
@@ -146,6 +207,11 @@ def load_jax(config: Any, folder: Path, settings: OpenPiConfig) -> OpenPiModel:
         ) from error
     _require_used(params, network, folder, config.name)
     network.eval()
+    if settings.noise_level:
+        raise ConfigError(
+            f"noise_level: got {settings.noise_level} for a JAX checkpoint, want 0, as its compiled loop has no random "
+            f"steps; convert it to PyTorch with openpi's script, or leave it out"
+        )
     kind = JaxTokens if config.model.model_type is models.ModelType.PI0_FAST else JaxFlow
     return kind(network, device, settings)
 

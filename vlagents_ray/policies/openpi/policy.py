@@ -12,7 +12,7 @@ import numpy as np
 from vlagents_ray.contract import Contract, StateSpec
 from vlagents_ray.errors import ConfigError, PolicyFailed
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.base import ModelPolicy, Prediction, Row
+from vlagents_ray.policies.base import ModelPolicy, Prediction, Row, shared_frames
 from vlagents_ray.policies.base.checkpoint import STEP, find_checkpoint
 from vlagents_ray.policies.base.model_code import use_source
 from vlagents_ray.policies.base.model_inputs import (
@@ -22,6 +22,7 @@ from vlagents_ray.policies.base.model_inputs import (
     needs_gripper,
 )
 from vlagents_ray.policies.base.realtime import Guide
+from vlagents_ray.policies.flow import OFFERED
 from vlagents_ray.policies.openpi.config import OpenPiConfig
 from vlagents_ray.policies.openpi.models import OpenPiModel, load_jax, load_torch
 from vlagents_ray.policies.openpi.robots import RobotConvention, choose_robot
@@ -74,6 +75,7 @@ class OpenPi(ModelPolicy):
             action=robot.action,
             chunk=self.chunk(self.model.horizon),
             history=1,
+            behaviour=self.offered(OFFERED if self.config.noise_level else ()),
         )
 
     def load(self) -> LoadedOpenPi:
@@ -105,36 +107,57 @@ class OpenPi(ModelPolicy):
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         """Compute the chunks of all rows that openpi's transforms accept, in one call of the model."""
-        read = [self._read(row) for row in rows]
+        firsts, owners = self._shared(rows)
+        inputs = [self._read(rows[i]) for i in firsts]
+        read = [self._prepared(row, inputs[owner]) for row, owner in zip(rows, owners, strict=True)]
         spare = next((one for one in read if not isinstance(one, Exception)), None)
         if spare is None:
             return read  # type: ignore[return-value]  # errors all
         # A valid row stands in for an invalid one, so that the number of rows remains a compiled one.
-        flows = self._sample([spare if isinstance(one, Exception) else one for one in read])
+        spare = replace(spare, row=replace(spare.row, want=()))
+        flows, stated = self._sample([spare if isinstance(one, Exception) else one for one in read])
         actions = self._loaded().transforms.actions
         return [
-            one if isinstance(one, Exception) else Prediction(actions(one.inputs["state"], flow))
-            for one, flow in zip(read, flows, strict=True)
+            one
+            if isinstance(one, Exception)
+            else Prediction(actions(one.inputs["state"], flow), behaviour=stated.get(i, {}))
+            for i, (one, flow) in enumerate(zip(read, flows, strict=True))
         ]
 
-    def _read(self, row: Row) -> TransformedRow | Exception:
-        """Convert a row to the model's inputs; returns an exception for its session if that fails."""
-        loaded, observation = self._loaded(), row.frames[-1]
-        shape = loaded.model.noise_shape
+    def _shared(self, rows: Sequence[Row]) -> tuple[list[int], list[int]]:
+        """Return `shared_frames`, or each row by itself for a model whose rows cannot share an observation."""
+        each = list(range(len(rows)))
+        return shared_frames(rows) if self._loaded().model.shares else (each, each)
+
+    def _read(self, row: Row) -> dict[str, Any] | Exception:
+        """Convert what a row sees to the model's inputs; returns an exception for its session if that fails."""
         try:
-            inputs = loaded.transforms.read(observation, row.instruction)
-            if row.leftover is not None:
-                row = replace(row, leftover=loaded.transforms.plan(observation, row.instruction, row.leftover))
+            return self._loaded().transforms.read(row.frames[-1], row.instruction)
         except Exception as error:  # noqa: BLE001 - returned to the session of the observation
             return error
-        return TransformedRow(inputs, row, row.noise(*shape or ()))
 
-    def _sample(self, ready: Sequence[TransformedRow]) -> np.ndarray:
-        model = self._loaded().model
-        batch = require("jax").tree.map(lambda *leaves: np.stack(leaves), *(one.inputs for one in ready))
+    def _prepared(self, row: Row, inputs: dict[str, Any] | Exception) -> TransformedRow | Exception:
+        if isinstance(inputs, Exception):
+            return inputs
+        loaded = self._loaded()
+        try:
+            if row.leftover is not None:
+                row = replace(row, leftover=loaded.transforms.plan(row.frames[-1], row.instruction, row.leftover))
+        except Exception as error:  # noqa: BLE001 - returned to the session of the observation
+            return error
+        return TransformedRow(inputs, row, row.noise(*loaded.model.noise_shape or ()))
+
+    def _sample(self, ready: Sequence[TransformedRow]) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
+        """Return what the model computes for rows, and what is wanted of them, by their places."""
+        model, rows = self._loaded().model, [one.row for one in ready]
+        firsts, owners = self._shared(rows)
+        batch = require("jax").tree.map(lambda *leaves: np.stack(leaves), *(ready[i].inputs for i in firsts))
         shape = model.noise_shape
-        guide = None if shape is None else Guide.of([one.row for one in ready], *shape)
-        return model.sample(batch, np.stack([one.noise for one in ready]), guide)
+        guide = None if shape is None else Guide.of(rows, *shape)
+        random = model.random_steps(rows, self.config.noise_level)
+        flows = model.sample(batch, np.stack([one.noise for one in ready]), guide, owners, random)
+        dim = self._loaded().robot.action.dim
+        return flows, {} if random is None else random.stated(self.config.execute, dim)
 
     def _folder(self) -> Path:
         name, step = self.config.checkpoint, self.config.checkpoint_step

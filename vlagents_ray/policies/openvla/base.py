@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,10 +13,11 @@ from vlagents_ray.contract import ActionSpec
 from vlagents_ray.errors import InvalidObservation, NotReset
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelPolicy, Prediction, Row
-from vlagents_ray.policies.openvla.prismatic import Prismatic
+from vlagents_ray.policies.openvla.prismatic import ActionBins, Prismatic
 from vlagents_ray.policies.openvla.statistics import Scale, Statistics
 
 UNNORM_KEY = "unnorm_key"  # key of reset's options and of an observation's info, as sent by OpenVLA's clients
+OFFERED = ("logprob", "entropy", "replay")  # of action tokens
 _SINGLE_ARM = 7  # six numbers of a motion, and one of the gripper
 
 
@@ -36,6 +37,7 @@ class DecodedChunk:
     values: np.ndarray
     mean: np.ndarray | None = None
     spread: np.ndarray | None = None
+    behaviour: dict[str, Any] = field(default_factory=dict)  # what is wanted of the row
 
     def prediction(self, scale: Scale) -> Prediction:
         """Convert the answer to physical units."""
@@ -43,6 +45,7 @@ class DecodedChunk:
             scale.restore(self.values),
             None if self.mean is None else scale.restore(self.mean),
             None if self.spread is None else scale.restore_spread(self.spread),
+            self.behaviour,
         )
 
 
@@ -84,6 +87,26 @@ class PrismaticPolicy(ModelPolicy):
         for (i, entry), answer in zip(prepared.items(), answers, strict=True):
             results[i] = answer.prediction(entry.scale)
         return [results[i] for i in range(len(rows))]
+
+    def _decoded(
+        self, bins: ActionBins, prepared: Sequence[PreparedRow], tokens: Any, logits: Any
+    ) -> list[DecodedChunk]:
+        """Return the chunks of action tokens (B, H, D) that were chosen by logits (B, H, D, V)."""
+        parts = bins.values(tokens), *bins.moments(logits)
+        chunks = []
+        for i, entry in enumerate(prepared):
+            values, mean, spread = (part[i, :, : entry.scale.dim] for part in parts)
+            chunks.append(DecodedChunk(values, mean, spread, self._stated(bins, entry, tokens[i], logits[i])))
+        return chunks
+
+    def _stated(self, bins: ActionBins, entry: PreparedRow, tokens: Any, logits: Any) -> dict[str, Any]:
+        """Return what is wanted of a row with tokens (H, D), drawn from the bins by logits (H, D, V)."""
+        if not entry.row.want:
+            return {}
+        tokens = tokens[:, : entry.scale.dim]
+        logprob, entropy = map(self._used, bins.stated(tokens, logits[:, : entry.scale.dim]))
+        said = {"logprob": logprob, "entropy": float(entropy.sum()), "replay": {"tokens": tokens.cpu().numpy()}}
+        return {name: said[name] for name in entry.row.want}
 
     @property
     def _statistics(self) -> Statistics:

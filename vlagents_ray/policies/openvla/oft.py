@@ -12,7 +12,7 @@ from typing_extensions import Self
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, InvalidObservation
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.base import Row
+from vlagents_ray.policies.base import Row, shared_frames
 from vlagents_ray.policies.base.model_inputs import (
     camera_images,
     camera_specs,
@@ -22,7 +22,7 @@ from vlagents_ray.policies.base.model_inputs import (
     state_vector,
 )
 from vlagents_ray.policies.openvla import preprocessing
-from vlagents_ray.policies.openvla.base import DecodedChunk, PreparedRow, PrismaticPolicy
+from vlagents_ray.policies.openvla.base import OFFERED, DecodedChunk, PreparedRow, PrismaticPolicy
 from vlagents_ray.policies.openvla.components import Film, Mlp, Projector, read_component, require_unused
 from vlagents_ray.policies.openvla.parallel import ModelInput, Parallel
 from vlagents_ray.policies.openvla.prismatic import Prismatic, PrismaticConfig, load_prismatic
@@ -85,6 +85,7 @@ class OpenVLAOFT(PrismaticPolicy):
             action=self._action(),
             chunk=self.chunk(self.config.horizon),
             history=1,
+            behaviour=self.offered(OFFERED if self.config.head == "tokens" else ()),
         )
 
     @property
@@ -147,17 +148,19 @@ class OpenVLAOFT(PrismaticPolicy):
 
     def _compute(self, prepared: Sequence[PreparedRow]) -> list[DecodedChunk]:
         """Run one forward pass, or one for each diffusion step. Regression has one answer, also for all samples."""
-        inputs = [entry.model_input for entry in prepared]
+        firsts, owners = shared_frames([entry.row for entry in prepared])
+        inputs = [prepared[i].model_input for i in firsts]
         shape = (self.model.horizon, self.model.dim)
         if self.config.head == "l1":
-            return [DecodedChunk(chunk) for chunk in self.model.regress(inputs)]
+            answers = self.model.regress(inputs)
+            return [DecodedChunk(answers[owner]) for owner in owners]
         if self.config.head == "diffusion":
             noise = np.stack([entry.row.noise(*shape) for entry in prepared])
-            return [DecodedChunk(chunk) for chunk in self.model.denoise(inputs, noise)]
+            return [DecodedChunk(chunk) for chunk in self.model.denoise(inputs, owners, noise)]
         draws = np.stack(
             [entry.row.rng.random(shape) if entry.row.sample else np.full(shape, np.nan) for entry in prepared]
         )
-        return [DecodedChunk(*parts) for parts in zip(*self.model.choose(inputs, draws), strict=True)]
+        return self._decoded(self.model.base.bins, prepared, *self.model.choose(inputs, owners, draws))
 
 
 def _action_dim(statistics: Statistics, unnorm_key: str | None, head: Mlp | None) -> int:

@@ -47,25 +47,29 @@ class Parallel:
         with require("torch").inference_mode():
             return _numpy(self._heads(self._hidden(self._sequences(inputs))))
 
-    def denoise(self, inputs: Sequence[ModelInput], noise: np.ndarray) -> np.ndarray:
-        """Return chunks (B, H, D) in [-1, 1] of the diffusion head, from noise of that shape."""
+    def denoise(self, inputs: Sequence[ModelInput], owners: Sequence[int], noise: np.ndarray) -> np.ndarray:
+        """Return chunks (B, H, D) in [-1, 1] of the diffusion head, from noise of that shape.
+
+        `owners` (B,) names the input of each chunk; its images are encoded once.
+        """
         torch = require("torch")
         with torch.inference_mode():
-            seen = self._sequences(inputs)
+            sequences = self._sequences(inputs)
+            seen = [sequences[owner] for owner in owners]
             start = self.base.to_device(torch.from_numpy(noise))
             return _numpy(denoise(start, lambda time, noisy: self._noise(seen, time, noisy), *self.steps))
 
-    def choose(self, inputs: Sequence[ModelInput], draws: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return chunks (B, H, D) in [-1, 1] by action tokens, and mean and deviation of the bins of each token.
+    def choose(self, inputs: Sequence[ModelInput], owners: Sequence[int], draws: np.ndarray) -> tuple[Any, Any]:
+        """Return the tokens (B, H, D) of chunks, and the logits (B, H, D, V) by which they were chosen.
 
-        `draws` (B, H, D) are those of `ActionBins.choose`.
+        `owners` (B,) names the input of each chunk, which is computed once; `draws` (B, H, D) are those of
+        `ActionBins.choose`.
         """
         torch = require("torch")
         with torch.inference_mode():
             hidden = self._hidden(self._sequences(inputs)).unflatten(1, (self.horizon, self.dim))
-            logits = self.base.network.language_model.lm_head(hidden).float()
-            tokens = self.base.bins.choose(logits, torch.tensor(draws, device=self.base.device))
-            return self.base.bins.values(tokens), *self.base.bins.moments(logits)
+            logits = self.base.network.language_model.lm_head(hidden).float()[list(owners)]
+            return self.base.bins.choose(logits, torch.tensor(draws, device=self.base.device)), logits
 
     def _heads(self, hidden: Any) -> Any:
         return self.head(hidden.reshape(len(hidden), self.horizon, -1))  # type: ignore[misc]

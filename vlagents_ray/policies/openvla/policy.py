@@ -14,10 +14,10 @@ from pydantic import Field
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.interface import Obs
-from vlagents_ray.policies.base import Row
+from vlagents_ray.policies.base import Row, shared_frames
 from vlagents_ray.policies.base.model_inputs import camera_images, camera_specs, choose_cameras
 from vlagents_ray.policies.openvla import preprocessing
-from vlagents_ray.policies.openvla.base import DecodedChunk, PreparedRow, PrismaticPolicy
+from vlagents_ray.policies.openvla.base import OFFERED, DecodedChunk, PreparedRow, PrismaticPolicy
 from vlagents_ray.policies.openvla.prismatic import Prismatic, PrismaticConfig, load_prismatic
 from vlagents_ray.registry import require
 
@@ -55,6 +55,7 @@ class OpenVLA(PrismaticPolicy):
             action=self._action(),
             chunk=self.chunk(1),
             history=1,
+            behaviour=self.offered(OFFERED),
         )
 
     def load(self) -> Prismatic:
@@ -76,29 +77,20 @@ class OpenVLA(PrismaticPolicy):
         return row.frames[-1], self.model.tokens(row.instruction)
 
     def _compute(self, prepared: Sequence[PreparedRow]) -> list[DecodedChunk]:
-        """Decode all answers: a session's own greedily, samples at temperature 1 with the same prompt."""
-        prompts = {_prompt(entry): entry.model_input for entry in prepared}
-        places = {prompt: place for place, prompt in enumerate(prompts)}
+        """Decode all answers: a session's own greedily unless something is wanted of it, samples at temperature 1."""
+        firsts, owners = shared_frames([entry.row for entry in prepared])
         draws = np.full((len(prepared), max(entry.scale.dim for entry in prepared)), np.nan)
         for numbers, entry in zip(draws, prepared, strict=True):
             if entry.row.sample:
                 numbers[: entry.scale.dim] = entry.row.rng.random(entry.scale.dim)
-        answers = decode(self.model, list(prompts.values()), [places[_prompt(entry)] for entry in prepared], draws)
-        return [
-            DecodedChunk(*(part[None, : entry.scale.dim] for part in parts))
-            for entry, *parts in zip(prepared, *answers, strict=True)
-        ]
-
-
-def _prompt(entry: PreparedRow) -> tuple[int, str]:
-    """Return a key that a session's own row and its samples share."""
-    return id(entry.row.frames), entry.row.instruction
+        tokens, logits = decode(self.model, [prepared[i].model_input for i in firsts], owners, draws)
+        return self._decoded(self.model.bins, prepared, tokens[:, None], logits[:, None])
 
 
 def decode(
     model: Prismatic, prompts: Sequence[tuple[Any, list[int]]], owners: Sequence[int], draws: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return R answers to P prompts, (R, S) in [-1, 1], and mean and deviation of the bins of each token.
+) -> tuple[Any, Any]:
+    """Return R answers to P prompts, as tokens (R, S) and the logits (R, S, V) by which they were chosen.
 
     Args:
         model: The checkpoint.
@@ -131,7 +123,7 @@ def decode(
                 hidden, cache = read.last_hidden_state[:, -1], read.past_key_values
             logits.append(language.lm_head(hidden).float())
             chosen.append(model.bins.choose(logits[-1], uniform[:, step]))
-        return model.bins.values(torch.stack(chosen, 1)), *model.bins.moments(torch.stack(logits, 1))
+        return torch.stack(chosen, 1), torch.stack(logits, 1)
 
 
 def _left_padded(model: Prismatic, prompts: Sequence[tuple[Any, list[int]]]) -> tuple[Any, Any]:

@@ -165,5 +165,15 @@ class ActionBins:
         spread = (over * (self._middles - mean[..., None]) ** 2).sum(-1).sqrt()
         return np.asarray(mean.cpu()), np.asarray(spread.cpu())
 
+    def logprob(self, tokens: Any, logits: Any) -> Any:
+        """Return the log-probabilities (…) of tokens (…) among the bins, nats, differentiable in logits (…, V)."""
+        over = logits[..., self._tokens].double().log_softmax(-1)
+        return over.gather(-1, (self._first - tokens)[..., None])[..., 0]
+
+    def stated(self, tokens: Any, logits: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Return the log-probabilities (…) of tokens of bins, and the entropies (…) of the distributions, nats."""
+        entropy = require("torch").special.entr(self._over_bins(logits)).sum(-1)
+        return np.asarray(self.logprob(tokens, logits).cpu()), np.asarray(entropy.cpu())
+
     def _over_bins(self, logits: Any) -> Any:
         return logits[..., self._tokens].double().softmax(-1)

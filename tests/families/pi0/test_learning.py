@@ -1,0 +1,157 @@
+"""What π0 states of its acts for learners, and what its samples cost, on a small random checkpoint."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from normal_steps import logprob_of_steps
+
+from tests.families.pi0 import tiny
+from tests.families.pi0.test_pi0 import BATCHED, begun, seen
+from vlagents_ray.interface import BEHAVIOUR, DISTRIBUTION, SAMPLES, WANT, Act
+from vlagents_ray.policies import pi0
+from vlagents_ray.policies.flow import logprob_of_chain
+from vlagents_ray.policies.pi0 import Pi0
+
+ALL = ["logprob", "entropy", "replay"]
+LEVEL = 0.5
+SUMMED = 2e-3  # how far a sum of 25 log-probabilities may be off, in float32: each is of a step of about 0.1
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tiny.save(tmp_path_factory.mktemp("pi0"))
+
+
+@pytest.fixture(scope="module")
+def plain(folder: Path) -> Pi0:
+    return made(folder)
+
+
+@pytest.fixture(scope="module")
+def learnt(folder: Path) -> Pi0:
+    return made(folder, noise_level=LEVEL)
+
+
+def made(folder: Path, **settings: Any) -> Pi0:
+    policy = Pi0.from_config({"checkpoint": str(folder), **settings})
+    policy.initialize()
+    return policy
+
+
+def encoded(policy: Pi0, *seeds: int) -> dict[str, Any]:
+    """What sessions see, as the model's inputs."""
+    sessions = [begun(policy, seed) for seed in seeds]
+    for session, seed in zip(sessions, seeds, strict=True):
+        session.observe(seen(seed))
+    episodes = [session.episode for session in sessions]
+    rows = [pi0.Row(tuple(one.frames), one.instruction, one.rng) for one in episodes]
+    return dict(policy._inputs(rows))
+
+
+def test_it_offers_what_random_steps_have(plain: Pi0, learnt: Pi0) -> None:
+    assert plain.contract.behaviour is None
+    assert learnt.contract.behaviour == tuple(ALL)
+
+
+def test_acts_of_which_nothing_is_wanted_are_those_without_random_steps(plain: Pi0, learnt: Pi0) -> None:
+    acts = [begun(policy, 0).act(seen(0, **{SAMPLES: 2})) for policy in (plain, learnt)]
+    np.testing.assert_array_equal(acts[0].action, acts[1].action)
+    np.testing.assert_array_equal(acts[0].info[DISTRIBUTION]["samples"], acts[1].info[DISTRIBUTION]["samples"])
+    assert BEHAVIOUR not in acts[1].info
+
+
+def test_the_log_probability_is_that_of_the_network_itself(learnt: Pi0) -> None:
+    said = begun(learnt, 0).act(seen(0, **{WANT: ALL})).info[BEHAVIOUR]
+    network, inputs = learnt.model.network, encoded(learnt, 0)
+
+    def velocity(noisy: Any, time: float) -> Any:
+        """The network's, of images, words and actions in one pass, without a cache."""
+        with torch.no_grad():
+            return network(**inputs, noise=noisy, timestep=torch.tensor([time])).logits
+
+    total = logprob_of_steps(velocity, said["replay"]["chain"], LEVEL)[:, : tiny.ACTION_DIM]
+    np.testing.assert_allclose(said["logprob"], total, atol=SUMMED)
+    steps = len(said["replay"]["chain"]) - 1
+    assert said["entropy"] == pytest.approx(normal_entropies(steps) * total.numel(), rel=1e-5)
+
+
+def normal_entropies(steps: int) -> float:
+    """The entropies of a number's steps."""
+    times = [1 - step / steps for step in range(steps)]
+    stds = [LEVEL * (time / max(1 - time, 1 / steps) / steps) ** 0.5 for time in times]
+    return float(sum(torch.distributions.Normal(0, std).entropy() for std in stds))
+
+
+def test_a_learner_recomputes_what_was_stated_of_several_acts(learnt: Pi0) -> None:
+    sessions = [begun(learnt, seed) for seed in range(3)]
+    acts = learnt.act_batch([seen(seed, **{WANT: ALL}) for seed in range(3)], sessions)
+    said = [act.info[BEHAVIOUR] for act in acts if isinstance(act, Act)]
+    chain = torch.from_numpy(np.stack([one["replay"]["chain"] for one in said]))
+    with torch.no_grad():
+        velocity = pi0.flow_velocity(learnt.model.network, encoded(learnt, 0, 1, 2), torch.float32)
+        again = logprob_of_chain(velocity, chain, said[0]["replay"]["noise_level"])[:, :, : tiny.ACTION_DIM]
+    np.testing.assert_allclose(again, np.stack([one["logprob"] for one in said]), atol=SUMMED)
+    for act, one in zip(acts, said, strict=True):
+        np.testing.assert_array_equal(act.action, learnt.model.actions(one["replay"]["chain"][-1]))
+
+
+def test_a_chain_is_less_likely_to_other_weights(folder: Path, learnt: Pi0) -> None:
+    said = begun(learnt, 0).act(seen(0, **{WANT: ALL})).info[BEHAVIOUR]
+    network = copy.deepcopy(learnt.model.network)
+    with torch.no_grad():
+        network.action_out_proj.bias.add_(0.5)
+        velocity = pi0.flow_velocity(network, encoded(learnt, 0), torch.float32)
+        other = logprob_of_chain(velocity, torch.from_numpy(said["replay"]["chain"])[None], LEVEL)
+    assert other[:, :, : tiny.ACTION_DIM].sum() < said["logprob"].sum() - 1
+
+
+def test_a_log_probability_for_each_sample_and_for_the_rows_that_are_used(folder: Path, learnt: Pi0) -> None:
+    short = made(folder, noise_level=LEVEL, execute=4)
+    act = begun(short, 0).act(seen(0, **{WANT: ALL, SAMPLES: 3}))
+    found = act.info[DISTRIBUTION]
+    assert act.info[BEHAVIOUR]["logprob"].shape == act.action.shape == (4, tiny.ACTION_DIM)
+    assert found["logprob"].shape == found["samples"].shape == (3, 4, tiny.ACTION_DIM)
+    with torch.no_grad():
+        velocity = pi0.flow_velocity(learnt.model.network, encoded(learnt, 0), torch.float32, [0, 0, 0])
+        again = logprob_of_chain(velocity, torch.from_numpy(found["replay"]["chain"]), LEVEL)
+    np.testing.assert_allclose(again[:, :4, : tiny.ACTION_DIM], found["logprob"], atol=SUMMED)
+
+
+def test_neighbours_change_neither_what_is_drawn_nor_what_is_not(learnt: Pi0) -> None:
+    wanted = [seen(0), seen(1, **{WANT: ALL, SAMPLES: 2}), seen(2, **{WANT: ALL})]
+    together = learnt.act_batch(wanted, [begun(learnt, seed) for seed in range(3)])
+    for seed, act in enumerate(together):
+        assert isinstance(act, Act)
+        alone = begun(learnt, seed).act(wanted[seed])
+        np.testing.assert_allclose(act.action, alone.action, atol=BATCHED)
+        if BEHAVIOUR in alone.info:
+            np.testing.assert_allclose(act.info[BEHAVIOUR]["logprob"], alone.info[BEHAVIOUR]["logprob"], atol=SUMMED)
+
+
+def test_the_samples_of_an_observation_are_of_one_reading_of_it(learnt: Pi0, monkeypatch: pytest.MonkeyPatch) -> None:
+    read: list[int] = []
+    embed = learnt.model.network.model.embed_prefix
+
+    def counted(tokens: Any, *rest: Any) -> Any:
+        read.append(len(tokens))
+        return embed(tokens, *rest)
+
+    monkeypatch.setattr(learnt.model.network.model, "embed_prefix", counted)
+    views = [seen(0, **{SAMPLES: 8, WANT: ALL}), seen(1), seen(2, **{SAMPLES: 3})]
+    shared = learnt.act_batch(views, [begun(learnt, seed) for seed in range(3)])
+    monkeypatch.setattr(pi0, "shared_frames", lambda rows: (list(range(len(rows))), list(range(len(rows)))))
+    each = learnt.act_batch(views, [begun(learnt, seed) for seed in range(3)])
+    assert read == [3, 14]
+    for one, other in zip(shared, each, strict=True):
+        assert isinstance(one, Act)
+        assert isinstance(other, Act)
+        np.testing.assert_allclose(one.action, other.action, atol=BATCHED)
+        if DISTRIBUTION in one.info:
+            samples = [act.info[DISTRIBUTION]["samples"] for act in (one, other)]
+            np.testing.assert_allclose(*samples, atol=BATCHED)
