@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 from collections import deque
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,23 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve import ports
 from vlagents_ray.serve.launch.haproxy import PublicListener, ingress_environment
 from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK, free_port, free_ports, is_free, keep
+
+
+@pytest.fixture
+def claims(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """None of this process at the beginning, and none of the test at its end."""
+    monkeypatch.setattr(ports, "_claims", deque())
+    yield
+    while ports._claims:
+        os.close(ports._claims.pop())
+
+
+def free_range(length: int) -> tuple[int, int]:
+    """Ports next to each other that nobody has, below those that the kernel gives to connections."""
+    for first in range(10_000, 20_000, length):
+        if all(is_free(EVERYWHERE, port) for port in range(first, first + length)):
+            return first, first + length
+    pytest.fail(f"no {length} free ports next to each other")
 
 
 def test_a_port_that_is_taken_on_one_address_is_not_free_everywhere() -> None:
@@ -26,40 +44,40 @@ def test_a_port_that_is_taken_on_one_address_is_not_free_everywhere() -> None:
         assert not is_free(EVERYWHERE, port)
 
 
+@pytest.mark.usefixtures("claims")
 def test_haproxys_ports_are_different_ones_that_nobody_has(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.socket() as taken:
-        for first in range(41_000, 42_000, 4):
-            if all(is_free(EVERYWHERE, port) for port in range(first, first + 4)):
-                break
+        first, end = free_range(4)
         taken.bind(("127.0.0.2", first))
         taken.listen()
-        monkeypatch.setattr(ports, "_PORTS", (first, first + 4))
+        monkeypatch.setattr(ports, "_PORTS", (first, end))
         assert free_ports(3) == [first + 1, first + 2, first + 3]
 
 
+@pytest.mark.usefixtures("claims")
 def test_no_port_is_given_twice_though_nobody_listens_yet(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ports, "_PORTS", (41_000, 41_100))
+    first, end = free_range(100)
+    monkeypatch.setattr(ports, "_PORTS", (first, end))
     monkeypatch.setattr(ports, "_CLAIMS", 40)
-    monkeypatch.setattr(ports, "_claims", deque())
     monkeypatch.setattr(ports, "_kept", set())
-    keep(*range(41_000, 41_010))
+    keep(*range(first, first + 10))
     given = [free_port() for _ in range(200)]  # more than there are: the oldest are given again
-    assert min(given) >= 41_010
+    assert min(given) >= first + 10
     assert all(len(set(given[i : i + 40])) == 40 for i in range(160))
-    while ports._claims:
-        os.close(ports._claims.pop())
 
 
+@pytest.mark.usefixtures("claims")
 def test_two_processes_are_given_different_ports(monkeypatch: pytest.MonkeyPatch) -> None:
+    few = free_range(12)
     draw = (
-        "import sys; from vlagents_ray.serve import ports; ports._PORTS = (42_000, 42_012)\n"
+        f"import sys; from vlagents_ray.serve import ports; ports._PORTS = {few}\n"
         "print(*(ports.free_port() for _ in range(5)), flush=True); sys.stdin.read()"
     )
     with subprocess.Popen([sys.executable, "-c", draw], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as other:
         assert other.stdin is not None
         assert other.stdout is not None
         theirs = set(map(int, other.stdout.readline().split()))
-        monkeypatch.setattr(ports, "_PORTS", (42_000, 42_012))
+        monkeypatch.setattr(ports, "_PORTS", few)
         ours = {free_port() for _ in range(5)}
         other.stdin.close()
     assert len(theirs) == len(ours) == 5
