@@ -67,11 +67,14 @@ def test_the_verdict_names_what_is_missed(changes: dict[str, object], missed: li
 @pytest.mark.slow
 @pytest.mark.ray
 def test_killed_workers_lose_no_episode_and_repeat_none() -> None:
-    found = measure_soak(SoakPlan(episodes=300, kill_every_s=0.1, max_steps=40))
-    assert found["keys_once"]
-    assert found["done"] == 300
-    assert found["killed"] > 0
-    assert found["retries"] > 0
+    for _ in range(4):  # on a busy machine one worker may play all of them while the other one starts
+        found = measure_soak(SoakPlan(episodes=300, kill_every_s=0.1, max_steps=40))
+        assert found["keys_once"]
+        assert found["done"] == 300
+        if found["killed"] and found["retries"]:
+            break
+    else:
+        pytest.fail("no worker was killed in the middle of an episode")
     assert found["memory"]["driver"]["begin_mib"] > 0
     assert found["gap_ms"]["first"]["median"] > 0
     [every, *_] = soak_outcomes(found)

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
+from contextlib import suppress
 
 import pytest
+
+from vlagents_ray.ray_tools.signals import interrupts, stop_signals
 
 # A Ray whose head is lost as soon as somebody looks; `{body}` is what the command does meanwhile.
 COMMAND = """
@@ -77,6 +81,27 @@ def test_a_server_that_hangs_while_it_leaves_ends_and_says_where() -> None:
     assert ended.returncode == 1
     assert "Timeout (0:00:01)!" in ended.stderr
     assert "most recent call first" in ended.stderr
+
+
+@pytest.mark.parametrize("number", [2, 15], ids=["Ctrl-C", "SIGTERM"])
+def test_an_interrupt_that_python_drops_ends_the_command_all_the_same(number: int) -> None:
+    """A server that had it in one of Ray's callbacks, as it started, served on for ever."""
+    dropped = f"class Gone:\n            def __del__(self): __import__('signal').raise_signal({number})"
+    body = f"{dropped}\n        Gone()\n        atexit.unregister(time.sleep)\n        loss.wait()"
+    ended = run(COMMAND.format(body=body, leave_s=30).replace("0.05, Lost", "60, Lost"))  # Ray is well
+    assert ended.returncode == 130
+    assert "Exception ignored in" in ended.stderr, "it was not dropped"
+    assert ended.stderr.endswith("error interrupted\n")
+
+
+def test_an_evaluation_does_not_begin_after_an_interrupt_that_was_dropped() -> None:
+    with interrupts():
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGTERM)
+        with pytest.raises(KeyboardInterrupt), stop_signals():
+            pytest.fail("it began")
+    with stop_signals() as stop:
+        assert not stop.is_set()
 
 
 def run(code: str) -> subprocess.CompletedProcess[str]:

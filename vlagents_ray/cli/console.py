@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import signal
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from vlagents_ray.errors import ConfigError, VLAgentsError
+from vlagents_ray.ray_tools.signals import interrupts
 from vlagents_ray.settings import wrong_settings
 
 
@@ -56,9 +56,9 @@ def errors() -> Iterator[None]:
 
     SIGTERM is treated as Ctrl-C, so that what was started is taken down in order.
     """
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        yield
+        with interrupts():
+            yield
     except ValidationError as error:
         fail(f"wrong settings: {wrong_settings(error, _model_of(error))}", 2)
     except ConfigError as error:
@@ -67,8 +67,6 @@ def errors() -> Iterator[None]:
         fail(f"{type(error).__name__}: {error}", 1)
     except KeyboardInterrupt as error:
         fail(str(error) or "interrupted", 130)
-    finally:
-        signal.signal(signal.SIGTERM, before)
 
 
 def _model_of(error: ValidationError) -> type | None:

@@ -19,11 +19,13 @@ from typing import Any
 from vlagents_ray.cli.console import say_error
 from vlagents_ray.errors import ClusterLost
 from vlagents_ray.ray_tools.private import LOGGERS, node_of_this_process, output_printer, set_output_printer
+from vlagents_ray.ray_tools.signals import raise_dropped_interrupt
 
 log = logging.getLogger(__name__)
 
 _LEAVE_S = 10.0  # for a command to end in order
 _EXIT_S = 3.0  # for its process to end then: Ray's own farewell may wait for what is not there any more
+_LOOK_S = 1.0  # between two looks for an interrupt that Python dropped
 _END_S = 90.0  # from Ctrl-C to the end: Serve has a third of it to end in order, and Ray's farewell the rest
 RESTART = "start it again"
 RESUME = "what was played is kept: go on with --resume when there is a cluster again"
@@ -140,7 +142,8 @@ class RayLoss:
     def wait(self) -> None:
         """Block until Ray is lost and raise `ClusterLost`; an interrupt has the command end within `_END_S`."""
         try:
-            self._known.wait()
+            while not self._known.wait(_LOOK_S):
+                raise_dropped_interrupt()
         except KeyboardInterrupt:
             self.left.set()
             faulthandler.dump_traceback_later(_END_S, exit=True)  # and says where, whatever hangs in whatever thread

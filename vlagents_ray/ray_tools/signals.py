@@ -1,4 +1,4 @@
-"""Handlers of signals: SIGTERM beside Ray, and a request to stop."""
+"""Handlers of signals: Ctrl-C and SIGTERM beside Ray, and a request to stop."""
 
 from __future__ import annotations
 
@@ -7,6 +7,38 @@ import signal
 import threading
 from collections.abc import Iterator
 from types import FrameType
+
+_interrupted = threading.Event()
+
+
+@contextlib.contextmanager
+def interrupts() -> Iterator[None]:
+    """Raise `KeyboardInterrupt` at Ctrl-C and at SIGTERM within the context, and remember it.
+
+    Python drops an exception that a handler raises while a destructor or a callback of Ray's C code runs. Then
+    `raise_dropped_interrupt` raises it. Outside the main thread Python delivers no signals, and this does nothing.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        _interrupted.set()
+        signal.default_int_handler(number, frame)
+
+    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        _interrupted.clear()
+
+
+def raise_dropped_interrupt() -> None:
+    """Raise `KeyboardInterrupt` if one was raised in `interrupts`, and this process goes on as if none had been."""
+    if _interrupted.is_set():
+        raise KeyboardInterrupt
 
 
 @contextlib.contextmanager
@@ -29,6 +61,7 @@ def stop_signals() -> Iterator[threading.Event]:
     A handler that only sets a flag cannot interrupt a transaction. Outside the main thread Python delivers no signals,
     and the event is never set.
     """
+    raise_dropped_interrupt()
     stop = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         yield stop
