@@ -62,7 +62,7 @@ class EngineTarget:
         return [asyncio.run(self._own.newest_weights()).number]
 
     def close(self) -> None:
-        """Do nothing."""
+        """Leave the engine as it is: its owner closes it."""
 
 
 class AppTarget:

@@ -48,12 +48,11 @@ _OPTIONAL: dict[str, Any] = {
     "request_id": "",
     "session": "",
     "rank": "robot",
-    "step": None,
     "deadline_ms": None,
 }  # with defaults
 _WITH_OBS = ("reset", "act", "observe")
-_OF_CLOSE = ("op", *_OPTIONAL)
-_REQUEST_KEYS = {"op", "obs", "instruction", "kwargs", "contract", "history", "blobs", *_OPTIONAL}
+_OF_CLOSE = ("op", "step", *_OPTIONAL)
+_REQUEST_KEYS = {"op", "obs", "instruction", "kwargs", "contract", "history", "blobs", "step", *_OPTIONAL}
 
 
 def encode_request(request: Request, codec: ImageCodec = RAW) -> bytes:
@@ -145,7 +144,8 @@ def _read_request(node: dict[str, Any], reader: ValueReader, limits: Limits, ops
             kwargs=reader.value(node.get("kwargs") or {}),
             contract=node.get("contract"),
             history=[read_obs(one, reader, limits) for one in history],
-            **{name: node.get(name, default) for name, default in _OPTIONAL.items()} | {"step": _step(node)},
+            step=_step(node),
+            **{name: node.get(name, default) for name, default in _OPTIONAL.items()},
         ),
         limits,
     )
