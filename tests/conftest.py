@@ -14,11 +14,12 @@ import pytest
 from assets import assets
 from fail_on_skip import pytest_make_collect_report, pytest_runtest_makereport
 from needs import left_out, nothing_else, skip_what_is_missing
+from process_resources import pytest_pyfunc_call
 from xdist_workers import own_ray_folder, turn
 
 from vlagents_ray.envs.rendering.headless import prepare_rendering
 
-__all__ = ["pytest_make_collect_report", "pytest_runtest_makereport"]
+__all__ = ["pytest_make_collect_report", "pytest_pyfunc_call", "pytest_runtest_makereport"]
 
 # No test talks to the world; set before anything that reads them is imported.
 os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")

@@ -58,6 +58,7 @@ def no_descriptors_left() -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_NOFILE, limits)
 
 
+@pytest.mark.own_process
 def test_who_comes_when_no_descriptor_is_left_is_turned_away_and_the_next_let_in(endpoint: Endpoint) -> None:
     for _ in range(2):
         with endpoint.connect() as refused:

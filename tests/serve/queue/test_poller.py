@@ -302,6 +302,7 @@ def test_only_other_threads_wake_the_queue(slow: Callable[..., Slow], monkeypatc
     theirs.close()
 
 
+@pytest.mark.own_process
 def test_no_descriptor_and_no_thread_is_left() -> None:
     files, running = descriptors(), running_threads()
     for lend in (False, True):

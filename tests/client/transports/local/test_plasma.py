@@ -62,6 +62,7 @@ def test_a_replicas_socket_that_is_another_users_is_sent_nothing(
             PlasmaTransport("app").connect_to(HandleTransport("app"), {"plasma": {"socket": path, "node": HERE}}, 1)
 
 
+@pytest.mark.own_process
 @pytest.mark.parametrize("broken", [KeyboardInterrupt(), UnicodeError("a key that is no text"), OSError("gone")])
 def test_a_connection_that_fails_is_closed_at_once(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, broken: BaseException

@@ -352,6 +352,7 @@ def test_a_slow_and_a_greedy_client_hold_up_nobody(open_gr00t) -> None:
         context.term()
 
 
+@pytest.mark.own_process
 def test_mutated_messages_get_an_error_or_an_answer(open_gr00t, replicas: Replicas) -> None:
     """A good client acts all the while; memory and threads stay what they were."""
     port = open_gr00t(sessions=16)

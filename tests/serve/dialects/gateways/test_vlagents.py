@@ -180,6 +180,7 @@ def _answers(port: int) -> bool:
         return False
 
 
+@pytest.mark.own_process
 def test_mutated_frames_end_their_own_client_at_most(open_vlagents, replicas: Replicas) -> None:
     """Over as many connections as they end; a good client acts all the while."""
     port = open_vlagents(sessions=16)

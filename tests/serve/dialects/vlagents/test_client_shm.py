@@ -82,6 +82,7 @@ def test_a_client_on_another_machine_names_none(segment: Segment) -> None:
         SharedMemory(same_machine=False).read(segment.name, 5)
 
 
+@pytest.mark.own_process
 def test_descriptors_do_not_pile_up(segment: Segment) -> None:
     memory = SharedMemory(same_machine=True)
     segments = [Segment(create=True, size=64) for _ in range(80)]

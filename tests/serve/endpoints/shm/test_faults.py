@@ -87,6 +87,7 @@ def test_who_leaves_before_hearing_that_the_replica_is_full_keeps_nobody_out(ser
         assert call(other, request("reset"), 5).error is None
 
 
+@pytest.mark.own_process
 @pytest.mark.parametrize("message", [bytes(LocalAddress.REQUEST.size), b""])
 def test_descriptors_that_a_message_brings_are_all_closed(served: tuple[Engine, ShmServer], message: bytes) -> None:
     before = descriptors()

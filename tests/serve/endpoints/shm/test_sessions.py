@@ -127,6 +127,7 @@ def test_a_late_reply_is_discarded_and_its_memory_is_not_reused_meanwhile(served
     transport.close()
 
 
+@pytest.mark.own_process
 def test_a_killed_client_leaves_nothing(served: tuple[Engine, ShmServer]) -> None:
     engine, endpoint = served
     before = descriptors()
@@ -150,6 +151,7 @@ def test_a_killed_client_leaves_nothing(served: tuple[Engine, ShmServer]) -> Non
     wait_for(lambda: not descriptors() - before)
 
 
+@pytest.mark.own_process
 def test_many_sessions_leave_nothing(served: tuple[Engine, ShmServer]) -> None:
     def cycle() -> None:
         transport = client(served[1])
