@@ -23,6 +23,7 @@ app = typer.Typer(
     help="Serve Vision-Language-Action models with Ray, and evaluate them in parallel simulation.",
 )
 env = typer.Typer(no_args_is_help=True, help="Python environments for policies that the server's own does not suit.")
+learn = typer.Typer(no_args_is_help=True, help="Policies that learn, with their server in the loop.")
 app.command("serve")(serve_command)
 
 
@@ -55,6 +56,7 @@ app.command("report")(report_command)
 app.add_typer(bench, name="bench")
 app.add_typer(env, name="env")
 app.add_typer(keys, name="keys")
+app.add_typer(learn, name="learn")
 app.add_typer(new, name="new")
 app.add_typer(slurm, name="slurm")
 
@@ -88,6 +90,29 @@ def doctor(port: Annotated[int, typer.Option(help="The port that a server would 
 @env.callback()
 def _group() -> None:
     """Keep `make` a command of its own."""
+
+
+@learn.callback()
+def _learn_group() -> None:
+    """Keep `tabletop` a command of its own."""
+
+
+@learn.command("tabletop")
+def learn_tabletop_command(
+    out_dir: Annotated[Path, typer.Option("--out", help="Folder of the results.")] = Path("runs/learn"),
+    seed: Annotated[int, typer.Option(min=0, help="Of the network and of the training's episodes.")] = 0,
+    demonstrations: Annotated[int, typer.Option(min=1, help="Episodes of the teacher that are cloned.")] = 48,
+    iterations: Annotated[int, typer.Option(min=1, help="Pushes of new weights in RPD, and in PPO.")] = 10,
+    held_out: Annotated[int, typer.Option(min=1, help="Episodes of each evaluation, the same for all.")] = 200,
+) -> None:
+    """A small policy learns to lift pucks, in some minutes: from demonstrations, with a teacher's advice, and alone."""
+    from vlagents_ray.cli.ray_session import quiet_ray
+    from vlagents_ray.evaluate import print_summary
+    from vlagents_ray.learn.tabletop.run import LearnPlan, learn_tabletop
+
+    plan = LearnPlan(fresh(out_dir), seed, demonstrations, iterations=iterations, held_out=held_out)
+    with errors(), quiet_ray(None):
+        print_summary(out, learn_tabletop(plan, out.print))
 
 
 @env.command("make")

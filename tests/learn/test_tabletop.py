@@ -1,0 +1,183 @@
+"""`vlagents-ray learn tabletop`: student, teacher and learner in one process, and the whole loop at a small size."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from ray_processes import processes, ray_folder
+
+from vlagents_ray import Act, Agent, Obs
+from vlagents_ray.envs.tabletop.env import Tabletop
+from vlagents_ray.errors import InvalidObservation, MissingCamera
+from vlagents_ray.evaluate import Results
+from vlagents_ray.interface import BEHAVIOUR, WANT
+from vlagents_ray.learn.tabletop.colours import named_colour, puck_position
+from vlagents_ray.learn.tabletop.learner import Learner, advantages, advice, inputs_of
+from vlagents_ray.learn.tabletop.run import ENV_OPTIONS
+from vlagents_ray.learn.tabletop.student import Student
+from vlagents_ray.learn.tabletop.teacher import Teacher
+from vlagents_ray.testing.agents import check_agent
+
+
+class ServedTeacher(Teacher):
+    """A teacher with the batches of `RemoteAgent`."""
+
+    def sessions(self, number: int) -> list[ServedTeacher]:
+        return [ServedTeacher() for _ in range(number)]
+
+    def reset_batch(self, obs: list[Obs], texts: list[str], sessions: list[Teacher]) -> list[Any]:
+        return [one.reset(first, text) for one, first, text in zip(sessions, obs, texts, strict=True)]
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+def played(seed: int, chosen: Callable[[Obs], Act], agent: Agent) -> tuple[bool, list[Obs], list[np.ndarray], str]:
+    """An episode: whether it was solved, its observations and actions, and the instruction."""
+    env = Tabletop("lift", **ENV_OPTIONS)
+    obs, _ = env.reset(seed=seed)
+    agent.reset(obs, env.instruction)
+    seen, actions, solved, truncated = [], [], False, False
+    while not truncated:
+        act = chosen(obs)
+        seen.append(obs)
+        actions.append(act.action)
+        obs, _, _, truncated, info = env.step(act)
+        solved = solved or info["success"]
+    return solved, seen, actions, env.instruction
+
+
+def columns(episodes: list[tuple[bool, list[Obs], list[np.ndarray], str]]) -> dict[str, Any]:
+    """The transitions of episodes."""
+    seen = [obs for episode in episodes for obs in episode[1]]
+    return {
+        "cameras.front": np.stack([obs.cameras["front"] for obs in seen]),
+        "gripper": np.array([obs.gripper for obs in seen], np.float32),
+        "state.xyzrpy": np.stack([obs.state["xyzrpy"] for obs in seen]),
+        "instruction": np.array([one[3] for one in episodes for _ in one[1]], object),
+        "t": np.array([t for one in episodes for t in range(len(one[1]))], np.int32),
+        "action": np.stack([action for one in episodes for action in one[2]]),
+    }
+
+
+def test_a_puck_is_seen_where_it_stands() -> None:
+    for seed in range(30):
+        env = Tabletop("lift", **ENV_OPTIONS)
+        obs, _ = env.reset(seed=seed)
+        colour = named_colour(env.instruction)
+        assert env._world is not None
+        puck = env._world.puck(colour)
+        seen = puck_position(obs.cameras["front"], colour)
+        assert seen is not None
+        assert np.hypot(seen[0] - puck.x, seen[1] - puck.y) < 0.01  # m
+    assert puck_position(np.zeros((96, 96, 3), np.uint8), "red") is None
+
+
+def test_an_instruction_without_a_puck_is_refused() -> None:
+    with pytest.raises(InvalidObservation, match="lift the COLOUR puck"):
+        named_colour("fold the towel")
+    teacher = Teacher()
+    teacher.reset(Obs(), "lift the red puck")
+    with pytest.raises(MissingCamera, match="front"):
+        teacher.act(Obs())
+
+
+def test_the_teacher_lifts_the_puck_and_gives_the_same_advice_to_others() -> None:
+    teacher = Teacher()
+    episodes = [played(seed, teacher.act, teacher) for seed in range(20)]
+    assert sum(solved for solved, *_ in episodes) >= 19
+
+    found = columns(episodes[:3])
+    np.testing.assert_array_equal(advice(ServedTeacher(), found), found["action"])  # type: ignore[arg-type]
+
+
+@pytest.mark.torch
+def test_the_student_keeps_what_an_agent_promises_and_neighbours_change_no_bit() -> None:
+    student = Student()
+    student.initialize()
+    check_agent(student, instructions=["lift the red puck", "lift the blue puck", "lift the green puck"])
+    env = Tabletop("lift", **ENV_OPTIONS)
+    first, _ = env.reset(seed=1)
+    others = [Student(), Student()]
+    for one in others:
+        one.network = student.network
+        one.reset(first, "lift the red puck", seed=3)
+    first.info[WANT] = ["logprob", "value"]
+    alone = others[0].act(first)
+    _, together = student.act_batch([Obs(first.cameras, 0.5, first.state), first], others)
+    assert isinstance(together, Act)
+    np.testing.assert_array_equal(alone.action, together.action)
+    said, also = alone.info[BEHAVIOUR], together.info[BEHAVIOUR]
+    np.testing.assert_array_equal(said["logprob"], also["logprob"])
+    assert said["value"] == also["value"]
+
+
+@pytest.mark.torch
+def test_a_log_probability_is_that_of_the_normal_distribution_that_was_drawn_from() -> None:
+    import torch
+
+    student = Student()
+    student.initialize()
+    obs, _ = Tabletop("lift", **ENV_OPTIONS).reset(seed=1)
+    student.reset(obs, "lift the red puck", seed=3)
+    mean = student.act(obs).action
+    drawn = student.act(Obs(obs.cameras, obs.gripper, obs.state, {WANT: ["logprob"]}))
+    normal = torch.distributions.Normal(torch.from_numpy(mean), student.network.log_std.detach().exp())
+    expected = normal.log_prob(torch.from_numpy(drawn.action)).numpy()
+    assert (drawn.action != mean).all()
+    np.testing.assert_allclose(drawn.info[BEHAVIOUR]["logprob"][0], expected, rtol=1e-3, atol=1e-3)
+
+
+def test_advantages_are_those_of_the_formula() -> None:
+    found = {"reward": [0.0, 1.0, 0.0], "value": [0.5, 0.25, 0.75], "t": [0, 1, 0]}
+    gain, targets = advantages({name: np.array(values, np.float32) for name, values in found.items()})
+    last = 1 + 0.98 * 0.25 - 0.25
+    np.testing.assert_allclose(gain, [0.98 * 0.25 - 0.5 + 0.98 * 0.95 * last, last, 0.98 * 0.75 - 0.75], rtol=1e-6)
+    np.testing.assert_allclose(targets, gain + found["value"], rtol=1e-6)
+
+
+@pytest.mark.torch
+def test_the_learner_imitates_and_the_advised_one_stays_near_the_advice() -> None:
+    teacher = Teacher()
+    found = columns([played(seed, teacher.act, teacher) for seed in range(8)])
+    seen, actions = inputs_of(found), found["action"]
+    learner = Learner()
+    before, after = learner.imitate(seen, actions, 1), learner.imitate(seen, actions, 300)
+    assert after < before / 5
+    rows = len(seen)
+    of_the_student = {"reward": np.zeros(rows, np.float32), "value": np.zeros(rows, np.float32)}
+    of_the_student["logprob"] = np.full(rows, -1.0, np.float32)
+    copy = learner.copy()
+    copy.improve(found | of_the_student, 50, (seen, actions))
+    assert copy.imitate(seen, actions, 1) < before / 5
+    assert learner.state()["policy.0.weight"].ne(copy.state()["policy.0.weight"]).any()
+
+
+@pytest.mark.server
+@pytest.mark.torch
+@pytest.mark.slow
+def test_the_command_leaves_a_report_of_all_versions_on_the_same_episodes_and_nothing_running(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", "from vlagents_ray.cli import main; main()", "learn", "tabletop"]
+    small = ["--demonstrations", "8", "--iterations", "2", "--held-out", "6", "--out", str(tmp_path / "run")]
+    with ray_folder() as folder:
+        environment = os.environ | {"RAY_TMPDIR": str(folder), "COLUMNS": "120"}
+        done = subprocess.run(
+            [*command, *small], capture_output=True, text=True, timeout=600, check=False, env=environment
+        )
+        assert done.returncode == 0, done.stdout + done.stderr
+        assert not processes(folder), "left running"
+    assert "demonstrations: 8 of 8 episodes solved" in done.stdout
+    results = Results.load(tmp_path / "run")
+    methods = [contender.partition("@")[0] for contender in results.contenders]
+    assert methods == ["bc", "rpd", "rpd", "ppo", "ppo"]
+    seeds = {tuple(sorted(episode.seed for episode in cell.episodes)) for cell in results.cells}
+    assert len(seeds) == 1
+    assert len(next(iter(seeds))) == 6
+    assert (tmp_path / "run" / "report.html").is_file()

@@ -1,0 +1,140 @@
+"""The student: a small trainable policy of images and words, with a value, for learners of reinforcement."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.contract import Contract
+from vlagents_ray.envs.tabletop.env import Tabletop
+from vlagents_ray.errors import MissingCamera, MissingState
+from vlagents_ray.interface import BEHAVIOUR, WANT, Act, Agent, Obs
+from vlagents_ray.learn.tabletop.colours import BINS, WORDS, named_colour, places
+from vlagents_ray.registry import require
+
+ACTION = 4  # numbers of an action: x, y, z, gripper
+STATE = 4  # of the robot's own state: x, y, z, gripper
+INPUTS = 3 * BINS + STATE + len(WORDS)  # numbers of an input
+_LOOKS = 3  # places that the network looks at
+_ROWS = 16  # of a pass
+_METRES = 5.0  # units of the robot's position per m
+
+
+def inputs(obs: Obs, colour: str) -> np.ndarray:
+    """Return what the network gets of an observation, (INPUTS,) float32.
+
+    Args:
+        obs: The observation, with the camera "front", the state "xyzrpy" and the gripper.
+        colour: The puck's, out of `WORDS`.
+    """
+    if "front" not in obs.cameras:
+        raise MissingCamera("front", have=obs.cameras)
+    if "xyzrpy" not in obs.state:
+        raise MissingState("xyzrpy", have=obs.state)
+    robot = [*(_METRES * obs.state["xyzrpy"][:3]), float(obs.gripper or 0.0)]
+    word = [float(colour == one) for one in WORDS]
+    return np.concatenate([places(obs.cameras["front"]).ravel(), robot, word]).astype(np.float32)
+
+
+def make_network(seed: int = 0) -> Any:
+    """Return a new network: inputs (B, INPUTS) to means of actions (B, 4) and values (B,); `log_std` is (4,)."""
+    torch = require("torch")
+    nn = torch.nn
+
+    class Network(nn.Module):  # type: ignore[misc, name-defined]
+        """Looks at places whose colours the word selects, and moves by where they are from the fingertips."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.look = nn.Linear(len(WORDS), BINS * _LOOKS)
+            self.aim = nn.Linear(2, 2)  # from the camera's places to the robot's
+            size = _LOOKS * 9 + STATE
+            self.policy = _perceptron(nn, size, ACTION)
+            self.value = _perceptron(nn, size, 1)
+            self.log_std = nn.Parameter(torch.full((ACTION,), -2.3))
+            with torch.no_grad():
+                self.aim.weight.copy_(torch.eye(2) * _METRES / 10)
+                self.aim.bias.zero_()
+
+        def forward(self, inputs: Any) -> tuple[Any, Any]:
+            seen, robot, word = inputs.split([3 * BINS, STATE, len(WORDS)], dim=-1)
+            seen = seen.unflatten(-1, (BINS, 3))
+            scores = 8 * self.look(word).unflatten(-1, (_LOOKS, BINS)) + torch.log(seen[:, None, :, 0] + 1e-4)
+            looked = scores.softmax(-1) @ seen  # (B, LOOKS, 3)
+            away = self.aim(looked[..., 1:]) - robot[:, None, :2]
+            scales = [away, torch.tanh(4 * away), torch.tanh(20 * away)]
+            features = torch.cat([torch.cat([looked, *scales], -1).flatten(1), robot], -1)
+            return self.policy(features), self.value(features).squeeze(-1)
+
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return Network()
+
+
+def _perceptron(nn: Any, size: int, out: int) -> Any:
+    hidden = 192
+    return nn.Sequential(
+        nn.Linear(size, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU(), nn.Linear(hidden, out)
+    )
+
+
+class Student(Agent):
+    """Acts by the mean of a normal distribution, or draws from it if a log-probability is wanted."""
+
+    trainable = "network"
+    shared = ("network",)
+
+    def __init__(self, seed: int = 0) -> None:
+        self.seed = seed
+        self.network: Any = None
+        self._colour = ""
+        self._draws = np.random.default_rng(seed)
+
+    def initialize(self) -> None:
+        require("torch").set_num_threads(1)
+        self.network = make_network(self.seed)
+
+    @property
+    def contract(self) -> Contract:
+        return replace(Tabletop.known_contract({"width": None, "height": None}), behaviour=("logprob", "value"))
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        """Begin an episode of `tabletop/lift`.
+
+        Raises:
+            InvalidObservation: The instruction names no puck.
+        """
+        self._colour = named_colour(instruction)
+        self._draws = np.random.default_rng(kwargs.get("seed") or 0)
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        return self.act_batch([obs], [self])[0]  # type: ignore[return-value]
+
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        """Compute the actions of all sessions, in passes of one size, so that neighbours change no bit of a result."""
+        torch = require("torch")
+        rows = np.zeros((-len(obs) // _ROWS * -_ROWS, INPUTS), np.float32)
+        for row, one, session in zip(rows, obs, sessions, strict=False):
+            row[:] = inputs(one, session._colour)  # type: ignore[attr-defined]
+        with torch.inference_mode():
+            passes = [self.network(part) for part in torch.from_numpy(rows).split(_ROWS)]
+            means, values = (torch.cat(parts)[: len(obs)] for parts in zip(*passes, strict=True))
+            log_std = self.network.log_std.numpy()
+        return [
+            self._answer(one, session, mean, log_std, float(value))
+            for one, session, mean, value in zip(obs, sessions, means.numpy(), values, strict=True)
+        ]
+
+    def _answer(self, obs: Obs, session: Any, mean: np.ndarray, log_std: np.ndarray, value: float) -> Act:
+        wanted = obs.info.get(WANT)
+        if not wanted:
+            return Act(mean)
+        draws = session._draws.standard_normal(ACTION).astype(np.float32)
+        logprob = -0.5 * draws**2 - log_std - 0.5 * math.log(2 * math.pi)
+        said = {"logprob": logprob[None], "value": value}
+        return Act(mean + np.exp(log_std) * draws, info={BEHAVIOUR: {name: said[name] for name in wanted}})
