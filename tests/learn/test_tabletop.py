@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 import sys
@@ -11,16 +12,19 @@ from typing import Any
 
 import numpy as np
 import pytest
-from ray_processes import processes, ray_folder
+from eval_fakes import wait_for
+from ray_processes import end, processes, ray_folder
 
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.envs.tabletop.env import Tabletop
-from vlagents_ray.errors import InvalidObservation, MissingCamera
+from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera
 from vlagents_ray.evaluate import Results
+from vlagents_ray.evaluate.results.summary import pushed_of
 from vlagents_ray.interface import BEHAVIOUR, WANT
 from vlagents_ray.learn.tabletop.colours import named_colour, puck_position
 from vlagents_ray.learn.tabletop.learner import Learner, advantages, advice, inputs_of
-from vlagents_ray.learn.tabletop.run import ENV_OPTIONS
+from vlagents_ray.learn.tabletop.plan import LearnPlan
+from vlagents_ray.learn.tabletop.run import ENV_OPTIONS, RunCheckpoints
 from vlagents_ray.learn.tabletop.student import Student
 from vlagents_ray.learn.tabletop.teacher import Teacher
 from vlagents_ray.testing.agents import check_agent
@@ -145,39 +149,100 @@ def test_advantages_are_those_of_the_formula() -> None:
 
 @pytest.mark.torch
 def test_the_learner_imitates_and_the_advised_one_stays_near_the_advice() -> None:
+    learner, rows = taught()
+    before, after = learner.imitate(1), learner.imitate(300)
+    assert after < before / 5
+    assert learner.steps == 301
+    unchanged = learner.checkpoint()["network"]["policy.0.weight"].clone()
+    learner.improve(rows, 50, advised=True)
+    assert learner.imitate(1) < before / 5
+    assert learner.state()["policy.0.weight"].ne(unchanged).any()
+
+
+@pytest.mark.torch
+def test_a_learner_goes_on_from_a_checkpoint_to_the_same_bit(tmp_path: Path) -> None:
+    import torch
+
+    learner, rows = taught()
+    learner.imitate(20)
+    torch.save(learner.checkpoint(), tmp_path / "state")
+    other = Learner(seed=0)
+    other.restore(torch.load(tmp_path / "state", weights_only=True))
+    for one in (learner, other):
+        one.improve(rows, 20, advised=True)
+        one.imitate(5)
+    for name, value in learner.state().items():
+        assert torch.equal(value, other.state()[name]), name
+
+
+def taught() -> tuple[Learner, dict[str, Any]]:
+    """A learner with the demonstrations of eight episodes, and transitions as if they were the student's own."""
     teacher = Teacher()
     found = columns([played(seed, teacher.act, teacher) for seed in range(8)])
-    seen, actions = inputs_of(found), found["action"]
     learner = Learner()
-    before, after = learner.imitate(seen, actions, 1), learner.imitate(seen, actions, 300)
-    assert after < before / 5
-    rows = len(seen)
-    of_the_student = {"reward": np.zeros(rows, np.float32), "value": np.zeros(rows, np.float32)}
-    of_the_student["logprob"] = np.full(rows, -1.0, np.float32)
-    copy = learner.copy()
-    copy.improve(found | of_the_student, 50, (seen, actions))
-    assert copy.imitate(seen, actions, 1) < before / 5
-    assert learner.state()["policy.0.weight"].ne(copy.state()["policy.0.weight"]).any()
+    learner.add_advice(inputs_of(found), found["action"])
+    rows = np.arange(len(found["t"]))
+    own = {"reward": rows % 2, "value": rows % 3, "logprob": -1 - rows % 2}
+    return learner, found | {name: values.astype(np.float32) for name, values in own.items()}
+
+
+@pytest.mark.parametrize(
+    ("second", "wrong"), [({}, "already has a run"), ({"resume": True, "steps": 7}, r'other settings: .*"steps":7')]
+)
+def test_a_folder_takes_one_run(tmp_path: Path, second: dict[str, Any], wrong: str) -> None:
+    RunCheckpoints(LearnPlan(out=tmp_path))
+    RunCheckpoints(LearnPlan(out=tmp_path, resume=True, iterations=20))  # it may go on for longer
+    with pytest.raises(ConfigError, match=wrong):
+        RunCheckpoints(LearnPlan(out=tmp_path, **second))
+
+
+SMALL = {"demonstrations": 8, "clone_steps": 300, "iterations": 2, "episodes": 8, "steps": 50}
+SMALL |= {"evaluate_every": 1, "held_out": 6, "num_envs": 4}
 
 
 @pytest.mark.server
 @pytest.mark.torch
 @pytest.mark.slow
-def test_the_command_leaves_a_report_of_all_versions_on_the_same_episodes_and_nothing_running(tmp_path: Path) -> None:
-    command = [sys.executable, "-c", "from vlagents_ray.cli import main; main()", "learn", "tabletop"]
-    small = ["--demonstrations", "8", "--iterations", "2", "--held-out", "6", "--out", str(tmp_path / "run")]
+def test_a_run_that_is_killed_goes_on_to_the_table_of_one_that_was_not(tmp_path: Path) -> None:
+    plan = tmp_path / "small.yaml"
+    plan.write_text(json.dumps(SMALL))
     with ray_folder() as folder:
-        environment = os.environ | {"RAY_TMPDIR": str(folder), "COLUMNS": "120"}
-        done = subprocess.run(
-            [*command, *small], capture_output=True, text=True, timeout=600, check=False, env=environment
-        )
-        assert done.returncode == 0, done.stdout + done.stderr
-        assert not processes(folder), "left running"
-    assert "demonstrations: 8 of 8 episodes solved" in done.stdout
-    results = Results.load(tmp_path / "run")
-    methods = [contender.partition("@")[0] for contender in results.contenders]
-    assert methods == ["bc", "rpd", "rpd", "ppo", "ppo"]
-    seeds = {tuple(sorted(episode.seed for episode in cell.episodes)) for cell in results.cells}
-    assert len(seeds) == 1
-    assert len(next(iter(seeds))) == 6
-    assert (tmp_path / "run" / "report.html").is_file()
+        whole = learn(folder, plan, "--out", str(tmp_path / "whole"))
+        killed = start(folder, plan, "--out", str(tmp_path / "killed"))
+        wait_for(lambda: (tmp_path / "killed" / "checkpoints" / "rpd.pt").exists() or killed.poll() is not None)
+        killed.kill()
+        killed.communicate()
+        end(folder)
+        resumed = learn(folder, plan, "--out", str(tmp_path / "killed"), "--resume")
+    assert "demonstrations: 8 of 8 episodes solved" in whole
+    assert "demonstrations" not in resumed
+    tables = [table(Results.load(tmp_path / name)) for name in ("whole", "killed")]
+    assert tables[0] == tables[1]
+    assert list(tables[0]) == ["bc@300", "rpd@350", "rpd@400", "ppo@350", "ppo@400"]
+    assert (tmp_path / "killed" / "report.html").is_file()
+
+
+def start(folder: Path, *arguments: object) -> subprocess.Popen[str]:
+    """Start the command in a Ray of its own."""
+    command = [sys.executable, "-c", "from vlagents_ray.cli import main; main()", "learn", "tabletop"]
+    environment = os.environ | {"RAY_TMPDIR": str(folder)}
+    options: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
+    return subprocess.Popen([*command, *map(str, arguments)], env=environment, **options)
+
+
+def learn(folder: Path, *arguments: object) -> str:
+    """Run the command to its end, after which nothing runs."""
+    with start(folder, *arguments) as process:
+        printed, _ = process.communicate(timeout=600)
+    assert process.returncode == 0, printed
+    assert not processes(folder), "left running"
+    return printed
+
+
+def table(results: Results) -> dict[str, tuple[str | None, list[tuple[int, float]]]]:
+    """The weights, and seed and reward of each episode, by contender."""
+    found = {}
+    for cell in results.cells:
+        episodes = sorted((one.result.key.seed, one.result.episode_return) for one in cell.episodes)
+        found[cell.contender] = pushed_of(cell), episodes
+    return {name: found[name] for name in results.contenders}

@@ -72,8 +72,9 @@ def errors() -> Iterator[None]:
 def _model_of(error: ValidationError) -> type | None:
     """Return the model that these settings are of, if users write it."""
     from vlagents_ray.evaluate import EvalConfig
+    from vlagents_ray.learn.tabletop.plan import LearnPlan
 
-    return EvalConfig if error.title == EvalConfig.__name__ else None
+    return next((model for model in (EvalConfig, LearnPlan) if model.__name__ == error.title), None)
 
 
 def fail(message: str, code: int) -> NoReturn:

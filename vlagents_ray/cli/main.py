@@ -13,6 +13,7 @@ from vlagents_ray.cli.evaluation.command import evaluate_command
 from vlagents_ray.cli.evaluation.results import export_command, merge_command, replay_command, report_command
 from vlagents_ray.cli.keys import keys
 from vlagents_ray.cli.new import new
+from vlagents_ray.cli.options import parse_list, read_yaml
 from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.cli.slurm import slurm
 
@@ -99,20 +100,28 @@ def _learn_group() -> None:
 
 @learn.command("tabletop")
 def learn_tabletop_command(
-    out_dir: Annotated[Path, typer.Option("--out", help="Folder of the results.")] = Path("runs/learn"),
-    seed: Annotated[int, typer.Option(min=0, help="Of the network and of the training's episodes.")] = 0,
-    demonstrations: Annotated[int, typer.Option(min=1, help="Episodes of the teacher that are cloned.")] = 48,
-    iterations: Annotated[int, typer.Option(min=1, help="Pushes of new weights in RPD, and in PPO.")] = 10,
-    held_out: Annotated[int, typer.Option(min=1, help="Episodes of each evaluation, the same for all.")] = 200,
+    file: Annotated[Path | None, typer.Argument(help="Settings (.yaml), such as examples/learn/rpd.yaml.")] = None,
+    out_dir: Annotated[Path | None, typer.Option("--out", help="Folder of the results.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="Of the networks and of the training's episodes.")] = None,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with what is in --out.")] = False,
+    track: Annotated[str, typer.Option(help="Show success rates in: wandb, trackio, tensorboard.")] = "",
 ) -> None:
-    """A small policy learns to lift pucks, in some minutes: from demonstrations, with a teacher's advice, and alone."""
-    from vlagents_ray.cli.ray_session import quiet_ray
+    """A small policy learns to lift pucks, in minutes: from demonstrations, with a teacher's advice, and alone."""
+    from vlagents_ray.cli.ray_session import RESUME, exit_if_ray_is_lost, quiet_ray
     from vlagents_ray.evaluate import print_summary
-    from vlagents_ray.learn.tabletop.run import LearnPlan, learn_tabletop
+    from vlagents_ray.learn.tabletop.plan import LearnPlan
+    from vlagents_ray.learn.tabletop.progress import LearnBar
+    from vlagents_ray.learn.tabletop.run import learn_tabletop
 
-    plan = LearnPlan(fresh(out_dir), seed, demonstrations, iterations=iterations, held_out=held_out)
-    with errors(), quiet_ray(None):
-        print_summary(out, learn_tabletop(plan, out.print))
+    given = {"out": out_dir, "seed": seed, "resume": resume or None, "track": parse_list(track) or None}
+    with errors():
+        plan = (
+            {} if file is None else {"out": Path("runs") / file.stem} | read_yaml(file, "file of settings", "`methods`")
+        )
+        plan |= {name: value for name, value in given.items() if value is not None}
+        with quiet_ray(None), exit_if_ray_is_lost(RESUME), LearnBar(out) as bar:
+            summary = learn_tabletop(LearnPlan.model_validate(plan), bar)
+        print_summary(out, summary)
 
 
 @env.command("make")

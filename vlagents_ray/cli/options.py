@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -69,3 +70,25 @@ def parse_time(text: str, option: str) -> float:
         return datetime.datetime.fromisoformat(text).timestamp()
     except ValueError as error:
         raise ConfigError(f"{option}: got {text!r}, want seconds since 1970, or as in 2027-01-31T18:30") from error
+
+
+def read_yaml(file: Path, kind: str, keys: str) -> dict[str, Any]:
+    """Read a YAML file of settings.
+
+    Args:
+        file: The file.
+        kind: What it is, for messages.
+        keys: Its most important keys, for messages.
+
+    Raises:
+        ConfigError: There is no such file, or it holds no mapping.
+    """
+    if not file.is_file():
+        raise ConfigError(f"{kind} {str(file)!r} does not exist")
+    try:
+        document = yaml.safe_load(file.read_text())
+    except yaml.YAMLError as error:
+        raise ConfigError(f"{file}: not YAML ({error})") from error
+    if not isinstance(document, dict):
+        raise ConfigError(f"{file}: got {type(document).__name__}, want a mapping with {keys}")
+    return document

@@ -67,6 +67,7 @@ class Publisher:
         partial: bool = False,
         allow_same: bool = False,
         pin: bool = False,
+        version: int | None = None,
     ) -> int:
         """Let the policy act with new weights, and return their version once all replicas hold them.
 
@@ -78,14 +79,16 @@ class Publisher:
             partial: Whether names may be missing, whose values stay, as when only adapters are trained.
             allow_same: Whether all values may equal those that the policy holds.
             pin: Whether robots, and others that do not follow, also act with it from their next reset on.
+            version: The number of the version, such as the step of training; by default the newest one's + 1.
 
         Returns:
-            The version, as in `act.info["policy"]["version"]`: 1 for the first push. With "wait", replicas act with it
+            The version, as in `act.info["policy"]["version"]`. With "wait", replicas act with it
             later; see `acknowledged`.
 
         Raises:
             InvalidWeights: The values do not fit the policy; nothing was changed.
             UnchangedWeights: The values equal those that the policy holds.
+            InvalidInput: The version is not above the newest one.
             NotTrainable: The policy names no parameters to train.
             Overloaded: Another push is under way.
             PolicyUnavailable: A replica cannot be reached; nothing was changed.
@@ -93,7 +96,7 @@ class Publisher:
         """
         if not isinstance(named, Mapping):
             raise InvalidWeights(f"weights: got {type(named).__name__}, want values by name, such as a state_dict")
-        return self._target.push(named, PushOptions(mode, partial, allow_same, pin))
+        return self._target.push(named, PushOptions(mode, partial, allow_same, pin, version))
 
     def acknowledged(self, version: int) -> int:
         """Return the number of replicas that act with this version, or with a later one.

@@ -131,8 +131,8 @@ class ServerTarget:
         header = header_of(values)
         if len(header) > MESSAGE_BYTES:
             raise InvalidWeights(f"weights: {len(values)} names take {len(header)} bytes, the limit is {MESSAGE_BYTES}")
-        query = urlencode({name: str(value).lower() for name, value in asdict(options).items()})
-        with closing(open_websocket(f"{self._url}?{query}", self._credentials, _ANSWER_S)) as socket:
+        stated = {name: str(value).lower() for name, value in asdict(options).items() if value is not None}
+        with closing(open_websocket(f"{self._url}?{urlencode(stated)}", self._credentials, _ANSWER_S)) as socket:
             for part in chain((header,), parts_of(values)):
                 answer = self._ask(socket, part)
                 if "code" in answer:

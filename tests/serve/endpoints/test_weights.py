@@ -131,8 +131,9 @@ def test_a_learner_elsewhere_pushes_and_asks_which_replicas_act_with_it(serving:
         assert weights.push(gains(1)) == 1
         assert weights.push({"offset": np.ones(2)}, partial=True, mode="keep", allow_same=True) == 2
         assert (weights.acknowledged(1), weights.acknowledged(2), weights.acknowledged(3)) == (1, 1, 0)
+        assert weights.push(gains(1), version=500, allow_same=True) == 500
     held = server.engine.models.own_weights._agent.tree
-    assert server.engine.weights.describe()["newest"]["version"] == 2
+    assert server.engine.weights.describe()["newest"]["version"] == 500
     assert held["offset"].tolist() == [0, 0]  # no session has begun since
     newest = server.engine.models.own_weights.newest.values
     assert (newest["gain"][0], newest["gain"][-1], newest["offset"][0]) == (1, 1, 1)
@@ -252,6 +253,10 @@ def test_a_learner_that_is_silent_is_not_waited_for(serving: Serving) -> None:
         ("?mode=abort", [], InvalidInput),
         ("?partial=yes", [], InvalidInput),
         ("?pickle=true", [], InvalidInput),
+        ("?version=true", [], InvalidInput),
+        ("?version=0", [], InvalidInput),
+        ("?version=-1", [], InvalidInput),
+        ("?version=9" + "9" * 5000, [], InvalidInput),
         ("", [b"garbage"], MalformedMessage),
         ("", [b"\0" * (MESSAGE_BYTES + 1)], MessageTooLarge),
         ("?partial=true", [header_of({"offset": np.zeros(2, np.float32)}), b"\0" * 9], MalformedMessage),

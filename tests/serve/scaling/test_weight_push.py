@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 
-from vlagents_ray.errors import InvalidWeights, Overloaded, PolicyUnavailable, UnchangedWeights
+from vlagents_ray.errors import InvalidInput, InvalidWeights, Overloaded, PolicyUnavailable, UnchangedWeights
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
@@ -153,6 +153,17 @@ def test_what_changes_nothing_is_refused_everywhere(app: Application) -> None:
     with pytest.raises(UnchangedWeights):
         app.push(5)
     assert app.push(5, PushOptions(allow_same=True)).version == 2
+
+
+def test_a_learner_numbers_versions_as_it_likes_if_they_rise(app: Application) -> None:
+    app.start(Gain(), Gain())
+    assert app.push(5, PushOptions(version=500)).version == 500
+    with pytest.raises(InvalidInput, match="version: got 500, want one above 500, the newest that acts"):
+        app.push(6, PushOptions(version=500))
+    assert app.push(6).version == 501
+    assert app.gains() == [(501, 6.0)] * 2
+    with pytest.raises(InvalidInput, match=r"version: got 9007199254740992, want a number in \[1, 9007199254740991\]"):
+        PushOptions(version=2**53)
 
 
 def test_if_one_replica_cannot_be_reached_none_acts_with_it(app: Application) -> None:

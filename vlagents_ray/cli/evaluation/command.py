@@ -7,10 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-import yaml
 
 from vlagents_ray.cli.console import errors
-from vlagents_ray.cli.options import YAML_SUFFIXES, Address, Set, parse_list, parse_settings, parse_time
+from vlagents_ray.cli.options import YAML_SUFFIXES, Address, Set, parse_list, parse_settings, parse_time, read_yaml
 from vlagents_ray.cli.ray_session import RESUME, exit_if_ray_is_lost
 from vlagents_ray.errors import ConfigError
 
@@ -193,12 +192,4 @@ def _with_resources(config: EvalConfig, resources: dict[str, float]) -> EvalConf
 
 def read_run(file: Path) -> dict[str, Any]:
     """Read a file of runs; results go to runs/NAME unless it names a folder."""
-    if not file.is_file():
-        raise ConfigError(f"file of runs {str(file)!r} does not exist")
-    try:
-        document = yaml.safe_load(file.read_text())
-    except yaml.YAMLError as error:
-        raise ConfigError(f"{file}: not YAML ({error})") from error
-    if not isinstance(document, dict):
-        raise ConfigError(f"{file}: got {type(document).__name__}, want a mapping with `policies` and `suites`")
-    return {"out": Path("runs") / file.stem} | document
+    return {"out": Path("runs") / file.stem} | read_yaml(file, "file of runs", "`policies` and `suites`")

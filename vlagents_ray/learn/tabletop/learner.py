@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from vlagents_ray.client import RemoteAgent
 from vlagents_ray.interface import Obs
 from vlagents_ray.learn.tabletop.colours import named_colour
-from vlagents_ray.learn.tabletop.student import inputs, make_network
+from vlagents_ray.learn.tabletop.student import ACTION, INPUTS, inputs, make_network
 from vlagents_ray.registry import require
 
 DISCOUNT, TRACE = 0.98, 0.95  # gamma and lambda of generalised advantage estimation (arXiv 1506.02438)
@@ -91,47 +91,70 @@ class Learner:
     def __init__(self, seed: int = 0) -> None:
         """Make a new network."""
         self._torch, self._seed = require("torch"), seed
+        self.steps = 0
+        """The number of steps so far."""
+        self._rng = self._generator()
         self.network = make_network(seed)
-        self._rng = np.random.default_rng(seed)
         look = list(self.network.look.parameters())
         others = [one for name, one in self.network.named_parameters() if not name.startswith("look.")]
         self._optimizer = self._torch.optim.Adam([{"params": look, "lr": _LOOK_RATE}, {"params": others, "lr": _RATE}])
+        self._seen = np.empty((0, INPUTS), np.float32)
+        self._advised = np.empty((0, ACTION), np.float32)  # what the teacher would have done at each
 
     def state(self) -> dict[str, Any]:
         """Return the weights, for a `Publisher`."""
         return dict(self.network.state_dict())
 
-    def imitate(self, seen: np.ndarray, actions: np.ndarray, steps: int) -> float:
-        """Take steps towards actions, by the mean squared error; return that of the last step.
+    def checkpoint(self) -> dict[str, Any]:
+        """Return all that another learner needs to go on, for `restore`."""
+        return {
+            "steps": self.steps,
+            "network": self.network.state_dict(),
+            "optimizer": self._optimizer.state_dict(),
+            "seen": self._torch.from_numpy(self._seen),
+            "advised": self._torch.from_numpy(self._advised),
+        }
+
+    def restore(self, checkpoint: Mapping[str, Any]) -> None:
+        """Go on where the learner that made the checkpoint was."""
+        self.steps = checkpoint["steps"]
+        self.network.load_state_dict(checkpoint["network"])
+        self._optimizer.load_state_dict(checkpoint["optimizer"])
+        self._seen, self._advised = checkpoint["seen"].numpy(), checkpoint["advised"].numpy()
+
+    def add_advice(self, seen: np.ndarray, actions: np.ndarray) -> None:
+        """Take what the teacher does, or would have done, as a part of all that `imitate` and `improve` learn from.
 
         Args:
             seen: Inputs of the network, (T, INPUTS).
             actions: What is to be done at each, (T, 4).
-            steps: The number of steps.
         """
+        self._seen = np.concatenate([self._seen, seen])
+        self._advised = np.concatenate([self._advised, actions])
+
+    def imitate(self, steps: int) -> float:
+        """Take steps towards the advice, by the mean squared error; return that of the last step."""
         error = self._torch.zeros(())
-        for rows in self._batches(len(seen), steps):
-            mean, _ = self.network(self._tensor(seen, rows))
-            error = self._error(mean, actions, rows)
+        self._rng = self._generator()
+        for _ in range(steps):
+            error = self._distance_to_advice()
             self._step(error)
         return float(error.detach())
 
-    def improve(
-        self, columns: Mapping[str, np.ndarray], steps: int, advised: tuple[np.ndarray, np.ndarray] | None = None
-    ) -> None:
+    def improve(self, columns: Mapping[str, np.ndarray], steps: int, *, advised: bool = False) -> None:
         """Take steps of PPO on the transitions of the student's own episodes.
 
         Args:
             columns: The transitions.
             steps: The number of steps.
-            advised: Inputs and what the teacher would have done at each: then the squared error to that is a part of
-                the loss, which makes it refined policy distillation (RPD, arXiv 2503.05833).
+            advised: Whether the squared error to the teacher's advice is a part of the loss, which makes it refined
+                policy distillation (RPD, arXiv 2503.05833).
         """
-        torch = self._torch
+        torch, self._rng = self._torch, self._generator()
         seen, (gain, targets) = inputs_of(columns), advantages(columns)
         gain = (gain - gain.mean()) / (gain.std() + 1e-6)
-        taught = self._batches(len(advised[0]), steps) if advised else []
-        for step, rows in enumerate(self._batches(len(seen), steps)):
+        for _ in range(steps):
+            rows = self._draw(len(seen))
             mean, value = self.network(self._tensor(seen, rows))
             normal = torch.distributions.Normal(mean, self.network.log_std.exp())
             logprob = normal.log_prob(self._tensor(columns["action"], rows)).sum(-1)
@@ -139,22 +162,19 @@ class Learner:
             better = self._tensor(gain, rows)
             objective = torch.minimum(ratio * better, ratio.clamp(1 - _CLIP, 1 + _CLIP) * better).mean()
             loss = ((value - self._tensor(targets, rows)) ** 2).mean() - objective
-            if advised:
-                mean, _ = self.network(self._tensor(advised[0], taught[step]))
-                loss = _PPO * loss + self._error(mean, advised[1], taught[step])
-            self._step(loss)
+            self._step(_PPO * loss + self._distance_to_advice() if advised else loss)
 
-    def copy(self) -> Learner:
-        """Return another learner with the same weights, and an optimizer that begins anew."""
-        other = Learner(self._seed)
-        other.network.load_state_dict(self.network.state_dict())
-        return other
+    def _generator(self) -> np.random.Generator:
+        """Return one that a learner which goes on from a checkpoint has as well."""
+        return np.random.default_rng([self._seed, self.steps])
 
-    def _error(self, mean: Any, actions: np.ndarray, rows: np.ndarray) -> Any:
-        return ((mean - self._tensor(actions, rows)) ** 2).mean()
+    def _distance_to_advice(self) -> Any:
+        rows = self._draw(len(self._seen))
+        mean, _ = self.network(self._tensor(self._seen, rows))
+        return ((mean - self._tensor(self._advised, rows)) ** 2).mean()
 
-    def _batches(self, number: int, steps: int) -> Sequence[np.ndarray]:
-        return [self._rng.integers(number, size=min(_BATCH, number)) for _ in range(steps)]
+    def _draw(self, number: int) -> np.ndarray:
+        return self._rng.integers(number, size=min(_BATCH, number))
 
     def _tensor(self, values: np.ndarray, rows: np.ndarray) -> Any:
         return self._torch.from_numpy(np.asarray(values, np.float32)[rows])
@@ -164,3 +184,4 @@ class Learner:
         loss.backward()
         self._torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self._optimizer.step()
+        self.steps += 1

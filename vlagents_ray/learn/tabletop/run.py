@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Callable
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,11 +10,14 @@ import numpy as np
 from vlagents_ray.client import RemoteAgent
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig
+from vlagents_ray.evaluate.artifacts.storage import whole
 from vlagents_ray.evaluate.results.summary import Summary
 from vlagents_ray.learn.columns import arrays
 from vlagents_ray.learn.publisher import Publisher
 from vlagents_ray.learn.rollouts import Rollouts
 from vlagents_ray.learn.tabletop.learner import Learner, advice, inputs_of
+from vlagents_ray.learn.tabletop.plan import LearnPlan, Method
+from vlagents_ray.learn.tabletop.progress import LearnBar
 from vlagents_ray.learn.training_evaluation import TrainingEvaluation
 from vlagents_ray.registry import require
 from vlagents_ray.serve.launch.deployment_file import deployment, together
@@ -25,132 +25,156 @@ from vlagents_ray.serve.launch.server import running_server
 
 ENV = "tabletop/lift"
 ENV_OPTIONS: dict[str, Any] = {"width": 96, "height": 96, "max_steps": 30}
-_STUDENT, _TEACHER = "serve://student", "serve://teacher"
+_TEACHER = "teacher"
 _HELD_OUT, _TRAINING = 10_000_000, 20_000_000  # first seeds: no episode is both played for training and evaluated
 
-logger = logging.getLogger(__name__)
 
-
-@dataclass(frozen=True, slots=True)
-class LearnPlan:
-    """How much is learned, and where the results go."""
-
-    out: Path  # folder of the results
-    seed: int = 0  # of the network, and of the training's episodes
-    demonstrations: int = 48  # episodes of the teacher
-    clone_steps: int = 2000  # of the optimizer, for behaviour cloning
-    iterations: int = 10  # of RPD, and of PPO
-    episodes: int = 32  # of the student in each iteration
-    steps: int = 500  # of the optimizer in each iteration
-    held_out: int = 200  # episodes of an evaluation, the same for each version
-    workers: int = 2
-    num_envs: int = 16  # environments of a worker
-
-
-def learn_tabletop(plan: LearnPlan, say: Callable[[str], None] = logger.info) -> Summary:
-    """Record demonstrations, clone them, improve the clone with and without a teacher, and compare all of it.
+def learn_tabletop(plan: LearnPlan, progress: LearnBar) -> Summary:
+    """Record demonstrations, clone them, improve the clone by each method, and compare all of it.
 
     Args:
         plan: How much is learned.
-        say: Takes a line about each step of it.
+        progress: Shows what was done.
 
     Returns:
-        The summary of all versions: "bc@1", "rpd@N" and "ppo@N".
+        The summary of all versions, whose numbers are the optimizer's steps: "bc@2000", "rpd@4500", …
 
     Raises:
-        ConfigError: The folder has results already.
+        ConfigError: The folder has another run, or has one and `resume` is off.
         MissingDependency: torch or the extra "learn" is not installed.
     """
-    if (plan.out / "results.db").exists():
-        raise ConfigError(f"{plan.out} already has results: choose another folder")
+    checkpoints = RunCheckpoints(plan)
     require("torch").set_num_threads(1)  # its networks are small
-    policies = {
-        name: deployment(f"vlagents_ray.learn.tabletop.{name}:{name.title()}", batch={"max_size": 64})
-        for name in ("student", "teacher")
-    }
+    policies: dict[str, Any] = {name: deployment(_source("student"), batch={"max_size": 64}) for name in plan.methods}
+    policies[_TEACHER] = deployment(_source(_TEACHER), batch={"max_size": 64})
     with running_server(together(policies), ingress=False):
-        return _Course(plan, say).take()
+        return _LearnRun(plan, checkpoints, progress).summary()
 
 
-class _Course:
-    """One course of learning, against the servers of student and teacher."""
+def _source(module: str) -> str:
+    return f"vlagents_ray.learn.tabletop.{module}:{module.title()}"
 
-    def __init__(self, plan: LearnPlan, say: Callable[[str], None]) -> None:
-        self._plan, self._say = plan, say
-        self._weights = Publisher(_STUDENT)
 
-    def take(self) -> Summary:
-        plan = self._plan
-        seen, advised = self._demonstrations()
-        clone = Learner(plan.seed)
-        error = clone.imitate(seen, advised, plan.clone_steps)
-        self._say(f"bc: {plan.clone_steps} steps, mean squared error {error:.4f}")
-        summary = self._evaluate("bc", self._weights.push(clone.state()))
-        for method in ("rpd", "ppo"):
-            summary = self._improve(method, clone, seen, advised)
+class RunCheckpoints:
+    """The state of each method after its last iteration, in `out`/checkpoints; each file is whole, or is not there."""
+
+    def __init__(self, plan: LearnPlan) -> None:
+        """Begin a run, or go on with one of the same settings; raises `ConfigError` as `learn_tabletop` does."""
+        self._folder = plan.out / "checkpoints"
+        file = self._folder / "plan.json"
+        mine = plan.model_dump_json(exclude={"methods", "out", "resume", "iterations", "track", "tracking"})
+        if not file.is_file():
+            with whole(file) as part:
+                part.write_text(mine)
+        elif not plan.resume:
+            raise ConfigError(f"{plan.out} already has a run: go on with it (resume), or choose another folder")
+        elif (its := file.read_text()) != mine:
+            raise ConfigError(f"{plan.out} has a run with other settings: got {mine}, want {its}, or another folder")
+
+    def save(self, name: str, state: Mapping[str, Any]) -> None:
+        """Write the state of a method; if that fails, the one before stays."""
+        with whole(self._folder / f"{name}.pt") as part:
+            require("torch").save(dict(state), part)
+
+    def load(self, name: str) -> dict[str, Any] | None:
+        """Read the state of a method; None if there is none yet."""
+        file = self._folder / f"{name}.pt"
+        if not file.is_file():
+            return None
+        state: dict[str, Any] = require("torch").load(file, weights_only=True)
+        return state
+
+
+class _LearnRun:
+    """A run, against the servers of the students and of their teacher."""
+
+    def __init__(self, plan: LearnPlan, checkpoints: RunCheckpoints, progress: LearnBar) -> None:
+        self._plan, self._checkpoints, self._progress = plan, checkpoints, progress
+
+    def summary(self) -> Summary:
+        clone = self._checkpoints.load("clone") or self._clone()
+        for number, method in enumerate(self._plan.methods):
+            summary = self._learn(method, clone, number * self._plan.iterations)
         return summary
 
-    def _rollouts(self, policy: str, want: tuple[str, ...] = ()) -> Rollouts:
+    def _clone(self) -> dict[str, Any]:
+        plan, learner = self._plan, Learner(self._plan.seed)
+        with self._rollouts(_TEACHER) as rollouts:
+            columns = arrays(rollouts.collect(plan.demonstrations))
+            self._progress.say(f"demonstrations: {_solved(columns)} of {plan.demonstrations} episodes solved")
+            learner.add_advice(inputs_of(columns), columns["action"])
+        error = learner.imitate(plan.clone_steps)
+        self._progress.say(f"clone: {plan.clone_steps} steps, mean squared error {error:.4f}")
+        state = {"iteration": 0, "position": 0, "learner": learner.checkpoint()}
+        self._checkpoints.save("clone", state)
+        return state
+
+    def _learn(self, method: Method, clone: Mapping[str, Any], done: int) -> Summary:
+        """Learn by one method, from where it had got to; `done` iterations were of the methods before."""
+        plan, learner = self._plan, Learner(self._plan.seed)
+        state = self._checkpoints.load(method) or clone
+        learner.restore(state["learner"])
+        last = 0 if method == "bc" else plan.iterations
+        with (
+            Publisher(_url(method)) as weights,
+            self._rollouts(method, want=("logprob", "value"), first=state["position"]) as rollouts,
+            RemoteAgent(_url(_TEACHER)) as teacher,
+        ):
+            for iteration in range(state["iteration"], last + 1):
+                self._progress.at(done + iteration, len(plan.methods) * plan.iterations)
+                rollouts.version = version = weights.push(learner.state(), version=learner.steps)
+                if iteration == last or (iteration and iteration % plan.evaluate_every == 0):
+                    summary = self._evaluate(method, version)
+                if iteration == last:
+                    break
+                columns = arrays(rollouts.collect(plan.episodes))
+                rate = _solved(columns) / plan.episodes
+                self._progress.say(f"{method}@{version}: {rate:.0%} of {plan.episodes} episodes of the training solved")
+                if method == "rpd":
+                    learner.add_advice(inputs_of(columns), advice(teacher, columns))
+                learner.improve(columns, plan.steps, advised=method == "rpd")
+                state = {"iteration": iteration + 1, "position": rollouts.position, "learner": learner.checkpoint()}
+                self._checkpoints.save(method, state)
+        return summary
+
+    def _rollouts(self, policy: str, want: Sequence[str] = (), first: int = 0) -> Rollouts:
         return Rollouts(
             ENV,
-            policy,
+            _url(policy),
             workers=self._plan.workers,
             num_envs=self._plan.num_envs,
             want=want,
             seed=_TRAINING * (1 + self._plan.seed),
+            first=first,
             env_options=ENV_OPTIONS,
         )
 
-    def _demonstrations(self) -> tuple[np.ndarray, np.ndarray]:
-        with self._rollouts(_TEACHER) as rollouts:
-            columns = arrays(rollouts.collect(self._plan.demonstrations))
-            self._say(f"demonstrations: {_solved(columns)} of {self._plan.demonstrations} episodes solved")
-            return inputs_of(columns), columns["action"].copy()
-
-    def _improve(self, method: str, clone: Learner, seen: np.ndarray, advised: np.ndarray) -> Summary:
-        plan, learner = self._plan, clone.copy()
-        with self._rollouts(_STUDENT, ("logprob", "value")) as rollouts, RemoteAgent(_TEACHER) as teacher:
-            version = self._weights.push(learner.state())
-            for iteration in range(1, plan.iterations + 1):
-                rollouts.version = version
-                columns = arrays(rollouts.collect(plan.episodes))
-                if method == "rpd":
-                    seen = np.concatenate([seen, inputs_of(columns)])
-                    advised = np.concatenate([advised, advice(teacher, columns)])
-                    learner.improve(columns, plan.steps, (seen, advised))
-                else:
-                    learner.improve(columns, plan.steps)
-                version = self._weights.push(learner.state())
-                rate = _solved(columns) / plan.episodes
-                self._say(
-                    f"{method} {iteration} of {plan.iterations}: {rate:.0%} of its {plan.episodes} episodes solved"
-                )
-                if 2 * iteration == plan.iterations:
-                    self._evaluate(method, version)
-        return self._evaluate(method, version)
-
-    def _evaluate(self, method: str, version: int) -> Summary:
+    def _evaluate(self, method: Method, version: int) -> Summary:
+        mine = self._plan
         suite = SuiteConfig(
-            envs=[ENV],
-            env_options=ENV_OPTIONS,
-            seeds=[_HELD_OUT],
-            episodes=self._plan.held_out,
-            num_envs=self._plan.num_envs,
+            envs=[ENV], env_options=ENV_OPTIONS, seeds=[_HELD_OUT], episodes=mine.held_out, num_envs=mine.num_envs
         )
         plan = EvalConfig(
             policies=[PolicyConfig(name=method)],
             suites=[suite],
-            workers=self._plan.workers,
-            out=self._plan.out,
+            workers=mine.workers,
+            out=mine.out,
             resume=True,
+            track=mine.track,
+            tracking=mine.tracking,
         )
-        summary = TrainingEvaluation(_STUDENT, plan).play(version)
-        newest = summary.totals[-1]
-        rate = f"{newest.success_once.rate:.0%}"
-        self._say(f"{newest.contender}: {rate} of the {self._plan.held_out} held-out episodes solved")
+        summary = TrainingEvaluation(_url(method), plan).play(version)
+        [newest] = [total for total in summary.totals if total.contender == f"{method}@{version}"]
+        self._progress.say(
+            f"{newest.contender}: {newest.success_once.rate:.1%} of {mine.held_out} held-out episodes solved"
+        )
         return summary
 
 
-def _solved(columns: dict[str, np.ndarray]) -> int:
+def _url(app: str) -> str:
+    return f"serve://{app}"
+
+
+def _solved(columns: Mapping[str, np.ndarray]) -> int:
     """Return the number of episodes in which the task was solved at some step."""
     return len(np.unique(columns["episode"][columns["success"]]))

@@ -36,6 +36,7 @@ logger = logging.getLogger(__name__)
 PATH = "/v1/weights"
 _SCOPE = "weights"
 _POLICY_VIOLATION = 1008  # a WebSocket close code
+_DIGITS = 20  # most of a version's number
 _TRUTH = {"true": True, "false": False}
 
 
@@ -162,8 +163,14 @@ def _options(query: Mapping[str, str]) -> PushOptions:
     stated: dict[str, Any] = {}
     for name, value in query.items():
         if name not in {field.name for field in fields(PushOptions)}:
-            raise InvalidInput(f"weights: got the option {name[:40]!r}, want mode, partial, allow_same or pin")
-        if name != "mode" and value not in _TRUTH:
-            raise InvalidInput(f"weights: {name}: got {value[:40]!r}, want true or false")
-        stated[name] = value if name == "mode" else _TRUTH[value]
+            raise InvalidInput(f"weights: got the option {name[:40]!r}, want mode, partial, allow_same, pin or version")
+        if name == "mode":
+            stated[name] = value
+        elif name == "version" and value.isdecimal() and len(value) <= _DIGITS:
+            stated[name] = int(value)
+        elif name != "version" and value in _TRUTH:
+            stated[name] = _TRUTH[value]
+        else:
+            want = "a number" if name == "version" else "true or false"
+            raise InvalidInput(f"weights: {name}: got {value[:40]!r}, want {want}")
     return PushOptions(**stated)

@@ -14,7 +14,7 @@ import time
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
 from typing import Any, Protocol, TypeVar
 
-from vlagents_ray.errors import InvalidWeights, PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import InvalidInput, InvalidWeights, PolicyUnavailable, VLAgentsError
 from vlagents_ray.serve.scaling.held_sessions import PeerEnded, PeerUnreachable
 from vlagents_ray.serve.weights.updates import HeldVersion, NewestVersion, PushOptions, PushResult, WeightUpdates
 
@@ -118,6 +118,7 @@ class WeightPusher:
 
         Raises:
             VLAgentsError: A replica refused the version. None acts with it.
+            InvalidInput: The number of the version is not above that of the newest one.
             PolicyUnavailable: A replica cannot be reached. None acts with the version.
         """
         begun = time.perf_counter()
@@ -125,7 +126,10 @@ class WeightPusher:
             newest = {self._own: await self._own.newest_weights(), **await self._loaded(await self._others())}
             if len({one.model for one in newest.values()}) > 1:
                 raise PolicyUnavailable("weights: the replicas are changing their checkpoint; push again in a while")
-            number = max(one.number for one in newest.values()) + 1
+            last = max(one.number for one in newest.values())
+            number = last + 1 if options.version is None else options.version
+            if number <= last:
+                raise InvalidInput(f"version: got {number}, want one above {last}, the newest that acts")
             staged: dict[WeightsReplica, str] = {}
 
             async def stage(replica: WeightsReplica) -> None:

@@ -15,6 +15,7 @@ from vlagents_ray.weights.safetensors import ValueSpec
 
 OPTION = "weights"  # of a reset
 _COLLECTED = 1000  # most durations of pushes that wait to be collected
+_LARGEST = 2**53 - 1  # number of a version, which JSON carries exactly
 _FOLLOW, _PINNED = "follow", "pinned"
 
 
@@ -26,8 +27,11 @@ class PushOptions:
     partial: bool = False  # whether names may be missing, whose values stay
     allow_same: bool = False  # whether all values may equal those of the newest version
     pin: bool = False  # whether sessions that do not follow also get it, at their next reset
+    version: int | None = None  # its number, such as the step of training; None: the newest one's + 1
 
     def __post_init__(self) -> None:
+        if self.version is not None and not 1 <= self.version <= _LARGEST:
+            raise InvalidInput(f"version: got {self.version}, want a number in [1, {_LARGEST}]")
         if self.mode not in get_args(PushMode):
             raise InvalidInput(f"mode: got {self.mode!r}, want one of {list(get_args(PushMode))}")
 
