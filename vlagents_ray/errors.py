@@ -32,7 +32,8 @@
     ├── ConfigError (also ValueError)       a setting is unknown, missing or contradictory
     │   ├── UnknownPolicy
     │   ├── UnknownWrapper
-    │   └── UnknownEnv
+    │   ├── UnknownEnv
+    │   └── WeightsLost                     the policy acts with other weights than those that were pushed
     ├── EnvFailed                           a simulator failed: infrastructure, never the policy
     ├── StorageFailed                       results cannot be written: a full disk, no permission
     ├── ClusterLost                         the head of the Ray cluster no longer answers
@@ -252,6 +253,12 @@ class ConfigError(VLAgentsError, ValueError):
     """A setting is unknown, missing or contradictory."""
 
     code = "config"
+
+
+class WeightsLost(ConfigError):
+    """The policy acts with other weights than a learner says: it was restarted since the push, or not pushed to."""
+
+    code = "weights_lost"
 
 
 class UnknownPolicy(ConfigError):

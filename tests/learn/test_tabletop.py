@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -203,21 +205,33 @@ SMALL |= {"evaluate_every": 1, "held_out": 6, "num_envs": 4}
 @pytest.mark.server
 @pytest.mark.torch
 @pytest.mark.slow
-def test_a_run_that_is_killed_goes_on_to_the_table_of_one_that_was_not(tmp_path: Path) -> None:
+def test_whatever_is_killed_the_table_is_that_of_a_run_where_nothing_was(tmp_path: Path) -> None:
+    def until_rpd_learns(run: subprocess.Popen[str], name: str) -> None:
+        wait_for(lambda: (tmp_path / name / "checkpoints" / "rpd.pt").exists() or run.poll() is not None)
+
     plan = tmp_path / "small.yaml"
     plan.write_text(json.dumps(SMALL))
     with ray_folder() as folder:
         whole = learn(folder, plan, "--out", str(tmp_path / "whole"))
         killed = start(folder, plan, "--out", str(tmp_path / "killed"))
-        wait_for(lambda: (tmp_path / "killed" / "checkpoints" / "rpd.pt").exists() or killed.poll() is not None)
+        until_rpd_learns(killed, "killed")
         killed.kill()
         killed.communicate()
         end(folder)
         resumed = learn(folder, plan, "--out", str(tmp_path / "killed"), "--resume")
+        bereft = start(folder, plan, "--out", str(tmp_path / "bereft"))
+        until_rpd_learns(bereft, "bereft")
+        for pid in [*processes(folder, "ray::ServeReplica:rpd"), *processes(folder, "ray::Rollout")]:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        printed, _ = bereft.communicate(timeout=600)
+    assert bereft.returncode == 0, printed
+    assert "they are pushed again" in printed
     assert "demonstrations: 8 of 8 episodes solved" in whole
     assert "demonstrations" not in resumed
-    tables = [table(Results.load(tmp_path / name)) for name in ("whole", "killed")]
-    assert tables[0] == tables[1]
+    tables = [table(Results.load(tmp_path / name)) for name in ("whole", "killed", "bereft")]
+    assert tables[1] == tables[0]
+    assert tables[2] == tables[0]
     assert list(tables[0]) == ["bc@300", "rpd@350", "rpd@400", "ppo@350", "ppo@400"]
     assert (tmp_path / "killed" / "report.html").is_file()
 

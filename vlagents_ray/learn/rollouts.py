@@ -12,7 +12,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from vlagents_ray.errors import ConfigError, PolicyFailed, from_code
+from vlagents_ray.errors import ConfigError, PolicyFailed, WeightsLost, from_code
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.plan.cases import cells, require_envs
 from vlagents_ray.evaluate.plan.config import EvalConfig
@@ -197,6 +197,7 @@ class Rollouts:
 
         Raises:
             ConfigError: The number is not that of whole groups, or the envs have different columns.
+            WeightsLost: The policy acts with older weights than `version`, after a restart: push them, and call again.
             VLAgentsError: The last infrastructure error, after `abort_after` lost episodes in a row.
         """
         if episodes < 1 or episodes % self._groups:
@@ -300,9 +301,10 @@ class Rollouts:
         versions = transitions.column("version").to_numpy()
         episode.oldest, self._version = int(versions.min()), max(self._version, int(versions.max()))
         if self._max_lag is not None and episode.pushed - episode.oldest > self._max_lag:  # so it would be forever
-            raise ConfigError(
+            raise WeightsLost(
                 f"version: {job.key} began when rollouts.version had been set to {episode.pushed}, but its acts name "
-                f"{episode.oldest}; set it to what a push returned, after it has (a policy that names none has 0)"
+                f"{episode.oldest}; set it to what a push returned, after it has (a policy that names none has 0), and "
+                f"push again if a replica was restarted since then"
             )
 
     def _replay_stale(self) -> None:

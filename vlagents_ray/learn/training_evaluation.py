@@ -10,7 +10,7 @@ from typing import Any
 
 from vlagents_ray.client import RemoteAgent
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import ConfigError
+from vlagents_ray.errors import ConfigError, WeightsLost
 from vlagents_ray.evaluate.plan.cases import require_envs
 from vlagents_ray.evaluate.plan.config import EvalConfig, PushedWeights
 from vlagents_ray.evaluate.report.progress import Progress
@@ -89,8 +89,8 @@ class TrainingEvaluation:
             The summary of all versions so far, of which the newest is the last of `totals`.
 
         Raises:
-            ConfigError: The policy acts with another version, or the results of this version are of other weights, as
-                after a restart of the training.
+            WeightsLost: The policy acts with another version: push this one, and call again.
+            ConfigError: The results of this version are of other weights, as after a restart of the training.
             NotTrainable: The agent names no parameters to train.
             VLAgentsError: As for `evaluate`.
         """
@@ -115,7 +115,7 @@ class TrainingEvaluation:
         with RemoteAgent(url, transport=policy.transport, connect_timeout_s=self._plan.connect_timeout_s) as remote:
             newest = (remote.metadata.get("policy_version") or {}).get("newest") or {}
         if newest.get("version") != version:
-            raise ConfigError(
+            raise WeightsLost(
                 f"version: got {version}, but the newest that {url} acts with is {newest.get('version')}; want what "
                 f"the last push returned, once `acknowledged` counts all replicas"
             )

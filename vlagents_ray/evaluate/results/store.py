@@ -17,7 +17,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from vlagents_ray.errors import ConfigError
+from vlagents_ray.errors import ConfigError, WeightsLost
 from vlagents_ray.evaluate.artifacts.storage import storing
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, WorkerInfo
@@ -136,7 +136,7 @@ class Store:
             return
         acted = (result.first_policy_version, result.policy_version, result.policy_fingerprint)
         if acted != (want.version, want.version, want.fingerprint):
-            raise ConfigError(
+            raise WeightsLost(
                 f"policy: {result.key} was played by versions {acted[0]} to {acted[1]} of the weights ({acted[2]}), "
                 f"want {want.version} ({want.fingerprint}); push nothing while a version is evaluated, and let the "
                 f"policy's `options` ask for no other"

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 
 from vlagents_ray.client import RemoteAgent
-from vlagents_ray.errors import ConfigError
+from vlagents_ray.errors import ConfigError, WeightsLost
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig
 from vlagents_ray.evaluate.artifacts.storage import whole
 from vlagents_ray.evaluate.results.summary import Summary
@@ -26,7 +26,10 @@ from vlagents_ray.serve.launch.server import running_server
 ENV = "tabletop/lift"
 ENV_OPTIONS: dict[str, Any] = {"width": 96, "height": 96, "max_steps": 30}
 _TEACHER = "teacher"
+_RESTARTS = 5  # of a replica, in one iteration, after which the run ends
 _HELD_OUT, _TRAINING = 10_000_000, 20_000_000  # first seeds: no episode is both played for training and evaluated
+
+Played = TypeVar("Played")
 
 
 def learn_tabletop(plan: LearnPlan, progress: LearnBar) -> Summary:
@@ -122,20 +125,38 @@ class _LearnRun:
         ):
             for iteration in range(state["iteration"], last + 1):
                 self._progress.at(done + iteration, len(plan.methods) * plan.iterations)
-                rollouts.version = version = weights.push(learner.state(), version=learner.steps)
                 if iteration == last or (iteration and iteration % plan.evaluate_every == 0):
-                    summary = self._evaluate(method, version)
+                    summary = self._played(weights, learner, lambda: self._evaluate(method, learner.steps))
                 if iteration == last:
                     break
-                columns = arrays(rollouts.collect(plan.episodes))
-                rate = _solved(columns) / plan.episodes
-                self._progress.say(f"{method}@{version}: {rate:.0%} of {plan.episodes} episodes of the training solved")
+                columns = arrays(self._played(weights, learner, lambda: self._collect(rollouts, learner.steps)))
+                self._progress.say(
+                    f"{method}@{learner.steps}: {_solved(columns)} of {plan.episodes} episodes of the training solved"
+                )
                 if method == "rpd":
                     learner.add_advice(inputs_of(columns), advice(teacher, columns))
                 learner.improve(columns, plan.steps, advised=method == "rpd")
                 state = {"iteration": iteration + 1, "position": rollouts.position, "learner": learner.checkpoint()}
                 self._checkpoints.save(method, state)
         return summary
+
+    def _played(self, weights: Publisher, learner: Learner, play: Callable[[], Played]) -> Played:
+        """Play with the learner's weights; they are pushed again if the replica that had them was restarted."""
+        restarts = 0
+        while True:
+            if not weights.acknowledged(learner.steps):
+                weights.push(learner.state(), version=learner.steps)
+            try:
+                return play()
+            except WeightsLost as error:
+                restarts += 1
+                if restarts > _RESTARTS:
+                    raise
+                self._progress.say(f"{error}; they are pushed again")
+
+    def _collect(self, rollouts: Rollouts, version: int) -> Any:
+        rollouts.version = version
+        return rollouts.collect(self._plan.episodes)
 
     def _rollouts(self, policy: str, want: Sequence[str] = (), first: int = 0) -> Rollouts:
         return Rollouts(
