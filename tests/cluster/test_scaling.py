@@ -66,7 +66,7 @@ def test_two_drivers_on_one_cluster_play_a_part_each_and_their_results_are_merge
         serving = [sys.executable, "-m", "benchmarks.scaling_driver"]
         settings["address"] = cluster.address
         with LineProcess("server", cluster.head.command([*serving, json.dumps(settings)]), our_environment()) as server:
-            server.read(120)
+            server.read(300)
             parts = [tmp_path / seed for seed in ("0", "6")]
             drivers = [
                 host.start([sys.executable, "-c", DRIVER, SLEEPING_ENV, part.name, str(part)])
