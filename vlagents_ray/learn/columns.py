@@ -29,9 +29,9 @@ The log-probabilities of a chunk's rows add up to that of the chunk. If the poli
 that of the first row, and the others have NaN, as they have in `value` and `entropy`.
 
 With `want=["replay"]` there is a column for each name in `act.info["behaviour"]["replay"]`, such as `replay.tokens`,
-(A, H, D) int64, `replay.chain`, (A, K + 1, H, M) float32, and `replay.noise_level`, (A,). Values are of whole chunks, also
-where only some rows of a chunk are executed; their dtypes are the policy's. In Arrow each is in the first row of its
-answer's chunk. `answers` returns which answer each step is of.
+(A, H, D) int64, `replay.chain`, (A, K + 1, H, M) float32, and `replay.noise_level`, (A,). Values are of whole chunks,
+also where only some rows of a chunk are executed; their dtypes are the policy's. In Arrow each is in the first row of
+its answer's chunk. `answers` returns which answer each step is of.
 """
 
 from __future__ import annotations

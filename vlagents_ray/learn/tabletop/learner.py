@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -12,6 +12,9 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.learn.tabletop.colours import named_colour
 from vlagents_ray.learn.tabletop.student import inputs, make_network
 from vlagents_ray.registry import require
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 DISCOUNT, TRACE = 0.98, 0.95  # gamma and lambda of generalised advantage estimation (arXiv 1506.02438)
 _CLIP = 0.2  # of PPO's ratio (arXiv 1707.06347)
@@ -85,13 +88,15 @@ def advantages(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarra
     return found, found + columns["value"]
 
 
-class Learner:
-    """Trains the student's network."""
+class NetworkLearner:
+    """Trains the network of a student by behaviour cloning; reinforcement is that of the classes below it."""
+
+    make_network = staticmethod(make_network)
 
     def __init__(self, seed: int = 0) -> None:
         """Make a new network."""
         self._torch, self._seed = require("torch"), seed
-        self.network = make_network(seed)
+        self.network = self.make_network(seed)
         self._rng = np.random.default_rng(seed)
         look = list(self.network.look.parameters())
         others = [one for name, one in self.network.named_parameters() if not name.startswith("look.")]
@@ -102,7 +107,7 @@ class Learner:
         return dict(self.network.state_dict())
 
     def imitate(self, seen: np.ndarray, actions: np.ndarray, steps: int) -> float:
-        """Take steps towards actions, by the mean squared error; return that of the last step.
+        """Take steps towards actions; return the error of the last step.
 
         Args:
             seen: Inputs of the network, (T, INPUTS).
@@ -111,10 +116,40 @@ class Learner:
         """
         error = self._torch.zeros(())
         for rows in self._batches(len(seen), steps):
-            mean, _ = self.network(self._tensor(seen, rows))
-            error = self._error(mean, actions, rows)
+            error = self._error(seen, actions, rows)
             self._step(error)
         return float(error.detach())
+
+    def copy(self) -> Self:
+        """Return another learner with the same weights, and an optimizer that begins anew."""
+        other = type(self)(self._seed)
+        other.network.load_state_dict(self.network.state_dict())
+        return other
+
+    def _error(self, seen: np.ndarray, actions: np.ndarray, rows: np.ndarray) -> Any:
+        """Return the error of the network's actions in some rows: the mean squared one."""
+        mean, _ = self.network(self._tensor(seen, rows))
+        return ((mean - self._tensor(actions, rows)) ** 2).mean()
+
+    def _clipped(self, ratio: Any, gain: Any) -> Any:
+        """Return the clipped objective of PPO for ratios of probabilities, and advantages."""
+        return self._torch.minimum(ratio * gain, ratio.clamp(1 - _CLIP, 1 + _CLIP) * gain).mean()
+
+    def _batches(self, number: int, steps: int) -> Sequence[np.ndarray]:
+        return [self._rng.integers(number, size=min(_BATCH, number)) for _ in range(steps)]
+
+    def _tensor(self, values: np.ndarray, rows: np.ndarray) -> Any:
+        return self._torch.from_numpy(np.asarray(values, np.float32)[rows])
+
+    def _step(self, loss: Any) -> None:
+        self._optimizer.zero_grad()
+        loss.backward()
+        self._torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
+        self._optimizer.step()
+
+
+class Learner(NetworkLearner):
+    """Trains the student's network."""
 
     def improve(
         self, columns: Mapping[str, np.ndarray], steps: int, advised: tuple[np.ndarray, np.ndarray] | None = None
@@ -136,31 +171,7 @@ class Learner:
             normal = torch.distributions.Normal(mean, self.network.log_std.exp())
             logprob = normal.log_prob(self._tensor(columns["action"], rows)).sum(-1)
             ratio = (logprob - self._tensor(columns["logprob"], rows)).exp()
-            better = self._tensor(gain, rows)
-            objective = torch.minimum(ratio * better, ratio.clamp(1 - _CLIP, 1 + _CLIP) * better).mean()
-            loss = ((value - self._tensor(targets, rows)) ** 2).mean() - objective
+            loss = ((value - self._tensor(targets, rows)) ** 2).mean() - self._clipped(ratio, self._tensor(gain, rows))
             if advised:
-                mean, _ = self.network(self._tensor(advised[0], taught[step]))
-                loss = _PPO * loss + self._error(mean, advised[1], taught[step])
+                loss = _PPO * loss + self._error(*advised, taught[step])
             self._step(loss)
-
-    def copy(self) -> Learner:
-        """Return another learner with the same weights, and an optimizer that begins anew."""
-        other = Learner(self._seed)
-        other.network.load_state_dict(self.network.state_dict())
-        return other
-
-    def _error(self, mean: Any, actions: np.ndarray, rows: np.ndarray) -> Any:
-        return ((mean - self._tensor(actions, rows)) ** 2).mean()
-
-    def _batches(self, number: int, steps: int) -> Sequence[np.ndarray]:
-        return [self._rng.integers(number, size=min(_BATCH, number)) for _ in range(steps)]
-
-    def _tensor(self, values: np.ndarray, rows: np.ndarray) -> Any:
-        return self._torch.from_numpy(np.asarray(values, np.float32)[rows])
-
-    def _step(self, loss: Any) -> None:
-        self._optimizer.zero_grad()
-        loss.backward()
-        self._torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
-        self._optimizer.step()
