@@ -115,7 +115,7 @@ def test_a_log_probability_is_that_of_the_softmax_which_the_tokens_are_drawn_fro
         np.testing.assert_allclose(said["logprob"][0], softmax.log_prob(torch.from_numpy(drawn)), rtol=1e-4)
         assert said["entropy"] == pytest.approx(float(softmax.entropy().sum()), rel=1e-4)
     shares = np.stack([np.bincount(column, minlength=TOKENS) / len(acts) for column in tokens.T])
-    np.testing.assert_allclose(shares, softmax.probs.numpy(), atol=0.04)  # 5 standard deviations of a share of 0.05
+    np.testing.assert_allclose(shares, softmax.probs.numpy(), atol=0.04)  # 4 standard deviations of a share of 0.1
     np.testing.assert_array_equal(student.act(obs).action, actions_of(softmax.probs.argmax(-1).numpy()))
 
 

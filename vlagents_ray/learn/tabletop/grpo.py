@@ -11,6 +11,7 @@ from vlagents_ray.learn.tabletop.learner import NetworkLearner, inputs_of
 from vlagents_ray.learn.tabletop.token_student import make_token_network, tokens_of
 
 _EPSILON = 1e-6  # beside the standard deviation of a group
+_RATE = 1e-4  # learning rate of GRPO: what few episodes say is mostly noise, which larger steps would learn
 
 
 def group_advantages(columns: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -49,6 +50,8 @@ class TokenLearner(NetworkLearner):
         kept = np.flatnonzero(gain)
         if not len(kept):
             return
+        for group in self._optimizer.param_groups:
+            group["lr"] = _RATE
         seen, tokens = inputs_of(columns), columns["replay.tokens"][:, 0]
         for picked in self._batches(len(kept), steps):
             rows = kept[picked]

@@ -8,7 +8,7 @@ import numpy as np
 
 from vlagents_ray.learn.tabletop.student import ACTION, Student, head, looking, seeded
 
-TOKENS = 21  # bins of each number of an action, whose middles are from -1 to 1
+TOKENS = 11  # bins of each number of an action, whose middles are from -1 to 1
 
 
 def tokens_of(actions: np.ndarray) -> np.ndarray:
