@@ -108,6 +108,23 @@ def test_collect_plays_so_many_and_no_others(pool: type[Workers]) -> None:
         assert list(dict.fromkeys(arrays(found.collect(2))["key"])) == planned(7)[5:]
 
 
+class Replayed(ToZero):
+    """States tokens to compute its log-probabilities again from."""
+
+    def act(self, obs: Obs) -> Act:
+        act = super().act(obs)
+        if obs.info.get("want") == ["replay"]:
+            act.info["behaviour"] = {"replay": {"tokens": np.rint(100 * act.rows()).astype(np.int64)}}
+        return act
+
+
+def test_the_replay_is_a_column() -> None:
+    with Rollouts(LINE, Replayed, workers=2, want=["replay"]) as found:
+        got = arrays(found.collect(4))
+    assert got["replay.tokens"].shape == (40, 1, 1)
+    np.testing.assert_array_equal(got["replay.tokens"][:, 0], np.rint(100 * got["action"]))
+
+
 def test_a_group_begins_in_one_state_and_differs_in_the_seed_of_the_policy() -> None:
     with Rollouts(LINE, ToZero, groups=3, workers=2, seed=10) as found:
         got = [arrays(batch) for batch in itertools.islice(found, 6)]

@@ -24,7 +24,7 @@ from vlagents_ray.evaluate import Results
 from vlagents_ray.evaluate.results.summary import pushed_of
 from vlagents_ray.interface import BEHAVIOUR, WANT
 from vlagents_ray.learn.tabletop.colours import named_colour, puck_position
-from vlagents_ray.learn.tabletop.learner import Learner, advantages, advice, inputs_of
+from vlagents_ray.learn.tabletop.learner import RPDLearner, advantages, advice, inputs_of
 from vlagents_ray.learn.tabletop.plan import LearnPlan
 from vlagents_ray.learn.tabletop.run import ENV_OPTIONS, RunCheckpoints
 from vlagents_ray.learn.tabletop.student import Student
@@ -156,7 +156,7 @@ def test_the_learner_imitates_and_the_advised_one_stays_near_the_advice() -> Non
     assert after < before / 5
     assert learner.steps == 301
     unchanged = learner.checkpoint()["network"]["policy.0.weight"].clone()
-    learner.improve(rows, 50, advised=True)
+    learner.improve(rows, 50)
     assert learner.imitate(1) < before / 5
     assert learner.state()["policy.0.weight"].ne(unchanged).any()
 
@@ -168,20 +168,20 @@ def test_a_learner_goes_on_from_a_checkpoint_to_the_same_bit(tmp_path: Path) -> 
     learner, rows = taught()
     learner.imitate(20)
     torch.save(learner.checkpoint(), tmp_path / "state")
-    other = Learner(seed=0)
+    other = RPDLearner(seed=0)
     other.restore(torch.load(tmp_path / "state", weights_only=True))
     for one in (learner, other):
-        one.improve(rows, 20, advised=True)
+        one.improve(rows, 20)
         one.imitate(5)
     for name, value in learner.state().items():
         assert torch.equal(value, other.state()[name]), name
 
 
-def taught() -> tuple[Learner, dict[str, Any]]:
+def taught() -> tuple[RPDLearner, dict[str, Any]]:
     """A learner with the demonstrations of eight episodes, and transitions as if they were the student's own."""
     teacher = Teacher()
     found = columns([played(seed, teacher.act, teacher) for seed in range(8)])
-    learner = Learner()
+    learner = RPDLearner()
     learner.add_advice(inputs_of(found), found["action"])
     rows = np.arange(len(found["t"]))
     own = {"reward": rows % 2, "value": rows % 3, "logprob": -1 - rows % 2}

@@ -3,6 +3,7 @@ from __future__ import annotations
 import copy
 import functools
 import pickle
+import re
 import warnings
 from typing import Any
 
@@ -21,7 +22,7 @@ from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job, plan
 from vlagents_ray.evaluate.workers.rollout import Report, Rollout
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.learn import transitions as recording
-from vlagents_ray.learn.columns import arrays
+from vlagents_ray.learn.columns import answers, arrays
 from vlagents_ray.learn.transitions import TransitionRecorder
 
 
@@ -167,6 +168,61 @@ def test_each_act_is_asked_for_what_is_wanted_and_says_its_version() -> None:
 def test_log_probabilities_add_up_to_that_of_the_chunk(stated: Any, rows: list[float]) -> None:
     _, got = transitions(Stating(chunk=2, stated={"logprob": stated}), want=["logprob"])
     np.testing.assert_array_equal(got["logprob"], np.tile(np.float32(rows), 5))
+
+
+class Replayable(Stating):
+    """Has the number of the act in the tokens and the chain of its replay; `later` is the replay of the second act."""
+
+    def __init__(self, *, chunk: int, later: Any = None) -> None:
+        super().__init__(chunk=chunk)
+        self._later = later
+
+    def act(self, obs: Obs) -> Act:
+        number, act = self.acts, super().act(obs)
+        rows = len(act.rows())
+        chain = np.full((3, rows, 2), number / 4, np.float32)
+        replay = {"tokens": np.full((rows, 1), number), "chain": chain, "noise_level": 0.5}
+        act.info["behaviour"] = {"replay": self._later if self._later is not None and number == 1 else replay}
+        return act
+
+
+def test_the_replay_is_of_the_whole_chunk_once_for_each_answer() -> None:
+    agent = Replayable(chunk=5)
+    batch, got = transitions(agent, execute=3, want=["replay"])
+    assert agent.asked == [["replay"]] * 4
+    numbers = np.arange(4)
+    np.testing.assert_array_equal(got["replay.tokens"], np.broadcast_to(numbers[:, None, None], (4, 5, 1)))
+    np.testing.assert_array_equal(got["replay.chain"], np.broadcast_to(numbers[:, None, None, None] / 4, (4, 3, 5, 2)))
+    np.testing.assert_array_equal(got["replay.noise_level"], [0.5] * 4)
+    assert [got[f"replay.{name}"].dtype for name in ("tokens", "chain", "noise_level")] == [np.int64, np.float32, float]
+    stated = batch.column("replay.noise_level").to_pylist()
+    assert stated == [[0.5], [], [], [0.5], [], [], [0.5], [], [], [0.5]], "in the first row of each answer"
+    assert all(np.shares_memory(got[name], arrays(batch)[name]) for name in got if name.startswith("replay."))
+
+
+@pytest.mark.parametrize("chunk", [1, 3, 10])  # one answer a step, the last one cut off, one answer an episode
+def test_each_step_of_several_episodes_finds_its_answer(chunk: int) -> None:
+    keys = [EpisodeKey(LINE, seed, seed, "x") for seed in (1, 2)]
+    batches = [transitions(Replayable(chunk=chunk), key=key, want=["replay"])[0] for key in keys]
+    got = arrays(pa.Table.from_batches(batches))
+    np.testing.assert_array_equal(got["replay.tokens"][answers(got), 0, 0], got["act"])
+    assert len(got["replay.tokens"]) == 2 * -(-10 // chunk)
+
+
+@pytest.mark.parametrize(
+    ("later", "message"),
+    [
+        ({"tokens": np.zeros((5, 2), np.int64)}, r"got \{'tokens': 'int64 \(5, 2\)'\}, want \{'chain': "),
+        ({"tokens": "abc"}, "got {'tokens': 'abc'}, want numbers and arrays of numbers by name"),
+        ([1, 2], r"got \[1, 2\], want numbers and arrays of numbers by name"),
+        ({}, "got {}, want numbers and arrays of numbers by name"),
+    ],
+)
+def test_a_replay_that_changes_its_shape_or_has_no_names_is_refused(later: Any, message: str) -> None:
+    failure = played(Replayable(chunk=5, later=later), want=["replay"]).failure
+    assert failure is not None
+    assert (failure.cause, failure.code) == ("user", "config")
+    assert re.search(message, failure.message), failure.message
 
 
 def test_a_policy_that_does_not_return_what_is_wanted_is_a_mistake_in_the_settings() -> None:

@@ -10,7 +10,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from vlagents_ray.learn.columns import arrays
+    from vlagents_ray.learn.columns import answers, arrays
     from vlagents_ray.learn.publisher import Publisher
     from vlagents_ray.learn.rollouts import Rollouts, RolloutStats
     from vlagents_ray.learn.training_evaluation import TrainingEvaluation
@@ -22,6 +22,7 @@ _LATE = {
     "RolloutStats": "rollouts",
     "Rollouts": "rollouts",
     "TrainingEvaluation": "training_evaluation",
+    "answers": "columns",
     "arrays": "columns",
     "as_vector_env": "vector_env",
 }
@@ -32,6 +33,7 @@ __all__ = [
     "RolloutStats",
     "Rollouts",
     "TrainingEvaluation",
+    "answers",
     "arrays",
     "as_vector_env",
 ]

@@ -21,15 +21,22 @@ an episode are in order; a `pyarrow.RecordBatch` of rollouts holds one whole epi
 | `final.COLUMN` | (1, ...) | the observation after the last step, for each column of one; a row an episode |
 | `logprob` | (T,) float32 | log-probability of the row, nats, if it is wanted; see below |
 | `value`, `entropy` | (T,) float32 | of the policy at this observation, if wanted; NaN where it was not asked |
+| `replay.NAME` | (A, ...) | of the policy's A answers, to compute log-probabilities again, if wanted; see below |
 | `version` | (T,) int64 | of the weights that chose the action; 0 if the policy names none |
 | `source` | (T,) str | who chose the action: "policy", or as `act.info["source"]` says ("human", "expert") |
 
 The log-probabilities of a chunk's rows add up to that of the chunk. If the policy states one for the whole chunk, it is
 that of the first row, and the others have NaN, as they have in `value` and `entropy`.
+
+With `want=["replay"]` there is a column for each name in `act.info["behaviour"]["replay"]`, such as `replay.tokens`,
+(A, H, D) int64, `replay.chain`, (A, K + 1, H, M) float32, and `replay.noise_level`, (A,). Values are of whole chunks,
+also where only some rows of a chunk are executed; their dtypes are the policy's. In Arrow each is in the first row of
+its answer's chunk. `answers` returns which answer each step is of.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -38,6 +45,7 @@ from vlagents_ray.registry import require
 
 EXTRA = "learn"  # of the package, with pyarrow and gymnasium
 FINAL = "final."
+REPLAY = "replay"
 
 
 def arrays(transitions: Any) -> dict[str, np.ndarray]:
@@ -56,6 +64,16 @@ def arrays(transitions: Any) -> dict[str, np.ndarray]:
     if isinstance(transitions, pa.Table):
         transitions = transitions.combine_chunks().to_batches()[0]
     return {name: _view(pa, transitions.column(name)) for name in transitions.schema.names}
+
+
+def answers(columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return which of the policy's answers each step is of, (T,) int64 from 0: its row of the columns `replay.NAME`.
+
+    Args:
+        columns: The columns of whole episodes, with `t` and `act`.
+    """
+    begun: np.ndarray = (columns["t"] == 0) | (np.diff(columns["act"], prepend=-1) != 0)
+    return np.cumsum(begun) - 1
 
 
 def _view(pa: Any, column: Any) -> np.ndarray:
@@ -91,8 +109,7 @@ def words(pa: Any, texts: list[str]) -> Any:
     return pa.array(texts, pa.string()).dictionary_encode()
 
 
-def at_the_end(pa: Any, value: np.ndarray, rows: int) -> Any:
-    """Return a column of lists: (1, ...) `value` in the last row, nothing in the others."""
-    offsets = np.zeros(rows + 1, np.int32)
-    offsets[-1] = 1
-    return pa.ListArray.from_arrays(pa.array(offsets), tensors(pa, value))
+def at_rows(pa: Any, values: np.ndarray, rows: np.ndarray) -> Any:
+    """Return a column of lists: the next of (N, ...) `values` where `rows`, (T,) bool, is true, nothing elsewhere."""
+    offsets = np.append(0, np.cumsum(rows)).astype(np.int32)
+    return pa.ListArray.from_arrays(pa.array(offsets), tensors(pa, values))

@@ -99,7 +99,7 @@ class Rollouts:
             workers: The number of workers.
             num_envs: Environments that one worker steps together, with one request to the policy for all of them.
             groups: Episodes from one start state, one after another, that differ in the seed of the policy (GRPO).
-            want: What the policy is to return for each act: "logprob", "value", "entropy".
+            want: What the policy is to return for each act: "logprob", "value", "entropy", "replay".
             max_lag: Deliver no episode with an act of weights that are more than so many versions old; it is played
                 again. 0 is on-policy; None delivers all.
             seed: The seed of the first start state; state n has `seed` + n.

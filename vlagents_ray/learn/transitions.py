@@ -13,11 +13,10 @@ from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.episode.stats import version_of
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.interface import BEHAVIOUR, WANT, Act, Obs
-from vlagents_ray.learn.columns import EXTRA, FINAL, at_the_end, constant, tensors, words
+from vlagents_ray.learn.columns import EXTRA, FINAL, REPLAY, at_rows, constant, tensors, words
 from vlagents_ray.registry import require
 
-WANTED = ("logprob", "value", "entropy")  # columns that a policy fills
-
+WANTED = ("logprob", "value", "entropy", REPLAY)  # columns that a policy fills
 
 _FIRST_ROWS = 128  # memory that is not written to costs nothing
 
@@ -39,10 +38,12 @@ class TransitionRecorder(EpisodeRecorder):
         self.request_info: Mapping[str, Any] = {WANT: list(want)} if want else {}
         self._seen: dict[str, _Rows] = {}  # the columns of the observations
         self._rows: list[tuple[np.ndarray, float, bool, int, int, str]] = []  # action, reward, success, act, version …
-        self._wanted: dict[str, list[float]] = {name: [] for name in self._want}
+        self._wanted: dict[str, list[float]] = {name: [] for name in self._want if name != REPLAY}
         self._acts = 0
         self._version, self._source = 0, "policy"
         self._next: dict[str, list[float]] = {}  # what was wanted, for the next rows of the act
+        self._replay: dict[str, _Rows] = {}  # a row an act of which any was executed
+        self._next_replay: dict[str, np.ndarray] = {}  # until the first row of the act is executed
 
     @property
     def wants_images(self) -> bool:
@@ -72,13 +73,33 @@ class TransitionRecorder(EpisodeRecorder):
                 f"take a policy that returns it, or leave it out of `want`"
             )
         rows = len(act.rows())
-        self._next = {name: _by_row(stated[name], rows, name) for name in self._want}
+        self._next = {name: _by_row(stated[name], rows, name) for name in self._wanted}
+        if REPLAY in self._want:
+            self._next_replay = self._checked_replay(stated[REPLAY])
 
     def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
         row = (np.array(action, np.float32), reward, success, self._acts - 1, self._version, self._source)
         self._rows.append(row)
         for name, values in self._wanted.items():
             values.append(self._next[name].pop(0))
+        for name, value in self._next_replay.items():
+            self._replay[name].add(value)
+        self._next_replay = {}
+
+    def _checked_replay(self, stated: Any) -> dict[str, np.ndarray]:
+        """Return an act's replay by name; its shapes must be those of the first act."""
+        values = dict(sorted(stated.items())) if isinstance(stated, Mapping) else {}
+        values = {name: np.asarray(value) for name, value in values.items()}
+        if not values or any(value.dtype.kind not in "iuf" for value in values.values()):
+            raise ConfigError(
+                f"act.info[{BEHAVIOUR!r}][{REPLAY!r}]: got {stated!r}, want numbers and arrays of numbers by name"
+            )
+        if not self._replay:
+            self._replay = {name: _Rows(value, value.dtype) for name, value in values.items()}
+        got = {name: f"{value.dtype} {value.shape}" for name, value in values.items()}
+        if got != (want := {name: f"{rows.dtype} {rows.shape}" for name, rows in self._replay.items()}):
+            raise ConfigError(f"act.info[{BEHAVIOUR!r}][{REPLAY!r}]: got {got}, want {want} as in the first act")
+        return values
 
     def finish(self, result: EpisodeResult) -> Artifacts:
         """Return the transitions of a whole episode; none of one that an error of the policy ended."""
@@ -106,7 +127,9 @@ class TransitionRecorder(EpisodeRecorder):
         }
         columns = {"key": constant(pa, str(result.key), rows), "instruction": constant(pa, result.instruction, rows)}
         columns |= {name: tensors(pa, values) for name, values in numbers.items()}
-        columns |= {FINAL + name: at_the_end(pa, values[-1:], rows) for name, values in seen.items()}
+        columns |= {FINAL + name: at_rows(pa, values[-1:], last) for name, values in seen.items()}
+        begun = np.diff(acts, prepend=-1) != 0  # rows that are the first of their act
+        columns |= {f"{REPLAY}.{name}": at_rows(pa, values.all(), begun) for name, values in self._replay.items()}
         columns["source"] = words(pa, list(sources))
         return pa.RecordBatch.from_pydict(columns)
 
@@ -115,7 +138,7 @@ class _Rows:
     """Arrays of one shape, copied into an array that grows, so that none of them is copied twice."""
 
     def __init__(self, first: np.ndarray, dtype: Any) -> None:
-        self.shape = first.shape
+        self.shape, self.dtype = first.shape, dtype
         self._rows = np.empty((_FIRST_ROWS, *first.shape), dtype)
         self._number = 0
 

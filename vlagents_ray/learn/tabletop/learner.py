@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -85,16 +85,19 @@ def advantages(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarra
     return found, found + columns["value"]
 
 
-class Learner:
-    """Trains the student's network."""
+class NetworkLearner:
+    """Trains a network of a student: by behaviour cloning, and as its subclass improves the student's own episodes."""
+
+    want: tuple[str, ...]
+    """What the student states for `improve`, beside its actions."""
+    make_network: Callable[[int], Any]
 
     def __init__(self, seed: int = 0) -> None:
         """Make a new network."""
         self._torch, self._seed = require("torch"), seed
         self.steps = 0
         """The number of steps so far."""
-        self._rng = self._generator()
-        self.network = make_network(seed)
+        self.network = self.make_network(seed)
         look = list(self.network.look.parameters())
         others = [one for name, one in self.network.named_parameters() if not name.startswith("look.")]
         self._optimizer = self._torch.optim.Adam([{"params": look, "lr": _LOOK_RATE}, {"params": others, "lr": _RATE}])
@@ -123,7 +126,7 @@ class Learner:
         self._seen, self._advised = checkpoint["seen"].numpy(), checkpoint["advised"].numpy()
 
     def add_advice(self, seen: np.ndarray, actions: np.ndarray) -> None:
-        """Take what the teacher does, or would have done, as a part of all that `imitate` and `improve` learn from.
+        """Take what the teacher does, or would have done, as a part of all that is imitated.
 
         Args:
             seen: Inputs of the network, (T, INPUTS).
@@ -133,48 +136,38 @@ class Learner:
         self._advised = np.concatenate([self._advised, actions])
 
     def imitate(self, steps: int) -> float:
-        """Take steps towards the advice, by the mean squared error; return that of the last step."""
-        error = self._torch.zeros(())
-        self._rng = self._generator()
+        """Take steps towards the advice; return the error of the last step."""
+        error, rng = self._torch.zeros(()), self._generator()
         for _ in range(steps):
-            error = self._distance_to_advice()
+            error = self._distance_to_advice(rng)
             self._step(error)
         return float(error.detach())
 
-    def improve(self, columns: Mapping[str, np.ndarray], steps: int, *, advised: bool = False) -> None:
-        """Take steps of PPO on the transitions of the student's own episodes.
+    def improve(self, columns: Mapping[str, np.ndarray], steps: int) -> None:
+        """Take steps by the transitions of the student's own episodes.
 
         Args:
-            columns: The transitions.
+            columns: The transitions, with what the learner wants.
             steps: The number of steps.
-            advised: Whether the squared error to the teacher's advice is a part of the loss, which makes it refined
-                policy distillation (RPD, arXiv 2503.05833).
         """
-        torch, self._rng = self._torch, self._generator()
-        seen, (gain, targets) = inputs_of(columns), advantages(columns)
-        gain = (gain - gain.mean()) / (gain.std() + 1e-6)
-        for _ in range(steps):
-            rows = self._draw(len(seen))
-            mean, value = self.network(self._tensor(seen, rows))
-            normal = torch.distributions.Normal(mean, self.network.log_std.exp())
-            logprob = normal.log_prob(self._tensor(columns["action"], rows)).sum(-1)
-            ratio = (logprob - self._tensor(columns["logprob"], rows)).exp()
-            better = self._tensor(gain, rows)
-            objective = torch.minimum(ratio * better, ratio.clamp(1 - _CLIP, 1 + _CLIP) * better).mean()
-            loss = ((value - self._tensor(targets, rows)) ** 2).mean() - objective
-            self._step(_PPO * loss + self._distance_to_advice() if advised else loss)
+        raise NotImplementedError
+
+    def _distance_to_advice(self, rng: np.random.Generator) -> Any:
+        rows = drawn(rng, len(self._seen))
+        return self._error(self._tensor(self._seen, rows), self._advised[rows])
+
+    def _error(self, seen: Any, actions: np.ndarray) -> Any:
+        """Return the error of the network's actions: the mean squared one."""
+        mean, _ = self.network(seen)
+        return ((mean - self._torch.from_numpy(actions)) ** 2).mean()
+
+    def _clipped(self, ratio: Any, gain: Any) -> Any:
+        """Return the clipped objective of PPO for ratios of probabilities, and advantages."""
+        return self._torch.minimum(ratio * gain, ratio.clamp(1 - _CLIP, 1 + _CLIP) * gain).mean()
 
     def _generator(self) -> np.random.Generator:
         """Return one that a learner which goes on from a checkpoint has as well."""
         return np.random.default_rng([self._seed, self.steps])
-
-    def _distance_to_advice(self) -> Any:
-        rows = self._draw(len(self._seen))
-        mean, _ = self.network(self._tensor(self._seen, rows))
-        return ((mean - self._tensor(self._advised, rows)) ** 2).mean()
-
-    def _draw(self, number: int) -> np.ndarray:
-        return self._rng.integers(number, size=min(_BATCH, number))
 
     def _tensor(self, values: np.ndarray, rows: np.ndarray) -> Any:
         return self._torch.from_numpy(np.asarray(values, np.float32)[rows])
@@ -185,3 +178,38 @@ class Learner:
         self._torch.nn.utils.clip_grad_norm_(self.network.parameters(), 1.0)
         self._optimizer.step()
         self.steps += 1
+
+
+class PPOLearner(NetworkLearner):
+    """Trains the student's network by PPO."""
+
+    want = ("logprob", "value")
+    make_network = staticmethod(make_network)
+
+    def improve(self, columns: Mapping[str, np.ndarray], steps: int) -> None:
+        torch, rng = self._torch, self._generator()
+        seen, (gain, targets) = inputs_of(columns), advantages(columns)
+        gain = (gain - gain.mean()) / (gain.std() + 1e-6)
+        for _ in range(steps):
+            rows = drawn(rng, len(seen))
+            mean, value = self.network(self._tensor(seen, rows))
+            normal = torch.distributions.Normal(mean, self.network.log_std.exp())
+            logprob = normal.log_prob(self._tensor(columns["action"], rows)).sum(-1)
+            ratio = (logprob - self._tensor(columns["logprob"], rows)).exp()
+            loss = ((value - self._tensor(targets, rows)) ** 2).mean() - self._clipped(ratio, self._tensor(gain, rows))
+            self._step(self._advised_loss(loss, rng))
+
+    def _advised_loss(self, loss: Any, _: np.random.Generator) -> Any:
+        return loss
+
+
+class RPDLearner(PPOLearner):
+    """Trains by refined policy distillation (arXiv 2503.05833): the distance to a teacher's advice is in PPO's loss."""
+
+    def _advised_loss(self, loss: Any, rng: np.random.Generator) -> Any:
+        return _PPO * loss + self._distance_to_advice(rng)
+
+
+def drawn(rng: np.random.Generator, number: int) -> np.ndarray:
+    """Return the rows of a batch."""
+    return rng.integers(number, size=min(_BATCH, number))

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, PositiveInt
 
 from vlagents_ray.evaluate.plan.config import Tracker, TrackingConfig
 
-Method = Literal["bc", "rpd", "ppo"]
+Method = Literal["bc", "rpd", "ppo", "grpo"]
 
 
 class LearnPlan(BaseModel):
@@ -25,6 +25,7 @@ class LearnPlan(BaseModel):
     clone_steps: PositiveInt = 2000  # of the optimizer
     iterations: PositiveInt = 10  # of each method
     episodes: PositiveInt = 32  # of the student in each iteration
+    groups: PositiveInt = 8  # episodes from one start state, in "grpo"
     steps: PositiveInt = 500  # of the optimizer in each iteration
     evaluate_every: PositiveInt = 5  # iterations
     held_out: PositiveInt = 200  # episodes of an evaluation, the same for each version

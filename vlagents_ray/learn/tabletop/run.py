@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -15,7 +15,8 @@ from vlagents_ray.evaluate.results.summary import Summary
 from vlagents_ray.learn.columns import arrays
 from vlagents_ray.learn.publisher import Publisher
 from vlagents_ray.learn.rollouts import Rollouts
-from vlagents_ray.learn.tabletop.learner import Learner, advice, inputs_of
+from vlagents_ray.learn.tabletop.grpo import GRPOLearner
+from vlagents_ray.learn.tabletop.learner import NetworkLearner, PPOLearner, RPDLearner, advice, inputs_of
 from vlagents_ray.learn.tabletop.plan import LearnPlan, Method
 from vlagents_ray.learn.tabletop.progress import LearnBar
 from vlagents_ray.learn.training_evaluation import TrainingEvaluation
@@ -29,6 +30,21 @@ _TEACHER = "teacher"
 _RESTARTS = 5  # of a replica, in one iteration, after which the run ends
 _HELD_OUT, _TRAINING = 10_000_000, 20_000_000  # first seeds: no episode is both played for training and evaluated
 
+
+class _MethodParts(NamedTuple):
+    """What a method trains, and how."""
+
+    student: str  # class of the policy, below this package
+    learner: type[NetworkLearner]
+    learns: bool = True  # whether it goes on after the clone
+
+
+_METHODS: dict[Method, _MethodParts] = {
+    "bc": _MethodParts("student:Student", PPOLearner, learns=False),
+    "rpd": _MethodParts("student:Student", RPDLearner),
+    "ppo": _MethodParts("student:Student", PPOLearner),
+    "grpo": _MethodParts("token_student:TokenStudent", GRPOLearner),
+}
 Played = TypeVar("Played")
 
 
@@ -48,14 +64,13 @@ def learn_tabletop(plan: LearnPlan, progress: LearnBar) -> Summary:
     """
     checkpoints = RunCheckpoints(plan)
     require("torch").set_num_threads(1)  # its networks are small
-    policies: dict[str, Any] = {name: deployment(_source("student"), batch={"max_size": 64}) for name in plan.methods}
-    policies[_TEACHER] = deployment(_source(_TEACHER), batch={"max_size": 64})
+    sources = {_TEACHER: "teacher:Teacher"} | {method: _METHODS[method].student for method in plan.methods}
+    policies = {
+        app: deployment(f"vlagents_ray.learn.tabletop.{source}", batch={"max_size": 64})
+        for app, source in sources.items()
+    }
     with running_server(together(policies), ingress=False):
         return _LearnRun(plan, checkpoints, progress).summary()
-
-
-def _source(module: str) -> str:
-    return f"vlagents_ray.learn.tabletop.{module}:{module.title()}"
 
 
 class RunCheckpoints:
@@ -93,34 +108,45 @@ class _LearnRun:
 
     def __init__(self, plan: LearnPlan, checkpoints: RunCheckpoints, progress: LearnBar) -> None:
         self._plan, self._checkpoints, self._progress = plan, checkpoints, progress
+        self._clones: dict[str, dict[str, Any]] = {}  # checkpoints of learners, by the student that they train
 
     def summary(self) -> Summary:
-        clone = self._checkpoints.load("clone") or self._clone()
+        demonstrations = self._checkpoints.load("demonstrations") or self._demonstrations()
         for number, method in enumerate(self._plan.methods):
-            summary = self._learn(method, clone, number * self._plan.iterations)
+            state = self._checkpoints.load(method) or self._cloned(method, demonstrations)
+            summary = self._learn(method, state, number * self._plan.iterations)
         return summary
 
-    def _clone(self) -> dict[str, Any]:
-        plan, learner = self._plan, Learner(self._plan.seed)
+    def _demonstrations(self) -> dict[str, Any]:
         with self._rollouts(_TEACHER) as rollouts:
-            columns = arrays(rollouts.collect(plan.demonstrations))
-            self._progress.say(f"demonstrations: {_solved(columns)} of {plan.demonstrations} episodes solved")
-            learner.add_advice(inputs_of(columns), columns["action"])
-        error = learner.imitate(plan.clone_steps)
-        self._progress.say(f"clone: {plan.clone_steps} steps, mean squared error {error:.4f}")
-        state = {"iteration": 0, "position": 0, "learner": learner.checkpoint()}
-        self._checkpoints.save("clone", state)
-        return state
+            columns = arrays(rollouts.collect(self._plan.demonstrations))
+            self._progress.say(f"demonstrations: {_solved(columns)} of {self._plan.demonstrations} episodes solved")
+            arrived = {"seen": inputs_of(columns), "actions": columns["action"].copy()}
+        found = {name: require("torch").from_numpy(values) for name, values in arrived.items()}
+        self._checkpoints.save("demonstrations", found)
+        return found
 
-    def _learn(self, method: Method, clone: Mapping[str, Any], done: int) -> Summary:
+    def _cloned(self, method: Method, demonstrations: Mapping[str, Any]) -> dict[str, Any]:
+        student, make, _ = _METHODS[method]
+        if student not in self._clones:
+            learner = make(self._plan.seed)
+            learner.add_advice(demonstrations["seen"].numpy(), demonstrations["actions"].numpy())
+            error = learner.imitate(self._plan.clone_steps)
+            self._progress.say(f"clone of the demonstrations: {learner.steps} steps, error {error:.4f}")
+            self._clones[student] = learner.checkpoint()
+        return {"iteration": 0, "position": 0, "learner": self._clones[student]}
+
+    def _learn(self, method: Method, state: Mapping[str, Any], done: int) -> Summary:
         """Learn by one method, from where it had got to; `done` iterations were of the methods before."""
-        plan, learner = self._plan, Learner(self._plan.seed)
-        state = self._checkpoints.load(method) or clone
+        plan, parts = self._plan, _METHODS[method]
+        learner = parts.learner(plan.seed)
         learner.restore(state["learner"])
-        last = 0 if method == "bc" else plan.iterations
+        last = plan.iterations if parts.learns else 0
         with (
             Publisher(_url(method)) as weights,
-            self._rollouts(method, want=("logprob", "value"), first=state["position"]) as rollouts,
+            self._rollouts(
+                method, want=learner.want, first=state["position"], groups=plan.groups if method == "grpo" else 1
+            ) as rollouts,
             RemoteAgent(_url(_TEACHER)) as teacher,
         ):
             for iteration in range(state["iteration"], last + 1):
@@ -135,12 +161,12 @@ class _LearnRun:
                 )
                 if method == "rpd":
                     learner.add_advice(inputs_of(columns), advice(teacher, columns))
-                learner.improve(columns, plan.steps, advised=method == "rpd")
-                state = {"iteration": iteration + 1, "position": rollouts.position, "learner": learner.checkpoint()}
-                self._checkpoints.save(method, state)
+                learner.improve(columns, plan.steps)
+                progress = {"iteration": iteration + 1, "position": rollouts.position}
+                self._checkpoints.save(method, progress | {"learner": learner.checkpoint()})
         return summary
 
-    def _played(self, weights: Publisher, learner: Learner, play: Callable[[], Played]) -> Played:
+    def _played(self, weights: Publisher, learner: NetworkLearner, play: Callable[[], Played]) -> Played:
         """Play with the learner's weights; they are pushed again if the replica that had them was restarted."""
         restarts = 0
         while True:
@@ -158,7 +184,7 @@ class _LearnRun:
         rollouts.version = version
         return rollouts.collect(self._plan.episodes)
 
-    def _rollouts(self, policy: str, want: Sequence[str] = (), first: int = 0) -> Rollouts:
+    def _rollouts(self, policy: str, want: Sequence[str] = (), first: int = 0, groups: int = 1) -> Rollouts:
         return Rollouts(
             ENV,
             _url(policy),
@@ -167,6 +193,7 @@ class _LearnRun:
             want=want,
             seed=_TRAINING * (1 + self._plan.seed),
             first=first,
+            groups=groups,
             env_options=ENV_OPTIONS,
         )
 
@@ -198,4 +225,4 @@ def _url(app: str) -> str:
 
 def _solved(columns: Mapping[str, np.ndarray]) -> int:
     """Return the number of episodes in which the task was solved at some step."""
-    return len(np.unique(columns["episode"][columns["success"]]))
+    return int(np.logical_or.reduceat(columns["success"], np.flatnonzero(columns["t"] == 0)).sum())

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -20,6 +21,7 @@ ACTION = 4  # numbers of an action: x, y, z, gripper
 STATE = 4  # of the robot's own state: x, y, z, gripper
 INPUTS = 3 * BINS + STATE + len(WORDS)  # numbers of an input
 _LOOKS = 3  # places that the network looks at
+FEATURES = _LOOKS * 9 + STATE  # numbers that the heads of a network get
 _ROWS = 16  # of a pass
 _METRES = 5.0  # units of the robot's position per m
 
@@ -40,46 +42,68 @@ def inputs(obs: Obs, colour: str) -> np.ndarray:
     return np.concatenate([places(obs.cameras["front"]).ravel(), robot, word]).astype(np.float32)
 
 
-def make_network(seed: int = 0) -> Any:
-    """Return a new network: inputs (B, INPUTS) to means of actions (B, 4) and values (B,); `log_std` is (4,)."""
+@functools.cache
+def looking() -> Any:
+    """Return the class of networks that look at places whose colours the word selects, and where the fingers are."""
     torch = require("torch")
     nn = torch.nn
 
-    class Network(nn.Module):  # type: ignore[misc, name-defined]
-        """Looks at places whose colours the word selects, and moves by where they are from the fingertips."""
+    class Looking(nn.Module):  # type: ignore[misc, name-defined]
+        """Inputs (B, INPUTS) to features (B, FEATURES)."""
 
         def __init__(self) -> None:
             super().__init__()
             self.look = nn.Linear(len(WORDS), BINS * _LOOKS)
             self.aim = nn.Linear(2, 2)  # from the camera's places to the robot's
-            size = _LOOKS * 9 + STATE
-            self.policy = _perceptron(nn, size, ACTION)
-            self.value = _perceptron(nn, size, 1)
-            self.log_std = nn.Parameter(torch.full((ACTION,), -2.3))
             with torch.no_grad():
                 self.aim.weight.copy_(torch.eye(2) * _METRES / 10)
                 self.aim.bias.zero_()
 
-        def forward(self, inputs: Any) -> tuple[Any, Any]:
+        def features(self, inputs: Any) -> Any:
             seen, robot, word = inputs.split([3 * BINS, STATE, len(WORDS)], dim=-1)
             seen = seen.unflatten(-1, (BINS, 3))
             scores = 8 * self.look(word).unflatten(-1, (_LOOKS, BINS)) + torch.log(seen[:, None, :, 0] + 1e-4)
             looked = scores.softmax(-1) @ seen  # (B, LOOKS, 3)
             away = self.aim(looked[..., 1:]) - robot[:, None, :2]
             scales = [away, torch.tanh(4 * away), torch.tanh(20 * away)]
-            features = torch.cat([torch.cat([looked, *scales], -1).flatten(1), robot], -1)
+            return torch.cat([torch.cat([looked, *scales], -1).flatten(1), robot], -1)
+
+    return Looking
+
+
+def head(out: int) -> Any:
+    """Return a new perceptron from features to `out` numbers."""
+    nn, hidden = require("torch").nn, 192
+    return nn.Sequential(
+        nn.Linear(FEATURES, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU(), nn.Linear(hidden, out)
+    )
+
+
+def make_network(seed: int = 0) -> Any:
+    """Return a new network: inputs (B, INPUTS) to means of actions (B, 4) and values (B,); `log_std` is (4,)."""
+    torch = require("torch")
+
+    class Network(looking()):  # type: ignore[misc]
+        """Moves by the features."""
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.policy, self.value = head(ACTION), head(1)
+            self.log_std = torch.nn.Parameter(torch.full((ACTION,), -2.3))
+
+        def forward(self, inputs: Any) -> tuple[Any, Any]:
+            features = self.features(inputs)
             return self.policy(features), self.value(features).squeeze(-1)
 
+    return seeded(Network, seed)
+
+
+def seeded(make: Callable[[], Any], seed: int) -> Any:
+    """Return a new network with random weights of this seed, and leave torch's own generator as it was."""
+    torch = require("torch")
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return Network()
-
-
-def _perceptron(nn: Any, size: int, out: int) -> Any:
-    hidden = 192
-    return nn.Sequential(
-        nn.Linear(size, hidden), nn.SiLU(), nn.Linear(hidden, hidden), nn.SiLU(), nn.Linear(hidden, out)
-    )
+        return make()
 
 
 class Student(Agent):
@@ -87,6 +111,8 @@ class Student(Agent):
 
     trainable = "network"
     shared = ("network",)
+    behaviour: tuple[str, ...] = ("logprob", "value")  # what it states for a learner
+    make_network = staticmethod(make_network)
 
     def __init__(self, seed: int = 0) -> None:
         self.seed = seed
@@ -96,11 +122,11 @@ class Student(Agent):
 
     def initialize(self) -> None:
         require("torch").set_num_threads(1)
-        self.network = make_network(self.seed)
+        self.network = self.make_network(self.seed)
 
     @property
     def contract(self) -> Contract:
-        return replace(Tabletop.known_contract({"width": None, "height": None}), behaviour=("logprob", "value"))
+        return replace(Tabletop.known_contract({"width": None, "height": None}), behaviour=self.behaviour)
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin an episode of `tabletop/lift`.
@@ -123,18 +149,25 @@ class Student(Agent):
             row[:] = inputs(one, session._colour)  # type: ignore[attr-defined]
         with torch.inference_mode():
             passes = [self.network(part) for part in torch.from_numpy(rows).split(_ROWS)]
-            means, values = (torch.cat(parts)[: len(obs)] for parts in zip(*passes, strict=True))
-            log_std = self.network.log_std.numpy()
-        return [
-            self._answer(one, session, mean, log_std, float(value))
-            for one, session, mean, value in zip(obs, sessions, means.numpy(), values, strict=True)
-        ]
+            outputs = [torch.cat(parts)[: len(obs)].numpy() for parts in zip(*passes, strict=True)]
+        answers: list[Act | Exception] = []
+        for one, session, *own in zip(obs, sessions, *outputs, strict=True):
+            if wanted := one.info.get(WANT):
+                action, said = self._draw(session._draws, *own)
+                answers.append(Act(action, info={BEHAVIOUR: {name: said[name] for name in wanted}}))
+            else:
+                answers.append(Act(self._best(*own)))
+        return answers
 
-    def _answer(self, obs: Obs, session: Any, mean: np.ndarray, log_std: np.ndarray, value: float) -> Act:
-        wanted = obs.info.get(WANT)
-        if not wanted:
-            return Act(mean)
-        draws = session._draws.standard_normal(ACTION).astype(np.float32)
-        logprob = -0.5 * draws**2 - log_std - 0.5 * math.log(2 * math.pi)
-        said = {"logprob": logprob[None], "value": value}
-        return Act(mean + np.exp(log_std) * draws, info={BEHAVIOUR: {name: said[name] for name in wanted}})
+    def _best(self, *outputs: Any) -> np.ndarray:
+        """Return the action for one row of the network's outputs, (4,) float32."""
+        mean: np.ndarray = outputs[0]
+        return mean
+
+    def _draw(self, draws: np.random.Generator, *outputs: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        """Return an action that is drawn from the distribution, and what a learner may want to know of it."""
+        mean, value = outputs
+        log_std = self.network.log_std.detach().numpy()
+        drawn = draws.standard_normal(ACTION).astype(np.float32)
+        logprob = -0.5 * drawn**2 - log_std - 0.5 * math.log(2 * math.pi)
+        return mean + np.exp(log_std) * drawn, {"logprob": logprob[None], "value": float(value)}

@@ -1,0 +1,71 @@
+"""The learner of a student of tokens: behaviour cloning, and GRPO."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.learn.tabletop.learner import NetworkLearner, drawn, inputs_of
+from vlagents_ray.learn.tabletop.token_student import make_token_network, tokens_of
+
+_EPSILON = 1e-6  # beside the standard deviation of a group
+_RATE = 1e-4  # learning rate of GRPO: what few episodes say is mostly noise, which larger steps would learn
+
+
+def group_advantages(columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return the advantages of the actions by the groups of episodes from one start state, (T,) float32.
+
+    An episode's reward is 1 if the task was solved at any step. Each of its actions has the advantage (reward - mean of
+    the group) / (standard deviation of the group + 1e-6) (GRPO, arXiv 2402.03300), those after the task was solved have
+    none. Nor have those of groups whose episodes were all solved, or none of them (DAPO, arXiv 2503.14476).
+    """
+    starts, success = np.flatnonzero(columns["t"] == 0), columns["success"]
+    lengths = np.diff([*starts, len(success)])
+    solved = np.logical_or.reduceat(success, starts).astype(np.float64)
+    group = columns["episode"][starts]
+    gain = np.zeros(len(starts))
+    for number in np.unique(group):
+        members = group == number
+        gain[members] = (solved[members] - solved[members].mean()) / (solved[members].std() + _EPSILON)
+    before = np.cumsum(success) - success  # steps at which a task was solved, in the rows before each
+    over = before > np.repeat(before[starts], lengths)
+    return np.where(over, 0.0, np.repeat(gain, lengths)).astype(np.float32)
+
+
+class GRPOLearner(NetworkLearner):
+    """Trains the network of a student of tokens."""
+
+    want = ("logprob", "replay")
+    make_network = staticmethod(make_token_network)
+
+    def improve(self, columns: Mapping[str, np.ndarray], steps: int) -> None:
+        """Take steps of GRPO on the transitions of the student's own episodes, without a value and a reference policy.
+
+        Args:
+            columns: The transitions, with `logprob` and `replay.tokens`, of whole groups of episodes.
+            steps: The number of steps; none is taken if no group has both solved and other episodes.
+        """
+        gain = group_advantages(columns)
+        kept = np.flatnonzero(gain)
+        if not len(kept):
+            return
+        for group in self._optimizer.param_groups:
+            group["lr"] = _RATE
+        seen, tokens = inputs_of(columns), columns["replay.tokens"][:, 0]
+        rng = self._generator()
+        for _ in range(steps):
+            rows = kept[drawn(rng, len(kept))]
+            logprob = self._logprob(self._tensor(seen, rows), tokens[rows]).sum(-1)
+            ratio = (logprob - self._tensor(columns["logprob"], rows)).exp()
+            self._step(-self._clipped(ratio, self._tensor(gain, rows)))
+
+    def _error(self, seen: Any, actions: np.ndarray) -> Any:
+        """Return the cross-entropy of the actions' tokens, nats a token."""
+        return -self._logprob(seen, tokens_of(actions)).mean()
+
+    def _logprob(self, seen: Any, tokens: np.ndarray) -> Any:
+        """Return the log-probabilities of tokens, (B, 4)."""
+        logprobs, _ = self.network(seen)
+        return logprobs.gather(-1, self._torch.from_numpy(tokens)[..., None]).squeeze(-1)
