@@ -10,7 +10,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -18,6 +18,7 @@ from eval_fakes import wait_for
 from ray_processes import end, processes, ray_folder
 
 from vlagents_ray import Act, Agent, Obs
+from vlagents_ray.cli.options import read_yaml
 from vlagents_ray.envs.tabletop.env import Tabletop
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera
 from vlagents_ray.evaluate import Results
@@ -25,7 +26,7 @@ from vlagents_ray.evaluate.results.summary import pushed_of
 from vlagents_ray.interface import BEHAVIOUR, WANT
 from vlagents_ray.learn.tabletop.colours import named_colour, puck_position
 from vlagents_ray.learn.tabletop.learner import RPDLearner, advantages, advice, inputs_of
-from vlagents_ray.learn.tabletop.plan import LearnPlan
+from vlagents_ray.learn.tabletop.plan import LearnPlan, Method
 from vlagents_ray.learn.tabletop.run import ENV_OPTIONS, RunCheckpoints
 from vlagents_ray.learn.tabletop.student import Student
 from vlagents_ray.learn.tabletop.teacher import Teacher
@@ -198,7 +199,29 @@ def test_a_folder_takes_one_run(tmp_path: Path, second: dict[str, Any], wrong: s
         RunCheckpoints(LearnPlan(out=tmp_path, **second))
 
 
-SMALL = {"demonstrations": 8, "clone_steps": 300, "iterations": 2, "episodes": 8, "steps": 50}
+EXAMPLES = sorted((Path(__file__).parents[2] / "examples" / "learn").glob("*.yaml"))
+
+
+@pytest.mark.parametrize("file", EXAMPLES, ids=lambda file: file.stem)
+def test_an_example_is_a_plan_and_ends_with_its_method(file: Path) -> None:
+    plan = LearnPlan.model_validate(read_yaml(file, "file of settings", "`methods`"))
+    assert plan.methods[-1] == file.stem
+    assert f"examples/learn/{file.name}" in (Path(__file__).parents[2] / "docs/tutorials/learn.md").read_text()
+
+
+def test_there_is_an_example_of_each_method() -> None:
+    assert {file.stem for file in EXAMPLES} == set(get_args(Method))
+
+
+SMALL = {
+    "methods": ["bc", "rpd", "ppo", "grpo"],
+    "groups": 4,
+    "demonstrations": 8,
+    "clone_steps": 300,
+    "iterations": 2,
+    "episodes": 8,
+    "steps": 50,
+}
 SMALL |= {"evaluate_every": 1, "held_out": 6, "num_envs": 4}
 
 
@@ -232,7 +255,8 @@ def test_whatever_is_killed_the_table_is_that_of_a_run_where_nothing_was(tmp_pat
     tables = [table(Results.load(tmp_path / name)) for name in ("whole", "killed", "bereft")]
     assert tables[1] == tables[0]
     assert tables[2] == tables[0]
-    assert list(tables[0]) == ["bc@300", "rpd@350", "rpd@400", "ppo@350", "ppo@400"]
+    # A learner of groups takes no step if each group has one outcome.
+    assert list(tables[0])[:6] == ["bc@300", "rpd@350", "rpd@400", "ppo@350", "ppo@400", "grpo@300"]
     assert (tmp_path / "killed" / "report.html").is_file()
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.learn.tabletop.learner import NetworkLearner, drawn, inputs_of
+from vlagents_ray.learn.tabletop.learner import NetworkLearner, inputs_of
 from vlagents_ray.learn.tabletop.token_student import make_token_network, tokens_of
 
 _EPSILON = 1e-6  # beside the standard deviation of a group
@@ -38,6 +38,7 @@ class GRPOLearner(NetworkLearner):
     """Trains the network of a student of tokens."""
 
     want = ("logprob", "replay")
+    batch = 512
     make_network = staticmethod(make_token_network)
 
     def improve(self, columns: Mapping[str, np.ndarray], steps: int) -> None:
@@ -56,7 +57,7 @@ class GRPOLearner(NetworkLearner):
         seen, tokens = inputs_of(columns), columns["replay.tokens"][:, 0]
         rng = self._generator()
         for _ in range(steps):
-            rows = kept[drawn(rng, len(kept))]
+            rows = kept[self._drawn(rng, len(kept))]
             logprob = self._logprob(self._tensor(seen, rows), tokens[rows]).sum(-1)
             ratio = (logprob - self._tensor(columns["logprob"], rows)).exp()
             self._step(-self._clipped(ratio, self._tensor(gain, rows)))

@@ -16,7 +16,6 @@ from vlagents_ray.registry import require
 DISCOUNT, TRACE = 0.98, 0.95  # gamma and lambda of generalised advantage estimation (arXiv 1506.02438)
 _CLIP = 0.2  # of PPO's ratio (arXiv 1707.06347)
 _RATE, _LOOK_RATE = 2e-3, 1e-2  # learning rates of the network, and of its choice of colours
-_BATCH = 256
 _PPO = 0.01  # weight of PPO's loss beside the teacher's advice
 
 
@@ -91,6 +90,8 @@ class NetworkLearner:
     want: tuple[str, ...]
     """What the student states for `improve`, beside its actions."""
     make_network: Callable[[int], Any]
+    batch = 256
+    """Transitions of a step."""
 
     def __init__(self, seed: int = 0) -> None:
         """Make a new network."""
@@ -153,7 +154,7 @@ class NetworkLearner:
         raise NotImplementedError
 
     def _distance_to_advice(self, rng: np.random.Generator) -> Any:
-        rows = drawn(rng, len(self._seen))
+        rows = self._drawn(rng, len(self._seen))
         return self._error(self._tensor(self._seen, rows), self._advised[rows])
 
     def _error(self, seen: Any, actions: np.ndarray) -> Any:
@@ -168,6 +169,10 @@ class NetworkLearner:
     def _generator(self) -> np.random.Generator:
         """Return one that a learner which goes on from a checkpoint has as well."""
         return np.random.default_rng([self._seed, self.steps])
+
+    def _drawn(self, rng: np.random.Generator, number: int) -> np.ndarray:
+        """Return the rows of a batch."""
+        return rng.integers(number, size=min(self.batch, number))
 
     def _tensor(self, values: np.ndarray, rows: np.ndarray) -> Any:
         return self._torch.from_numpy(np.asarray(values, np.float32)[rows])
@@ -191,7 +196,7 @@ class PPOLearner(NetworkLearner):
         seen, (gain, targets) = inputs_of(columns), advantages(columns)
         gain = (gain - gain.mean()) / (gain.std() + 1e-6)
         for _ in range(steps):
-            rows = drawn(rng, len(seen))
+            rows = self._drawn(rng, len(seen))
             mean, value = self.network(self._tensor(seen, rows))
             normal = torch.distributions.Normal(mean, self.network.log_std.exp())
             logprob = normal.log_prob(self._tensor(columns["action"], rows)).sum(-1)
@@ -208,8 +213,3 @@ class RPDLearner(PPOLearner):
 
     def _advised_loss(self, loss: Any, rng: np.random.Generator) -> Any:
         return _PPO * loss + self._distance_to_advice(rng)
-
-
-def drawn(rng: np.random.Generator, number: int) -> np.ndarray:
-    """Return the rows of a batch."""
-    return rng.integers(number, size=min(_BATCH, number))

@@ -142,6 +142,7 @@ class _LearnRun:
         learner = parts.learner(plan.seed)
         learner.restore(state["learner"])
         last = plan.iterations if parts.learns else 0
+        clone_has_rate = method != "bc" and "bc" in plan.methods and parts.student == _METHODS["bc"].student
         with (
             Publisher(_url(method)) as weights,
             self._rollouts(
@@ -151,7 +152,7 @@ class _LearnRun:
         ):
             for iteration in range(state["iteration"], last + 1):
                 self._progress.at(done + iteration, len(plan.methods) * plan.iterations)
-                if iteration == last or (iteration and iteration % plan.evaluate_every == 0):
+                if iteration == last or (iteration % plan.evaluate_every == 0 and (iteration or not clone_has_rate)):
                     summary = self._played(weights, learner, lambda: self._evaluate(method, learner.steps))
                 if iteration == last:
                     break
