@@ -233,6 +233,14 @@ def start_serve(http: dict[str, Any], location: str) -> tuple[Any, list[Any]]:
     return client, proxies
 
 
+def proxies_now(client: Any) -> list[Any]:
+    """Return the refs of the proxies that Serve has now, in place of those that `start_serve` returned."""
+    import ray
+
+    handles = ray.get(client._controller.get_proxies.remote())
+    return [handle.ready.remote() for handle in handles.values()]
+
+
 def proxy_timeout_s() -> float:
     """Return the time in which Serve's proxies have to listen."""
     from ray.serve._private.constants import HTTP_PROXY_TIMEOUT

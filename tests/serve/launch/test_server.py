@@ -1,4 +1,4 @@
-"""Which process builds the applications of a server."""
+"""Which process builds the applications of a server, and what it waits for."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from typing import Any
 import pytest
 from ray.serve.schema import ServeDeploySchema
 
+from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.serve.launch.deployment_file import deployment, together, with_settings
-from vlagents_ray.serve.launch.server import _deploy
+from vlagents_ray.serve.launch.server import _deploy, _wait_for_proxies
 
 
 class FakeClient:
@@ -68,3 +69,33 @@ def test_a_cluster_of_others_keeps_the_file() -> None:
     client, config = FakeClient(), deployment("noop")
     _deploy(client, config, own=False, ends_at_once=False)
     assert (client.by_serve, client.built_here) == ([config], [])
+
+
+@pytest.mark.parametrize("deaths", [0, 2])
+def test_a_proxy_that_serve_replaces_is_waited_for(monkeypatch: pytest.MonkeyPatch, deaths: int) -> None:
+    """Serve kills one that does not start within some seconds."""
+    import ray
+
+    asked: list[str] = []
+
+    def get(refs: list[str], timeout: float) -> None:
+        asked.extend(refs)
+        if len(asked) <= deaths:
+            raise ray.exceptions.ActorDiedError
+
+    monkeypatch.setattr(ray, "get", get)
+    _wait_for_proxies(["first"], lambda: [f"after {len(asked)}"])
+    assert asked == ["first", "after 1", "after 2"][: deaths + 1]
+
+
+@pytest.mark.parametrize("late", ["ActorDiedError", "GetTimeoutError"])
+def test_proxies_that_never_listen_are_an_error(monkeypatch: pytest.MonkeyPatch, late: str) -> None:
+    import ray
+
+    def get(_: list[str], timeout: float) -> None:
+        raise getattr(ray.exceptions, late)
+
+    monkeypatch.setattr(ray, "get", get)
+    monkeypatch.setattr("vlagents_ray.serve.launch.server.proxy_timeout_s", lambda: 0.0)
+    with pytest.raises(PolicyUnavailable, match="proxies do not listen within 0 s"):
+        _wait_for_proxies([], list)

@@ -11,7 +11,6 @@ from vlagents_ray.learn.tabletop.learner import NetworkLearner, inputs_of
 from vlagents_ray.learn.tabletop.token_student import make_token_network, tokens_of
 
 _EPSILON = 1e-6  # beside the standard deviation of a group
-_RATE = 1e-4  # learning rate of GRPO: what few episodes say is mostly noise, which larger steps would learn
 
 
 def group_advantages(columns: Mapping[str, np.ndarray]) -> np.ndarray:
@@ -39,6 +38,8 @@ class GRPOLearner(NetworkLearner):
 
     want = ("logprob", "replay")
     batch = 512
+    steps_at_once = 20
+    rate = 1e-4  # what few episodes say is mostly noise, which larger or more steps would learn
     make_network = staticmethod(make_token_network)
 
     def improve(self, columns: Mapping[str, np.ndarray], steps: int) -> None:
@@ -52,10 +53,8 @@ class GRPOLearner(NetworkLearner):
         kept = np.flatnonzero(gain)
         if not len(kept):
             return
-        for group in self._optimizer.param_groups:
-            group["lr"] = _RATE
         seen, tokens = inputs_of(columns), columns["replay.tokens"][:, 0]
-        rng = self._generator()
+        rng = self._begin_improving()
         for _ in range(steps):
             rows = kept[self._drawn(rng, len(kept))]
             logprob = self._logprob(self._tensor(seen, rows), tokens[rows]).sum(-1)

@@ -92,6 +92,10 @@ class NetworkLearner:
     make_network: Callable[[int], Any]
     batch = 256
     """Transitions of a step."""
+    steps_at_once = 500
+    """Steps of `improve` on the same transitions, unless the plan says otherwise."""
+    rate: float | None = None
+    """Learning rate of `improve`; None: those of `imitate`."""
 
     def __init__(self, seed: int = 0) -> None:
         """Make a new network."""
@@ -153,6 +157,12 @@ class NetworkLearner:
         """
         raise NotImplementedError
 
+    def _begin_improving(self) -> np.random.Generator:
+        if self.rate is not None:
+            for group in self._optimizer.param_groups:
+                group["lr"] = self.rate
+        return self._generator()
+
     def _distance_to_advice(self, rng: np.random.Generator) -> Any:
         rows = self._drawn(rng, len(self._seen))
         return self._error(self._tensor(self._seen, rows), self._advised[rows])
@@ -189,10 +199,12 @@ class PPOLearner(NetworkLearner):
     """Trains the student's network by PPO."""
 
     want = ("logprob", "value")
+    steps_at_once = 40  # ten times the transitions of 32 episodes: more would fit their noise
+    rate: float | None = 3e-4
     make_network = staticmethod(make_network)
 
     def improve(self, columns: Mapping[str, np.ndarray], steps: int) -> None:
-        torch, rng = self._torch, self._generator()
+        torch, rng = self._torch, self._begin_improving()
         seen, (gain, targets) = inputs_of(columns), advantages(columns)
         gain = (gain - gain.mean()) / (gain.std() + 1e-6)
         for _ in range(steps):
@@ -210,6 +222,9 @@ class PPOLearner(NetworkLearner):
 
 class RPDLearner(PPOLearner):
     """Trains by refined policy distillation (arXiv 2503.05833): the distance to a teacher's advice is in PPO's loss."""
+
+    steps_at_once = NetworkLearner.steps_at_once  # the advice is no noise, and stays valid
+    rate = None
 
     def _advised_loss(self, loss: Any, rng: np.random.Generator) -> Any:
         return _PPO * loss + self._distance_to_advice(rng)

@@ -162,7 +162,7 @@ class _LearnRun:
                 )
                 if method == "rpd":
                     learner.add_advice(inputs_of(columns), advice(teacher, columns))
-                learner.improve(columns, plan.steps)
+                learner.improve(columns, plan.steps or learner.steps_at_once)
                 progress = {"iteration": iteration + 1, "position": rollouts.position}
                 self._checkpoints.save(method, progress | {"learner": learner.checkpoint()})
         return summary

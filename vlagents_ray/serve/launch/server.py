@@ -11,7 +11,7 @@ import functools
 import logging
 import os
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,7 @@ from vlagents_ray.ray_tools.private import (
     gpus_here,
     long_polls,
     node_of_this_process,
+    proxies_now,
     proxy_timeout_s,
     start_serve,
 )
@@ -46,6 +47,7 @@ log = logging.getLogger(__name__)
 
 _START_S, _GROW_S = 600.0, 3600.0  # time for a policy to get ready: here; on a cluster that may add a machine first
 _SHUTDOWN_S = 30.0
+_LOOK_S = 0.2  # between two looks at the proxies that Serve has
 _END_S = 0.1  # period at which a replica that ends checks for remaining requests; Serve's own is 2 s
 # Keys of a deployment file, and of an application in it, that Serve does not have to apply.
 _OUR_KEYS = {"applications", "http_options", "proxy_location"}
@@ -123,7 +125,7 @@ def running_server(
         inside = _internal_url(http)
         ours = {app.name for app in _our_apps(config)}
         urls = {name: inside + path if ingress else None for name, path in paths.items()}
-        _wait_for_proxies(proxies)
+        _wait_for_proxies(proxies, lambda: proxies_now(client))
         wait_until_ready(serve, urls, ours, deadline, remind)
         if ingress and address is None and (stats_port := os.environ.get("RAY_SERVE_HAPROXY_STATS_PORT")):
             wait_for_haproxy(serve, paths, int(stats_port), deadline)
@@ -259,15 +261,25 @@ def _ray(
         yield {"host": host, "port": port}
 
 
-def _wait_for_proxies(proxies: list[Any]) -> None:
-    """Wait until each of the proxies listens; raise the error of one that cannot."""
+def _wait_for_proxies(proxies: list[Any], proxies_now: Callable[[], list[Any]]) -> None:
+    """Wait until each of the proxies listens; raise the error of one that cannot.
+
+    Serve kills a proxy that does not start within some seconds, as on a busy node, and starts another one.
+    """
     import ray
 
     timeout_s = proxy_timeout_s()
-    try:
-        ray.get(proxies, timeout=timeout_s)
-    except ray.exceptions.GetTimeoutError as error:
-        raise PolicyUnavailable(f"Serve's proxies do not listen within {timeout_s:g} s") from error
+    deadline = time.monotonic() + timeout_s
+    while True:
+        try:
+            ray.get(proxies, timeout=max(deadline - time.monotonic(), 0.0))
+        except (ray.exceptions.GetTimeoutError, ray.exceptions.RayActorError) as error:
+            if time.monotonic() >= deadline:
+                raise PolicyUnavailable(f"Serve's proxies do not listen within {timeout_s:g} s") from error
+            time.sleep(_LOOK_S)
+            proxies = proxies_now()
+        else:
+            return
 
 
 def spread_over_gpus(parts: Mapping[str, ServeDeploySchema], *, kept: float = 0.0) -> dict[str, ServeDeploySchema]:
