@@ -202,7 +202,10 @@ def test_a_finished_dataset_has_no_folder_of_an_unfinished_episode(config: Confi
         ),
         ({"state": ["joints", "torque"]}, "state: .*Roller has no 'torque', want some of .*'gripper', 'joints'"),
         ({"state": ["joints", "joints"]}, "each of them once"),
-        ({"environment_state": ["gripper"]}, "environment_state: .*has no 'gripper', want some of .*'joints', 'xyzrpy'"),
+        (
+            {"environment_state": ["gripper"]},
+            "environment_state: .*has no 'gripper', want some of .*'joints', 'xyzrpy'",
+        ),
     ],
 )
 def test_what_the_episodes_do_not_have_cannot_be_chosen(

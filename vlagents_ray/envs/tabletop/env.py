@@ -32,7 +32,8 @@ class Tabletop(EvalEnv):
     Observation: camera "front" (height, width, 3); `state["xyzrpy"]` (6,), the fingertips' position
     in m and the gripper's constant orientation in rad, in the base frame of the package's docstring;
     `gripper` in [0, 1], 1 = open, about 0.58 around a puck. With `object_state`, also `state["puck"]` (3,),
-    the middle of the underside of the instruction's puck, and `state["target"]` (3,), where that is to be; m, in the base frame.
+    where the underside of the instruction's puck is, and `state["target"]` (3,), where it is to be; m, in
+    the base frame.
 
     Action (4,): `dx, dy, dz` in units of 0.03 m a step along the base frame's axes, and the gripper,
     1 = open, -1 = closed. Components outside [-1, 1] are clipped, as a robot's controller would.
