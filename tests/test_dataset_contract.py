@@ -35,6 +35,7 @@ ABOUT = DatasetContract(
     ("xyzrpy", "gripper"),
     {"observation.images.wrist": "wrist"},
     {0: (3.0, 0.5, -0.25), 3: 3.1, 5: -1.0},
+    ("xyzrpy",),
 )
 
 
@@ -54,6 +55,12 @@ def test_it_is_the_same_after_a_trip_through_statistics_as_float_tensors() -> No
     numbers = ABOUT.to_statistics(50)[STATISTICS][BYTES]
     assert DatasetContract.from_statistics(np.array(json.loads(json.dumps(numbers)), np.float32).tolist()) == ABOUT
     assert DatasetContract.from_statistics(np.array(numbers, np.float16).tolist()) == ABOUT
+
+
+def test_an_older_dataset_has_no_state_of_an_environment() -> None:
+    data = ABOUT.to_json()
+    del data["environment"]
+    assert DatasetContract.from_json(data) == replace(ABOUT, environment=())
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"state": []}', '{"contract": {"wings": 2}, "state": []}'])

@@ -35,6 +35,7 @@ class DatasetContract:
     state: tuple[str, ...] = ()  # parts side by side in `observation.state`; "gripper" is `Obs.gripper`
     cameras: Mapping[str, str] = field(default_factory=dict)  # feature -> camera
     angles: Mapping[int, Centre] = field(default_factory=dict)  # (first) place in `observation.state` -> centre, rad
+    environment: tuple[str, ...] = ()  # parts side by side in `observation.environment_state`
 
     @property
     def width(self) -> int:
@@ -63,6 +64,7 @@ class DatasetContract:
         """Return the contract as plain JSON values."""
         return {
             "state": list(self.state),
+            "environment": list(self.environment),
             "cameras": dict(self.cameras),
             "angles": {str(at): list(one) if isinstance(one, tuple) else one for at, one in self.angles.items()},
             "contract": self.contract.to_json(),
@@ -77,8 +79,9 @@ class DatasetContract:
                 tuple(map(str, data["state"])),
                 {str(key): str(name) for key, name in data["cameras"].items()},
                 {int(place): _centre(centre) for place, centre in data["angles"].items()},
+                tuple(map(str, data.get("environment", ()))),  # older datasets have none
             )
-            if unknown := set(found.state) - {*(found.contract.state or {}), GRIPPER}:
+            if unknown := {*found.state, *found.environment} - {*(found.contract.state or {}), GRIPPER}:
                 raise ValueError(f"its contract has no state {sorted(unknown)}")
             numbers = {at: np.atleast_1d(centre) for at, centre in found.angles.items()}
             if odd := [

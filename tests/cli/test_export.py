@@ -36,6 +36,14 @@ def test_cameras_parts_successes_and_ends_of_a_dataset_are_chosen(played: Path, 
     assert [key for key in info["features"] if "images" in key] == ["observation.images.wrist"]
 
 
+def test_a_dataset_without_cameras_has_a_state_of_the_environment(played: Path, tmp_path: Path) -> None:
+    done = export(played, tmp_path / "d", "--to", "lerobot", "--cameras", "", "--environment-state", "joints")
+    assert done.exit_code == 0, done.output
+    features = json.loads((tmp_path / "d/meta/info.json").read_text())["features"]
+    assert features["observation.environment_state"]["names"] == ["joints_0", "joints_1"]
+    assert not (tmp_path / "d/videos").exists()
+
+
 def test_a_table_has_no_frames_to_choose(played: Path, tmp_path: Path) -> None:
     done = export(played, tmp_path / "t.csv", "--to", "csv", "--cut-idle", "--state", "joints")
     assert done.exit_code == 2

@@ -147,9 +147,48 @@ def test_an_unknown_task_is_refused_with_the_known_ones() -> None:
         make_env("tabletop/juggle")
 
 
-def test_an_option_out_of_range_is_refused() -> None:
-    with pytest.raises(ConfigError, match="width is 3"):
-        Tabletop(width=3)
+@pytest.mark.parametrize(
+    ("task", "options", "text"),
+    [
+        ("lift", {"width": 3}, "width is 3, want at least 32"),
+        ("lift", {"pucks": 0}, "pucks is 0, want 1 to 4 in 'lift'"),
+        ("lift", {"pucks": 5}, "pucks is 5, want 1 to 4 in 'lift'"),
+        ("stack", {"pucks": 1}, "pucks is 1, want 2 to 4 in 'stack'"),
+        (None, {"pucks": 1}, "pucks is 1, want 2 to 4 in 'mixed'"),
+    ],
+)
+def test_an_option_out_of_range_is_refused(task: str | None, options: dict[str, int], text: str) -> None:
+    with pytest.raises(ConfigError, match=text):
+        Tabletop(task, **options)
+
+
+@pytest.mark.parametrize("task", ["pick_place", "slide", "lift"])
+def test_one_puck_is_the_only_one_that_is_named(task: str) -> None:
+    env = Tabletop(task, pucks=1)
+    _, info = env.reset(seed=0)
+    assert len({text.split(" puck ")[0] for text in [f"{text} " for text in info["instructions"]]}) == 1
+    assert np.mean([play(env, seed) for seed in range(20)]) >= 0.95
+
+
+@pytest.mark.parametrize("task", ["pick_place", "slide", "stack", "lift"])
+def test_the_state_of_the_objects_says_where_the_puck_is_and_where_it_is_to_be(task: str) -> None:
+    env = Tabletop(task, object_state=True)
+    check_env(env, steps=20)
+    seen, _ = env.reset(seed=0)
+    plain = Tabletop(task).reset(seed=0)[0]
+    assert {"puck", "target"} == set(seen.state) - set(plain.state)
+    np.testing.assert_array_equal(seen.cameras["front"], plain.cameras["front"])
+    expert = Scripted()
+    expert.reset(seen, env.instruction, env="tabletop", seed=0)
+    off = [np.linalg.norm(seen.state["puck"] - seen.state["target"])]
+    success = False
+    while not success:
+        seen, _, _, truncated, info = env.step(expert.act(seen))
+        assert not truncated
+        success = info["success"]
+        off.append(np.linalg.norm(seen.state["puck"] - seen.state["target"]))
+    assert off[0] > 0.07
+    assert off[-1] < 0.06, "within the pad, on the other puck, or somewhat higher than it had to be lifted"
 
 
 def test_a_step_before_reset_is_refused() -> None:

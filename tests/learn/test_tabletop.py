@@ -143,11 +143,13 @@ def test_a_log_probability_is_that_of_the_normal_distribution_that_was_drawn_fro
 
 
 def test_advantages_are_those_of_the_formula() -> None:
-    found = {"reward": [0.0, 1.0, 0.0], "value": [0.5, 0.25, 0.75], "t": [0, 1, 0]}
-    gain, targets = advantages({name: np.array(values, np.float32) for name, values in found.items()})
-    last = 1 + 0.98 * 0.25 - 0.25
-    np.testing.assert_allclose(gain, [0.98 * 0.25 - 0.5 + 0.98 * 0.95 * last, last, 0.98 * 0.75 - 0.75], rtol=1e-6)
-    np.testing.assert_allclose(targets, gain + found["value"], rtol=1e-6)
+    found = {"value": [0.5, 0.25, 9.0, 0.75, 0.5], "t": [0, 1, 2, 0, 1], "success": [False, True, True, False, False]}
+    gain, targets = advantages({name: np.array(values) for name, values in found.items()})
+    last, limit = 1 - 0.25, 0.98 * 0.5 - 0.5
+    first = 0.98 * 0.25 - 0.5 + 0.98 * 0.95 * last
+    expected = [first, last, 0, 0.98 * 0.5 - 0.75 + 0.98 * 0.95 * limit, limit]
+    np.testing.assert_allclose(gain, expected, rtol=1e-6)
+    np.testing.assert_allclose(targets, gain + np.array([0.5, 0.25, 0, 0.75, 0.5]), rtol=1e-6)
 
 
 @pytest.mark.torch
@@ -185,7 +187,8 @@ def taught() -> tuple[RPDLearner, dict[str, Any]]:
     learner = RPDLearner()
     learner.add_advice(inputs_of(found), found["action"])
     rows = np.arange(len(found["t"]))
-    own = {"reward": rows % 2, "value": rows % 3, "logprob": -1 - rows % 2}
+    own = {"value": rows % 3, "logprob": -1 - rows % 2}
+    found["success"] = rows % 50 == 0
     return learner, found | {name: values.astype(np.float32) for name, values in own.items()}
 
 

@@ -19,6 +19,7 @@ from vlagents_ray.naming import distinct
 from vlagents_ray.robot.statistics import ImageStatistics, Stats
 
 IMAGES, STATE, ACTION = "observation.images.", "observation.state", "action"
+ENVIRONMENT = "observation.environment_state"
 MOMENTS = {  # further columns of each recorded frame
     "captured_at": "float64",  # s since 1970
     "tick": "int64",  # of the control loop; gaps are missed or dropped frames

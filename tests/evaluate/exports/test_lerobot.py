@@ -166,6 +166,33 @@ def test_cameras_and_parts_of_the_state_are_chosen_in_that_order(config: Config,
     assert not (tmp_path / "d/videos/observation.images.base").exists()
 
 
+def test_parts_of_the_environments_state_are_apart_and_need_no_camera(config: Config, tmp_path: Path) -> None:
+    results = play(config(envs=[ROLLER], episodes=1, record="all"), Turner)
+    to_lerobot(results, tmp_path / "d", cameras=[], environment_state=["joints"])
+    features = info(tmp_path / "d")["features"]
+    assert [key for key in features if "images" in key] == []
+    assert features["observation.environment_state"]["names"] == ["joints_0", "joints_1"]
+    assert features["observation.state"]["names"] == [*(f"xyzrpy_{i}" for i in range(6)), "gripper"]
+    assert rows(tmp_path / "d", 0)["observation.environment_state"][0] == pytest.approx([0.1, 0.0])
+    about = DatasetContract.from_json(info(tmp_path / "d")[INFO])
+    assert about.environment == ("joints",)
+    assert set(about.contract.state or {}) == {"joints", "xyzrpy"}
+    assert sorted(path.name for path in (tmp_path / "d").iterdir()) == ["data", "meta"]
+
+
+def test_a_part_may_be_in_both_states(config: Config, tmp_path: Path) -> None:
+    results = play(config(envs=[ROLLER], episodes=1, record="all"), Turner)
+    to_lerobot(results, tmp_path / "d", state=["joints", "gripper"], environment_state=["joints"])
+    first = {key: values[0] for key, values in rows(tmp_path / "d", 0).items()}
+    assert first["observation.state"] == pytest.approx([0.1, 0.0, 1.0])
+    assert first["observation.environment_state"] == first["observation.state.joints"]
+
+
+def test_a_finished_dataset_has_no_folder_of_an_unfinished_episode(config: Config, tmp_path: Path) -> None:
+    to_lerobot(play(config(envs=[ROLLER], episodes=2, record="all"), Turner), tmp_path / "d")
+    assert sorted(path.name for path in (tmp_path / "d").iterdir()) == ["data", "meta", "videos"]
+
+
 @pytest.mark.parametrize(
     ("chosen", "text"),
     [
@@ -175,6 +202,10 @@ def test_cameras_and_parts_of_the_state_are_chosen_in_that_order(config: Config,
         ),
         ({"state": ["joints", "torque"]}, "state: .*Roller has no 'torque', want some of .*'gripper', 'joints'"),
         ({"state": ["joints", "joints"]}, "each of them once"),
+        (
+            {"environment_state": ["gripper"]},
+            "environment_state: .*has no 'gripper', want some of .*'joints', 'xyzrpy'",
+        ),
     ],
 )
 def test_what_the_episodes_do_not_have_cannot_be_chosen(

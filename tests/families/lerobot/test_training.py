@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,32 +20,40 @@ import torch
 from flat_config import flat_config
 from in_process_evaluation import play
 from safetensors.torch import load_file, save_file
+from typer.testing import CliRunner
 from wrist_roll_env import ROLLER, Roller, Turner
 
+from vlagents_ray.cli.main import app
+from vlagents_ray.cli.options import parse_settings
 from vlagents_ray.contract import Contract, StateSpec, require_match
 from vlagents_ray.dataset_contract import BYTES, STATISTICS, DatasetContract
+from vlagents_ray.envs import make_env
 from vlagents_ray.evaluate.exports import to_lerobot
 from vlagents_ray.interface import Act
 from vlagents_ray.policies.lerobot import LeRobot
+from vlagents_ray.policies.scripted import Scripted
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 
 STEPS = 10
+IMAGES, STATE_ALONE = 0, 1  # in the order of the page
 TINY = ["dim_model=32", "n_heads=2", "dim_feedforward=64", "n_encoder_layers=1", "chunk_size=8", "n_action_steps=4"]
 
 
-def documented() -> list[str]:
-    """The words of `lerobot-train` on the page about training, without the command."""
+def documented(command: str) -> list[list[str]]:
+    """The words of each such command on the page about training, without the command itself."""
     page = (Path(__file__).parents[3] / "docs/training.md").read_text()
-    [words] = re.findall(r"^\.venv-lerobot/bin/lerobot-train ((?:.*\\\n)*.*)$", page, re.MULTILINE)
-    return shlex.split(words.replace("\\\n", " "))
+    found = re.findall(rf"^{re.escape(command)} ((?:.*\\\n)*.*)$", page, re.MULTILINE)
+    return [shlex.split(words.replace("\\\n", " ")) for words in found]
 
 
-def train(dataset: Path, out: Path) -> Path:
+def train(dataset: Path, out: Path, route: int = IMAGES) -> Path:
     """The documented training, but ten steps of a tiny ACT; returns the folder of the checkpoint."""
     own = [f"--dataset.root={dataset}", f"--output_dir={out}", f"--steps={STEPS}", f"--save_freq={STEPS}"]
     small = [*(f"--policy.{word}" for word in TINY), "--policy.device=cpu", "--batch_size=2", "--num_workers=1"]
     changed = {word.partition("=")[0] for word in [*own, *small]}
-    kept = [word for word in documented() if word.partition("=")[0] not in changed]
+    kept = [
+        word for word in documented(".venv-lerobot/bin/lerobot-train")[route] if word.partition("=")[0] not in changed
+    ]
     done = subprocess.run(
         [str(Path(sys.executable).parent / "lerobot-train"), *kept, *own, *small],
         env={**os.environ, "HF_HUB_OFFLINE": "1"},
@@ -93,6 +102,34 @@ def test_a_policy_of_lerobots_own_command_is_served_without_settings(policy: LeR
     action = session.act(obs).action
     assert action.shape[-1] == 2
     assert np.isfinite(action).all()
+
+
+@pytest.mark.parametrize("route", [IMAGES, STATE_ALONE])
+def test_the_documented_commands_lead_from_recordings_to_a_policy_that_acts(route: int, tmp_path: Path) -> None:
+    record, *watched = documented("vlagents-ray eval")
+    task, options = record[0], settings_of(record, "--env-set")
+    run = flat_config(envs=[task], env_options=options, episodes=2, record="all", video="none", out=tmp_path / "run")
+    play(run, Scripted)
+    _, _, *chosen = documented("vlagents-ray export")[route]
+    exported = CliRunner().invoke(app, ["export", str(tmp_path / "run"), str(tmp_path / "dataset"), *chosen])
+    assert exported.exit_code == 0, exported.output
+    policy = served(train(tmp_path / "dataset", tmp_path / "act", route))
+    assert watched[route][0] == task
+    env = make_env(task, **settings_of(watched[route], "--env-set"))
+    assert policy.contract is not None
+    require_match(policy.contract, env.contract)
+    assert (set(policy.contract.cameras or {}) == set()) == (route == STATE_ALONE)
+    assert ("puck" in (policy.contract.state or {})) == (route == STATE_ALONE)
+    obs, _ = env.reset(seed=0)
+    session = AgentCopies(policy).make()
+    session.reset(obs, env.instruction, seed=0)
+    for _ in range(3):
+        for row in np.atleast_2d(session.act(obs).action):
+            obs, *_ = env.step(Act(row))
+
+
+def settings_of(words: list[str], option: str) -> dict[str, Any]:
+    return parse_settings([value for name, value in pairwise(words) if name == option], option)
 
 
 def test_its_contract_is_the_envs_with_the_meaning_of_its_actions(policy: LeRobot) -> None:

@@ -48,10 +48,16 @@ def export_command(
     to: Annotated[str, typer.Option(help="json, csv, parquet: a row an episode; lerobot: a dataset of what was seen.")],
     policy: Annotated[str | None, typer.Option(help="Only this one: NAME, or NAME@STEP in a sweep.")] = None,
     env: Annotated[str | None, typer.Option(help="Only this one.")] = None,
-    cameras: Annotated[str | None, typer.Option(help="lerobot: only these, as base,wrist. Default: all.")] = None,
+    cameras: Annotated[
+        str | None, typer.Option(help="lerobot: only these, as base,wrist; '' for none. Default: all.")
+    ] = None,
     state: Annotated[
         str | None,
         typer.Option(help="lerobot: only these parts of the state, in this order, as joints,gripper. Default: all."),
+    ] = None,
+    environment_state: Annotated[
+        str | None,
+        typer.Option(help="lerobot: these parts of the state are observation.environment_state, as puck,target."),
     ] = None,
     successes: Annotated[bool, typer.Option("--successes", help="lerobot: only episodes that were solved.")] = False,
     cut_idle: Annotated[
@@ -66,7 +72,7 @@ def export_command(
     with errors():
         if to not in EXPORTS:
             raise ConfigError(f"--to: got {to!r}, want one of {', '.join(EXPORTS)}")
-        named = {"cameras": cameras, "state": state}
+        named = {"cameras": cameras, "state": state, "environment_state": environment_state}
         chosen: dict[str, Any] = {name: parse_list(value) for name, value in named.items() if value is not None}
         chosen |= {name: True for name, on in (("successes", successes), ("cut_idle", cut_idle)) if on}
         if chosen and to != "lerobot":

@@ -10,7 +10,7 @@ import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import EvalEnv, one_row, require_known
-from vlagents_ray.envs.tabletop.goals import Goal, Task, draw_episode, goals
+from vlagents_ray.envs.tabletop.goals import PUCKS, Goal, Task, draw_episode, goals
 from vlagents_ray.envs.tabletop.render import ELEVATION, VIEW, TabletopRenderer
 from vlagents_ray.envs.tabletop.world import STEP_LIMIT, TabletopWorld
 from vlagents_ray.errors import ConfigError, NotReset
@@ -31,7 +31,9 @@ class Tabletop(EvalEnv):
 
     Observation: camera "front" (height, width, 3); `state["xyzrpy"]` (6,), the fingertips' position
     in m and the gripper's constant orientation in rad, in the base frame of the package's docstring;
-    `gripper` in [0, 1], 1 = open, about 0.58 around a puck.
+    `gripper` in [0, 1], 1 = open, about 0.58 around a puck. With `object_state`, also `state["puck"]` (3,),
+    where the underside of the instruction's puck is, and `state["target"]` (3,), where it is to be; m, in
+    the base frame.
 
     Action (4,): `dx, dy, dz` in units of 0.03 m a step along the base frame's axes, and the gripper,
     1 = open, -1 = closed. Components outside [-1, 1] are clipped, as a robot's controller would.
@@ -39,15 +41,45 @@ class Tabletop(EvalEnv):
     The reward is 1.0 in each step that ends in success, else 0.0. Nothing terminates an episode.
     """
 
-    def __init__(self, task: str | None = None, *, width: int = 224, height: int = 224, max_steps: int = 80) -> None:
-        """`width` and `height` of the image in pixels, at least 32; `max_steps` until truncation."""
+    def __init__(
+        self,
+        task: str | None = None,
+        *,
+        width: int = 224,
+        height: int = 224,
+        max_steps: int = 80,
+        pucks: int = PUCKS,
+        object_state: bool = False,
+    ) -> None:
+        """Make the environment of a task.
+
+        Args:
+            task: One of `tasks()`; `mixed` if None.
+            width: Of the image, at least 32 pixels.
+            height: Of the image, at least 32 pixels.
+            max_steps: Steps until truncation.
+            pucks: Pucks on the table, 1 to 4. A policy that takes no instruction can only know its puck if it is alone.
+            object_state: Whether the state has the places of the instruction's puck and of its target.
+
+        Raises:
+            ConfigError: There is no such task, or a number is out of its range.
+        """
         self.require_task(task)
-        for name, value, least in (("width", width, 32), ("height", height, 32), ("max_steps", max_steps, 1)):
-            if value < least:
-                raise ConfigError(f"tabletop: {name} is {value}, want at least {least}")
-        self.max_steps = max_steps
         self._task = task or MIXED
-        self._contract = self.known_contract({"width": width, "height": height})
+        fewest = 2 if self._task in (MIXED, "stack") else 1
+        ranges = {
+            "width": (width, 32, None),
+            "height": (height, 32, None),
+            "max_steps": (max_steps, 1, None),
+            "pucks": (pucks, fewest, PUCKS),
+        }
+        for name, (value, least, most) in ranges.items():
+            if value < least or (most is not None and value > most):
+                wanted = f"at least {least}" if most is None else f"{least} to {most} in {self._task!r}"
+                raise ConfigError(f"tabletop: {name} is {value}, want {wanted}")
+        self.max_steps = max_steps
+        self._pucks, self._object_state = pucks, object_state
+        self._contract = self.known_contract({"width": width, "height": height, "object_state": object_state})
         self._renderer = TabletopRenderer(width, height)
         self._world: TabletopWorld | None = None
         self._goal: Goal | None = None
@@ -63,9 +95,10 @@ class Tabletop(EvalEnv):
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
+        objects = {"puck": StateSpec(3, "m"), "target": StateSpec(3, "m")}
         return Contract(
             cameras={"front": CameraSpec(arguments["height"], arguments["width"])},
-            state={"xyzrpy": StateSpec(6, "m+rad")},
+            state={"xyzrpy": StateSpec(6, "m+rad")} | (objects if arguments.get("object_state") else {}),
             gripper=True,
             instruction=True,
             action=ActionSpec(
@@ -112,13 +145,13 @@ class Tabletop(EvalEnv):
             raise ConfigError(f"tabletop: unknown reset options {unknown}, want none or 'instruction'")
         rng = np.random.default_rng(seed % 2**64)  # numpy takes no negative seed
         task = _TASKS[rng.integers(len(_TASKS))] if self._task == MIXED else self._task_in_scene()
-        world, goal = draw_episode(task, rng)
+        world, goal = draw_episode(task, rng, self._pucks)
         if options:
             goal = self._chosen(world, options["instruction"])
         self._world, self._goal, self._steps = world, goal, 0
         self._renderer.begin(world.pads)
         info = {"instructions": [g.instruction for g in goals(world, goal.task)], "success": False}
-        return self._observe(world), info
+        return self._observe(world, goal), info
 
     def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
         world, goal = self._world, self._goal
@@ -129,14 +162,18 @@ class Tabletop(EvalEnv):
         world.step(dx * STEP_LIMIT, dy * STEP_LIMIT, dz * STEP_LIMIT, (grip + 1) / 2)
         self._steps += 1
         success = goal.reached(world)
-        return self._observe(world), float(success), False, self._steps >= self.max_steps, {"success": success}
+        return self._observe(world, goal), float(success), False, self._steps >= self.max_steps, {"success": success}
 
     def close(self) -> None:
         self._world = self._goal = None
 
-    def _observe(self, world: TabletopWorld) -> Obs:
-        state = np.array((world.x, world.y, world.z, *_POINTING_DOWN), np.float32)
-        return Obs(cameras={"front": self._renderer.draw(world)}, gripper=world.opening, state={"xyzrpy": state})
+    def _observe(self, world: TabletopWorld, goal: Goal) -> Obs:
+        state = {"xyzrpy": np.array((world.x, world.y, world.z, *_POINTING_DOWN), np.float32)}
+        if self._object_state:
+            puck = world.puck(goal.puck)
+            state["puck"] = np.array((puck.x, puck.y, puck.z), np.float32)
+            state["target"] = np.array(goal.place(world), np.float32)
+        return Obs(cameras={"front": self._renderer.draw(world)}, gripper=world.opening, state=state)
 
     def _task_in_scene(self) -> Task:
         return next(task for task in _TASKS if task == self._task)

@@ -19,7 +19,8 @@ TEMPLATES: dict[Task, str] = {
 }
 COLOURS = ("red", "green", "blue", "yellow", "purple")
 
-_PUCKS, _PADS = 4, 3
+PUCKS = 4  # at most
+_PADS = 3
 _AREA = (0.22, 0.13)  # m, half extents of the area in which objects are placed
 _CLEARANCE = 0.09  # m between centres: a puck's own radius, an open finger, and the neighbour
 _PAD_CLEARANCE = 0.125  # m between the centres of two pads
@@ -55,6 +56,17 @@ class Goal:
         at_pad = abs(puck.x - pad.x) <= _AT_PAD and abs(puck.y - pad.y) <= _AT_PAD and puck.z < 1e-3
         return at_pad and not (self.task == "slide" and puck.lifted)
 
+    def place(self, world: TabletopWorld) -> tuple[float, float, float]:
+        """Where the middle of the puck's underside is to be: x, y, z in m, in the base frame."""
+        if self.target is None:
+            puck = world.puck(self.puck)
+            return puck.x, puck.y, _LIFT_HEIGHT
+        if self.task == "stack":
+            below = world.puck(self.target)
+            return below.x, below.y, below.z + PUCK_HEIGHT
+        pad = world.pad(self.target)
+        return pad.x, pad.y, 0.0
+
 
 def goals(world: TabletopWorld, task: Task) -> list[Goal]:
     """List the goals of a task that are possible in this scene, in a fixed order."""
@@ -65,29 +77,29 @@ def goals(world: TabletopWorld, task: Task) -> list[Goal]:
     return [Goal(task, a, b) for a in pucks for b in targets if task != "stack" or a != b]
 
 
-def draw_episode(task: Task, rng: np.random.Generator) -> tuple[TabletopWorld, Goal]:
-    """Draw a scene and a goal; a slide is drawn only if no puck is in its way."""
+def draw_episode(task: Task, rng: np.random.Generator, pucks: int = PUCKS) -> tuple[TabletopWorld, Goal]:
+    """Draw a scene with so many pucks, and a goal; a slide is drawn only if no puck is in its way."""
     while True:
-        world = _draw_scene(rng)
+        world = _draw_scene(rng, pucks)
         wanted = [goal for goal in goals(world, task) if task != "slide" or _is_clear(world, goal)]
         if wanted:
             return world, wanted[rng.integers(len(wanted))]
 
 
-def _draw_scene(rng: np.random.Generator) -> TabletopWorld:
+def _draw_scene(rng: np.random.Generator, count: int) -> TabletopWorld:
     while True:
         places: list[tuple[float, float, float]] = []  # x, y, and the clearance from another of its kind
         for _ in range(200):
-            if len(places) == _PADS + _PUCKS:
+            if len(places) == _PADS + count:
                 break
             clearance = _PAD_CLEARANCE if len(places) < _PADS else _CLEARANCE
             x, y = rng.uniform(-1, 1, 2) * _AREA
             if all(math.hypot(x - p[0], y - p[1]) >= min(clearance, p[2]) for p in places):
                 places.append((float(x), float(y), clearance))
-        if len(places) < _PADS + _PUCKS:
+        if len(places) < _PADS + count:
             continue  # no free place is left: draw again
         pad_colours = rng.permutation(COLOURS)[:_PADS]
-        puck_colours = rng.permutation(COLOURS)[:_PUCKS]
+        puck_colours = rng.permutation(COLOURS)[:count]
         pads = [Pad(str(c), x, y) for c, (x, y, _) in zip(pad_colours, places[:_PADS], strict=True)]
         pucks = [Puck(str(c), x, y) for c, (x, y, _) in zip(puck_colours, places[_PADS:], strict=True)]
         return TabletopWorld(pucks, pads)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,6 +30,7 @@ from vlagents_ray.registry import require
 from vlagents_ray.robot.dataset import UNFINISHED, Dataset
 from vlagents_ray.robot.episode import (
     ACTION,
+    ENVIRONMENT,
     INDEX,
     STATE,
     Finished,
@@ -54,6 +56,7 @@ def to_lerobot(
     *,
     cameras: Sequence[str] | None = None,
     state: Sequence[str] | None = None,
+    environment_state: Sequence[str] = (),
     successes: bool = False,
     cut_idle: bool = False,
 ) -> int:
@@ -68,8 +71,10 @@ def to_lerobot(
 
     Args:
         cameras: The cameras of the dataset; by default all.
-        state: The parts of `observation.state` in this order, "gripper" for `Obs.gripper`; by default all, sorted, the
-            gripper last.
+        state: The parts of `observation.state` in this order, "gripper" for `Obs.gripper`; by default all that are not
+            in `environment_state`, sorted, the gripper last.
+        environment_state: The parts of `observation.environment_state` in this order: LeRobot's policies need it if
+            they get no camera.
         successes: Leave out episodes in which the task was never solved.
         cut_idle: End each episode where, after the task was solved, neither state nor action changes any more.
 
@@ -99,7 +104,7 @@ def to_lerobot(
 
     def demonstrations() -> Iterator[_Demonstration]:
         for cell, episode in recorded:
-            one = _demonstration(results, cell, episode, cameras, state, cut_idle, with_versions)
+            one = _demonstration(results, cell, episode, cameras, state, environment_state, cut_idle, with_versions)
             if len(one.actions):  # a policy that failed before it acted leaves an empty episode, which no dataset has
                 yield one
 
@@ -116,6 +121,7 @@ def to_lerobot(
             dataset.save(finished)
         if not dataset.episodes:
             raise ConfigError(f"{results.out}: in none of the {len(recorded)} recorded episodes did the policy act")
+        shutil.rmtree(root / UNFINISHED, ignore_errors=True)
         return dataset.episodes
 
 
@@ -134,7 +140,8 @@ class _Demonstration:
     actions: np.ndarray  # (N, A)
     rewards: np.ndarray  # (N,)
     success: np.ndarray  # (N,)
-    parts: tuple[str, ...]
+    parts: tuple[str, ...]  # of `observation.state`
+    environment: tuple[str, ...]  # parts of `observation.environment_state`
     state: dict[str, np.ndarray]  # (N, D) each
     gripper: np.ndarray | None  # (N,)
     versions: np.ndarray | None  # (N,) of the weights that chose each action; None if no episode's policy named them
@@ -151,17 +158,22 @@ def _demonstration(
     episode: Episode,
     cameras: Sequence[str] | None,
     state: Sequence[str] | None,
+    environment_state: Sequence[str],
     cut_idle: bool,
     with_versions: bool,
 ) -> _Demonstration:
     path = str(episode.trajectory)
     trajectory = Trajectory.load(results.file(path))
     parts = parts_of(trajectory.state, trajectory.gripper is not None)
+    numbers = [part for part in parts if part != GRIPPER or trajectory.gripper is None]
+    environment = _chosen("environment_state", environment_state, numbers, cell.env)
+    if state is None:
+        state = [part for part in parts if part not in environment]
     chosen = _chosen("state", state, parts, cell.env)
     shown = _chosen("cameras", cameras, trajectory.cameras, cell.env)
     videos = videos_of(Path(path), trajectory.cameras)
     with_gripper = trajectory.gripper is not None and GRIPPER in chosen
-    named = set(chosen) - ({GRIPPER} if with_gripper else set())
+    named = {*chosen, *environment} - ({GRIPPER} if with_gripper else set())
     kept = {part: values for part, values in trajectory.state.items() if part in named}
     gripper = trajectory.gripper if with_gripper else None
     frames = len(trajectory.actions)
@@ -176,6 +188,7 @@ def _demonstration(
         trajectory.rewards[:frames],
         trajectory.success[:frames],
         tuple(chosen),
+        tuple(environment),
         {part: values[:frames] for part, values in kept.items()},
         None if gripper is None else gripper[:frames],
         _versions(trajectory)[:frames] if with_versions else None,
@@ -243,7 +256,7 @@ def _finished(one: _Demonstration, angles: Mapping[int, Centre], folder: Path) -
     """The episode in the form that the dataset takes; its videos are put into `folder` first."""
     keys = camera_keys(one.videos)
     names = {key: camera for camera, key in keys.items()}
-    about = DatasetContract(_policy_contract(one), one.parts, names, angles)
+    about = DatasetContract(_policy_contract(one), one.parts, names, angles, one.environment)
     rows, features = _numbers(one, about)
     images: dict[str, Stats] = {}
     videos: dict[str, Path] = {}
@@ -284,10 +297,13 @@ def _numbers(one: _Demonstration, about: DatasetContract) -> tuple[dict[str, np.
     features[ACTION]["spec"] = one.cell.contract.get("action")
     if names:
         rows[STATE], features[STATE] = together, vector_feature(names)
+    if one.environment:
+        rows[ENVIRONMENT], names = state_vector(one.state, None, one.environment)
+        features[ENVIRONMENT] = vector_feature(names)
     if one.versions is not None:
         rows[VERSION] = one.versions
         features |= number_features({VERSION: "int64"})
-    keys = distinct(one.state, without_slash)
+    keys = distinct([part for part in one.parts if part in one.state], without_slash)
     place = 0
     for part in one.parts:
         if part not in one.state:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.learn.tabletop.learner import NetworkLearner, inputs_of
+from vlagents_ray.learn.tabletop.learner import NetworkLearner, inputs_of, until_solved
 from vlagents_ray.learn.tabletop.token_student import make_token_network, tokens_of
 
 _EPSILON = 1e-6  # beside the standard deviation of a group
@@ -28,9 +28,7 @@ def group_advantages(columns: Mapping[str, np.ndarray]) -> np.ndarray:
     for number in np.unique(group):
         members = group == number
         gain[members] = (solved[members] - solved[members].mean()) / (solved[members].std() + _EPSILON)
-    before = np.cumsum(success) - success  # steps at which a task was solved, in the rows before each
-    over = before > np.repeat(before[starts], lengths)
-    return np.where(over, 0.0, np.repeat(gain, lengths)).astype(np.float32)
+    return np.where(until_solved(columns), np.repeat(gain, lengths), 0.0).astype(np.float32)
 
 
 class GRPOLearner(NetworkLearner):

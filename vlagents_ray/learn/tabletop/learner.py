@@ -68,20 +68,30 @@ def advice(teacher: RemoteAgent, columns: Mapping[str, np.ndarray]) -> np.ndarra
     return actions
 
 
+def until_solved(columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Return which transitions are before the task was solved, or solve it, (T,) bool: the others teach nothing."""
+    starts, success = np.flatnonzero(columns["t"] == 0), columns["success"]
+    before = np.cumsum(success) - success  # steps at which a task was solved, in the rows before each
+    kept: np.ndarray = before == np.repeat(before[starts], np.diff([*starts, len(success)]))
+    return kept
+
+
 def advantages(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """Return the advantages of the actions, and the targets of the values, each (T,) float32.
 
-    Step limits alone end episodes, so that the value of what would follow is that of the last observation.
+    The reward is 1 for the step that solves the task, which ends the episode here; both are 0 after it. Otherwise the
+    step limit ends it, so that the value of what would follow is that of the last observation.
     """
-    found = np.zeros(len(columns["reward"]), np.float32)
+    value, success, kept = columns["value"], columns["success"], until_solved(columns)
+    gain = np.zeros(len(value), np.float32)
     following, later = 0.0, 0.0
-    for i in reversed(range(len(found))):
-        if i + 1 == len(found) or columns["t"][i + 1] == 0:
-            following, later = float(columns["value"][i]), 0.0
-        value = float(columns["value"][i])
-        later = columns["reward"][i] + DISCOUNT * following - value + DISCOUNT * TRACE * later
-        found[i], following = later, value
-    return found, found + columns["value"]
+    for i in reversed(np.flatnonzero(kept)):
+        last = i + 1 == len(value) or columns["t"][i + 1] == 0
+        if last or success[i]:
+            following, later = (0.0 if success[i] else float(value[i])), 0.0
+        later = float(success[i]) + DISCOUNT * following - float(value[i]) + DISCOUNT * TRACE * later
+        gain[i], following = later, float(value[i])
+    return gain, np.where(kept, gain + value, 0.0).astype(np.float32)
 
 
 class NetworkLearner:
@@ -205,10 +215,10 @@ class PPOLearner(NetworkLearner):
 
     def improve(self, columns: Mapping[str, np.ndarray], steps: int) -> None:
         torch, rng = self._torch, self._begin_improving()
-        seen, (gain, targets) = inputs_of(columns), advantages(columns)
-        gain = (gain - gain.mean()) / (gain.std() + 1e-6)
+        seen, (gain, targets), kept = inputs_of(columns), advantages(columns), np.flatnonzero(until_solved(columns))
+        gain = (gain - gain[kept].mean()) / (gain[kept].std() + 1e-6)
         for _ in range(steps):
-            rows = self._drawn(rng, len(seen))
+            rows = kept[self._drawn(rng, len(kept))]
             mean, value = self.network(self._tensor(seen, rows))
             normal = torch.distributions.Normal(mean, self.network.log_std.exp())
             logprob = normal.log_prob(self._tensor(columns["action"], rows)).sum(-1)

@@ -41,7 +41,7 @@ from vlagents_ray.registry import require
 log = logging.getLogger(__name__)
 
 STATE, ENVIRONMENT = "observation.state", "observation.environment_state"
-JOINTS, ENVIRONMENT_STATE = "joints", "environment_state"  # parts of `Obs.state` that make these, by default
+JOINTS, ENVIRONMENT_STATE = "joints", "environment_state"  # parts of `Obs.state` that make these, if nothing is known
 _MATCHED = ("min", "max", "mean")  # statistics by which the parts of a state are found in it
 _EMPTY = "empty_camera_"  # prefix of cameras that were always masked in training
 
@@ -54,7 +54,7 @@ class LoadedLeRobot:
     processors: Processors
     cameras: dict[str, str]  # the policy's observation key -> our name
     state: list[str]  # parts of the proprioception; empty if the policy has no state
-    environment: int  # length of the environment's state; 0 if the policy has none
+    environment: list[str]  # parts of the environment's state; empty if the policy has none
     contract: Contract
     trained: DatasetContract  # of the dataset; empty if it stated none
 
@@ -80,6 +80,12 @@ class LeRobot(ModelPolicy):
         feature = None if self.model is None else self.model.kind.config.robot_state_feature
         return None if feature is None else int(feature.shape[0])
 
+    @property
+    def environment_dim(self) -> int | None:
+        """The length of the environment's state; None if the policy has none."""
+        feature = None if self.model is None else self.model.kind.config.env_state_feature
+        return None if feature is None else int(feature.shape[0])
+
     def load(self) -> LoadedLeRobot:
         """Read the checkpoint; raises `ConfigError` if a part of it is missing, unknown or random."""
         with remote_code(allowed=self.config.trust_remote_code):
@@ -103,12 +109,13 @@ class LeRobot(ModelPolicy):
         parts = list(self.config.state or trained.state or [JOINTS]) if settings.robot_state_feature else []
         inputs = [*cameras, *(key for key in (STATE, ENVIRONMENT) if key in settings.input_features)]
         processors.require_statistics(settings, inputs)
-        environment = settings.env_state_feature.shape[0] if settings.env_state_feature else 0
+        environment = list(trained.environment or [ENVIRONMENT_STATE]) if settings.env_state_feature else []
         width = processors.width(settings.action_feature.shape[0])
         action = trained.contract.action
         contract = Contract(
             cameras={ours: _camera(settings, key) for key, ours in cameras.items()},
-            state=_states(parts, settings.robot_state_feature, environment, trained),
+            state=_states(parts, settings.robot_state_feature, trained)
+            | _environment_states(environment, settings.env_state_feature, trained),
             gripper=needs_gripper(parts),
             instruction=processors.instructed or None,
             action=action if action.dim == width else ActionSpec(dim=width),
@@ -126,7 +133,7 @@ class LeRobot(ModelPolicy):
         if model.state:
             frame[STATE] = model.trained.wrapped(state_vector(obs, model.state, self.state_dim))
         if model.environment:
-            frame[ENVIRONMENT] = state_vector(obs, [ENVIRONMENT_STATE], model.environment)
+            frame[ENVIRONMENT] = state_vector(obs, model.environment, self.environment_dim)
         return frame
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
@@ -257,8 +264,14 @@ def _camera(settings: Any, key: str) -> CameraSpec:
     return CameraSpec(height, width)
 
 
-def _states(parts: Sequence[str], feature: Any, environment: int, trained: DatasetContract) -> dict[str, StateSpec]:
+def _states(parts: Sequence[str], feature: Any, trained: DatasetContract) -> dict[str, StateSpec]:
     specs = state_specs(parts, feature.shape[0]) if parts else {}
     if tuple(parts) == trained.state:
         specs |= trained.contract.state or {}
-    return {**specs, ENVIRONMENT_STATE: StateSpec(environment)} if environment else specs
+    return specs
+
+
+def _environment_states(parts: Sequence[str], feature: Any, trained: DatasetContract) -> dict[str, StateSpec]:
+    specs = state_specs(parts, feature.shape[0]) if parts else {}
+    known = trained.contract.state or {}
+    return {part: known.get(part, spec) for part, spec in specs.items()}
