@@ -8,8 +8,9 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from subprocess import PIPE
 from typing import Any, get_args
 
 import numpy as np
@@ -217,72 +218,94 @@ def test_there_is_an_example_of_each_method() -> None:
 
 
 SMALL = {
-    "methods": ["bc", "rpd", "ppo", "grpo"],
-    "groups": 4,
+    "methods": ["bc", "rpd", "grpo"],
     "demonstrations": 8,
     "clone_steps": 300,
     "iterations": 2,
     "episodes": 8,
+    "groups": 4,
     "steps": 50,
+    "evaluate_every": 2,
+    "held_out": 6,
+    "num_envs": 4,
 }
-SMALL |= {"evaluate_every": 1, "held_out": 6, "num_envs": 4}
+
+
+@pytest.fixture(scope="module")
+def folder() -> Iterator[Path]:
+    """A folder with the plan, and of the Ray of each run."""
+    with ray_folder() as folder:
+        (folder / "plan.yaml").write_text(json.dumps(SMALL))
+        yield folder
+
+
+@pytest.fixture(scope="module")
+def undisturbed(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    """The table of a run in which nothing was killed."""
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    with start(folder, out) as run:
+        printed = ended(run, folder)
+    assert "demonstrations: 8 of 8 episodes solved" in printed
+    assert (out / "report.html").is_file()
+    found = table(out)
+    # A learner of groups takes no step if each group has one outcome.
+    assert list(found)[:3] == ["bc@300", "rpd@400", "grpo@300"]
+    return found
 
 
 @pytest.mark.server
 @pytest.mark.torch
 @pytest.mark.slow
-def test_whatever_is_killed_the_table_is_that_of_a_run_where_nothing_was(tmp_path: Path) -> None:
-    def until_rpd_learns(run: subprocess.Popen[str], name: str) -> None:
-        wait_for(lambda: (tmp_path / name / "checkpoints" / "rpd.pt").exists() or run.poll() is not None)
+def test_a_killed_run_goes_on_to_the_same_table(folder: Path, undisturbed: dict[str, Any], tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with start(folder, out) as run:
+        wait_until_rpd_learns(run, out)
+        run.kill()
+    end(folder)
+    with start(folder, out, "--resume") as run:
+        assert "demonstrations:" not in ended(run, folder)
+    assert table(out) == undisturbed
 
-    plan = tmp_path / "small.yaml"
-    plan.write_text(json.dumps(SMALL))
-    with ray_folder() as folder:
-        whole = learn(folder, plan, "--out", str(tmp_path / "whole"))
-        killed = start(folder, plan, "--out", str(tmp_path / "killed"))
-        until_rpd_learns(killed, "killed")
-        killed.kill()
-        killed.communicate()
-        end(folder)
-        resumed = learn(folder, plan, "--out", str(tmp_path / "killed"), "--resume")
-        bereft = start(folder, plan, "--out", str(tmp_path / "bereft"))
-        until_rpd_learns(bereft, "bereft")
+
+@pytest.mark.server
+@pytest.mark.torch
+@pytest.mark.slow
+def test_killed_replicas_and_workers_change_nothing(folder: Path, undisturbed: dict[str, Any], tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    with start(folder, out) as run:
+        wait_until_rpd_learns(run, out)
         for pid in [*processes(folder, "ray::ServeReplica:rpd"), *processes(folder, "ray::Rollout")]:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
-        printed, _ = bereft.communicate(timeout=600)
-    assert bereft.returncode == 0, printed
-    assert "they are pushed again" in printed
-    assert "demonstrations: 8 of 8 episodes solved" in whole
-    assert "demonstrations" not in resumed
-    tables = [table(Results.load(tmp_path / name)) for name in ("whole", "killed", "bereft")]
-    assert tables[1] == tables[0]
-    assert tables[2] == tables[0]
-    # A learner of groups takes no step if each group has one outcome.
-    assert list(tables[0])[:6] == ["bc@300", "rpd@350", "rpd@400", "ppo@350", "ppo@400", "grpo@300"]
-    assert (tmp_path / "killed" / "report.html").is_file()
+        assert "once more, as the policy was restarted" in ended(run, folder)
+    assert table(out) == undisturbed
 
 
-def start(folder: Path, *arguments: object) -> subprocess.Popen[str]:
+def start(folder: Path, out: Path, *options: str) -> subprocess.Popen[str]:
     """Start the command in a Ray of its own."""
     command = [sys.executable, "-c", "from vlagents_ray.cli import main; main()", "learn", "tabletop"]
-    environment = os.environ | {"RAY_TMPDIR": str(folder)}
-    options: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True}
-    return subprocess.Popen([*command, *map(str, arguments)], env=environment, **options)
+    command += [str(folder / "plan.yaml"), "--out", str(out), *options]
+    return subprocess.Popen(
+        command, env=os.environ | {"RAY_TMPDIR": str(folder)}, stdout=PIPE, stderr=subprocess.STDOUT, text=True
+    )
 
 
-def learn(folder: Path, *arguments: object) -> str:
-    """Run the command to its end, after which nothing runs."""
-    with start(folder, *arguments) as process:
-        printed, _ = process.communicate(timeout=600)
-    assert process.returncode == 0, printed
+def wait_until_rpd_learns(run: subprocess.Popen[str], out: Path) -> None:
+    """Until the first of its iterations is over."""
+    wait_for(lambda: (out / "checkpoints" / "rpd.pt").exists() or run.poll() is not None, timeout_s=400)
+
+
+def ended(run: subprocess.Popen[str], folder: Path) -> str:
+    """What the command has printed at its end, after which nothing runs."""
+    printed, _ = run.communicate(timeout=500)
+    assert run.returncode == 0, printed
     assert not processes(folder), "left running"
     return printed
 
 
-def table(results: Results) -> dict[str, tuple[str | None, list[tuple[int, float]]]]:
-    """The weights, and seed and reward of each episode, by contender."""
-    found = {}
+def table(out: Path) -> dict[str, tuple[str | None, list[tuple[int, float]]]]:
+    """The weights, and seed and return of each episode, by contender."""
+    results, found = Results.load(out), {}
     for cell in results.cells:
         episodes = sorted((one.result.key.seed, one.result.episode_return) for one in cell.episodes)
         found[cell.contender] = pushed_of(cell), episodes

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 
 from vlagents_ray.client import RemoteAgent
-from vlagents_ray.errors import ConfigError, WeightsLost
+from vlagents_ray.errors import ConfigError, PolicyUnavailable, WeightsLost
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig
 from vlagents_ray.evaluate.artifacts.storage import whole
 from vlagents_ray.evaluate.results.summary import Summary
@@ -27,7 +27,7 @@ from vlagents_ray.serve.launch.server import running_server
 ENV = "tabletop/lift"
 ENV_OPTIONS: dict[str, Any] = {"width": 96, "height": 96, "max_steps": 30}
 _TEACHER = "teacher"
-_RESTARTS = 5  # of a replica, in one iteration, after which the run ends
+_FAILURES = 10  # of the policy's server, in one iteration, after which the run ends
 _HELD_OUT, _TRAINING = 10_000_000, 20_000_000  # first seeds: no episode is both played for training and evaluated
 
 
@@ -132,7 +132,7 @@ class _LearnRun:
             learner = make(self._plan.seed)
             learner.add_advice(demonstrations["seen"].numpy(), demonstrations["actions"].numpy())
             error = learner.imitate(self._plan.clone_steps)
-            self._progress.say(f"clone of the demonstrations: {learner.steps} steps, error {error:.4f}")
+            self._progress.say(f"clone: {learner.steps} steps, error {error:.4f}")
             self._clones[student] = learner.checkpoint()
         return {"iteration": 0, "position": 0, "learner": self._clones[student]}
 
@@ -169,17 +169,17 @@ class _LearnRun:
 
     def _played(self, weights: Publisher, learner: NetworkLearner, play: Callable[[], Played]) -> Played:
         """Play with the learner's weights; they are pushed again if the replica that had them was restarted."""
-        restarts = 0
+        failures = 0
         while True:
-            if not weights.acknowledged(learner.steps):
-                weights.push(learner.state(), version=learner.steps)
             try:
+                if not weights.acknowledged(learner.steps):
+                    weights.push(learner.state(), version=learner.steps)
                 return play()
-            except WeightsLost as error:
-                restarts += 1
-                if restarts > _RESTARTS:
+            except (WeightsLost, PolicyUnavailable) as error:
+                failures += 1
+                if failures > _FAILURES:
                     raise
-                self._progress.say(f"{error}; they are pushed again")
+                self._progress.say(f"once more, as the policy was restarted: {str(error).partition(chr(10))[0]}")
 
     def _collect(self, rollouts: Rollouts, version: int) -> Any:
         rollouts.version = version
