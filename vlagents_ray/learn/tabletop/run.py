@@ -142,7 +142,8 @@ class _LearnRun:
         learner = parts.learner(plan.seed)
         learner.restore(state["learner"])
         last = plan.iterations if parts.learns else 0
-        clone_has_rate = method != "bc" and "bc" in plan.methods and parts.student == _METHODS["bc"].student
+        clone_is_bc = parts.learns and "bc" in plan.methods and parts.student == _METHODS["bc"].student
+        evaluated = {*range(plan.evaluate_every if clone_is_bc else 0, last, plan.evaluate_every), last}
         with (
             Publisher(_url(method)) as weights,
             self._rollouts(
@@ -152,7 +153,7 @@ class _LearnRun:
         ):
             for iteration in range(state["iteration"], last + 1):
                 self._progress.at(done + iteration, len(plan.methods) * plan.iterations)
-                if iteration == last or (iteration % plan.evaluate_every == 0 and (iteration or not clone_has_rate)):
+                if iteration in evaluated:
                     summary = self._played(weights, learner, lambda: self._evaluate(method, learner.steps))
                 if iteration == last:
                     break
