@@ -172,13 +172,17 @@ def test_a_learner_goes_on_from_a_checkpoint_to_the_same_bit(tmp_path: Path) -> 
     learner, rows = taught()
     learner.imitate(20)
     torch.save(learner.checkpoint(), tmp_path / "state")
-    other = RPDLearner(seed=0)
-    other.restore(torch.load(tmp_path / "state", weights_only=True))
-    for one in (learner, other):
+    state = torch.load(tmp_path / "state", weights_only=True)
+    others = [RPDLearner(seed=0) for _ in range(2)]
+    for one in others:  # of which the second begins where the first did
+        one.restore(state)
         one.improve(rows, 20)
         one.imitate(5)
+    learner.improve(rows, 20)
+    learner.imitate(5)
     for name, value in learner.state().items():
-        assert torch.equal(value, other.state()[name]), name
+        assert torch.equal(value, others[0].state()[name]), name
+        assert torch.equal(value, others[1].state()[name]), name
 
 
 def taught() -> tuple[RPDLearner, dict[str, Any]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from typing import Any
 
 import numpy as np
@@ -137,7 +138,7 @@ class NetworkLearner:
         """Go on where the learner that made the checkpoint was."""
         self.steps = checkpoint["steps"]
         self.network.load_state_dict(checkpoint["network"])
-        self._optimizer.load_state_dict(checkpoint["optimizer"])
+        self._optimizer.load_state_dict(deepcopy(checkpoint["optimizer"]))  # which torch would share, and change
         self._seen, self._advised = checkpoint["seen"].numpy(), checkpoint["advised"].numpy()
 
     def add_advice(self, seen: np.ndarray, actions: np.ndarray) -> None:
@@ -210,7 +211,7 @@ class PPOLearner(NetworkLearner):
 
     want = ("logprob", "value")
     steps_at_once = 40  # ten times the transitions of 32 episodes: more would fit their noise
-    rate: float | None = 3e-4
+    rate: float | None = 1e-4
     make_network = staticmethod(make_network)
 
     def improve(self, columns: Mapping[str, np.ndarray], steps: int) -> None:
