@@ -19,7 +19,7 @@ from eval_fakes import wait_for
 from ray_processes import end, processes, ray_folder
 
 from vlagents_ray import Act, Agent, Obs
-from vlagents_ray.cli.options import read_yaml
+from vlagents_ray.cli.options import read_run_file
 from vlagents_ray.envs.tabletop.env import Tabletop
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera
 from vlagents_ray.evaluate import Results
@@ -212,7 +212,7 @@ EXAMPLES = sorted((Path(__file__).parents[2] / "examples" / "learn").glob("*.yam
 
 @pytest.mark.parametrize("file", EXAMPLES, ids=lambda file: file.stem)
 def test_an_example_is_a_plan_and_ends_with_its_method(file: Path) -> None:
-    plan = LearnPlan.model_validate(read_yaml(file, "file of settings", "`methods`"))
+    plan = LearnPlan.model_validate(read_run_file(file, "file of settings", "`methods`"))
     assert plan.methods[-1] == file.stem
     assert f"examples/learn/{file.name}" in (Path(__file__).parents[2] / "docs/tutorials/learn.md").read_text()
 

@@ -13,7 +13,7 @@ from vlagents_ray.cli.evaluation.command import evaluate_command
 from vlagents_ray.cli.evaluation.results import export_command, merge_command, replay_command, report_command
 from vlagents_ray.cli.keys import keys
 from vlagents_ray.cli.new import new
-from vlagents_ray.cli.options import parse_list, read_yaml
+from vlagents_ray.cli.options import parse_list, read_run_file
 from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.cli.slurm import slurm
 
@@ -115,12 +115,11 @@ def learn_tabletop_command(
 
     given = {"out": out_dir, "seed": seed, "resume": resume or None, "track": parse_list(track) or None}
     with errors():
-        plan = (
-            {} if file is None else {"out": Path("runs") / file.stem} | read_yaml(file, "file of settings", "`methods`")
-        )
-        plan |= {name: value for name, value in given.items() if value is not None}
+        settings = {} if file is None else read_run_file(file, "file of settings", "`methods`")
+        settings |= {name: value for name, value in given.items() if value is not None}
+        plan = LearnPlan.model_validate(settings)
         with quiet_ray(None), exit_if_ray_is_lost(RESUME), LearnBar(out) as bar:
-            summary = learn_tabletop(LearnPlan.model_validate(plan), bar)
+            summary = learn_tabletop(plan, bar)
         print_summary(out, summary)
 
 

@@ -72,8 +72,8 @@ def parse_time(text: str, option: str) -> float:
         raise ConfigError(f"{option}: got {text!r}, want seconds since 1970, or as in 2027-01-31T18:30") from error
 
 
-def read_yaml(file: Path, kind: str, keys: str) -> dict[str, Any]:
-    """Read a YAML file of settings.
+def read_run_file(file: Path, kind: str, keys: str) -> dict[str, Any]:
+    """Read a YAML file of the settings of a run; results go to runs/NAME unless it names a folder.
 
     Args:
         file: The file.
@@ -91,4 +91,4 @@ def read_yaml(file: Path, kind: str, keys: str) -> dict[str, Any]:
         raise ConfigError(f"{file}: not YAML ({error})") from error
     if not isinstance(document, dict):
         raise ConfigError(f"{file}: got {type(document).__name__}, want a mapping with {keys}")
-    return document
+    return {"out": Path("runs") / file.stem} | document

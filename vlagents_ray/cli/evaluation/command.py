@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vlagents_ray.cli.console import errors
-from vlagents_ray.cli.options import YAML_SUFFIXES, Address, Set, parse_list, parse_settings, parse_time, read_yaml
+from vlagents_ray.cli.options import YAML_SUFFIXES, Address, Set, parse_list, parse_settings, parse_time, read_run_file
 from vlagents_ray.cli.ray_session import RESUME, exit_if_ray_is_lost
 from vlagents_ray.errors import ConfigError
 
@@ -191,5 +191,5 @@ def _with_resources(config: EvalConfig, resources: dict[str, float]) -> EvalConf
 
 
 def read_run(file: Path) -> dict[str, Any]:
-    """Read a file of runs; results go to runs/NAME unless it names a folder."""
-    return {"out": Path("runs") / file.stem} | read_yaml(file, "file of runs", "`policies` and `suites`")
+    """Read a file of runs."""
+    return read_run_file(file, "file of runs", "`policies` and `suites`")

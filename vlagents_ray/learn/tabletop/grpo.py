@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.learn.tabletop.learner import NetworkLearner, inputs_of, until_solved
+from vlagents_ray.learn.tabletop.learner import NetworkLearner, episodes, inputs_of, until_solved
 from vlagents_ray.learn.tabletop.token_student import make_token_network, tokens_of
 
 _EPSILON = 1e-6  # beside the standard deviation of a group
@@ -20,9 +20,8 @@ def group_advantages(columns: Mapping[str, np.ndarray]) -> np.ndarray:
     the group) / (standard deviation of the group + 1e-6) (GRPO, arXiv 2402.03300), those after the task was solved have
     none. Nor have those of groups whose episodes were all solved, or none of them (DAPO, arXiv 2503.14476).
     """
-    starts, success = np.flatnonzero(columns["t"] == 0), columns["success"]
-    lengths = np.diff([*starts, len(success)])
-    solved = np.logical_or.reduceat(success, starts).astype(np.float64)
+    starts, lengths = episodes(columns)
+    solved = np.logical_or.reduceat(columns["success"], starts).astype(np.float64)
     group = columns["episode"][starts]
     gain = np.zeros(len(starts))
     for number in np.unique(group):

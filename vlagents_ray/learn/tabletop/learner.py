@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from copy import deepcopy
 from typing import Any
 
@@ -36,6 +38,12 @@ def inputs_of(columns: Mapping[str, np.ndarray]) -> np.ndarray:
     return np.stack([inputs(obs, named_colour(text)) for obs, text in rows])
 
 
+def episodes(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first row and the number of rows of each episode, (E,) int64 each."""
+    starts = np.flatnonzero(columns["t"] == 0)
+    return starts, np.diff([*starts, len(columns["t"])])
+
+
 def advice(teacher: RemoteAgent, columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Ask a served teacher what it would have done at each observation of whole episodes.
 
@@ -49,31 +57,31 @@ def advice(teacher: RemoteAgent, columns: Mapping[str, np.ndarray]) -> np.ndarra
     Returns:
         Its actions, (T, 4) float32.
     """
-    starts = np.flatnonzero(columns["t"] == 0)
-    lengths = np.diff([*starts, len(columns["t"])])
+    starts, lengths = episodes(columns)
     seen, texts = observations(columns), columns["instruction"]
-    sessions = teacher.sessions(len(starts))
-    for answer in teacher.reset_batch([seen[i] for i in starts], [texts[i] for i in starts], sessions):
-        if isinstance(answer, Exception):
-            raise answer
     actions = np.empty_like(columns["action"])
-    for step in range(max(lengths)):
-        going = np.flatnonzero(lengths > step)
-        acts = teacher.act_batch([seen[starts[i] + step] for i in going], [sessions[i] for i in going])
-        for i, act in zip(going, acts, strict=True):
-            if isinstance(act, Exception):
-                raise act
-            actions[starts[i] + step] = act.action
-    for session in sessions:
-        session.close()
+    with ExitStack() as opened:
+        sessions = teacher.sessions(len(starts))
+        for session in sessions:
+            opened.callback(session.close)
+        for answer in teacher.reset_batch([seen[i] for i in starts], [texts[i] for i in starts], sessions):
+            if isinstance(answer, Exception):
+                raise answer
+        for step in range(max(lengths)):
+            going = np.flatnonzero(lengths > step)
+            acts = teacher.act_batch([seen[starts[i] + step] for i in going], [sessions[i] for i in going])
+            for i, act in zip(going, acts, strict=True):
+                if isinstance(act, Exception):
+                    raise act
+                actions[starts[i] + step] = act.action
     return actions
 
 
 def until_solved(columns: Mapping[str, np.ndarray]) -> np.ndarray:
     """Return which transitions are before the task was solved, or solve it, (T,) bool: the others teach nothing."""
-    starts, success = np.flatnonzero(columns["t"] == 0), columns["success"]
+    (starts, lengths), success = episodes(columns), columns["success"]
     before = np.cumsum(success) - success  # steps at which a task was solved, in the rows before each
-    kept: np.ndarray = before == np.repeat(before[starts], np.diff([*starts, len(success)]))
+    kept: np.ndarray = before == np.repeat(before[starts], lengths)
     return kept
 
 
@@ -95,7 +103,7 @@ def advantages(columns: Mapping[str, np.ndarray]) -> tuple[np.ndarray, np.ndarra
     return gain, np.where(kept, gain + value, 0.0).astype(np.float32)
 
 
-class NetworkLearner:
+class NetworkLearner(ABC):
     """Trains a network of a student: by behaviour cloning, and as its subclass improves the student's own episodes."""
 
     want: tuple[str, ...]
@@ -159,6 +167,7 @@ class NetworkLearner:
             self._step(error)
         return float(error.detach())
 
+    @abstractmethod
     def improve(self, columns: Mapping[str, np.ndarray], steps: int) -> None:
         """Take steps by the transitions of the student's own episodes.
 
@@ -166,7 +175,6 @@ class NetworkLearner:
             columns: The transitions, with what the learner wants.
             steps: The number of steps.
         """
-        raise NotImplementedError
 
     def _begin_improving(self) -> np.random.Generator:
         if self.rate is not None:

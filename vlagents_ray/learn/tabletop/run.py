@@ -12,11 +12,11 @@ from vlagents_ray.errors import ConfigError, PolicyUnavailable, WeightsLost
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig
 from vlagents_ray.evaluate.artifacts.storage import whole
 from vlagents_ray.evaluate.results.summary import Summary
-from vlagents_ray.learn.columns import arrays
+from vlagents_ray.learn.columns import EXTRA, arrays
 from vlagents_ray.learn.publisher import Publisher
 from vlagents_ray.learn.rollouts import Rollouts
 from vlagents_ray.learn.tabletop.grpo import GRPOLearner
-from vlagents_ray.learn.tabletop.learner import NetworkLearner, PPOLearner, RPDLearner, advice, inputs_of
+from vlagents_ray.learn.tabletop.learner import NetworkLearner, PPOLearner, RPDLearner, advice, episodes, inputs_of
 from vlagents_ray.learn.tabletop.plan import LearnPlan, Method
 from vlagents_ray.learn.tabletop.progress import LearnBar
 from vlagents_ray.learn.training_evaluation import TrainingEvaluation
@@ -37,13 +37,15 @@ class _MethodParts(NamedTuple):
     student: str  # class of the policy, below this package
     learner: type[NetworkLearner]
     learns: bool = True  # whether it goes on after the clone
+    advised: bool = False  # whether it asks the teacher about each transition
+    grouped: bool = False  # whether several episodes begin in one state
 
 
 _METHODS: dict[Method, _MethodParts] = {
     "bc": _MethodParts("student:Student", PPOLearner, learns=False),
-    "rpd": _MethodParts("student:Student", RPDLearner),
+    "rpd": _MethodParts("student:Student", RPDLearner, advised=True),
     "ppo": _MethodParts("student:Student", PPOLearner),
-    "grpo": _MethodParts("token_student:TokenStudent", GRPOLearner),
+    "grpo": _MethodParts("token_student:TokenStudent", GRPOLearner, grouped=True),
 }
 Played = TypeVar("Played")
 
@@ -62,8 +64,9 @@ def learn_tabletop(plan: LearnPlan, progress: LearnBar) -> Summary:
         ConfigError: The folder has another run, or has one and `resume` is off.
         MissingDependency: torch or the extra "learn" is not installed.
     """
-    checkpoints = RunCheckpoints(plan)
+    require("pyarrow", extra=EXTRA)
     require("torch").set_num_threads(1)  # its networks are small
+    checkpoints = RunCheckpoints(plan)
     sources = {_TEACHER: "teacher:Teacher"} | {method: _METHODS[method].student for method in plan.methods}
     policies = {
         app: deployment(f"vlagents_ray.learn.tabletop.{source}", batch={"max_size": 64})
@@ -127,14 +130,14 @@ class _LearnRun:
         return found
 
     def _cloned(self, method: Method, demonstrations: Mapping[str, Any]) -> dict[str, Any]:
-        student, make, _ = _METHODS[method]
-        if student not in self._clones:
-            learner = make(self._plan.seed)
+        parts = _METHODS[method]
+        if parts.student not in self._clones:
+            learner = parts.learner(self._plan.seed)
             learner.add_advice(demonstrations["seen"].numpy(), demonstrations["actions"].numpy())
             error = learner.imitate(self._plan.clone_steps)
             self._progress.say(f"clone: {learner.steps} steps, error {error:.4f}")
-            self._clones[student] = learner.checkpoint()
-        return {"iteration": 0, "position": 0, "learner": self._clones[student]}
+            self._clones[parts.student] = learner.checkpoint()
+        return {"iteration": 0, "position": 0, "learner": self._clones[parts.student]}
 
     def _learn(self, method: Method, state: Mapping[str, Any], done: int) -> Summary:
         """Learn by one method, from where it had got to; `done` iterations were of the methods before."""
@@ -147,11 +150,11 @@ class _LearnRun:
         with (
             Publisher(_url(method)) as weights,
             self._rollouts(
-                method, want=learner.want, first=state["position"], groups=plan.groups if method == "grpo" else 1
+                method, want=learner.want, first=state["position"], groups=plan.groups if parts.grouped else 1
             ) as rollouts,
             RemoteAgent(_url(_TEACHER)) as teacher,
         ):
-            for iteration in range(state["iteration"], last + 1):
+            for iteration in range(min(state["iteration"], last), last + 1):
                 self._progress.at(done + iteration, len(plan.methods) * plan.iterations)
                 if iteration in evaluated:
                     summary = self._played(weights, learner, lambda: self._evaluate(method, learner.steps))
@@ -161,7 +164,7 @@ class _LearnRun:
                 self._progress.say(
                     f"{method}@{learner.steps}: {_solved(columns)} of {plan.episodes} episodes of the training solved"
                 )
-                if method == "rpd":
+                if parts.advised:
                     learner.add_advice(inputs_of(columns), advice(teacher, columns))
                 learner.improve(columns, plan.steps or learner.steps_at_once)
                 progress = {"iteration": iteration + 1, "position": rollouts.position}
@@ -227,4 +230,4 @@ def _url(app: str) -> str:
 
 def _solved(columns: Mapping[str, np.ndarray]) -> int:
     """Return the number of episodes in which the task was solved at some step."""
-    return int(np.logical_or.reduceat(columns["success"], np.flatnonzero(columns["t"] == 0)).sum())
+    return int(np.logical_or.reduceat(columns["success"], episodes(columns)[0]).sum())

@@ -56,7 +56,7 @@ _OUR_APP_KEYS = {"name", "route_prefix", "import_path", "args"}
 
 @dataclass(frozen=True, slots=True)
 class Server:
-    """A running server."""
+    """Says where a running server is reached."""
 
     url: str  # http(s)://host:port
     apps: Mapping[str, str] = field(default_factory=dict)  # URL of each application
@@ -261,7 +261,7 @@ def _ray(
         yield {"host": host, "port": port}
 
 
-def _wait_for_proxies(proxies: list[Any], proxies_now: Callable[[], list[Any]]) -> None:
+def _wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) -> None:
     """Wait until each of the proxies listens; raise the error of one that cannot.
 
     Serve kills a proxy that does not start within some seconds, as on a busy node, and starts another one.
@@ -277,7 +277,7 @@ def _wait_for_proxies(proxies: list[Any], proxies_now: Callable[[], list[Any]]) 
             if time.monotonic() >= deadline:
                 raise PolicyUnavailable(f"Serve's proxies do not listen within {timeout_s:g} s") from error
             time.sleep(_LOOK_S)
-            proxies = proxies_now()
+            proxies = look_again()
         else:
             return
 
