@@ -275,19 +275,39 @@ def test_a_killed_run_goes_on_to_the_same_table(folder: Path, undisturbed: dict[
 @pytest.mark.torch
 @pytest.mark.slow
 def test_killed_replicas_and_workers_change_nothing(folder: Path, undisturbed: dict[str, Any], tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    with start(folder, out) as run:
-        wait_until_rpd_learns(run, out)
+    out, pushed, killed = tmp_path / "run", tmp_path / "pushed", tmp_path / "killed"
+    with start(folder, out, before=HELD.format(pushed=str(pushed), killed=str(killed))) as run:
+        wait_for(lambda: pushed.exists() or run.poll() is not None, timeout_s=400)
         for pid in [*processes(folder, "ray::ServeReplica:rpd"), *processes(folder, "ray::Rollout")]:
             with contextlib.suppress(ProcessLookupError):
                 os.kill(pid, signal.SIGKILL)
+        killed.touch()
         assert "once more, as the policy was restarted" in ended(run, folder)
     assert table(out) == undisturbed
 
 
-def start(folder: Path, out: Path, *options: str) -> subprocess.Popen[str]:
-    """Start the command in a Ray of its own."""
-    command = [sys.executable, "-c", "from vlagents_ray.cli import main; main()", "learn", "tabletop"]
+# A run that waits when the replica of `rpd` holds the weights of its second iteration, before episodes are played.
+HELD = """
+import pathlib, time
+from vlagents_ray.learn.tabletop.run import _LearnRun
+
+collect, pushed, killed = _LearnRun._collect, pathlib.Path({pushed!r}), pathlib.Path({killed!r})
+
+def held(self, rollouts, version):
+    if version == 350:
+        pushed.touch()
+        while not killed.exists():
+            time.sleep(0.1)
+    return collect(self, rollouts, version)
+
+_LearnRun._collect = held
+"""
+
+
+def start(folder: Path, out: Path, *options: str, before: str = "") -> subprocess.Popen[str]:
+    """Start the command in a Ray of its own, in a process that first runs the code of `before`."""
+    code = before + "\nfrom vlagents_ray.cli import main; main()"
+    command = [sys.executable, "-c", code, "learn", "tabletop"]
     command += [str(folder / "plan.yaml"), "--out", str(out), *options]
     return subprocess.Popen(
         command, env=os.environ | {"RAY_TMPDIR": str(folder)}, stdout=PIPE, stderr=subprocess.STDOUT, text=True
