@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -55,6 +56,14 @@ class Pi0Config(ModelConfig):
 
 
 @dataclass(frozen=True)
+class FlowCores:
+    """The two passes of the network, which are functions of tensors: `encode` and `velocity_of`, or compiled forms."""
+
+    encode: Callable[..., Any]
+    velocity: Callable[..., Any]
+
+
+@dataclass(frozen=True)
 class LoadedPi0:
     """The model and its processor."""
 
@@ -62,6 +71,7 @@ class LoadedPi0:
     processor: Any
     device: Any
     dtype: Any
+    cores: FlowCores
 
     def planned(self, row: Row) -> Row:
         """Return the row with its leftover actions in the model's units."""
@@ -114,8 +124,6 @@ class Pi0(ModelPolicy):
 
     def load(self) -> LoadedPi0:
         """Load the model with every parameter of the checkpoint, and its processor with all statistics."""
-        if self.config.compile:
-            raise ConfigError("compile: not done for pi0, whose cache changes its length at each step; leave it out")
         path = find_checkpoint(
             self.config.checkpoint,
             self.config.checkpoint_step,
@@ -124,7 +132,12 @@ class Pi0(ModelPolicy):
         device = torch_device(self.config.device)
         dtype = torch_dtype(self.config.dtype, device)
         ensure_torchvision()
-        return LoadedPi0(_network(path, device, dtype), _processor(path), device, dtype)
+        network = _network(path, device, dtype)
+        cores = FlowCores(
+            self.compilation.core("encode", partial(encode, network)),
+            self.compilation.core("velocity", partial(velocity_of, network)),
+        )
+        return LoadedPi0(network, _processor(path), device, dtype, cores)
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin an episode; an instruction longer than in training is refused, not truncated."""
@@ -199,7 +212,8 @@ class Pi0(ModelPolicy):
         model = self._loaded()
         firsts, owners = shared_frames(rows)
         inputs = self._inputs([rows[i] for i in firsts])
-        return flow_velocity(model.network, inputs, model.dtype, owners if len(firsts) < len(rows) else None)
+        shared = owners if len(firsts) < len(rows) else None
+        return flow_velocity(model.network, inputs, model.dtype, shared, model.cores)
 
     def _follow(
         self, velocity: Callable[[Any, float], Any], noise: Any, guide: Guide | None, random: RandomSteps | None
@@ -230,7 +244,11 @@ def _cameras(chosen: Mapping[str, str] | None) -> dict[str, str]:
 
 
 def flow_velocity(
-    network: Any, inputs: Mapping[str, Any], dtype: Any, owners: Sequence[int] | None = None
+    network: Any,
+    inputs: Mapping[str, Any],
+    dtype: Any,
+    owners: Sequence[int] | None = None,
+    cores: FlowCores | None = None,
 ) -> Callable[[Any, float], Any]:
     """Return the flow's velocity as a function of noisy actions (B, H, D) and time; inputs are encoded once.
 
@@ -239,35 +257,57 @@ def flow_velocity(
         inputs: Tokens, images and states of P observations, as `PI0Processor` returns them, on the network's device.
         dtype: The type in which the network computes.
         owners: The observation of each of the B rows; None: row i is of observation i.
+        cores: The passes of the network, if they are compiled.
 
     Returns:
         The function, whose result is (B, H, D) float32.
     """
     torch = require("torch")
+    cores = cores or FlowCores(partial(encode, network), partial(velocity_of, network))
     mask, state = inputs["attention_mask"], inputs["state"]
-    prefix = network.model.embed_prefix(inputs["input_ids"], inputs["pixel_values"], inputs["pixel_attention_mask"])
-    cache = network.model.vlm(
-        inputs_embeds=prefix,
+    encoded = cores.encode(inputs["input_ids"], inputs["pixel_values"], inputs["pixel_attention_mask"], mask)
+    if owners is not None:
+        index = torch.tensor(owners, device=mask.device)
+        encoded, mask, state = encoded[index], mask[index], state[index]
+
+    def velocity(actions: Any, time: float) -> Any:
+        times = torch.full((len(actions),), time, dtype=torch.float32, device=actions.device)
+        return cores.velocity(encoded, mask, state, actions.to(dtype), times)
+
+    return velocity
+
+
+def encode(network: Any, tokens: Any, images: Any, cameras: Any, mask: Any) -> Any:
+    """Return the keys and values (P, layers, 2, heads, L, E) of tokens (P, L) and images, of which `mask` is not 0.
+
+    Args:
+        network: The `PI0ForConditionalGeneration`.
+        tokens: (P, L) int64.
+        images: (P, cameras, 3, S, S).
+        cameras: (P, cameras) bool, which of the images are there.
+        mask: (P, L), 0 for padding.
+    """
+    import torch  # the compiler follows a statement, and not `require`
+
+    layers = network.model.vlm(
+        inputs_embeds=network.model.embed_prefix(tokens, images, cameras),
         attention_mask=mask,
         position_ids=mask.cumsum(-1) - 1,
         token_type_ids=torch.zeros_like(mask),
         use_cache=True,
-    ).past_key_values
-    length = cache.get_seq_length()
-    if owners is not None:
-        index = torch.tensor(owners, device=mask.device)
-        cache.batch_select_indices(index)
-        mask, state = mask[index], state[index]
+    ).past_key_values.layers
+    return torch.stack([torch.stack([layer.keys, layer.values], 1) for layer in layers], 1)
 
-    def velocity(actions: Any, time: float) -> Any:
-        times = torch.full((len(actions),), time, dtype=torch.float32, device=actions.device)
-        output = network(
-            state=state, noise=actions.to(dtype), timestep=times, attention_mask=mask, past_key_values=cache
-        )
-        cache.crop(length - cache.get_seq_length())  # later steps must not attend to this one
-        return output.logits.float()
 
-    return velocity
+def velocity_of(network: Any, encoded: Any, mask: Any, state: Any, actions: Any, times: Any) -> Any:
+    """Return the velocity (B, H, D) float32 of noisy actions (B, H, D) at times (B,); see `encode` for the others."""
+    from transformers import DynamicCache
+
+    cache = DynamicCache()  # of this step alone: later ones must not attend to it
+    for number, layer in enumerate(encoded.unbind(1)):
+        cache.update(layer[:, 0], layer[:, 1], number)
+    output = network(state=state, noise=actions, timestep=times, attention_mask=mask, past_key_values=cache)
+    return output.logits.float()
 
 
 def _network(path: Path, device: Any, dtype: Any) -> Any:

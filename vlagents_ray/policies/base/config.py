@@ -8,7 +8,9 @@ from pydantic import BaseModel, Field, field_validator, model_validator
 from typing_extensions import Self
 
 from vlagents_ray.policies.base.checkpoint import STEP
+from vlagents_ray.policies.compilation import CompileMode
 
+COMPILED_SIZES = [1, 2, 4, 8, 16]
 DType = Literal["auto", "float32", "bfloat16", "float16"]
 NoiseLevel = Annotated[
     float,
@@ -30,7 +32,11 @@ class ModelConfig(BaseModel, extra="forbid"):
     checkpoint_step: int | None = Field(default=None, ge=0, description="the training step that replaces `{step}`")
     device: str = Field(default="auto", description="'auto' (an accelerator if there is one), 'cpu', 'cuda', 'cuda:1'")
     dtype: DType = Field(default="auto", description="of the weights; 'auto': the family's own choice")
-    compile: bool = Field(default=False, description="compile the forward pass; needs a warm-up of every batch size")
+    compile: CompileMode = Field(
+        default=False,
+        description="compile the forward pass for each of `batch_sizes`, as CUDA graphs on a GPU; what does not compile, "
+        "or computes something else, runs without, or is an error with 'require'",
+    )
     seed: int = Field(default=0, ge=0, description="mixed with the seed of each episode")
 
     cameras: dict[str, str] | None = Field(
@@ -56,8 +62,8 @@ class ModelConfig(BaseModel, extra="forbid"):
     max_rows: int = Field(default=64, ge=1, description="rows in one forward pass, at most; samples count as rows")
     batch_sizes: list[int] | None = Field(
         default=None,
-        description="for compiled models: the only numbers of rows to run, ascending; each is run once when the "
-        "model is loaded, smaller batches are padded",
+        description="the only numbers of rows to run, ascending; each is run, or compiled, when the model is loaded, "
+        f"smaller batches are padded; unset: {COMPILED_SIZES} if `compile` is set, else any",
     )
 
     @model_validator(mode="after")
@@ -70,9 +76,9 @@ class ModelConfig(BaseModel, extra="forbid"):
         return self
 
     @model_validator(mode="after")
-    def _random_steps_are_not_compiled(self) -> Self:
-        if self.compile and getattr(self, "noise_level", None):
-            raise ValueError("compile and noise_level: got both, want one of them; random steps are not compiled")
+    def _compiled_sizes_are_few(self) -> Self:
+        if self.compile and self.batch_sizes is None:
+            self.batch_sizes = list(COMPILED_SIZES)
         return self
 
     @field_validator("batch_sizes")

@@ -7,6 +7,7 @@ import copy
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,6 +18,8 @@ from vlagents_ray.errors import InvalidAction, InvalidObservation, NotReset, Pol
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, Act, Agent, Obs
 from vlagents_ray.policies.base.config import ModelConfig
 from vlagents_ray.policies.base.model_inputs import count_in, leftover_plan, wanted_behaviour, wanted_samples
+from vlagents_ray.policies.compilation import Compilation
+from vlagents_ray.policies.loading import report_progress
 from vlagents_ray.validation import check_action
 
 
@@ -78,11 +81,12 @@ class ModelPolicy(Agent, abc.ABC):
     `config.rows` rows. A session's noise comes from its own generator, seeded by the config's seed and the episode's.
     """
 
-    shared: ClassVar[tuple[str, ...]] = ("config", "model")
+    shared: ClassVar[tuple[str, ...]] = ("config", "model", "compilation")
 
     def __init__(self, config: Any) -> None:
         self.config: ModelConfig = config
         self.model: Any = None
+        self.compilation = Compilation(self.config.compile)  # `load` marks the model's cores with it
         self.episode: PolicyEpisode | None = None
 
     @property
@@ -123,12 +127,14 @@ class ModelPolicy(Agent, abc.ABC):
         """Compute one chunk for each row, all in one forward pass. A row's result must not depend on the others."""
 
     def initialize(self) -> None:
-        """Load the checkpoint; with `batch_sizes`, run each of them once."""
+        """Load the checkpoint; with `batch_sizes`, run each of them once, or compile the model's cores for it."""
         self.model = self.load()
-        for size in self.config.batch_sizes or ():
-            for prediction in self._forward([self._example() for _ in range(size)]):
-                if isinstance(prediction, Exception):
-                    raise prediction
+        sizes = self.config.batch_sizes or ()
+        for number, size in enumerate(sizes, 1):
+            report_progress(f"{'compiling' if self.config.compile else 'running'} {size} rows ({number} of {len(sizes)})")
+            if self.compilation.cores:
+                self.compilation.add_size(size, partial(self._run_examples, size))
+            self._run_examples(size)
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin the episode with the seed `kwargs["seed"]` (an int, 0 if not given)."""
@@ -260,22 +266,28 @@ class ModelPolicy(Agent, abc.ABC):
             found += results[: len(part)]
         return found
 
-    def _example(self) -> Row:
-        """Return a row for the warm-up: black images and zeros that fit the contract."""
-        contract = self.contract or Contract()
+    def _run_examples(self, size: int) -> None:
+        """Run a forward pass of that many rows; raises the first error of a row."""
+        for prediction in self._forward([self._example(seed) for seed in range(size)]):
+            if isinstance(prediction, Exception):
+                raise prediction
+
+    def _example(self, seed: int) -> Row:
+        """Return a row for the warm-up: random images, and zeros for a state, that fit the contract."""
+        rng, contract = np.random.default_rng(seed), self.contract or Contract()
         lengths = {name: part.dim or 1 for name, part in (contract.state or {}).items()}
         unstated = [name for name, part in (contract.state or {}).items() if part.dim is None]
         if unstated and self.state_dim is not None:
             lengths[unstated[0]] += self.state_dim - len(unstated) - bool(contract.gripper)
         obs = Obs(
             cameras={
-                name: np.zeros((one.height or 224, one.width or 224, 3), np.uint8)
+                name: rng.integers(0, 256, (one.height or 224, one.width or 224, 3), np.uint8)
                 for name, one in (contract.cameras or {}).items()
             },
             gripper=1.0,
             state={name: np.zeros(length, np.float32) for name, length in lengths.items()},
         )
-        return Row((self.perceive(obs),) * self.history, "warm up", np.random.default_rng(0))
+        return Row((self.perceive(obs),) * self.history, "warm up", rng)
 
 
 def _sample(row: Row, draws: np.random.Generator) -> Row:

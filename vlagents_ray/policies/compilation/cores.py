@@ -1,0 +1,171 @@
+"""Pure cores of a model, compiled for a few batch sizes, and compared with the eager pass before they are used.
+
+A core is a function of tensors alone, whose first dimension is the batch and whose other dimensions never change; it
+returns such a tensor, or a tuple of them. `torch.compile` makes one program for each core and batch size, without graph
+breaks; on a GPU it is captured in a CUDA graph. All programs are made while the policy loads. A batch between two sizes
+is padded with copies of its last row, whose results are dropped; one for which there is no program runs eagerly.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, Literal
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.policies.compilation.cuda_graph import CudaGraph
+from vlagents_ray.policies.compilation.kept_programs import keep_torch_programs
+from vlagents_ray.policies.loading import report_uncompiled
+from vlagents_ray.registry import require
+
+logger = logging.getLogger(__name__)
+
+CompileMode = bool | Literal["require"]
+
+# Largest error of a row of a core's result, as a share of the row's norm, by the coarsest type that it computes with:
+# compiled sums run in another order, and merged kernels keep float32 where the eager pass rounds between them.
+TOLERANCE = {"float32": 1e-3, "float16": 1e-2, "bfloat16": 5e-2}
+_SHOWN = 300  # characters of a compiler's error in the log
+
+
+class CompilationFailed(Exception):
+    """A core could not be compiled, or its program computes something else than the eager pass."""
+
+
+class Compilation:
+    """The compiled cores of one policy."""
+
+    backend: ClassVar[str] = "inductor"  # of torch.compile
+
+    def __init__(self, mode: CompileMode) -> None:
+        """Compile nothing yet.
+
+        Args:
+            mode: Whether to compile; with "require", what cannot be compiled is an error.
+        """
+        self.mode = mode
+        self.sizes: list[int] = []  # batch sizes for which all cores are compiled, ascending
+        self.building: int | None = None  # the batch size whose programs are being made
+        self.cores: list[Core] = []
+
+    def core(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+        """Return a function's compiled form, or the function itself if nothing is compiled.
+
+        Args:
+            name: The core's name in messages.
+            function: The core. Its arguments are tensors on the model's device. It must read nothing that changes but
+                the model's weights, whose values may change.
+        """
+        if not self.mode:
+            return function
+        self.cores.append(Core(self, name, function))
+        return self.cores[-1]
+
+    def add_size(self, size: int, forward: Callable[[], object]) -> None:
+        """Compile all cores for a batch size, larger than those before, and compare them with the eager pass.
+
+        If that fails, batches of this size use the programs of the next larger size, or run eagerly.
+
+        Args:
+            size: The number of rows.
+            forward: Runs a forward pass of that many rows.
+
+        Raises:
+            ConfigError: A core failed, and the mode is "require".
+        """
+        keep_torch_programs()
+        began, self.building = time.monotonic(), size
+        try:
+            forward()
+        except CompilationFailed as failure:
+            for core in self.cores:
+                core.drop(size)
+            if self.mode == "require":
+                raise ConfigError(
+                    f"compile: require: {failure}; with `compile: true` it would run without compilation"
+                ) from failure
+            logger.warning("not compiled for %d rows: %s", size, failure)
+            report_uncompiled(f"{size} rows: {failure}")
+        else:
+            self.sizes.append(size)
+            logger.info("compiled for %d rows in %.1f s", size, time.monotonic() - began)
+        finally:
+            self.building = None
+
+
+class Core:
+    """A core with its programs."""
+
+    def __init__(self, owner: Compilation, name: str, function: Callable[..., Any]) -> None:
+        self._owner, self._name, self._function = owner, name, function
+        self._programs: dict[int, Callable[..., Any]] = {}
+
+    def __call__(self, *tensors: Any) -> Any:
+        """Return the core's result for a batch of any size."""
+        rows, building = len(tensors[0]), self._owner.building
+        if building == rows:
+            return self._compared(tensors)
+        size = next((size for size in self._owner.sizes if size >= rows and size in self._programs), None)
+        if size is None or building is not None:
+            return self._function(*tensors)
+        result = self._programs[size](*(_padded(tensor, size) for tensor in tensors))
+        return tuple(one[:rows] for one in result) if isinstance(result, tuple) else result[:rows]
+
+    def drop(self, size: int) -> None:
+        """Drop the program for a batch size."""
+        self._programs.pop(size, None)
+
+    def _compared(self, tensors: Sequence[Any]) -> Any:
+        """Return the eager result, once the program is made and its result is near it."""
+        wanted, size = self._function(*tensors), len(tensors[0])
+        try:
+            if size not in self._programs:
+                self._programs[size] = self._compiled(tensors)
+            error, limit = _largest_error(self._programs[size](*tensors), wanted), _tolerance([*tensors, *_each(wanted)])
+        except Exception as failure:  # compilers raise any error
+            said = " ".join(str(failure).split())[:_SHOWN]
+            raise CompilationFailed(f"{self._name!r}: {type(failure).__name__}: {said}") from failure
+        if not error <= limit:  # also if it is not a number
+            raise CompilationFailed(f"{self._name!r}: its results are off by {error:.2g}, want at most {limit:g}")
+        return wanted
+
+    def _compiled(self, tensors: Sequence[Any]) -> Callable[..., Any]:
+        function = self._function
+
+        def core(*tensors: Any) -> Any:
+            return function(*tensors)
+
+        # torch counts the programs of each code object, and gives up after eight of them
+        core.__code__ = core.__code__.replace(co_name=f"{self._name}_{len(tensors[0])}")
+        program: Callable[..., Any] = require("torch").compile(
+            core, fullgraph=True, dynamic=False, backend=self._owner.backend
+        )
+        program(*tensors)
+        return CudaGraph(program, tensors) if tensors[0].device.type == "cuda" else program
+
+
+def _padded(tensor: Any, size: int) -> Any:
+    missing = size - len(tensor)
+    return require("torch").cat([tensor, tensor[-1:].expand(missing, *tensor.shape[1:])]) if missing else tensor
+
+
+def _each(result: Any) -> Sequence[Any]:
+    return result if isinstance(result, tuple) else (result,)
+
+
+def _largest_error(got: Any, wanted: Any) -> float:
+    """Return the largest relative error of a row, by its Euclidean norm, among all tensors of the results."""
+    errors = []
+    for one, other in zip(_each(got), _each(wanted), strict=True):
+        if one.shape != other.shape:
+            return float("nan")
+        off, size = (part.float().flatten(1).norm(dim=1) for part in (one - other, other))
+        errors.append(float((off / size.clamp(min=1e-12)).max()))
+    return max(errors) if all(error == error for error in errors) else float("nan")
+
+
+def _tolerance(tensors: Sequence[Any]) -> float:
+    """Return the tolerance of the coarsest type among tensors."""
+    types = {str(tensor.dtype).removeprefix("torch.") for tensor in tensors}
+    return max(TOLERANCE.get(name, 0.0) for name in types) or TOLERANCE["float32"]
