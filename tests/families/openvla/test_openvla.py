@@ -126,7 +126,7 @@ def test_samples_belong_to_their_session(policy: OpenVLA) -> None:
 
 def test_samples_share_their_sessions_prompt(policy: OpenVLA, monkeypatch: pytest.MonkeyPatch) -> None:
     read = []
-    backbone = policy.model.network.vision_backbone
+    backbone = policy.model.base.network.vision_backbone
     forward = backbone.forward
     monkeypatch.setattr(backbone, "forward", lambda pixels: read.append(len(pixels)) or forward(pixels))
     policy.act_batch([seen(0, **{SAMPLES: 5}), seen(1)], [begun(policy, 0), begun(policy, 1)])
@@ -138,7 +138,7 @@ ALL = ["logprob", "entropy", "replay"]
 
 def scored(policy: OpenVLA, seed: int, tokens: np.ndarray) -> torch.distributions.Categorical:
     """The distributions over bins of each token after those before it, all in one pass of the whole sequence."""
-    model = policy.model
+    model = policy.model.base
     patches = model.network.projector(model.network.vision_backbone(policy.perceive(seen(seed))[None]))[0]
     words = model.embed(model.tokens(WORDS[seed]))
     sequence = torch.cat([words[:1], patches, words[1:], model.embed(tokens.tolist()[:-1])])
@@ -160,8 +160,8 @@ def test_the_log_probability_is_that_of_the_tokens_in_one_pass_over_them(policy:
 
 def unit(policy: OpenVLA, tokens: np.ndarray) -> np.ndarray:
     """The action of tokens."""
-    scale = policy.model.statistics.scale("bridge_orig")
-    return scale.restore(policy.model.bins.values(torch.tensor(tokens))).astype(np.float32)
+    scale = policy.model.base.statistics.scale("bridge_orig")
+    return scale.restore(policy.model.base.bins.values(torch.tensor(tokens))).astype(np.float32)
 
 
 def test_an_act_of_which_something_is_wanted_is_drawn_and_others_are_the_likeliest(policy: OpenVLA) -> None:
@@ -184,7 +184,7 @@ def test_each_sample_has_its_log_probability(policy: OpenVLA) -> None:
 def test_pictures_may_be_those_of_libero(loaded: Callable[..., Any]) -> None:
     cropping = loaded("openvla", center_crop=True)
     obs = seen(0)
-    want = cropping.model.pixels(preprocessing.middle(preprocessing.resized(obs.cameras["front"])))
+    want = cropping.model.base.pixels(preprocessing.middle(preprocessing.resized(obs.cameras["front"])))
     assert torch.equal(cropping.perceive(obs), want)
     assert not torch.equal(cropping.perceive(obs), loaded("openvla").perceive(obs))
 
@@ -196,7 +196,7 @@ def test_a_checkpoints_own_code_runs_where_that_is_allowed(
     monkeypatch.setattr("transformers.dynamic_module_utils.HF_MODULES_CACHE", str(tmp_path))
     monkeypatch.syspath_prepend(tmp_path)
     policy = loaded("remote", trust_remote_code=True)
-    assert type(policy.model.network).__module__.startswith("transformers_modules.")
+    assert type(policy.model.base.network).__module__.startswith("transformers_modules.")
     same = loaded("remote")
     assert np.array_equal(begun(policy, 0).act(seen(0)).action, begun(same, 0).act(seen(0)).action)
 
@@ -205,6 +205,6 @@ def test_the_first_version_has_its_own_prompt(checkpoint: Callable[[str], Path],
     (tmp_path / "openvla-v01-7b").symlink_to(checkpoint("openvla"))
     policy = OpenVLA.from_config({"checkpoint": str(tmp_path / "openvla-v01-7b"), "unnorm_key": "bridge_orig"})
     policy.initialize()
-    prompt = policy.model.tokenizer.decode(policy.model.tokens("Push")[1:-1])
+    prompt = policy.model.base.tokenizer.decode(policy.model.base.tokens("Push")[1:-1])
     assert prompt.startswith("A chat between a curious user")
     assert prompt.endswith("USER: What action should the robot take to push? ASSISTANT:")

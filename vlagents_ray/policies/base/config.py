@@ -34,8 +34,8 @@ class ModelConfig(BaseModel, extra="forbid"):
     dtype: DType = Field(default="auto", description="of the weights; 'auto': the family's own choice")
     compile: CompileMode = Field(
         default=False,
-        description="compile the forward pass for each of `batch_sizes`, as CUDA graphs on a GPU; what does not compile, "
-        "or computes something else, runs without, or is an error with 'require'",
+        description="compile the forward pass for each of `batch_sizes`, as CUDA graphs on a GPU; what cannot be "
+        "compiled, or computes something else then, runs without; with 'require' it is an error",
     )
     seed: int = Field(default=0, ge=0, description="mixed with the seed of each episode")
 

@@ -131,7 +131,9 @@ class ModelPolicy(Agent, abc.ABC):
         self.model = self.load()
         sizes = self.config.batch_sizes or ()
         for number, size in enumerate(sizes, 1):
-            report_progress(f"{'compiling' if self.config.compile else 'running'} {size} rows ({number} of {len(sizes)})")
+            report_progress(
+                f"{'compiling' if self.config.compile else 'running'} {size} rows ({number} of {len(sizes)})"
+            )
             if self.compilation.cores:
                 self.compilation.add_size(size, partial(self._run_examples, size))
             self._run_examples(size)

@@ -112,7 +112,7 @@ class OpenVLAOFT(PrismaticPolicy):
             name: Projector(saved[name], name).to(**place) if name in saved else None
             for name in ("proprio_projector", "noisy_action_projector")
         }
-        return Parallel(
+        parallel = Parallel(
             base,
             horizon=config.horizon,
             dim=_action_dim(base.statistics, config.unnorm_key, head),
@@ -122,6 +122,8 @@ class OpenVLAOFT(PrismaticPolicy):
             film=Film(saved["vision_backbone"], base.network.vision_backbone).to(**place) if config.film else None,
             steps=(config.diffusion_steps, config.inference_steps),
         )
+        parallel.compile_with(self.compilation)
+        return parallel
 
     def perceive(self, obs: Obs) -> tuple[tuple[Any, ...], np.ndarray | None]:
         """Return the images as inputs of the backbones, (C, S, S) float32 each, and the state vector (P,)."""

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.openvla.components import Film, Mlp, Projector
 from vlagents_ray.policies.openvla.prismatic import Prismatic
 from vlagents_ray.registry import require
@@ -29,9 +30,12 @@ class ModelInput:
     proprio: np.ndarray | None  # (P,) in [-1, 1]
 
 
-@dataclass(frozen=True)
+@dataclass
 class Parallel:
-    """A checkpoint of OFT: OpenVLA's, and its components; components that it was trained without are None."""
+    """A checkpoint of OFT: OpenVLA's, and its components; components that it was trained without are None.
+
+    `look` and `attend` are functions of tensors, which `compile_with` replaces by their compiled forms.
+    """
 
     base: Prismatic
     horizon: int  # H, the number of rows of a chunk
@@ -41,6 +45,11 @@ class Parallel:
     noisy: Projector | None  # embeds noisy actions: the head is a diffusion head
     film: Film | None
     steps: tuple[int, int]  # diffusion steps: in training, at inference
+
+    def compile_with(self, compilation: Compilation) -> None:
+        """Mark what of the model is compiled."""
+        self.look = compilation.core("look", self.look)  # type: ignore[method-assign]
+        self.attend = compilation.core("attend", self.attend)  # type: ignore[method-assign]
 
     def regress(self, inputs: Sequence[ModelInput]) -> np.ndarray:
         """Return chunks (B, H, D) in [-1, 1] of the regression head."""
@@ -85,16 +94,34 @@ class Parallel:
         words = [self.base.embed([*model_input.tokens, _STOP]) for model_input in inputs]
         views = len(inputs[0].pictures)
         pixels = self.base.to_device([picture for model_input in inputs for picture in model_input.pictures])
-        if self.film is None:
-            patches = self.base.network.vision_backbone(pixels)
-        else:
-            language = torch.stack([one.mean(0) for one in words])
-            patches = self.film(pixels, language.repeat_interleave(views, 0))
-        seen = self.base.network.projector(patches).unflatten(0, (len(inputs), views)).flatten(1, 2)
+        language = torch.stack([one.mean(0) for one in words])
+        seen = self.look(pixels.unflatten(0, (len(inputs), views)), language)
         if self.proprio is not None:
             states = self.base.to_device([torch.from_numpy(model_input.proprio) for model_input in inputs])
             seen = torch.cat([seen, self.proprio(states)[:, None]], 1)
         return list(zip(seen, words, strict=True))
+
+    def look(self, pixels: Any, language: Any) -> Any:
+        """Return the embeddings (P, N, D) of images (P, views, C, S, S); `language` is the mean of words (P, D)."""
+        views = pixels.shape[1]
+        images = pixels.flatten(0, 1)
+        if self.film is None:
+            patches = self.base.network.vision_backbone(images)
+        else:
+            patches = self.film(images, language.repeat_interleave(views, 0))
+        return self.base.network.projector(patches).unflatten(0, (len(pixels), views)).flatten(1, 2)
+
+    def attend(self, embeddings: Any, lengths: Any) -> Any:
+        """Return hidden states (B, L, D) of sequences (B, L, D), each token attending to all of its row's length."""
+        import torch  # the compiler follows a statement, and not `require`
+
+        model, length = self.base.network.language_model.model, embeddings.shape[1]
+        places = lengths.new_ones(1, length).cumsum(1) - 1
+        hidden = (places >= lengths[:, None])[:, None, None].expand(-1, 1, length, -1)
+        mask = embeddings.new_zeros(1).expand(hidden.shape).masked_fill(hidden, torch.finfo(embeddings.dtype).min)
+        for layer in model.layers:
+            [embeddings] = layer(embeddings, attention_mask=mask, position_ids=places)
+        return model.norm(embeddings)
 
     def _hidden(self, sequences: Sequence[tuple[Any, Any]], actions: Any = None) -> Any:
         """Return hidden states (B, H * D, …) of the action tokens, which are `actions` or zeros.
@@ -110,14 +137,13 @@ class Parallel:
             for (seen, words), tokens in zip(sequences, actions, strict=True)
         ]
         embeddings = torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)
+        missing = max(0, self.base.padded_tokens - max(len(words) for _, words in sequences))
+        embeddings = torch.nn.functional.pad(embeddings, (0, 0, 0, missing))
         lengths = torch.tensor([len(row) for row in rows], device=self.base.device)
-        length = embeddings.shape[1]
-        visible = torch.arange(length, device=self.base.device) < lengths[:, None]
-        mask = visible[:, None, None].expand(-1, 1, length, -1).to(embeddings.dtype)
-        hidden = self.base.network.language_model.model(inputs_embeds=embeddings, attention_mask=mask, use_cache=False)
+        hidden = self.attend(embeddings, lengths)
         starts = lengths - count - 2  # the token before an action predicts it, as in training
         places = starts[:, None] + torch.arange(count, device=self.base.device)
-        return hidden.last_hidden_state[torch.arange(len(rows))[:, None], places]
+        return hidden[torch.arange(len(rows))[:, None], places]
 
 
 def _numpy(tensor: Any) -> np.ndarray:

@@ -1,12 +1,14 @@
 """OpenVLA: decodes the next action from an image and an instruction, token by token.
 
 Upstream's `predict_action` takes one prompt and calls `generate`. Here prompts of different lengths are padded on the
-left, with masks and positions that give each the same result as alone, and share every forward pass.
+left, with masks and positions that give each the same result as alone, and share every forward pass. Keys and values
+are one tensor of a fixed length, with a place for each token to come, which is masked until then.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,7 @@ from vlagents_ray.contract import Contract
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import Row, shared_frames
 from vlagents_ray.policies.base.model_inputs import camera_images, camera_specs, choose_cameras
+from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.openvla import preprocessing
 from vlagents_ray.policies.openvla.base import OFFERED, DecodedChunk, PreparedRow, PrismaticPolicy
 from vlagents_ray.policies.openvla.prismatic import Prismatic, PrismaticConfig, load_prismatic
@@ -39,7 +42,7 @@ class OpenVLA(PrismaticPolicy):
 
     Config = OpenVLAConfig
     config: OpenVLAConfig
-    model: Prismatic
+    model: TokenDecoder
 
     def __init__(self, config: OpenVLAConfig) -> None:
         super().__init__(config)
@@ -58,23 +61,25 @@ class OpenVLA(PrismaticPolicy):
             behaviour=self.offered(OFFERED),
         )
 
-    def load(self) -> Prismatic:
+    def load(self) -> TokenDecoder:
         """Read the checkpoint."""
-        return load_prismatic(self.config)
+        decoder = TokenDecoder(load_prismatic(self.config))
+        decoder.compile_with(self.compilation)
+        return decoder
 
     def perceive(self, obs: Obs) -> Any:
         """Return the image as the input of the backbones, (C, S, S) float32."""
         image = camera_images(obs, self._cameras)[_IMAGE]
         if self.config.center_crop:
             image = preprocessing.middle(preprocessing.resized(image))
-        return self.model.pixels(image)
+        return self.model.base.pixels(image)
 
     @property
     def _checkpoint(self) -> Prismatic | None:
-        return self.model
+        return None if self.model is None else self.model.base
 
     def _model_input(self, row: Row, key: str) -> tuple[Any, list[int]]:
-        return row.frames[-1], self.model.tokens(row.instruction)
+        return row.frames[-1], self.model.base.tokens(row.instruction)
 
     def _compute(self, prepared: Sequence[PreparedRow]) -> list[DecodedChunk]:
         """Decode all answers: a session's own greedily unless something is wanted of it, samples at temperature 1."""
@@ -83,61 +88,114 @@ class OpenVLA(PrismaticPolicy):
         for numbers, entry in zip(draws, prepared, strict=True):
             if entry.row.sample:
                 numbers[: entry.scale.dim] = entry.row.rng.random(entry.scale.dim)
-        tokens, logits = decode(self.model, [prepared[i].model_input for i in firsts], owners, draws)
-        return self._decoded(self.model.bins, prepared, tokens[:, None], logits[:, None])
+        tokens, logits = self.model.decode([prepared[i].model_input for i in firsts], owners, draws)
+        return self._decoded(self.model.base.bins, prepared, tokens[:, None], logits[:, None])
 
 
-def decode(
-    model: Prismatic, prompts: Sequence[tuple[Any, list[int]]], owners: Sequence[int], draws: np.ndarray
-) -> tuple[Any, Any]:
-    """Return R answers to P prompts, as tokens (R, S) and the logits (R, S, V) by which they were chosen.
+@dataclass
+class TokenDecoder:
+    """A checkpoint, and its passes: functions of tensors, which `compile_with` replaces by their compiled forms."""
 
-    Args:
-        model: The checkpoint.
-        prompts: The pixels (C, S, S) and tokens of each prompt.
-        owners: (R,), the prompt of each answer; a prompt with several answers is read once.
-        draws: (R, S), for `ActionBins.choose`.
-    """
-    torch = require("torch")
-    with torch.inference_mode():
-        uniform = torch.tensor(draws, device=model.device)
-        embeddings, mask = _left_padded(model, prompts)
-        language = model.network.language_model
-        positions = (mask.cumsum(-1) - 1).clamp(min=0)
-        read = language.model(inputs_embeds=embeddings, attention_mask=mask, position_ids=positions, use_cache=True)
-        index = torch.tensor(owners, device=model.device)
-        hidden, mask, position = read.last_hidden_state[index, -1], mask[index], positions[index, -1:]
-        cache = tuple((keys[index], values[index]) for keys, values in read.past_key_values)
-        chosen: list[Any] = []
-        logits: list[Any] = []
-        for step in range(draws.shape[1]):
-            if step:
-                mask = torch.cat([mask, mask.new_ones(len(mask), 1)], 1)
-                read = language.model(
-                    input_ids=chosen[-1][:, None],
-                    attention_mask=mask,
-                    position_ids=position + step,
-                    past_key_values=cache,
-                    use_cache=True,
-                )
-                hidden, cache = read.last_hidden_state[:, -1], read.past_key_values
-            logits.append(language.lm_head(hidden).float())
-            chosen.append(model.bins.choose(logits[-1], uniform[:, step]))
-        return torch.stack(chosen, 1), torch.stack(logits, 1)
+    base: Prismatic
+
+    def compile_with(self, compilation: Compilation) -> None:
+        """Mark what of the model is compiled."""
+        self.look = compilation.core("look", self.look)  # type: ignore[method-assign]
+        self.read = compilation.core("read", self.read)  # type: ignore[method-assign]
+        self.continue_from = compilation.core("continue", self.continue_from)  # type: ignore[method-assign]
+
+    def decode(
+        self, prompts: Sequence[tuple[Any, list[int]]], owners: Sequence[int], draws: np.ndarray
+    ) -> tuple[Any, Any]:
+        """Return R answers to P prompts, as tokens (R, S) and the logits (R, S, V) by which they were chosen.
+
+        Args:
+            prompts: The pixels (C, S, S) and tokens of each prompt.
+            owners: (R,), the prompt of each answer; a prompt with several answers is read once.
+            draws: (R, S), for `ActionBins.choose`.
+        """
+        torch, base, steps = require("torch"), self.base, draws.shape[1]
+        with torch.inference_mode():
+            uniform = torch.tensor(draws, device=base.device)
+            embeddings, mask = self._left_padded(prompts)
+            hidden, cache = self.read(embeddings, mask)
+            index = torch.tensor(owners, device=base.device)
+            length, position = mask.shape[1], mask.sum(1)[index]
+            # a place for each token but the last one, and one at the end for the token that is being read
+            cache = torch.nn.functional.pad(cache[index], (0, 0, 0, steps - 1))
+            hidden, mask = hidden[index], torch.nn.functional.pad(mask[index], (0, steps))
+            mask[:, -1] = 1
+            chosen: list[Any] = []
+            logits: list[Any] = []
+            for step in range(steps):
+                if step:
+                    hidden, own = self.continue_from(chosen[-1], position + step - 1, mask, cache)
+                    place = length + step - 1
+                    cache[..., place, :], mask[:, place] = own, 1
+                logits.append(base.network.language_model.lm_head(hidden).float())
+                chosen.append(base.bins.choose(logits[-1], uniform[:, step]))
+            return torch.stack(chosen, 1), torch.stack(logits, 1)
+
+    def look(self, pixels: Any) -> Any:
+        """Return the embeddings (P, N, D) of images (P, C, S, S)."""
+        network = self.base.network
+        return network.projector(network.vision_backbone(pixels))
+
+    def read(self, embeddings: Any, mask: Any) -> tuple[Any, Any]:
+        """Return what follows prompts (P, L, D), of which `mask` (P, L) is not 0.
+
+        Returns:
+            The last hidden state (P, D), and keys and values (P, layers, 2, heads, L, E).
+        """
+        read = self.base.network.language_model.model(
+            inputs_embeds=embeddings,
+            attention_mask=mask,
+            position_ids=(mask.cumsum(-1) - 1).clamp(min=0),
+            use_cache=True,
+        )
+        return read.last_hidden_state[:, -1], _stacked(read.past_key_values)
+
+    def continue_from(self, tokens: Any, positions: Any, mask: Any, cache: Any) -> tuple[Any, Any]:
+        """Return what follows tokens (R,) at `positions` (R,).
+
+        Args:
+            tokens: The last token of each row.
+            positions: Their places in the text.
+            mask: (R, T + 1), not 0 for what each token attends to: T places of the cache, and itself.
+            cache: Keys and values (R, layers, 2, heads, T, E).
+
+        Returns:
+            The hidden state (R, D), and the token's own keys and values (R, layers, 2, heads, E).
+        """
+        read = self.base.network.language_model.model(
+            input_ids=tokens[:, None],
+            attention_mask=mask,
+            position_ids=positions[:, None],
+            past_key_values=tuple((layer[:, 0], layer[:, 1]) for layer in cache.unbind(1)),
+            use_cache=True,
+        )
+        own = tuple((keys[:, :, -1:], values[:, :, -1:]) for keys, values in read.past_key_values)
+        return read.last_hidden_state[:, -1], _stacked(own)[..., 0, :]
+
+    def _left_padded(self, prompts: Sequence[tuple[Any, list[int]]]) -> tuple[Any, Any]:
+        """Return embeddings (P, L, D) and their mask (P, L), with the patches after the first token, as in training."""
+        torch, base = require("torch"), self.base
+        patches = self.look(base.to_device([pixels for pixels, _ in prompts]))
+        rows = []
+        for seen, (_, tokens) in zip(patches, prompts, strict=True):
+            words = base.embed(tokens)
+            rows.append(torch.cat([words[:1], seen, words[1:]]))
+        length = max(*map(len, rows), base.padded_tokens and base.padded_tokens + patches.shape[1])
+        embeddings = patches.new_zeros(len(rows), length, patches.shape[-1])
+        mask = torch.zeros(len(rows), length, dtype=torch.long, device=base.device)
+        for i, row in enumerate(rows):
+            embeddings[i, -len(row) :] = row
+            mask[i, -len(row) :] = 1
+        return embeddings, mask
 
 
-def _left_padded(model: Prismatic, prompts: Sequence[tuple[Any, list[int]]]) -> tuple[Any, Any]:
-    """Return embeddings (P, L, D) and their mask (P, L), with the patches after the first token, as in training."""
-    torch = require("torch")
-    patches = model.network.projector(model.network.vision_backbone(model.to_device([pixels for pixels, _ in prompts])))
-    rows = []
-    for seen, (_, tokens) in zip(patches, prompts, strict=True):
-        words = model.embed(tokens)
-        rows.append(torch.cat([words[:1], seen, words[1:]]))
-    length = max(map(len, rows))
-    embeddings = patches.new_zeros(len(rows), length, patches.shape[-1])
-    mask = torch.zeros(len(rows), length, dtype=torch.long, device=model.device)
-    for i, row in enumerate(rows):
-        embeddings[i, -len(row) :] = row
-        mask[i, -len(row) :] = 1
-    return embeddings, mask
+def _stacked(cache: Any) -> Any:
+    """Return a model's keys and values (B, heads, L, E) of each layer as one tensor (B, layers, 2, heads, L, E)."""
+    import torch  # the compiler follows a statement, and not `require`
+
+    return torch.stack([torch.stack(layer, 1) for layer in cache], 1)

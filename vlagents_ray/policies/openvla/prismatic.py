@@ -41,6 +41,7 @@ class Prismatic:
     prompt: str
     device: Any
     dtype: Any
+    padded_tokens: int  # the length to which shorter prompts are padded; 0: that of the longest one
 
     def pixels(self, image: np.ndarray) -> Any:
         """Convert an (H, W, 3) uint8 image to an input of the checkpoint's backbones, (C, S, S) float32 on the CPU."""
@@ -97,13 +98,18 @@ def load_prismatic(config: PrismaticConfig, bounds: Bounds = "q99") -> Prismatic
         prompt=_PROMPT_V01 if "openvla-v01" in config.checkpoint else _PROMPT,
         device=device,
         dtype=dtype,
+        padded_tokens=config.compiled_tokens if config.compile else 0,
     )
 
 
 class PrismaticConfig(ModelConfig):
     """Settings of both policies."""
 
-    compile: Literal[False] = Field(default=False, description="not for this family: prompts' lengths vary too much")
+    compiled_tokens: int = Field(
+        default=64,
+        ge=1,
+        description="with `compile`: tokens to which prompts are padded; longer ones run without compilation",
+    )
     unnorm_key: str | None = Field(
         default=None,
         description="dataset whose statistics turn answers into physical units, with or without `_no_noops`; unset: "

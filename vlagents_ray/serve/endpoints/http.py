@@ -112,14 +112,16 @@ class _HttpEndpoint:
         self._machine_metadata = machine_metadata
 
     async def health(self, http: HttpRequest) -> Response:
-        """Reply whether the policy is ready, and nothing else, since this path requires no key."""
+        """Reply whether the policy is ready, or at which step of loading, and nothing else: this path needs no key."""
         try:
             ready = await asyncio.wait_for(asyncio.to_thread(lambda: self._engine.ready), _HEALTH_S)
         except asyncio.TimeoutError:  # a policy's own check hangs
             ready = False
         if ready:
             return PlainTextResponse("OK\n")
-        unready = PolicyUnavailable("the policy is loading, or did not load; GET /v1/metadata says which")
+        step = self._engine.models.step
+        loading = f"the policy is loading{step and f' ({step})'}"
+        unready = PolicyUnavailable(f"{loading}, or did not load; GET /v1/metadata says which")
         return problem_response(unready, request_id(http))
 
     async def show_metadata(self, http: HttpRequest) -> Response:

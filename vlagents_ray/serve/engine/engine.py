@@ -82,11 +82,11 @@ class Engine:
         self.pauses = PauseDetector(clock)
         loader = Loader(self._source, version, batch_sizes, check, self.calls)
         self.models = ModelManager(self._source, loader, self.sessions)
-        self._batch_sizes = batch_sizes
         self.stats = MetricsBuffer()
         self.admission = Admission(in_flight_bytes)
-        self._reply_bytes = reply_bytes
-        self._unready: VLAgentsError | None = PolicyUnavailable("the policy is loading; try again")  # for clients
+        self._batch_sizes, self._reply_bytes = batch_sizes, reply_bytes
+        self._loading = self.models.loading()
+        self._unready: VLAgentsError | None = self._loading  # for clients
         self._failure: PolicyFailed | None = None  # why the policy did not load, for the operator
         self._hung: PolicyCall | None = None  # overdue call that `notice_hung` found
         self.draining = False  # whether the replica will stop, so that replies ask clients to reconnect elsewhere
@@ -134,7 +134,7 @@ class Engine:
     def require_ready(self) -> None:
         """Raise `PolicyUnavailable` while the policy loads, `PolicyFailed` if it did not load or its thread ended."""
         if self._unready is not None:
-            raise self._unready
+            raise self.models.loading() if self._unready is self._loading else self._unready
         if not self.queue.alive():
             raise PolicyFailed("the policy's thread has ended")
 

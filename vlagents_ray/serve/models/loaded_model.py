@@ -17,6 +17,7 @@ from vlagents_ray.errors import UnknownSession
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
+from vlagents_ray.policies.loading import loading_report
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.models.checkpoints import Checkpoints, resolved
@@ -45,6 +46,7 @@ class LoadedModel:
     calls: PolicyCalls  # running calls of the replica, including those of this agent
     parameters: ModelWeights  # versions of the weights
     busy: threading.Lock  # lock held while its agent runs, or is being closed
+    uncompiled: Sequence[str]  # what runs without compilation, although its settings ask for it
     since: float = field(default_factory=time.monotonic)  # time at which it was loaded, s
     sessions: int = 0  # number of sessions that hold it
     closed: bool = False
@@ -117,6 +119,7 @@ class Loader:
         self._batch_sizes = batch_sizes
         self._check = check
         self._calls = calls
+        self.on_progress: Callable[[str], None] = lambda _: None  # called with each step of a long load
 
     def load(self, choice: CheckpointChoice, settings: dict[str, Any], agent: Agent | None = None) -> LoadedModel:
         """Load a model into `agent`, by default a new one; the agent is closed if it cannot be served.
@@ -135,7 +138,7 @@ class Loader:
     def _load(self, choice: CheckpointChoice, settings: dict[str, Any], agent: Agent | None) -> LoadedModel:
         agent = agent or self._source.make(settings)
         try:
-            with used_checkpoints() as found:
+            with used_checkpoints() as found, loading_report(self.on_progress) as report:
                 agent.initialize()
             weights = agent.weights_id or weights_of(found)
             contract = agent.contract
@@ -154,7 +157,19 @@ class Loader:
         parameters = ModelWeights(agent, busy, digest, version)
         key, calls = key_of(settings), self._calls
         return LoadedModel(
-            choice, settings, key, agent, contract, copies, padding, weights, version, calls, parameters, busy
+            choice,
+            settings,
+            key,
+            agent,
+            contract,
+            copies,
+            padding,
+            weights,
+            version,
+            calls,
+            parameters,
+            busy,
+            report.uncompiled,
         )
 
     def version(self, settings: Mapping[str, Any]) -> str:

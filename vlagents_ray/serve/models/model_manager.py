@@ -50,8 +50,11 @@ class ModelManager:
         """Manage models from `loader` for `sessions`; a model's sessions are closed when it is evicted at once."""
         self.contract: Contract | None = None  # contract of the deployment's own model that was loaded last
         self.weights: dict[str, str | None] | None = None  # weights of the deployment's own model that was loaded last
+        self.step = ""  # the step of a long first load, such as "compiling 4 rows (3 of 5)"
+        self.on_step: Callable[[str], None] = lambda _: None  # called with it, on the thread that loads
         self._source = source
         self._loader = loader
+        loader.on_progress = self._set_step
         self._sessions = sessions
         self._first: Agent | None = None
         self._fingerprint = ""
@@ -119,8 +122,18 @@ class ModelManager:
         with self._changed:
             model = self._cache.find(DEFAULT)
         if model is None:
-            raise PolicyUnavailable("the policy is loading; try again")
+            raise self.loading()
         return model.parameters
+
+    @property
+    def uncompiled(self) -> list[str]:
+        """What of the loaded models runs without compilation, although their settings ask for it."""
+        with self._changed:
+            return [what for model in self._cache.loaded.values() for what in model.uncompiled]
+
+    def loading(self) -> PolicyUnavailable:
+        """Return the error for clients while the first checkpoint is loaded, which names the step."""
+        return PolicyUnavailable(f"the policy is loading{self.step and f' ({self.step})'}; try again")
 
     def describe(self) -> dict[str, Any]:
         """Return the available choices, the loaded checkpoints and the state of the last swap, for the metadata."""
@@ -215,6 +228,11 @@ class ModelManager:
     def _release_model(self, session: Session[LoadedModel]) -> None:
         if self._cache.release_model(session):
             self._changed.notify_all()
+
+    def _set_step(self, step: str) -> None:
+        if not self._loaded:
+            self.step = step
+            self.on_step(step)
 
     def _set_own_model(self, model: LoadedModel) -> None:
         self.contract, self._fingerprint = model.contract, model.version[1]

@@ -2,10 +2,10 @@
 
     python -m vlagents_ray.serve.python_env.child_main
 
-It needs the light install and pydantic, not Ray. The first line of its standard input is `Settings`, as JSON. When the
-policy is loaded, it writes one line of JSON with the contract and the address of its `ShmServer`, through which all
-requests go; if the policy does not load, the line holds the error. A further byte of input lets it close the policy and
-end. The end of its input, or the death of its parent, ends it at once.
+It needs the light install and pydantic, not Ray. The first line of its standard input is `Settings`, as JSON. Each step
+of a long load is a line of JSON. When the policy is loaded, it writes one with the contract and the address of its
+`ShmServer`, through which all requests go; if the policy does not load, the line holds the error. A further byte of
+input lets it close the policy and end. The end of its input, or the death of its parent, ends it at once.
 """
 
 from __future__ import annotations
@@ -100,6 +100,7 @@ def run() -> None:
         )
         server = ShmServer(engine, _NO_LIMITS, NoKey.INSIDE, INNER_OPS)
         server.open()
+        engine.models.on_step = lambda step: answer({"step": step})
         engine.start()
     except Exception as error:
         logging.getLogger(__name__).exception("the policy did not load")
@@ -107,7 +108,15 @@ def run() -> None:
         answer({"error": f"{type(cause).__name__}: {cause}"})
         sys.exit(1)
     contract = None if engine.contract is None else engine.contract.to_json()
-    answer({"local": asdict(server.address), "contract": contract, "weights": engine.models.weights})
+    models = engine.models
+    answer(
+        {
+            "local": asdict(server.address),
+            "contract": contract,
+            "weights": models.weights,
+            "uncompiled": models.uncompiled,
+        }
+    )
     over.wait()
     engine.close()
     server.close()

@@ -22,6 +22,7 @@ from typing import Any
 from vlagents_ray.client.transports.local.shm import ShmTransport
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, ConnectionLost, PolicyFailed, PolicyUnavailable, VLAgentsError
+from vlagents_ray.policies.loading import report_progress, report_uncompiled
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.python_env import child_main
 from vlagents_ray.serve.python_env.child_main import Settings
@@ -139,13 +140,19 @@ class Child:
     def _introduced(self, process: subprocess.Popen[bytes], keeper: threading.Thread) -> dict[str, Any]:
         """Return the document that the process sends once its policy is loaded; raise `PolicyFailed` if it did not."""
         _write(process, json.dumps(asdict(self._settings)).encode() + b"\n")
-        line = b"" if process.stdout is None else process.stdout.readline()
-        if not line:
-            keeper.join(_EXIT_S)
-            raise PolicyFailed(f"{self._ended()}; it said:\n{''.join(self._last_words).strip()}")
-        said: dict[str, Any] = json.loads(line)
+        while True:
+            line = b"" if process.stdout is None else process.stdout.readline()
+            if not line:
+                keeper.join(_EXIT_S)
+                raise PolicyFailed(f"{self._ended()}; it said:\n{''.join(self._last_words).strip()}")
+            said: dict[str, Any] = json.loads(line)
+            if "step" not in said:
+                break
+            report_progress(said["step"])
         if "error" in said:
             raise PolicyFailed(f"in {self._python}: {said['error']}")
+        for what in said["uncompiled"]:
+            report_uncompiled(what)
         return said
 
     def _keep(self) -> None:

@@ -12,6 +12,7 @@
 | `vlagents_utilisation` | gauge | share of the last second in which the policy's thread was busy |
 | `vlagents_policy_version` | gauge | newest version of the weights; 0 is the checkpoint that was loaded |
 | `vlagents_weight_push_ms` | histogram | from new weights at the replica that received them until all act with them |
+| `vlagents_uncompiled` | gauge | batch sizes that run without compilation, although the policy's `compile` is set |
 | `vlagents_hung_calls` | counter | op; calls of the policy that took longer than `limits` allow |
 | `vlagents_keys_unreadable_s` | gauge | time since which the file of API keys cannot be read; 0 if it can |
 
@@ -78,6 +79,7 @@ class Exporter:
         self._version = make(Gauge, "policy_version", "Newest version of the weights.")
         self._pushes = make(Histogram, "weight_push_ms", "Time until all replicas act with weights.", boundaries=_MS)
         self._hung = make(Counter, "hung_calls", "Calls of the policy over their time limit.", "op")
+        self._uncompiled = make(Gauge, "uncompiled", "Batch sizes that run without the compilation that is set.")
         self._unreadable = make(Gauge, "keys_unreadable_s", "Time in which the key file could not be read.")
         self._keys = keys
         self._meter = LoadMeter(engine.queue)
@@ -116,6 +118,7 @@ class Exporter:
         for took_ms in self._engine.weights.collect_pushes_ms():
             self._pushes.observe(took_ms)
         self._version.set(self._engine.weights.number)
+        self._uncompiled.set(len(self._engine.models.uncompiled))
         self._unreadable.set(0.0 if self._keys is None else self._keys.unreadable_s)
 
     def _export_collected(self, collected: Collected) -> None:

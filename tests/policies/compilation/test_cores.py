@@ -1,0 +1,214 @@
+"""Compiled cores: their results, when they are made, and what happens to one that cannot be compiled or is wrong."""
+
+from __future__ import annotations
+
+import copy
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from vlagents_ray import Obs
+from vlagents_ray.contract import ActionSpec, Contract, StateSpec
+from vlagents_ray.errors import ConfigError, InvalidObservation
+from vlagents_ray.interface import SAMPLES, Act
+from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
+from vlagents_ray.policies.base.model_inputs import state_vector
+from vlagents_ray.policies.compilation import Compilation
+from vlagents_ray.policies.loading import LoadingReport, loading_report
+
+pytestmark = pytest.mark.torch
+
+DIM, HORIZON = 3, 4
+WORDS = "go"
+
+
+class Linear(ModelPolicy):
+    """A chunk is a linear layer of the state, and of the session's noise."""
+
+    Config = ModelConfig
+    trainable = "model"
+    refused = False  # of every observation
+
+    @property
+    def contract(self) -> Contract:
+        return Contract(state={"joints": StateSpec(DIM)}, action=ActionSpec(dim=DIM), chunk=self.chunk(HORIZON))
+
+    def load(self) -> Any:
+        torch.manual_seed(0)
+        model = torch.nn.Linear(DIM, HORIZON * DIM).requires_grad_(False)
+        self.pass_of = self.compilation.core("linear", self._layer(model))
+        return model
+
+    def _layer(self, model: Any) -> Callable[..., Any]:
+        def layer(states: Any, noise: Any) -> Any:
+            return model(states).tanh().unflatten(1, (HORIZON, DIM)) + 0.1 * noise
+
+        return layer
+
+    def perceive(self, obs: Obs) -> np.ndarray:
+        if self.refused:
+            raise InvalidObservation("joints: refused")
+        return state_vector(obs, ["joints"], DIM)
+
+    def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
+        states = np.stack([row.frames[-1] for row in rows])
+        noise = np.stack([row.noise(HORIZON, DIM) for row in rows])
+        with torch.inference_mode():
+            chunks = self.pass_of(torch.from_numpy(states), torch.from_numpy(noise))
+        return [Prediction(chunk) for chunk in chunks.numpy()]
+
+
+class Breaking(Linear):
+    """A model that leaves the graph."""
+
+    def _layer(self, model: Any) -> Callable[..., Any]:
+        layer = super()._layer(model)
+
+        def breaking(states: Any, noise: Any) -> Any:
+            torch._dynamo.graph_break()
+            return layer(states, noise)
+
+        return breaking
+
+
+class Compiler:
+    """A backend of torch.compile that counts what it makes, and makes some of it wrong."""
+
+    def __init__(self) -> None:
+        self.rows: list[int] = []  # of each program
+        self.change: dict[int, Callable[[Any], Any]] = {}  # of the result, by the number of rows
+        self.calls = 0  # of programs
+
+    def __call__(self, graph: Any, examples: Sequence[Any]) -> Callable[..., Any]:
+        rows = next(len(one) for one in examples if not isinstance(one, torch.nn.Parameter))
+        self.rows.append(rows)
+
+        def program(*inputs: Any) -> Any:
+            self.calls += 1
+            return [self.change.get(rows, lambda result: result)(one) for one in graph(*inputs)]
+
+        return program
+
+
+@pytest.fixture
+def compiler(monkeypatch: pytest.MonkeyPatch) -> Iterator[Compiler]:
+    compiler = Compiler()
+    monkeypatch.setattr(Compilation, "backend", compiler)
+    yield compiler
+    torch._dynamo.reset()
+
+
+def made(kind: type[Linear] = Linear, **config: Any) -> Linear:
+    policy = kind.from_config({"checkpoint": "none", **config})
+    policy.initialize()
+    return policy
+
+
+def loaded(kind: type[Linear] = Linear, **config: Any) -> tuple[Linear, LoadingReport, list[str]]:
+    steps: list[str] = []
+    with loading_report(steps.append) as report:
+        return made(kind, **config), report, steps
+
+
+def acted(policy: Linear, seeds: Sequence[int], **info: Any) -> list[np.ndarray]:
+    rng = np.random.default_rng(7)
+    views = [Obs(state={"joints": rng.normal(size=DIM).astype(np.float32)}, info=info) for _ in range(max(seeds) + 1)]
+    sessions = [copy.copy(policy) for _ in seeds]
+    for session, seed in zip(sessions, seeds, strict=True):
+        session.reset(views[seed], WORDS, seed=seed)
+    acts = policy.act_batch([views[seed] for seed in seeds], sessions)
+    return [act.action for act in acts if isinstance(act, Act)]
+
+
+def test_batches_of_any_size_act_as_without_compilation(compiler: Compiler) -> None:
+    plain, compiled = made(), made(compile="require", batch_sizes=[1, 2, 4])
+    for size in (1, 2, 3, 4, 5, 9):
+        before = compiler.calls
+        for one, other in zip(acted(plain, range(size)), acted(compiled, range(size)), strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-6)
+        assert compiler.calls > before
+
+
+def test_neighbours_and_padding_change_nothing(compiler: Compiler) -> None:
+    compiled = made(compile="require", batch_sizes=[4])
+    together = acted(compiled, [0, 1, 2])
+    for seed, action in enumerate(together):
+        np.testing.assert_allclose(acted(compiled, [seed])[0], action, atol=1e-6)
+
+
+def test_programs_are_made_once_while_the_policy_loads(compiler: Compiler) -> None:
+    sizes = list(range(1, 13))  # more than torch allows for one function
+    policy, report, steps = loaded(compile="require", batch_sizes=sizes)
+    assert (compiler.rows, policy.compilation.sizes, report.uncompiled) == (sizes, sizes, [])
+    assert steps == [f"compiling {size} rows ({size} of 12)" for size in sizes]
+    acted(policy, range(5))
+    other = threading.Thread(target=acted, args=(policy, range(7)))  # the policy's thread is not always the loading one
+    other.start()
+    other.join()
+    acted(policy, range(5), **{SAMPLES: 2})
+    assert compiler.rows == sizes
+
+
+def test_pushed_weights_act_at_once_without_another_program(compiler: Compiler) -> None:
+    plain, compiled = made(), made(compile="require", batch_sizes=[2])
+    before = acted(compiled, [0])[0]
+    for policy in (plain, compiled):
+        policy.load_parameters({name: value + 0.5 for name, value in policy.parameters().items()})
+    after = acted(compiled, [0])[0]
+    np.testing.assert_allclose(after, acted(plain, [0])[0], atol=1e-6)
+    assert np.abs(after - before).max() > 0.1
+    assert compiler.rows == [2]
+
+
+def test_usual_sizes_if_none_are_given() -> None:
+    assert ModelConfig(checkpoint="any", compile=True).batch_sizes == [1, 2, 4, 8, 16]
+    assert ModelConfig(checkpoint="any").batch_sizes is None
+
+
+@pytest.mark.parametrize("wrong", [lambda out: out + 0.01, lambda out: out * float("nan"), lambda out: out.flip(0)])
+def test_a_program_with_other_results_is_not_used(
+    compiler: Compiler, caplog: pytest.LogCaptureFixture, wrong: Callable[[Any], Any]
+) -> None:
+    compiler.change[2] = wrong
+    policy, report, _ = loaded(compile=True, batch_sizes=[1, 2, 3])
+    assert policy.compilation.sizes == [1, 3]
+    [said] = report.uncompiled
+    assert said.startswith("2 rows: 'linear': its results are off by ")
+    assert "want at most 0.001" in caplog.text
+    for one, other in zip(acted(made(), [0, 1]), acted(policy, [0, 1]), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-6)
+
+
+def test_the_rounding_of_a_program_is_accepted(compiler: Compiler) -> None:
+    compiler.change[1] = lambda out: out * 1.0001
+    assert loaded(compile="require", batch_sizes=[1])[0].compilation.sizes == [1]
+
+
+def test_what_is_required_and_wrong_is_an_error(compiler: Compiler) -> None:
+    compiler.change[2] = lambda out: out + 1
+    with pytest.raises(ConfigError, match=r"compile: require: 'linear'.*off by.*want at most 0\.001"):
+        made(compile="require", batch_sizes=[1, 2])
+
+
+def test_what_leaves_the_graph_runs_without_compilation(compiler: Compiler) -> None:
+    policy, report, _ = loaded(Breaking, compile=True, batch_sizes=[1, 2])
+    assert (policy.compilation.sizes, len(report.uncompiled), compiler.rows) == ([], 2, [])
+    np.testing.assert_allclose(acted(policy, [0])[0], acted(made(), [0])[0], atol=1e-6)
+    with pytest.raises(ConfigError, match="compile: require: 'linear'"):
+        made(Breaking, compile="require", batch_sizes=[1])
+
+
+def test_an_error_of_the_policy_itself_is_raised(compiler: Compiler, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Linear, "refused", True)
+    with pytest.raises(InvalidObservation, match="joints: refused"):
+        made(compile=True)
+
+
+def test_nothing_is_compiled_unless_it_is_set(compiler: Compiler) -> None:
+    _, report, steps = loaded(batch_sizes=[1, 2])
+    assert (compiler.rows, report.uncompiled) == ([], [])
+    assert steps == ["running 1 rows (1 of 2)", "running 2 rows (2 of 2)"]
