@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray import Act, ActionSpec, Agent, Contract, Obs
+from vlagents_ray.policies.loading import report_progress, report_uncompiled
 
 ALIVE: weakref.WeakSet[Telling] = weakref.WeakSet()  # sessions that this process holds
 
@@ -77,6 +78,16 @@ class Telling(Agent):
             "gpus": os.environ.get("CUDA_VISIBLE_DEVICES"), "instruction": self.instruction, "acts": self.acts,
             "seen": list(self.seen), "alive": len(ALIVE),
         }  # fmt: skip
+
+
+class Compiling(Telling):
+    """Reports what a policy reports that compiles two sizes, and fails at one."""
+
+    def initialize(self) -> None:
+        super().initialize()
+        report_progress("compiling 1 rows (1 of 2)")
+        report_progress("compiling 2 rows (2 of 2)")
+        report_uncompiled("2 rows")
 
 
 class Unpicklable(Telling):

@@ -19,6 +19,7 @@ from starlette.testclient import TestClient
 from vlagents_ray.contract import CameraSpec, Contract, StateSpec
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.policies.loading import report_progress, report_uncompiled
 from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_reply, encode_request
 from vlagents_ray.protocol.messages import Limits, Request
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
@@ -210,6 +211,39 @@ def test_health_is_503_until_the_policy_is_loaded() -> None:
             answer = client.get(path)
             assert (answer.status_code, answer.json()["code"]) == (503, "unavailable")
         assert post(client, "reset").status_code == 503
+
+
+class Slow(Mean):
+    """A policy whose load has two steps, of which the second one waits."""
+
+    def __init__(self) -> None:
+        self.compiling, self.go_on = threading.Event(), threading.Event()
+
+    def initialize(self) -> None:
+        report_progress("compiling 1 rows (1 of 2)")
+        report_progress("compiling 2 rows (2 of 2)")
+        report_uncompiled("2 rows")
+        self.compiling.set()
+        self.go_on.wait(60)
+
+
+def test_health_and_refusals_name_the_step_of_a_long_start() -> None:
+    policy = Slow()
+    engine = Engine(policy)
+    starting = threading.Thread(target=engine.start)
+    with TestClient(AccessMiddleware(build_http_app(engine, dict, LIMITS), None, "app")) as client:
+        starting.start()
+        try:
+            assert policy.compiling.wait(60)
+            for answer in (client.get("/healthz"), client.get("/v1/metadata"), post(client, "reset")):
+                assert answer.status_code == 503
+                assert "the policy is loading (compiling 2 rows (2 of 2))" in answer.text
+        finally:
+            policy.go_on.set()
+            starting.join()
+        assert client.get("/healthz").text == "OK\n"
+        assert engine.models.uncompiled == ["2 rows"]
+    engine.close()
 
 
 NAN, HUGE = float("nan"), 10**400

@@ -28,6 +28,7 @@ from vlagents_ray.errors import (
     PolicyUnavailable,
     VLAgentsError,
 )
+from vlagents_ray.policies.loading import loading_report
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.python_env.child_agent import ChildAgent
@@ -99,6 +100,17 @@ def info(reply: Reply) -> dict[str, Any]:
     found = reply.act.info if reply.act is not None else reply.info
     assert found is not None
     return found
+
+
+def test_the_steps_of_a_long_start_there_are_reported_here() -> None:
+    one, steps = agent("Compiling"), list[str]()
+    try:
+        with loading_report(steps.append) as report:
+            one.initialize()
+    finally:
+        one.close()
+    assert steps == ["compiling 1 rows (1 of 2)", "compiling 2 rows (2 of 2)"]
+    assert report.uncompiled == ["2 rows"]
 
 
 def test_the_policy_runs_in_another_process_with_its_variables_and_this_ones_devices(

@@ -9,6 +9,7 @@ from typing import Any
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base import import_fixes
 from vlagents_ray.policies.base.config import DType
+from vlagents_ray.policies.compilation.kept_programs import keep_jax_programs
 from vlagents_ray.registry import require
 
 
@@ -39,8 +40,12 @@ def torch_dtype(name: DType, device: Any, preferred: str = "bfloat16") -> Any:
 
 
 def jax_device(name: str = "auto") -> Any:
-    """Return the JAX device of a name; "auto" takes the first one; raises `ConfigError` for a missing device."""
+    """Return the JAX device of a name; "auto" takes the first one; raises `ConfigError` for a missing device.
+
+    From then on, the programs that JAX compiles are kept for the next start.
+    """
     jax = require("jax")
+    keep_jax_programs(jax)
     if name == "auto":
         return jax.devices()[0]
     kind, _, index = name.partition(":")

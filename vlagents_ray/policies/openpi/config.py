@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 from pydantic import Field
 
 from vlagents_ray.policies.base import ModelConfig
@@ -12,6 +14,8 @@ from vlagents_ray.policies.openpi.robots import Layout
 class OpenPiConfig(ModelConfig):
     """Settings of openpi's policies, beside those of all models."""
 
+    whole_flow: ClassVar[bool] = True
+    compile: bool = Field(default=False, description="the config's own pytorch_compile_mode, for PyTorch")
     config: str = Field(
         min_length=1, description="the training config: one of openpi's names, such as pi05_libero, or 'module:NAME'"
     )

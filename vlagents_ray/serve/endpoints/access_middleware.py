@@ -1,8 +1,8 @@
 """Access control of a replica's HTTP paths and WebSockets: API keys, and time limits for slow clients.
 
 The middleware is an ASGI application around another one, so that everything behind it, the dialects included, is
-protected in the same way. Only `/healthz` requires no key; it reports only whether the policy is ready, or at which step
-of loading. A WebSocket is refused before it is accepted.
+protected in the same way. Only `/healthz` requires no key; it reports only whether the policy is ready, or which
+step of loading it is at. A WebSocket is refused before it is accepted.
 """
 
 from __future__ import annotations
