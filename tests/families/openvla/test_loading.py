@@ -46,7 +46,6 @@ def _link(source: str, target: str) -> None:
         ("openvla", "openvla", {"source_dir": "/nowhere"}, r"got \['/nowhere'\], want a folder with prismatic"),
         ("openvla", "openvla", {"trust_remote_code": True}, "names no code"),
         ("openvla", "openvla", {"trust_remote_code": True, "source_dir": "."}, "got both, want .* one of them"),
-        ("openvla", "openvla", {"compile": True}, "compile"),
         ("openvla_oft", "oft", {"film": True}, r"'vision_backbone', want one file vision_backbone--STEP"),
         ("openvla_oft", "oft", {"head": "diffusion"}, "'noisy_action_projector', want one file"),
         ("openvla_oft", "oft", {"head": "tokens"}, "has action_head--.*do not use"),

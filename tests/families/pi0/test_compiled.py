@@ -1,7 +1,4 @@
-"""π0 with compiled cores acts as without, on a small random checkpoint.
-
-The programs are those of Dynamo alone, without code for this machine, whose compiler would take minutes.
-"""
+"""π0 with compiled cores acts as without, on a small random checkpoint."""
 
 from __future__ import annotations
 
@@ -11,13 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
+from counting_compiler import counting_compiler
 from pushed_weights import check_pushed_weights
 
 from tests.families.pi0 import tiny
 from tests.families.pi0.test_pi0 import BATCHED, begun, seen
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT, Act, Obs
-from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.pi0 import Pi0
 
 SIZE = 3
@@ -30,17 +26,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def programs() -> Iterator[list[int]]:
-    """The rows of each program, as it is made."""
-    made: list[int] = []
-
-    def backend(graph: Any, examples: Any) -> Any:
-        made.append(next(len(one) for one in examples if not isinstance(one, torch.nn.Parameter) and one.ndim > 1))
-        return graph
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Compilation, "backend", backend)
-        yield made
-    torch._dynamo.reset()
+    """The rows of each program that is made."""
+    with counting_compiler() as compiler:
+        yield compiler.rows
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from counting_compiler import CountingCompiler, counting_compiler
 
 from vlagents_ray import Obs
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
@@ -75,31 +76,10 @@ class Breaking(Linear):
         return breaking
 
 
-class Compiler:
-    """A backend of torch.compile that counts what it makes, and makes some of it wrong."""
-
-    def __init__(self) -> None:
-        self.rows: list[int] = []  # of each program
-        self.change: dict[int, Callable[[Any], Any]] = {}  # of the result, by the number of rows
-        self.calls = 0  # of programs
-
-    def __call__(self, graph: Any, examples: Sequence[Any]) -> Callable[..., Any]:
-        rows = next(len(one) for one in examples if not isinstance(one, torch.nn.Parameter))
-        self.rows.append(rows)
-
-        def program(*inputs: Any) -> Any:
-            self.calls += 1
-            return [self.change.get(rows, lambda result: result)(one) for one in graph(*inputs)]
-
-        return program
-
-
 @pytest.fixture
-def compiler(monkeypatch: pytest.MonkeyPatch) -> Iterator[Compiler]:
-    compiler = Compiler()
-    monkeypatch.setattr(Compilation, "backend", compiler)
-    yield compiler
-    torch._dynamo.reset()
+def compiler() -> Iterator[CountingCompiler]:
+    with counting_compiler() as compiler:
+        yield compiler
 
 
 def made(kind: type[Linear] = Linear, **config: Any) -> Linear:
@@ -124,7 +104,7 @@ def acted(policy: Linear, seeds: Sequence[int], **info: Any) -> list[np.ndarray]
     return [act.action for act in acts if isinstance(act, Act)]
 
 
-def test_batches_of_any_size_act_as_without_compilation(compiler: Compiler) -> None:
+def test_batches_of_any_size_act_as_without_compilation(compiler: CountingCompiler) -> None:
     plain, compiled = made(), made(compile="require", batch_sizes=[1, 2, 4])
     for size in (1, 2, 3, 4, 5, 9):
         before = compiler.calls
@@ -133,14 +113,14 @@ def test_batches_of_any_size_act_as_without_compilation(compiler: Compiler) -> N
         assert compiler.calls > before
 
 
-def test_neighbours_and_padding_change_nothing(compiler: Compiler) -> None:
+def test_neighbours_and_padding_change_nothing(compiler: CountingCompiler) -> None:
     compiled = made(compile="require", batch_sizes=[4])
     together = acted(compiled, [0, 1, 2])
     for seed, action in enumerate(together):
         np.testing.assert_allclose(acted(compiled, [seed])[0], action, atol=1e-6)
 
 
-def test_programs_are_made_once_while_the_policy_loads(compiler: Compiler) -> None:
+def test_programs_are_made_once_while_the_policy_loads(compiler: CountingCompiler) -> None:
     sizes = list(range(1, 13))  # more than torch allows for one function
     policy, report, steps = loaded(compile="require", batch_sizes=sizes)
     assert (compiler.rows, policy.compilation.sizes, report.uncompiled) == (sizes, sizes, [])
@@ -153,7 +133,7 @@ def test_programs_are_made_once_while_the_policy_loads(compiler: Compiler) -> No
     assert compiler.rows == sizes
 
 
-def test_pushed_weights_act_at_once_without_another_program(compiler: Compiler) -> None:
+def test_pushed_weights_act_at_once_without_another_program(compiler: CountingCompiler) -> None:
     plain, compiled = made(), made(compile="require", batch_sizes=[2])
     before = acted(compiled, [0])[0]
     for policy in (plain, compiled):
@@ -164,6 +144,17 @@ def test_pushed_weights_act_at_once_without_another_program(compiler: Compiler) 
     assert compiler.rows == [2]
 
 
+def test_rows_of_another_shape_run_without_a_program(compiler: CountingCompiler) -> None:
+    compilation = Compilation("require")
+    core = compilation.core("sum", lambda numbers: numbers.sum(-1))
+    compilation.add_size(2, lambda: core(torch.ones(2, 3)))
+    calls = compiler.calls
+    assert core(torch.ones(2, 4)).tolist() == [4, 4]
+    assert (compiler.rows, compiler.calls) == ([2], calls)
+    assert core(torch.ones(1, 3)).tolist() == [3]
+    assert compiler.calls == calls + 1
+
+
 def test_usual_sizes_if_none_are_given() -> None:
     assert ModelConfig(checkpoint="any", compile=True).batch_sizes == [1, 2, 4, 8, 16]
     assert ModelConfig(checkpoint="any").batch_sizes is None
@@ -171,7 +162,7 @@ def test_usual_sizes_if_none_are_given() -> None:
 
 @pytest.mark.parametrize("wrong", [lambda out: out + 0.01, lambda out: out * float("nan"), lambda out: out.flip(0)])
 def test_a_program_with_other_results_is_not_used(
-    compiler: Compiler, caplog: pytest.LogCaptureFixture, wrong: Callable[[Any], Any]
+    compiler: CountingCompiler, caplog: pytest.LogCaptureFixture, wrong: Callable[[Any], Any]
 ) -> None:
     compiler.change[2] = wrong
     policy, report, _ = loaded(compile=True, batch_sizes=[1, 2, 3])
@@ -183,18 +174,18 @@ def test_a_program_with_other_results_is_not_used(
         np.testing.assert_allclose(one, other, atol=1e-6)
 
 
-def test_the_rounding_of_a_program_is_accepted(compiler: Compiler) -> None:
+def test_the_rounding_of_a_program_is_accepted(compiler: CountingCompiler) -> None:
     compiler.change[1] = lambda out: out * 1.0001
     assert loaded(compile="require", batch_sizes=[1])[0].compilation.sizes == [1]
 
 
-def test_what_is_required_and_wrong_is_an_error(compiler: Compiler) -> None:
+def test_what_is_required_and_wrong_is_an_error(compiler: CountingCompiler) -> None:
     compiler.change[2] = lambda out: out + 1
     with pytest.raises(ConfigError, match=r"compile: require: 'linear'.*off by.*want at most 0\.001"):
         made(compile="require", batch_sizes=[1, 2])
 
 
-def test_what_leaves_the_graph_runs_without_compilation(compiler: Compiler) -> None:
+def test_what_leaves_the_graph_runs_without_compilation(compiler: CountingCompiler) -> None:
     policy, report, _ = loaded(Breaking, compile=True, batch_sizes=[1, 2])
     assert (policy.compilation.sizes, len(report.uncompiled), compiler.rows) == ([], 2, [])
     np.testing.assert_allclose(acted(policy, [0])[0], acted(made(), [0])[0], atol=1e-6)
@@ -202,13 +193,13 @@ def test_what_leaves_the_graph_runs_without_compilation(compiler: Compiler) -> N
         made(Breaking, compile="require", batch_sizes=[1])
 
 
-def test_an_error_of_the_policy_itself_is_raised(compiler: Compiler, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_of_the_policy_itself_is_raised(compiler: CountingCompiler, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Linear, "refused", True)
     with pytest.raises(InvalidObservation, match="joints: refused"):
         made(compile=True)
 
 
-def test_nothing_is_compiled_unless_it_is_set(compiler: Compiler) -> None:
+def test_nothing_is_compiled_unless_it_is_set(compiler: CountingCompiler) -> None:
     _, report, steps = loaded(batch_sizes=[1, 2])
     assert (compiler.rows, report.uncompiled) == ([], [])
     assert steps == ["running 1 rows (1 of 2)", "running 2 rows (2 of 2)"]

@@ -1,9 +1,10 @@
 """Pure cores of a model, compiled for a few batch sizes, and compared with the eager pass before they are used.
 
-A core is a function of tensors alone, whose first dimension is the batch and whose other dimensions never change; it
+A core is a function of tensors alone, whose first dimension is the batch and whose other dimensions are fixed; it
 returns such a tensor, or a tuple of them. `torch.compile` makes one program for each core and batch size, without graph
 breaks; on a GPU it is captured in a CUDA graph. All programs are made while the policy loads. A batch between two sizes
-is padded with copies of its last row, whose results are dropped; one for which there is no program runs eagerly.
+is padded with copies of its last row, whose results are dropped; one for which there is no program, as its rows have
+another shape, or as it is too large, runs eagerly.
 """
 
 from __future__ import annotations
@@ -100,6 +101,7 @@ class Core:
     def __init__(self, owner: Compilation, name: str, function: Callable[..., Any]) -> None:
         self._owner, self._name, self._function = owner, name, function
         self._programs: dict[int, Callable[..., Any]] = {}
+        self._shapes: dict[int, list[Any]] = {}  # of a row of each argument, for each program
 
     def __call__(self, *tensors: Any) -> Any:
         """Return the core's result for a batch of any size."""
@@ -107,7 +109,7 @@ class Core:
         if building == rows:
             return self._compared(tensors)
         size = next((size for size in self._owner.sizes if size >= rows and size in self._programs), None)
-        if size is None or building is not None:
+        if size is None or building is not None or self._shapes[size] != _row_shapes(tensors):
             return self._function(*tensors)
         result = self._programs[size](*(_padded(tensor, size) for tensor in tensors))
         return tuple(one[:rows] for one in result) if isinstance(result, tuple) else result[:rows]
@@ -121,7 +123,7 @@ class Core:
         wanted, size = self._function(*tensors), len(tensors[0])
         try:
             if size not in self._programs:
-                self._programs[size] = self._compiled(tensors)
+                self._programs[size], self._shapes[size] = self._compiled(tensors), _row_shapes(tensors)
             error = _largest_error(self._programs[size](*tensors), wanted)
         except Exception as failure:  # compilers raise any error
             said = " ".join(str(failure).split())[:_SHOWN]
@@ -149,6 +151,10 @@ class Core:
 def _padded(tensor: Any, size: int) -> Any:
     missing = size - len(tensor)
     return require("torch").cat([tensor, tensor[-1:].expand(missing, *tensor.shape[1:])]) if missing else tensor
+
+
+def _row_shapes(tensors: Sequence[Any]) -> list[Any]:
+    return [tensor.shape[1:] for tensor in tensors]
 
 
 def _each(result: Any) -> Sequence[Any]:

@@ -1,0 +1,41 @@
+"""A backend of torch.compile that runs what Dynamo traced: it counts the programs that it makes, and can spoil some."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+import torch
+
+from vlagents_ray.policies.compilation import Compilation
+
+
+class CountingCompiler:
+    """Makes programs without code for this machine, whose compiler would take minutes."""
+
+    def __init__(self) -> None:
+        self.rows: list[int] = []  # of each program
+        self.change: dict[int, Callable[[Any], Any]] = {}  # of the results of programs, by their rows
+        self.calls = 0  # of programs
+
+    def __call__(self, graph: Any, examples: Sequence[Any]) -> Callable[..., Any]:
+        rows = next(len(one) for one in examples if not isinstance(one, torch.nn.Parameter) and one.ndim)
+        self.rows.append(rows)
+
+        def program(*inputs: Any) -> Any:
+            self.calls += 1
+            return [self.change.get(rows, lambda result: result)(one) for one in graph(*inputs)]
+
+        return program
+
+
+@contextmanager
+def counting_compiler() -> Iterator[CountingCompiler]:
+    """Let all policies compile with a `CountingCompiler`."""
+    with pytest.MonkeyPatch.context() as patch:
+        compiler = CountingCompiler()
+        patch.setattr(Compilation, "backend", compiler)
+        yield compiler
+    torch._dynamo.reset()
