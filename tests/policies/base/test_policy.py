@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -73,6 +74,29 @@ def loaded(**config: Any) -> Wobble:
 )
 def test_keeps_the_contract(config: dict[str, Any]) -> None:
     check_agent(made(**config), steps=2 * HORIZON)
+
+
+class Stepping(Wobble):
+    """Draws for all rows of a pass, and again for all of them, as flows with random steps do."""
+
+    def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
+        first = [row.noise(HORIZON, DIM) for row in rows]
+        return [Prediction(one - row.noise(HORIZON, DIM)) for one, row in zip(first, rows, strict=True)]
+
+
+def test_samples_do_not_depend_on_how_a_batch_is_cut_into_passes() -> None:
+    found = []
+    for most in (64, 3, 2, 1):
+        policy = Stepping.from_config({"checkpoint": "none", "max_rows": most})
+        policy.initialize()
+        sessions = [copy.copy(policy) for _ in range(2)]
+        for seed, session in enumerate(sessions):
+            session.reset(at(0.0), "go", seed=seed)
+        acts = policy.act_batch([at(0.0, **{SAMPLES: 3})] * 2, sessions)
+        found.append([act.info[DISTRIBUTION]["samples"] for act in acts if isinstance(act, Act)])
+    for other in found[1:]:
+        np.testing.assert_array_equal(found[0], other)
+    assert np.abs(found[0][0][0] - found[0][0][1]).max() > 0.01
 
 
 def test_a_session_gets_the_same_in_any_company() -> None:

@@ -144,6 +144,16 @@ def test_pushed_weights_act_at_once_without_another_program(compiler: CountingCo
     assert compiler.rows == [2]
 
 
+def test_one_program_for_tensors_of_any_kind(compiler: CountingCompiler) -> None:
+    compilation, plain = Compilation("require"), torch.arange(12.0).reshape(4, 3)
+    core = compilation.core("sum", lambda numbers: numbers.sum(-1))
+    with torch.inference_mode():
+        compilation.add_size(4, lambda: core(plain))
+        for numbers in (plain, plain.clone(), plain.clone().T.contiguous().T, plain[:2]):
+            assert core(numbers).tolist() == [3.0, 12.0, 21.0, 30.0][: len(numbers)]
+    assert compiler.rows == [4]
+
+
 def test_rows_of_another_shape_run_without_a_program(compiler: CountingCompiler) -> None:
     compilation = Compilation("require")
     core = compilation.core("sum", lambda numbers: numbers.sum(-1))

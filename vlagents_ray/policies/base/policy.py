@@ -220,7 +220,9 @@ class ModelPolicy(Agent, abc.ABC):
         )
         if not samples:
             return [own]
-        return [own, *(_sample(own, episode.draws) for _ in range(samples))]
+        # each with a generator of its own, as they may be computed in several passes
+        seeds = episode.draws.integers(2**63, size=samples)
+        return [own, *(_sample(own, np.random.default_rng(seed)) for seed in seeds)]
 
     def _act(self, session: ModelPolicy, found: list[Prediction | Exception]) -> Act | Exception:
         episode = session._begun()

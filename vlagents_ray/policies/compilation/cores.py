@@ -106,6 +106,7 @@ class Core:
     def __call__(self, *tensors: Any) -> Any:
         """Return the core's result for a batch of any size."""
         rows, building = len(tensors[0]), self._owner.building
+        tensors = tuple(map(_of_one_kind, tensors))
         if building == rows:
             return self._compared(tensors)
         size = next((size for size in self._owner.sizes if size >= rows and size in self._programs), None)
@@ -146,6 +147,14 @@ class Core:
         )
         program(*tensors)
         return CudaGraph(program, tensors) if tensors[0].device.type == "cuda" else program
+
+
+def _of_one_kind(tensor: Any) -> Any:
+    """Return the tensor as programs were made for it: contiguous, and an inference tensor in inference mode.
+
+    `torch.compile` makes another program for tensors of another kind.
+    """
+    return tensor.contiguous() if tensor.is_inference() else tensor.clone().contiguous()
 
 
 def _padded(tensor: Any, size: int) -> Any:

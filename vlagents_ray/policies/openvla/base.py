@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -87,6 +87,10 @@ class PrismaticPolicy(ModelPolicy):
         for (i, entry), answer in zip(prepared.items(), answers, strict=True):
             results[i] = answer.prediction(entry.scale)
         return [results[i] for i in range(len(rows))]
+
+    def _example(self, seed: int) -> Row:
+        """Return a row of any dataset; sessions may name theirs later."""
+        return replace(super()._example(seed), memory={UNNORM_KEY: self.config.unnorm_key or self._statistics.names[0]})
 
     def _decoded(
         self, bins: ActionBins, prepared: Sequence[PreparedRow], tokens: Any, logits: Any

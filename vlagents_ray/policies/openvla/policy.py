@@ -63,7 +63,8 @@ class OpenVLA(PrismaticPolicy):
 
     def load(self) -> TokenDecoder:
         """Read the checkpoint."""
-        decoder = TokenDecoder(load_prismatic(self.config))
+        base = load_prismatic(self.config)
+        decoder = TokenDecoder(base, max(base.statistics.action_dims(self.config.unnorm_key)))
         decoder.compile_with(self.compilation)
         return decoder
 
@@ -97,6 +98,7 @@ class TokenDecoder:
     """A checkpoint, and its passes: functions of tensors, which `compile_with` replaces by their compiled forms."""
 
     base: Prismatic
+    longest: int  # the number of tokens of an answer, at most
 
     def compile_with(self, compilation: Compilation) -> None:
         """Mark what of the model is compiled."""
@@ -122,8 +124,9 @@ class TokenDecoder:
             index = torch.tensor(owners, device=base.device)
             length, position = mask.shape[1], mask.sum(1)[index]
             # a place for each token but the last one, and one at the end for the token that is being read
-            cache = torch.nn.functional.pad(cache[index], (0, 0, 0, steps - 1))
-            hidden, mask = hidden[index], torch.nn.functional.pad(mask[index], (0, steps))
+            places = max(steps, self.longest)
+            cache = torch.nn.functional.pad(cache[index], (0, 0, 0, places - 1))
+            hidden, mask = hidden[index], torch.nn.functional.pad(mask[index], (0, places))
             mask[:, -1] = 1
             chosen: list[Any] = []
             logits: list[Any] = []

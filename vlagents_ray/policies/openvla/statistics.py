@@ -68,6 +68,11 @@ class Statistics:
             )
         return cls(found, bounds)
 
+    @property
+    def names(self) -> list[str]:
+        """The names of the datasets."""
+        return list(self._datasets)
+
     def key(self, wanted: str | None) -> str:
         """Return the dataset of that name, with or without `_no_noops`; without a name, the only one.
 
