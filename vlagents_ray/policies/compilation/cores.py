@@ -174,7 +174,7 @@ def _largest_error(got: Any, wanted: Any) -> float:
     """Return the largest relative error of a row, by its Euclidean norm, among all tensors of the results."""
     errors = []
     for one, other in zip(_each(got), _each(wanted), strict=True):
-        off, size = (part.float().flatten(1).norm(dim=1) for part in (one - other, other))
+        off, size = (part.float().reshape(len(part), -1).norm(dim=1) for part in (one - other, other))
         errors.append((off / size.clamp(min=1e-12)).max())
     return float(require("torch").stack(errors).max())  # which is NaN if any of them is
 
