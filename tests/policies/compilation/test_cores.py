@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import gc
 import threading
+import weakref
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -163,6 +165,16 @@ def test_rows_of_another_shape_run_without_a_program(compiler: CountingCompiler)
     assert (compiler.rows, compiler.calls) == ([2], calls)
     assert core(torch.ones(1, 3)).tolist() == [3]
     assert compiler.calls == calls + 1
+
+
+def test_a_closed_policy_keeps_no_weights(compiler: CountingCompiler) -> None:
+    policy = made(compile="require", batch_sizes=[2])
+    acted(policy, [0, 1])
+    weights = weakref.ref(next(policy.model.parameters()))
+    del policy.pass_of
+    policy.close()
+    gc.collect()
+    assert weights() is None
 
 
 def test_usual_sizes_if_none_are_given() -> None:

@@ -188,8 +188,8 @@ class ModelPolicy(Agent, abc.ABC):
         ]
 
     def close(self) -> None:
-        """Free the weights."""
-        self.model = None
+        """Free the weights, and the programs that compute with them."""
+        self.model, self.compilation = None, Compilation(self.config.compile)
 
     def _begun(self) -> PolicyEpisode:
         if self.episode is None:

@@ -25,7 +25,8 @@ def keep_torch_programs() -> None:
 
 def keep_jax_programs(jax: Any) -> None:
     """Let JAX keep its programs in the user's cache, unless `JAX_COMPILATION_CACHE_DIR` names another folder."""
-    if jax.config.jax_compilation_cache_dir is None and (folder := _folder("jax")) is not None:
+    chosen = getattr(jax.config, "jax_compilation_cache_dir", "an older JAX, without this setting")
+    if chosen is None and (folder := _folder("jax")) is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder))
 
 

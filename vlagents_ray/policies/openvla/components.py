@@ -131,7 +131,8 @@ class Film:
 
     def __call__(self, pixels: Any, language: Any) -> Any:
         """Return patches (B, P, V) of pixels (B, C, S, S) for instructions (B, D), each the mean of its embeddings."""
-        torch = require("torch")
+        import torch  # the compiler follows a statement, and not `require`
+
         parts = pixels.split(3, dim=1)
         return torch.cat([self._see(name, part, language) for name, part in zip(self._vits, parts, strict=True)], dim=2)
 
@@ -162,9 +163,13 @@ def _merged(saved: Weights) -> dict[str, Any]:
 
 
 def _linear(weights: Weights, layer: str, x: Any) -> Any:
-    return require("torch").nn.functional.linear(x, weights[f"{layer}.weight"], weights[f"{layer}.bias"])
+    import torch
+
+    return torch.nn.functional.linear(x, weights[f"{layer}.weight"], weights[f"{layer}.bias"])
 
 
 def _norm(weights: Weights, layer: str, x: Any) -> Any:
+    import torch
+
     bias = weights[f"{layer}.bias"]
-    return require("torch").nn.functional.layer_norm(x, bias.shape, weights[f"{layer}.weight"], bias)
+    return torch.nn.functional.layer_norm(x, bias.shape, weights[f"{layer}.weight"], bias)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import importlib
 import importlib.util
 import io
@@ -90,7 +91,11 @@ def _bare_packages(root: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        _take_out()
+        # torch.compile imports the module of a function that it compiles, by the module's name
+        alias = f"prismatic_{hashlib.sha256(str(root).encode()).hexdigest()[:16]}"
+        for name, module in _take_out().items():
+            module.__name__ = name.replace("prismatic", alias, 1)
+            sys.modules[module.__name__] = module
         sys.modules.update(before)
 
 
