@@ -49,6 +49,8 @@ class Compilation:
         self.sizes: list[int] = []  # batch sizes for which all cores are compiled, ascending
         self.building: int | None = None  # the batch size whose programs are being made
         self.cores: list[Core] = []
+        if mode:
+            keep_torch_programs()
 
     def core(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
         """Return a function's compiled form, or the function itself if nothing is compiled.
@@ -75,7 +77,6 @@ class Compilation:
         Raises:
             ConfigError: A core failed, and the mode is "require".
         """
-        keep_torch_programs()
         began, self.building = time.monotonic(), size
         try:
             forward()

@@ -18,8 +18,12 @@ _TORCH = "TORCHINDUCTOR_CACHE_DIR"
 
 
 def keep_torch_programs() -> None:
-    """Let torch keep its programs in the user's cache, unless `TORCHINDUCTOR_CACHE_DIR` names another folder."""
-    if not os.environ.get(_TORCH) and (folder := _folder("torch")) is not None:
+    """Let torch keep its programs in the user's cache, unless `TORCHINDUCTOR_CACHE_DIR` names another folder.
+
+    Torch writes its own choice, /tmp/torchinductor_USER, into that variable when it first needs it.
+    """
+    chosen = Path(os.environ.get(_TORCH, "")).name
+    if (not chosen or chosen.startswith("torchinductor_")) and (folder := _folder("torch")) is not None:
         os.environ[_TORCH] = str(folder)
 
 
