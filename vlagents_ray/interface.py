@@ -73,6 +73,7 @@ class Obs:
     gripper: float | None = None  # in [0, 1], 1 = open
     state: dict[str, np.ndarray] = field(default_factory=dict)  # (D,) float32
     info: dict[str, Any] = field(default_factory=dict)  # None, bool, int, float, str, bytes, array, list, dict
+    prepared: Any = field(default=None, repr=False, compare=False)  # what the server got from `Agent.prepare`, or None
 
 
 @dataclass(slots=True)
@@ -208,6 +209,23 @@ class Agent:
         Args:
             obs: The observation.
         """
+
+    def prepare(self, obs: Obs) -> Any:
+        """Compute what depends on one observation and the instruction alone, such as resized images and tokens.
+
+        A server may call this on a session's copy while other sessions, or an earlier request of this one, are acted
+        on, on several threads at once, and sets `obs.prepared` to the result before `act`. It does not have to: `act`
+        computes the same where that is None. Override this if it takes a noticeable part of the time of `act`.
+
+        Args:
+            obs: The observation to act on next; it must not be changed.
+
+        Returns:
+            Anything that does not share memory with the observation. The agent, and what its sessions share, must not
+            be changed, and only that may be read which `initialize` and `reset` have set, and which no new weights
+            change.
+        """
+        return None
 
     def act(self, obs: Obs) -> Act:
         """Compute an action, or a chunk of actions.

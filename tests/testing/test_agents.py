@@ -142,6 +142,14 @@ def with_act(change: Callable[[Act], object]) -> type[GoodAgent]:
     return Changed
 
 
+class PreparesOtherwise(GoodAgent):
+    def prepare(self, obs: Obs) -> Any:
+        return obs.state["joints"] * np.float32(0.999)
+
+    def act(self, obs: Obs) -> Any:
+        return super().act(obs if obs.prepared is None else replace(obs, state={"joints": obs.prepared}))
+
+
 class WrongChunk(GoodAgent):
     @property
     def contract(self) -> Contract | None:
@@ -194,6 +202,7 @@ BROKEN_AGENTS: list[tuple[type[GoodAgent], str]] = [
     (with_act(lambda act: replace(act, action=act.action[:1])), "want 2 numbers a row"),
     (with_act(lambda act: replace(act, done=np.bool_(True))), "done is bool"),
     (with_act(lambda act: replace(act, info={"t": np.float32(1)})), r"info\['t'\]"),
+    (PreparesOtherwise, "on a prepared observation.*`prepare` must compute what"),
     (WrongChunk, "has 1 rows, the contract states 4"),
     (DictContract, "contract: got dict"),
     (ResetsToNone, "reset: got NoneType"),

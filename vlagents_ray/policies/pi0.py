@@ -151,13 +151,24 @@ class Pi0(ModelPolicy):
                 )
         return info
 
-    def perceive(self, obs: Obs) -> tuple[list[np.ndarray], np.ndarray]:
-        """Return the images in the model's order, (height, width, 3) in its vision tower's size, and the state."""
+    def perceive(self, obs: Obs) -> dict[str, Any]:
+        """Return the model's inputs for one row, on the CPU, padded to the longest allowed instruction."""
         model = self._loaded()
         side = model.processor.image_processor.pad_size
         found = camera_images(obs, self.cameras)
-        images = [resize_with_pad(found[name], side["height"], side["width"]) for name in self.cameras]
-        return images, state_vector(obs, self.state, self.state_dim)
+        return dict(
+            model.processor(
+                images=[[resize_with_pad(found[name], side["height"], side["width"]) for name in self.cameras]],
+                text=[self._begun().instruction],
+                state=state_vector(obs, self.state, self.state_dim)[None],
+                text_kwargs={
+                    "padding": "max_length",
+                    "max_length": self.config.max_tokens + len(self.cameras) * model.processor.image_seq_length,
+                    "padding_side": "right",
+                    "return_tensors": "pt",
+                },
+            )
+        )
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
         """Compute the chunks of all rows with one flow, and the images and instructions of each observation once."""
@@ -186,24 +197,11 @@ class Pi0(ModelPolicy):
         return self.model
 
     def _inputs(self, rows: Sequence[Row]) -> Mapping[str, Any]:
-        """Return tokens, images and states on the device, padded to the longest allowed instruction."""
-        model = self._loaded()
-        frames = [row.frames[-1] for row in rows]
-        length = self.config.max_tokens + len(self.cameras) * model.processor.image_seq_length
-        batch = model.processor(
-            images=[images for images, _ in frames],
-            text=[row.instruction for row in rows],
-            state=np.stack([state for _, state in frames]),
-            text_kwargs={
-                "padding": "max_length",
-                "max_length": length,
-                "padding_side": "right",
-                "return_tensors": "pt",
-            },
-        )
-        floating = {key for key, value in batch.items() if value.is_floating_point()}
+        """Return tokens, images and states on the device."""
+        model, torch, frames = self._loaded(), require("torch"), [row.frames[-1] for row in rows]
+        batch = {key: torch.cat([frame[key] for frame in frames]) for key in frames[0]}
         return {
-            key: value.to(model.device, model.dtype if key in floating else None, non_blocking=True)
+            key: value.to(model.device, model.dtype if value.is_floating_point() else None, non_blocking=True)
             for key, value in batch.items()
         }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,8 @@ def check_agent(
     """Check that an agent implements the interface of `Agent`; initializes and closes it.
 
     Three sessions, copies of the initialized agent, run with an observation, an instruction and a seed each: one after
-    the other, then in turn, then in batches of 1, 2 and 3. Their actions must not depend on the other sessions.
+    the other, then in turn, with prepared observations, then in batches of 1, 2 and 3. Their actions must not depend on
+    the other sessions, nor on whether `prepare` was called.
 
     Args:
         agent: The agent, not initialized yet.
@@ -71,6 +73,15 @@ def check_agent(
                 f"act {step} of session {i}",
                 "it depends on other sessions: keep what belongs to an episode in self, and out of `shared`",
             )
+    if type(agent).prepare is not Agent.prepare:
+        for i, session in enumerate([suite.begin(i) for i in range(_SESSIONS)]):
+            for step in range(steps):
+                require_same(
+                    alone[i][step],
+                    suite.act(i, session, prepared=True),
+                    f"act {step} of session {i} on a prepared observation",
+                    "`prepare` must compute what `act` computes without it",
+                )
     for size in range(1, _SESSIONS + 1):
         batch = [suite.begin(i) for i in range(size)]
         for step in range(steps):
@@ -137,10 +148,10 @@ class _Suite:
         require_same(kept, given, "an earlier act", "a later one changed it: give a new array each time")
         return kept
 
-    def act(self, i: int, session: Agent) -> Act:
+    def act(self, i: int, session: Agent, *, prepared: bool = False) -> Act:
         obs = self._view(i)
         before = copy.deepcopy(obs)
-        act = session.act(obs)
+        act = session.act(replace(obs, prepared=session.prepare(obs)) if prepared else obs)
         require_same(before, obs, "the observation", "act changed the caller's: work on a copy")
         return self._checked(act, "act")
 

@@ -86,7 +86,7 @@ def test_the_log_probability_is_that_of_the_network_itself(port: Path, monkeypat
     act = begun(policy, "pi0", 0).act(seen("pi0", 0, **{WANT: ALL, SAMPLES: 2}))
     network, seen_velocities = policy.model.model._network, []
     session = begun(policy, "pi0", 0)
-    inputs = policy.model.transforms.read(session.perceive(seen("pi0", 0)), WORDS[0])
+    inputs = session.perceive(seen("pi0", 0)).inputs
     observation = _observation({key: _tensors(value) for key, value in inputs.items()})
     plain = network._preprocess_observation
     monkeypatch.setattr(network, "_preprocess_observation", lambda one, **_: plain(one, train=False))

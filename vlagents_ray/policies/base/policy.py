@@ -116,10 +116,9 @@ class ModelPolicy(Agent, abc.ABC):
 
     @abc.abstractmethod
     def perceive(self, obs: Obs) -> Any:
-        """Convert and resize an observation for the history.
+        """Convert and resize an observation for the history, as `Agent.prepare` does, whose rules apply.
 
-        The result must not be a view of the observation, whose memory is freed. An error fails the request of that
-        session only.
+        `self` is the session's copy, in an episode. An error fails the request of that session only.
         """
 
     @abc.abstractmethod
@@ -143,15 +142,7 @@ class ModelPolicy(Agent, abc.ABC):
         contract = self.contract
         if contract is not None and contract.instruction and not instruction:
             raise InvalidObservation("instruction: got none, want what the robot is to do, in words")
-        # numpy accepts no negative seed; each int64 maps to its own number modulo 2**64
-        seed = [self.config.seed, int(kwargs.get("seed") or 0) % 2**64]
-        self.episode = PolicyEpisode(
-            instruction or "",
-            deque(maxlen=self.history),
-            np.random.default_rng(seed),
-            np.random.default_rng([*seed, 1]),
-            ChunkBuffer(ENSEMBLE, self.config.ensemble_m),
-        )
+        self._begin(instruction or "", int(kwargs.get("seed") or 0))
         self.notice(obs)
         return {}
 
@@ -162,6 +153,10 @@ class ModelPolicy(Agent, abc.ABC):
         """Add an observation to the history."""
         self.notice(obs)
         self._begun().frames.append(self.perceive(obs))
+
+    def prepare(self, obs: Obs) -> Any:
+        """Return what `perceive` makes of the observation; None if actions of an earlier chunk may be left."""
+        return None if self.config.actions == "queue" and self.history == 1 else self.perceive(obs)
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         """Return a chunk (H, D), or one action (D,), by `config.actions`, for each session.
@@ -191,6 +186,17 @@ class ModelPolicy(Agent, abc.ABC):
         """Free the weights, and the programs that compute with them."""
         self.model, self.compilation = None, Compilation(self.config.compile)
 
+    def _begin(self, instruction: str, seed: int) -> None:
+        # numpy accepts no negative seed; each int64 maps to its own number modulo 2**64
+        seeds = [self.config.seed, seed % 2**64]
+        self.episode = PolicyEpisode(
+            instruction,
+            deque(maxlen=self.history),
+            np.random.default_rng(seeds),
+            np.random.default_rng([*seeds, 1]),
+            ChunkBuffer(ENSEMBLE, self.config.ensemble_m),
+        )
+
     def _begun(self) -> PolicyEpisode:
         if self.episode is None:
             raise NotReset(f"{type(self).__name__}: act before reset; call reset(obs, instruction) first")
@@ -204,7 +210,7 @@ class ModelPolicy(Agent, abc.ABC):
         rows_left = self.config.actions == "queue" and episode.plan.next is not None
         if rows_left and self.history == 1:
             return []
-        episode.frames.append(self.perceive(obs))
+        episode.frames.append(session.perceive(obs) if obs.prepared is None else obs.prepared)
         if rows_left:
             return []
         own = Row(
@@ -291,7 +297,9 @@ class ModelPolicy(Agent, abc.ABC):
             gripper=1.0,
             state={name: np.zeros(length, np.float32) for name, length in lengths.items()},
         )
-        return Row((self.perceive(obs),) * self.history, "warm up", rng)
+        session = copy.copy(self)
+        session._begin("warm up", seed)
+        return Row((session.perceive(obs),) * self.history, session._begun().instruction, rng)
 
 
 def _sample(row: Row, draws: np.random.Generator) -> Row:

@@ -45,6 +45,14 @@ class LoadedOpenPi:
 
 
 @dataclass(frozen=True)
+class SeenObs:
+    """An observation in openpi's form, without the prompt, and the model's inputs of it."""
+
+    raw: dict[str, Any]
+    inputs: dict[str, Any]
+
+
+@dataclass(frozen=True)
 class TransformedRow:
     """A row in the form of the model's inputs."""
 
@@ -101,15 +109,15 @@ class OpenPi(ModelPolicy):
             )
         return LoadedOpenPi(model, transforms, robot, config.model.action_horizon)
 
-    def perceive(self, obs: Obs) -> dict[str, Any]:
-        """Return the observation in openpi's form, without the prompt."""
-        return self._loaded().robot.read(obs)
+    def perceive(self, obs: Obs) -> SeenObs:
+        """Convert the observation to openpi's form, and by openpi's transforms to the model's inputs."""
+        loaded = self._loaded()
+        seen = loaded.robot.read(obs)
+        return SeenObs(seen, loaded.transforms.read(seen, self._begun().instruction))
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         """Compute the chunks of all rows that openpi's transforms accept, in one call of the model."""
-        firsts, owners = self._shared(rows)
-        inputs = [self._read(rows[i]) for i in firsts]
-        read = [self._prepared(row, inputs[owner]) for row, owner in zip(rows, owners, strict=True)]
+        read = [self._planned(row) for row in rows]
         spare = next((one for one in read if not isinstance(one, Exception)), None)
         if spare is None:
             return read  # type: ignore[return-value]  # errors all
@@ -129,23 +137,15 @@ class OpenPi(ModelPolicy):
         each = list(range(len(rows)))
         return shared_frames(rows) if self._loaded().model.shares else (each, each)
 
-    def _read(self, row: Row) -> dict[str, Any] | Exception:
-        """Convert what a row sees to the model's inputs; returns an exception for its session if that fails."""
-        try:
-            return self._loaded().transforms.read(row.frames[-1], row.instruction)
-        except Exception as error:  # noqa: BLE001 - returned to the session of the observation
-            return error
-
-    def _prepared(self, row: Row, inputs: dict[str, Any] | Exception) -> TransformedRow | Exception:
-        if isinstance(inputs, Exception):
-            return inputs
-        loaded = self._loaded()
+    def _planned(self, row: Row) -> TransformedRow | Exception:
+        """Return the row with its leftover actions in the model's units, or an exception for its session."""
+        loaded, seen = self._loaded(), row.frames[-1]
         try:
             if row.leftover is not None:
-                row = replace(row, leftover=loaded.transforms.plan(row.frames[-1], row.instruction, row.leftover))
+                row = replace(row, leftover=loaded.transforms.plan(seen.raw, row.instruction, row.leftover))
         except Exception as error:  # noqa: BLE001 - returned to the session of the observation
             return error
-        return TransformedRow(inputs, row, row.noise(*loaded.model.noise_shape or ()))
+        return TransformedRow(seen.inputs, row, row.noise(*loaded.model.noise_shape or ()))
 
     def _sample(self, ready: Sequence[TransformedRow]) -> tuple[np.ndarray, dict[int, dict[str, Any]]]:
         """Return what the model computes for rows, and what is wanted of them, by their places."""

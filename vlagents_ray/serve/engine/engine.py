@@ -34,6 +34,7 @@ from vlagents_ray.serve.models.model_manager import ModelManager
 from vlagents_ray.serve.queue.batch_queue import BatchQueue, PendingRequest, Rank
 from vlagents_ray.serve.queue.call_limits import CallLimits, PolicyCall, PolicyCalls
 from vlagents_ray.serve.queue.poller import Poller
+from vlagents_ray.serve.queue.preparation import Preparations
 from vlagents_ray.serve.sessions import Session, SessionFinder, SessionTable
 from vlagents_ray.serve.weights.updates import WeightUpdates, follows
 from vlagents_ray.serve.weights.versions import WeightsVersion
@@ -82,9 +83,9 @@ class Engine:
         self.pauses = PauseDetector(clock)
         loader = Loader(self._source, version, batch_sizes, check, self.calls)
         self.models = ModelManager(self._source, loader, self.sessions)
-        self.stats = MetricsBuffer()
-        self.admission = Admission(in_flight_bytes)
+        self.stats, self.admission = MetricsBuffer(), Admission(in_flight_bytes)
         self._batch_sizes, self._reply_bytes = batch_sizes, reply_bytes
+        self._preparations: Preparations | None = None  # None if the engine has no threads
         self._loading = self.models.loading()
         self._unready: VLAgentsError | None = self._loading  # for clients
         self._failure: PolicyFailed | None = None  # why the policy did not load, for the operator
@@ -119,6 +120,7 @@ class Engine:
             self._failure = PolicyFailed(f"{failed}: {error}")
             raise self._failure from error
         if threaded:
+            self._preparations = Preparations()
             self.pauses.start()
         self._unready = None
 
@@ -179,6 +181,8 @@ class Engine:
         self.pauses.stop()
         self.admission.close()
         self.queue.close(timeout_s=30)
+        if self._preparations is not None:
+            self._preparations.close()
         self.models.close()
 
     @property
@@ -213,14 +217,7 @@ class Engine:
         rank = Rank.SIMULATION if request.rank == "simulation" else Rank.ROBOT
         arrived = self.clock() if arrived is None else arrived
         ticket = PendingRequest(
-            session_id,
-            request,
-            done,
-            rank,
-            arrived,
-            connection=connection,
-            owner=owner,
-            transport=transport,
+            session_id, request, done, rank, arrived, connection=connection, owner=owner, transport=transport
         )
         if request.op == "act":
             session = self.sessions.get(session_id)
@@ -231,6 +228,8 @@ class Engine:
             session.owner, session.transport, session.connection = owner, transport, connection
             if (model := session.model) is not None:  # another thread may set it to None
                 model.check(request)
+            if self._preparations is not None and self.queue.window.overlaps:
+                ticket.preparation = self._preparations.begin(session.agent, request.obs)
         elif request.op == "reset":
             ticket.choice, request.kwargs = self._source.split_options(request.kwargs)
             ticket.follows = follows(request.kwargs, by_default=rank is not Rank.ROBOT)
@@ -323,6 +322,7 @@ class Engine:
             with model.busy, call:
                 model.require_open()
                 model.parameters.use(weights)
+                Preparations.finish([(ticket.preparation, session.agent) for ticket, session in acting])
                 results = model.agent.act_batch(observations, agents)  # type: ignore[arg-type]
                 synchronise()
             if len(results) != rows:

@@ -82,7 +82,7 @@ class BatchQueue:
         self._driven = False  # whether a caller of `take` drives the queue; each new request wakes it up
         self._dense = False  # whether requests arrive in quick succession
         self._poller = poller or Poller()
-        self._window = BatchWindow(patience, max_batch_size, is_open)
+        self.window = BatchWindow(patience, max_batch_size, is_open)
         self._gathering = False
         self._wait_over = threading.Event()
         self._unsent: list[tuple[PendingRequest, Reply]] = []
@@ -122,10 +122,10 @@ class BatchQueue:
                 raise PolicyUnavailable("the replica is stopping; connect again")
             for ticket in tickets:
                 self._load_timer.count(self._waiting.size, ticket.loaded or ticket.arrived)
-                if self._window.slow:
-                    self._window.record_arrival(ticket)
+                if self.window.slow:
+                    self.window.record_arrival(ticket)
                 self._waiting.add(ticket)
-                if self._gathering and self._window.ends_wait(ticket, self._waiting):
+                if self._gathering and self.window.ends_wait(ticket, self._waiting):
                     self._wait_over.set()
             self._wake()
 
@@ -173,7 +173,7 @@ class BatchQueue:
 
     def full_batch_waits(self) -> bool:
         """Return whether a full batch waits, so that replies to simulations can be sent while that one runs."""
-        return self._window.slow and self._waiting.sessions >= self._max
+        return self.window.slow and self._waiting.sessions >= self._max
 
     def answer_later(self, answers: Sequence[tuple[PendingRequest, Reply]]) -> None:
         """Send these replies from another thread once the next batch runs. Called in `run`, on the queue's thread."""
@@ -252,7 +252,7 @@ class BatchQueue:
         """Run a batch that `take` returned, and measure its duration. Called on the policy's thread."""
         begun = self._clock()
         self._running = batch
-        if self._window.slow and not self._window.alone:
+        if self.window.overlaps:
             self._poller.hand_to_reader()
         try:
             self._run(batch)
@@ -264,14 +264,14 @@ class BatchQueue:
         ended = self._clock()
         with self._lock:
             self._running = ()  # its observations may lie in memory that their sender needs back
-            self._window.record_end(ended, ended - begun)
+            self.window.record_end(ended, ended - begun)
         self._poller.reclaim()
 
     def _next(self) -> list[PendingRequest] | None:
         """Return the next batch: [] if no request has arrived for `idle_s`, None when the queue is closed."""
         if not self._wait_for_request():
             return []
-        if self._window.slow:
+        if self.window.slow:
             self._gather()
         return self.take()
 
@@ -287,7 +287,7 @@ class BatchQueue:
             left = self._waiting.clear() if closed else []
             batch, expired = self._waiting.take(self._max, now)
             if batch:
-                self._window.record_start(batch)
+                self.window.record_start(batch)
         for ticket in left:
             stopped = PolicyUnavailable("the replica is stopping; connect again")
             ticket.answer(Reply(ticket.request.request_id, error=stopped))
@@ -328,7 +328,7 @@ class BatchQueue:
     def _gather(self) -> None:
         """Wait for the remaining requests of a group, if `BatchWindow` finds that worthwhile."""
         with self._lock:
-            wait_s = 0.0 if self._closed else self._window.wait_s(time.perf_counter(), self._waiting)
+            wait_s = 0.0 if self._closed else self.window.wait_s(time.perf_counter(), self._waiting)
             if wait_s <= 0:
                 return
             self._wait_over.clear()

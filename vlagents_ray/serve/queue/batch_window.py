@@ -99,9 +99,14 @@ class BatchWindow:
             self._cost.add(self._last.acts, duration)
 
     @property
-    def alone(self) -> bool:
-        """Whether the last two batches were for one and the same session, or the last one if no other is known."""
-        return self._last.lone != "" and (self._previous is self._no_batch or self._previous.lone == self._last.lone)
+    def overlaps(self) -> bool:
+        """Whether it pays that other threads work on the next requests while a batch runs.
+
+        Batches then take milliseconds, and the last two were not both for one session, nor the last one if no other is
+        known.
+        """
+        last, previous = self._last, self._previous
+        return self.slow and not (last.lone != "" and (previous is self._no_batch or previous.lone == last.lone))
 
     def record_arrival(self, ticket: PendingRequest) -> None:
         """Estimate the return time of the session that sent the request.

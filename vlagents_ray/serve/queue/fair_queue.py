@@ -20,6 +20,7 @@ from enum import IntEnum
 
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.queue.checkpoint_choice import DEFAULT, CheckpointChoice
+from vlagents_ray.serve.queue.preparation import Preparation
 
 logger = logging.getLogger(__name__)
 
@@ -51,6 +52,7 @@ class PendingRequest:
     loaded: float | None = None  # time at which the checkpoint was loaded, s, if the reset had to wait for it
     begun: bool = False  # whether it is in a batch, so that the policy acts on it; guarded by the queue's lock
     first: int = 0  # step at which the episode begins, if the request is a reset
+    preparation: Preparation | None = None  # of its observation, on another thread
     return_s: float | None = None  # recent time from an answer to the session's next request, s, if known
 
     def answer(self, reply: Reply) -> None:
@@ -58,6 +60,9 @@ class PendingRequest:
         if self.cancelled:
             return
         self.cancelled = True
+        if self.preparation is not None:
+            self.preparation.cancel()
+            self.preparation = None
         # The callback refers to this ticket: a reference cycle would make the garbage collector pause the policy.
         done, self.done = self.done, _ignore_reply
         try:

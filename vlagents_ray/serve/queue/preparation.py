@@ -1,0 +1,77 @@
+"""Preparation of observations on other threads than the policy's, so that the next batch is ready when one ends.
+
+A batch does not wait for a preparation that has not begun: the policy's thread then does that itself, beginning with
+the last one. So a robot whose request comes last does not wait for the preparations of simulations before it.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+from vlagents_ray.images import cpu_affinity
+from vlagents_ray.interface import Agent, Obs
+
+logger = logging.getLogger(__name__)
+
+_THREADS = 4  # at most; images are resized without Python's lock
+
+
+class Preparation:
+    """`Agent.prepare` of one observation."""
+
+    __slots__ = ("_agent", "_future", "_obs")
+
+    def __init__(self, agent: Agent, obs: Obs, threads: ThreadPoolExecutor) -> None:
+        self._agent, self._obs = agent, obs
+        self._future: Future[Any] = threads.submit(agent.prepare, obs)
+
+    def cancel(self) -> bool:
+        """Return whether it had not begun, and never will."""
+        return self._future.cancel()
+
+    def finish(self, agent: Agent | None, *, begun: bool) -> None:
+        """Wait for the result, if it has `begun`, else compute it here; it is set only if `agent` is the session's.
+
+        An error is raised by `act`, which then does the same without a preparation.
+        """
+        if agent is not self._agent:  # the session was reset meanwhile
+            return
+        try:
+            self._obs.prepared = self._future.result() if begun else self._agent.prepare(self._obs)
+        except Exception:
+            logger.debug("an observation could not be prepared", exc_info=True)
+
+
+class Preparations:
+    """The threads of a replica that prepare observations."""
+
+    def __init__(self) -> None:
+        self._threads = ThreadPoolExecutor(min(_THREADS, cpu_affinity.allowed()), "prepare")
+
+    def begin(self, agent: Agent | None, obs: Obs | None) -> Preparation | None:
+        """Begin to prepare an observation for a session's agent; None if there is nothing to do."""
+        if agent is None or obs is None or type(agent).prepare is Agent.prepare:
+            return None
+        try:
+            return Preparation(agent, obs, self._threads)
+        except RuntimeError:  # they have ended
+            return None
+
+    @staticmethod
+    def finish(preparations: Sequence[tuple[Preparation | None, Agent | None]]) -> None:
+        """Return when the observations of a batch are prepared. Called on the policy's thread."""
+        begun = []
+        for preparation, agent in reversed(preparations):
+            if preparation is not None and preparation.cancel():
+                preparation.finish(agent, begun=False)
+            elif preparation is not None:
+                begun.append((preparation, agent))
+        for preparation, agent in begun:
+            preparation.finish(agent, begun=True)
+
+    def close(self) -> None:
+        """End the threads after the preparations that they have begun."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
