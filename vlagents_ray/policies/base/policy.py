@@ -19,6 +19,7 @@ from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, Act
 from vlagents_ray.policies.base.config import ModelConfig
 from vlagents_ray.policies.base.model_inputs import count_in, leftover_plan, wanted_behaviour, wanted_samples
 from vlagents_ray.policies.compilation import Compilation
+from vlagents_ray.policies.determinism import require_deterministic
 from vlagents_ray.policies.loading import report_progress
 from vlagents_ray.validation import check_action
 
@@ -136,6 +137,8 @@ class ModelPolicy(Agent, abc.ABC):
             if self.compilation.cores:
                 self.compilation.add_size(size, partial(self._run_examples, size))
             self._run_examples(size)
+        if self.config.deterministic:
+            require_deterministic(self._chunks, self._example, self.config.rows)
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin the episode with the seed `kwargs["seed"]` (an int, 0 if not given)."""
@@ -268,6 +271,8 @@ class ModelPolicy(Agent, abc.ABC):
         most = self.config.rows
         for start in range(0, len(rows), most):
             part = rows[start : start + most]
+            if self.config.deterministic:  # each row has frames of its own, so that as many are encoded in every batch
+                part = [replace(row, frames=(*row.frames,)) for row in part]
             size = next((s for s in self.config.batch_sizes or () if s >= len(part)), len(part))
             padding = [copy.deepcopy(part[-1]) for _ in range(size - len(part))]
             results = self.predict([*part, *padding])
@@ -278,11 +283,18 @@ class ModelPolicy(Agent, abc.ABC):
 
     def _run_examples(self, size: int) -> None:
         """Run a forward pass of that many rows; raises the first error of a row."""
-        for prediction in self._forward([self._example(seed) for seed in range(size)]):
+        self._chunks([self._example(seed) for seed in range(size)])
+
+    def _chunks(self, rows: Sequence[Row]) -> list[np.ndarray]:
+        """Return the chunks of rows; raises the first error of a row."""
+        chunks = []
+        for prediction in self._forward(list(rows)):
             if isinstance(prediction, Exception):
                 raise prediction
+            chunks.append(prediction.actions)
+        return chunks
 
-    def _example(self, seed: int) -> Row:
+    def _example(self, seed: int, instruction: str = "warm up") -> Row:
         """Return a row for the warm-up: random images, and zeros for a state, that fit the contract."""
         rng, contract = np.random.default_rng(seed), self.contract or Contract()
         lengths = {name: part.dim or 1 for name, part in (contract.state or {}).items()}
@@ -298,7 +310,7 @@ class ModelPolicy(Agent, abc.ABC):
             state={name: np.zeros(length, np.float32) for name, length in lengths.items()},
         )
         session = copy.copy(self)
-        session._begin("warm up", seed)
+        session._begin(instruction, seed)
         return Row((session.perceive(obs),) * self.history, session._begun().instruction, rng)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -140,7 +141,9 @@ class LeRobot(ModelPolicy):
         """Compute the chunks, in one pass for all rows with images of one size unless the type cannot batch."""
         predictions: dict[int, Prediction] = {}
         for members in self._groups(rows):
-            predictions |= zip(members, self._draw([rows[i] for i in members]), strict=True)
+            missing = len(rows) - len(members) if self.config.deterministic and self.model.kind.batched else 0
+            drawn = self._draw([rows[i] for i in members] + [copy.deepcopy(rows[members[-1]]) for _ in range(missing)])
+            predictions |= zip(members, drawn[: len(members)], strict=True)
         return [predictions[i] for i in range(len(rows))]
 
     def _groups(self, rows: Sequence[Row]) -> list[list[int]]:

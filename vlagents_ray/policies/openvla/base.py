@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -83,14 +84,20 @@ class PrismaticPolicy(ModelPolicy):
                 prepared[i] = PreparedRow(row, self._statistics.scale(key), self._model_input(row, key))
             except Exception as error:  # noqa: BLE001 - handed to the session whose request failed
                 results[i] = error
-        answers = self._compute(list(prepared.values())) if prepared else []
+        entries = list(prepared.values())
+        if entries and self.config.deterministic:  # as many as without errors
+            entries += [copy.deepcopy(entries[-1]) for _ in range(len(rows) - len(entries))]
+        answers = self._compute(entries)[: len(prepared)] if entries else []
         for (i, entry), answer in zip(prepared.items(), answers, strict=True):
             results[i] = answer.prediction(entry.scale)
         return [results[i] for i in range(len(rows))]
 
-    def _example(self, seed: int) -> Row:
+    def _example(self, seed: int, instruction: str = "warm up") -> Row:
         """Return a row of any dataset; sessions may name theirs later."""
-        return replace(super()._example(seed), memory={UNNORM_KEY: self.config.unnorm_key or self._statistics.names[0]})
+        return replace(
+            super()._example(seed, instruction),
+            memory={UNNORM_KEY: self.config.unnorm_key or self._statistics.names[0]},
+        )
 
     def _decoded(
         self, bins: ActionBins, prepared: Sequence[PreparedRow], tokens: Any, logits: Any

@@ -41,6 +41,7 @@ class Prismatic:
     prompt: str
     device: Any
     dtype: Any
+    deterministic: bool  # whether longer prompts than that are refused
     padded_tokens: int  # the length to which shorter prompts are padded; 0: that of the longest one
 
     def pixels(self, image: np.ndarray) -> Any:
@@ -50,12 +51,12 @@ class Prismatic:
     def tokens(self, instruction: str) -> list[int]:
         """Return the prompt for an instruction.
 
-        Raises `InvalidObservation` if it is longer than in the model's training.
+        Raises `InvalidObservation` if it is longer than in the model's training, or than all are padded to.
         """
         ids: list[int] = self.tokenizer(self.prompt.format(instruction.lower())).input_ids
         if ids[-1] != _SPACE:
             ids.append(_SPACE)
-        most = self.network.config.llm_max_length
+        most = self.padded_tokens if self.deterministic else self.network.config.llm_max_length
         if len(ids) > most:
             raise InvalidObservation(f"instruction: got {len(ids)} tokens with the prompt, want {most} at most")
         return ids
@@ -98,7 +99,8 @@ def load_prismatic(config: PrismaticConfig, bounds: Bounds = "q99") -> Prismatic
         prompt=_PROMPT_V01 if "openvla-v01" in config.checkpoint else _PROMPT,
         device=device,
         dtype=dtype,
-        padded_tokens=config.compiled_tokens if config.compile else 0,
+        padded_tokens=config.compiled_tokens if config.compile or config.deterministic else 0,
+        deterministic=config.deterministic,
     )
 
 
@@ -108,7 +110,8 @@ class PrismaticConfig(ModelConfig):
     compiled_tokens: int = Field(
         default=64,
         ge=1,
-        description="with `compile`: tokens to which prompts are padded; longer ones run without compilation",
+        description="with `compile` or `deterministic`: tokens to which prompts are padded; longer ones run without "
+        "compilation, or are refused",
     )
     unnorm_key: str | None = Field(
         default=None,

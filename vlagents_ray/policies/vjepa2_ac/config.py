@@ -13,6 +13,7 @@ from vlagents_ray.policies.base.config import ModelConfig
 class VJepa2AcConfig(ModelConfig):
     """Settings of V-JEPA 2-AC, beside those of all models: its checkpoint, and the search for plans."""
 
+    deterministic: Literal[False] = Field(default=False, description="not for this family, either")
     compile: Literal[False] = Field(default=False, description="not for this family: its batches have too many sizes")
     encoder: str | None = Field(
         default=None, description="folder or hub id of a `VJEPA2Model` instead of the encoder in the checkpoint"

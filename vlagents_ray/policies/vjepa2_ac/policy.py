@@ -153,8 +153,8 @@ class VJepa2Ac(ModelPolicy):
             predictions.append(Prediction(steps, mean=steps, std=std[i], info={"energy": float(energy[i])}))
         return predictions
 
-    def _example(self, seed: int) -> Row:
-        example = super()._example(seed)
+    def _example(self, seed: int, instruction: str = "warm up") -> Row:
+        example = super()._example(seed, instruction)
         return replace(example, memory={_GOAL: example.frames[-1].pixels})
 
 
