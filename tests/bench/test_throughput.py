@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import pytest
 
+from vlagents_ray.bench.figures import rate_of
 from vlagents_ray.bench.policy import BarePolicy
-from vlagents_ray.bench.throughput import ThroughputPlan, rate_of
+from vlagents_ray.bench.throughput import ThroughputPlan
 
 
 def test_the_ideal_of_the_default_policy() -> None:

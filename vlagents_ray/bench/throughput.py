@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.bench.clients import ROBOT, SIMULATION, Call, LoadGenerator, OwnClient, own_clients
+from vlagents_ray.bench.figures import rate_of
 from vlagents_ray.bench.line_process import START_S, LineProcess, our_environment
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
@@ -201,17 +202,6 @@ def _one_each(found: Sequence[OwnClient]) -> list[OwnClient]:
         if kept is None or (kept.actor and not one.actor) or one.codec == "auto":
             first[one.transport] = one
     return list(first.values())
-
-
-def rate_of(calls: Sequence[Sequence[Call]]) -> float:
-    """Return actions a second: the slope of the line through all ends of calls.
-
-    They come in batches, so that counting them in a time would be wrong by up to a batch. 0 for fewer than two calls.
-    """
-    ends = np.sort([call[0] for one in calls for call in one])
-    if len(ends) < 2 or ends[0] == ends[-1]:
-        return 0.0
-    return float(np.polyfit(ends - ends[0], np.arange(len(ends)), 1)[0])
 
 
 def _point(plan: ThroughputPlan, fleet: _Fleet, clients: int) -> dict[str, Any]:

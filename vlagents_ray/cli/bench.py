@@ -266,15 +266,18 @@ def show_round_trips(found: Mapping[str, Any], title: str) -> None:
 
 def show_policy(found: Mapping[str, Any]) -> None:
     """Print a row for each batch size."""
-    rows = table("batch", "bare actions/s", "ms a batch", "queued actions/s", "round trip ms", "mean batch", "peak MiB")
+    rows = table(
+        "batch", "bare actions/s", "ms a batch", "queued actions/s", "round trip ms", "p99 ms", "mean batch",
+        "peak MiB",
+    )  # fmt: skip
     chunk = f", {found['chunk']} rows an action" if (found["chunk"] or 1) > 1 else ""
     rows.title = f"{found['policy']} on {found['device']}{chunk}"
     for row in found["batches"]:
         bare, queued = row["bare"], row["queued"]
         rows.add_row(
             str(row["batch"]), f"{bare['actions_per_s']:.1f}", f"{bare['batch_ms']:.2f}",
-            f"{queued['actions_per_s']:.1f}", f"{queued['round_trip_ms']:.2f}", f"{queued['mean_batch']:.2f}",
-            f"{row['peak_mib']:.0f}",
+            f"{queued['actions_per_s']:.1f}", f"{queued['round_trip_ms']:.2f}", f"{queued['p99_ms']:.2f}",
+            f"{queued['mean_batch']:.2f}", f"{row['peak_mib']:.0f}",
         )  # fmt: skip
     out.print(rows)
 
