@@ -12,7 +12,7 @@ import typer
 from rich.text import Text
 
 from vlagents_ray.cli.console import errors, out, progress, save, table
-from vlagents_ray.cli.options import parse_counts, parse_list, parse_settings
+from vlagents_ray.cli.options import parse_counts, parse_dims, parse_list
 from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -147,11 +147,10 @@ def bench_policy(
     from vlagents_ray.serve.launch.deployment_file import server_args
 
     with errors():
-        dims = parse_settings(state, "--state")
-        if not all(isinstance(number, int) and number > 0 for number in dims.values()):
-            raise ConfigError(f"--state: got {dims}, want a number from 1 on for each part")
         args, batches = server_args(file, app), parse_counts(batch, "--batch")
-        found = measure_policy(PolicyPlan(args, batches, seconds, rounds, image, dims), progress)
+        found = measure_policy(
+            PolicyPlan(args, batches, seconds, rounds, image, parse_dims(state, "--state")), progress
+        )  # fmt: skip
     show_policy(found)
     save(found, json_file)
 

@@ -16,6 +16,7 @@ from vlagents_ray.cli.new import new
 from vlagents_ray.cli.options import parse_list, read_run_file
 from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.cli.slurm import slurm
+from vlagents_ray.cli.tune.command import tune_command
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -54,6 +55,7 @@ app.command("export")(export_command)
 app.command("merge")(merge_command)
 app.command("replay")(replay_command)
 app.command("report")(report_command)
+app.command("tune")(tune_command)
 app.add_typer(bench, name="bench")
 app.add_typer(env, name="env")
 app.add_typer(keys, name="keys")

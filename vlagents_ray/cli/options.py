@@ -44,6 +44,14 @@ def parse_settings(texts: Iterable[str], option: str) -> dict[str, Any]:
     return settings
 
 
+def parse_dims(texts: Iterable[str], option: str) -> dict[str, int]:
+    """Parse `PART=N`, the numbers in parts of the state."""
+    dims = parse_settings(texts, option)
+    if not all(isinstance(number, int) and number > 0 for number in dims.values()):
+        raise ConfigError(f"{option}: got {dims}, want a number from 1 on for each part")
+    return dims
+
+
 def parse_list(text: str) -> list[str]:
     """Split at commas; empty parts are left out."""
     return [one.strip() for one in text.split(",") if one.strip()]

@@ -64,12 +64,18 @@ def read_deployment(
 
 def server_args(source: str, app: str | None = None) -> ServerArgs:
     """Return the settings of one policy of a deployment: that of the application `app`, or of the only application."""
+    return ServerArgs(**policy_application(source, app).args)
+
+
+def policy_application(source: str, app: str | None = None) -> ServeApplicationSchema:
+    """Return one application of a deployment that serves a policy: that of the name `app`, or the only one."""
     ours = {one.name: one for one in _ours(read_deployment(source))}
     if app is None and len(ours) == 1:
         [app] = ours
     if app not in ours:
         raise ConfigError(f"{source}: holds the policies {sorted(ours)}, got {app!r}; name one of them as the app")
-    return ServerArgs(**ours[app].args)
+    application: ServeApplicationSchema = ours[app]
+    return application
 
 
 def with_gateways_at(config: ServeDeploySchema, host: str) -> ServeDeploySchema:

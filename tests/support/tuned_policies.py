@@ -1,0 +1,78 @@
+"""Policies with settings that `vlagents-ray tune` tries, and what can go wrong with them."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import BaseModel
+
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.interface import Act, Agent, Obs
+
+
+class TunableConfig(BaseModel, extra="forbid"):
+    """What a batch costs, how far bfloat16 is off, and at which number of rows it fails."""
+
+    compile: bool = False
+    dtype: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
+    batch_sizes: list[int] | None = None
+    eager_ms: float = 60.0  # of a batch that is not compiled
+    off: float = 0.0  # of all numbers, in bfloat16
+    most_rows: int | None = None  # larger batches have no memory
+    compiles: bool = True
+
+
+class Tunable(Agent):
+    """Acts on state, image and seed. Compiled, a batch costs nothing; in float16, its process ends while it loads."""
+
+    Config: ClassVar[type] = TunableConfig
+    shared: ClassVar[tuple[str, ...]] = ("config",)
+    contract = Contract(
+        cameras={"front": CameraSpec(8, 8)}, state={"joints": StateSpec(2)}, action=ActionSpec(dim=2), chunk=3
+    )
+
+    def __init__(self, config: TunableConfig) -> None:
+        self.config = config
+
+    def initialize(self) -> None:
+        if self.config.dtype == "float16":
+            os._exit(7)
+        if self.config.compile and not self.config.compiles:
+            raise ConfigError("compile: this one has no compiler")
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self.seed = kwargs["seed"]
+        return {}
+
+    def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
+        if self.config.most_rows is not None and len(obs) > self.config.most_rows:
+            raise MemoryError(f"{len(obs)} rows")
+        time.sleep(0 if self.config.compile else self.config.eager_ms / 1000)
+        off = self.config.off if self.config.dtype == "bfloat16" else 0.0
+        return [
+            Act(np.tile(one.state["joints"] + session.seed + one.cameras["front"].mean() + off, (3, 1)))  # type: ignore[attr-defined]
+            for one, session in zip(obs, sessions, strict=True)
+        ]
+
+
+class Unseeded(Tunable):
+    """Acts at random, whatever the seed."""
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self.seed = int.from_bytes(os.urandom(2), "big")
+        return {}
+
+
+class Plain(Agent):
+    """A policy without settings."""
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        return Act(np.zeros(3, np.float32))
