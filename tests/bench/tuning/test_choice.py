@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from vlagents_ray.bench.tuning.choice import (
-    Goal,
     GoalMissed,
     MeasuredPoint,
+    TuningGoal,
     Variant,
     choose,
     chosen_settings,
@@ -20,7 +20,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.config.deployment import BatchArgs
 
 OWN, COMPILED, BF16 = Variant(), Variant({"compile": True, "batch_sizes": [1, 2, 4]}), Variant({"dtype": "bfloat16"})
-THROUGHPUT = Goal("throughput")
+THROUGHPUT = TuningGoal("throughput")
 
 
 def point(variant: Variant, sessions: int, rate: float, p99: float = 50.0) -> MeasuredPoint:
@@ -40,7 +40,7 @@ def test_a_variant_must_be_five_percent_better_than_one_with_fewer_changes() -> 
 
 
 def test_for_robots_the_most_sessions_within_the_time_are_chosen() -> None:
-    goal = Goal("robots", 60.0)
+    goal = TuningGoal("robots", 60.0)
     points = [point(OWN, 1, 30, 20), point(OWN, 2, 40, 59), point(OWN, 4, 90, 61), point(COMPILED, 2, 50, 40)]
     assert choose(points[:3], goal) == points[1]
     assert choose(points, goal) == points[3]  # as many, with shorter round trips
@@ -50,21 +50,21 @@ def test_for_robots_the_most_sessions_within_the_time_are_chosen() -> None:
 
 def test_a_goal_that_nothing_reaches_is_an_error_with_the_nearest() -> None:
     with pytest.raises(GoalMissed, match=r"got 10.* 20\.0 ms, with 1 session and own settings"):
-        choose([point(OWN, 1, 30, 20), point(COMPILED, 2, 50, 40)], Goal("robots", 10.0))
+        choose([point(OWN, 1, 30, 20), point(COMPILED, 2, 50, 40)], TuningGoal("robots", 10.0))
 
 
 @pytest.mark.parametrize(("kind", "p99"), [("robots", None), ("throughput", 5.0)])
 def test_only_robots_have_a_longest_round_trip(kind: Any, p99: float | None) -> None:
     with pytest.raises(ConfigError, match="--p99-ms"):
-        Goal(kind, p99)
+        TuningGoal(kind, p99)
 
 
 def test_the_default_is_what_the_file_gives_as_it_is() -> None:
     points = [point(OWN, 4, 30, 40), point(OWN, 16, 50, 90), point(COMPILED, 16, 80)]
     assert default_point(points, THROUGHPUT, 16) == points[1]
     assert default_point(points, THROUGHPUT, 8) is None  # was not measured
-    assert default_point(points, Goal("robots", 60.0), 16) == points[0]
-    assert default_point(points, Goal("robots", 30.0), 16) is None
+    assert default_point(points, TuningGoal("robots", 60.0), 16) == points[0]
+    assert default_point(points, TuningGoal("robots", 30.0), 16) is None
 
 
 def test_the_settings_are_those_that_differ_from_the_file() -> None:

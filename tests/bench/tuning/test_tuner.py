@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from vlagents_ray.bench.tuning.choice import Goal, choose
+from vlagents_ray.bench.tuning.choice import TuningGoal, choose
 from vlagents_ray.bench.tuning.tuner import TunePlan, Tuner, VariantFailed
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.config.deployment import ServerArgs
@@ -23,13 +23,13 @@ def importable(monkeypatch: pytest.MonkeyPatch) -> None:
 def tuner(policy: str = "Tunable", *, batch: dict[str, Any] | None = None, **given: Any) -> Tuner:
     plan = {name: given.pop(name) for name in list(given) if name in TunePlan.__dataclass_fields__}
     args = ServerArgs(policy=f"tuned_policies:{policy}", config=given, batch=batch or {"max_size": 2})
-    return Tuner(TunePlan(**{"args": args, "goal": Goal("throughput"), "max_batch": 2, "seconds": 0.1, **plan}))
+    return Tuner(TunePlan(**{"args": args, "goal": TuningGoal("throughput"), "max_batch": 2, "seconds": 0.1, **plan}))
 
 
 def test_compilation_that_helps_is_chosen() -> None:
     measured = tuner()
     points = measured.measure()
-    chosen = choose(points, Goal("throughput"))
+    chosen = choose(points, TuningGoal("throughput"))
     assert chosen.variant.changes == {"compile": True, "batch_sizes": [1, 2]}
     assert chosen.difference == 0
     assert {one.variant.name for one in points} == {"own settings", "compile: true"}
@@ -55,7 +55,7 @@ def test_a_type_whose_actions_are_near_enough_passes() -> None:
 
 
 def test_a_batch_without_memory_ends_the_sizes_and_smaller_ones_stay() -> None:
-    measured = tuner(compile=True, most_rows=2, max_batch=4, goal=Goal("robots", 60_000.0))
+    measured = tuner(compile=True, most_rows=2, max_batch=4, goal=TuningGoal("robots", 60_000.0))
     assert [one.sessions for one in measured.measure()] == [1, 2]
     assert measured.left_out == ["own settings, 4 sessions: MemoryError: 4 rows"]
 
@@ -80,14 +80,14 @@ def test_a_policy_that_is_random_in_itself_cannot_be_compared() -> None:
 
 def test_a_policy_without_such_settings_gets_a_batch_size() -> None:
     args = ServerArgs(policy="tuned_policies:Plain", batch={"max_size": 2})
-    plan = TunePlan(args, Goal("throughput"), max_batch=2, seconds=0.1)
+    plan = TunePlan(args, TuningGoal("throughput"), max_batch=2, seconds=0.1)
     assert {one.variant.name for one in Tuner(plan).measure()} == {"own settings"}
     with pytest.raises(ConfigError, match="no setting `dtype`"):
-        Tuner(TunePlan(args, Goal("throughput"), dtypes=["bfloat16"])).measure()
+        Tuner(TunePlan(args, TuningGoal("throughput"), dtypes=["bfloat16"])).measure()
 
 
 def test_fixed_sizes_of_the_file_are_those_that_are_measured() -> None:
-    measured = tuner(batch={"sizes": [2, 3]}, compile=True, max_batch=3, goal=Goal("robots", 60_000.0))
+    measured = tuner(batch={"sizes": [2, 3]}, compile=True, max_batch=3, goal=TuningGoal("robots", 60_000.0))
     assert [one.sessions for one in measured.measure()] == [2, 3]
     with pytest.raises(ConfigError, match="--max-batch: got 1"):
         tuner(batch={"sizes": [2, 3]}, max_batch=1).measure()
@@ -96,4 +96,4 @@ def test_fixed_sizes_of_the_file_are_those_that_are_measured() -> None:
 def test_packages_that_only_ray_installs_are_refused() -> None:
     args = ServerArgs(policy="noop", environment={"requirements": ["torch"]})
     with pytest.raises(ConfigError, match=r"environment\.requirements"):
-        TunePlan(args, Goal("throughput"))
+        TunePlan(args, TuningGoal("throughput"))

@@ -17,7 +17,7 @@ class GoalMissed(VLAgentsError):
 
 
 @dataclass(frozen=True, slots=True)
-class Goal:
+class TuningGoal:
     """The goal of `tune`: the most actions a second, or the most robots whose round trips are short enough."""
 
     kind: Literal["throughput", "robots"]
@@ -56,7 +56,7 @@ class MeasuredPoint:
     peak_mib: float
     difference: float  # largest difference from the actions of the file's own settings, as a share of their range
 
-    def reaches(self, goal: Goal) -> bool:
+    def reaches(self, goal: TuningGoal) -> bool:
         """Whether round trips are short enough for robots, if the goal is of them."""
         return goal.p99_ms is None or self.p99_ms <= goal.p99_ms
 
@@ -66,7 +66,7 @@ def sessions(number: int) -> str:
     return f"{number} session{'s' if number > 1 else ''}"
 
 
-def choose(points: Sequence[MeasuredPoint], goal: Goal) -> MeasuredPoint:
+def choose(points: Sequence[MeasuredPoint], goal: TuningGoal) -> MeasuredPoint:
     """Choose the point that is best for a goal.
 
     A variant must be 5 % better than one with fewer changes, or serve more robots.
@@ -89,7 +89,7 @@ def choose(points: Sequence[MeasuredPoint], goal: Goal) -> MeasuredPoint:
     return best
 
 
-def default_point(points: Sequence[MeasuredPoint], goal: Goal, max_size: int) -> MeasuredPoint | None:
+def default_point(points: Sequence[MeasuredPoint], goal: TuningGoal, max_size: int) -> MeasuredPoint | None:
     """Return what the file gives as it is; None if that was not measured, or misses the goal.
 
     Args:
@@ -133,17 +133,17 @@ def figures(points: Sequence[MeasuredPoint], chosen: MeasuredPoint | None) -> li
     return rows
 
 
-def _best(points: Sequence[MeasuredPoint], goal: Goal) -> MeasuredPoint:
+def _best(points: Sequence[MeasuredPoint], goal: TuningGoal) -> MeasuredPoint:
     return max(points, key=lambda point: point.actions_per_s if goal.kind == "throughput" else point.sessions)
 
 
-def _is_better(one: MeasuredPoint, other: MeasuredPoint, goal: Goal) -> bool:
+def _is_better(one: MeasuredPoint, other: MeasuredPoint, goal: TuningGoal) -> bool:
     if goal.kind == "throughput":
         return one.actions_per_s > _BETTER * other.actions_per_s
     return (one.sessions, 0.0) > (other.sessions, one.p99_ms * _BETTER - other.p99_ms)
 
 
-def _nearest(points: Sequence[MeasuredPoint], goal: Goal) -> str:
+def _nearest(points: Sequence[MeasuredPoint], goal: TuningGoal) -> str:
     if not points:
         return "no settings could be measured"
     found = min(points, key=lambda point: point.p99_ms)

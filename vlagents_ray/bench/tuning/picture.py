@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from vlagents_ray.bench.figures import check_plot_file
-from vlagents_ray.bench.tuning.choice import Goal, MeasuredPoint
+from vlagents_ray.bench.tuning.choice import MeasuredPoint, TuningGoal
 from vlagents_ray.registry import require
 
 
@@ -14,7 +14,7 @@ def plot_latency(
     points: Sequence[MeasuredPoint],
     chosen: MeasuredPoint | None,
     default: MeasuredPoint | None,
-    goal: Goal,
+    goal: TuningGoal,
     file: Path,
     title: str,
 ) -> None:

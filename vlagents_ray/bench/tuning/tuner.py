@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.bench.line_process import LineProcess, ProcessFailed, our_environment
-from vlagents_ray.bench.tuning.choice import Goal, MeasuredPoint, Variant, sessions
+from vlagents_ray.bench.tuning.choice import MeasuredPoint, TuningGoal, Variant, sessions
 from vlagents_ray.bench.tuning.observation_file import save_observations
 from vlagents_ray.bench.tuning.parity import largest_difference
 from vlagents_ray.bench.tuning.process import FRAMES, ProcessSettings
@@ -38,7 +38,7 @@ class TunePlan:
     """The settings of `Tuner`."""
 
     args: ServerArgs  # of a deployment file
-    goal: Goal
+    goal: TuningGoal
     max_batch: int = 32
     minutes: float = 5.0  # that all of it may take
     seconds: float = 2.0  # of each measurement

@@ -59,7 +59,7 @@ def tune_command(
     ] = [],  # noqa: B006
 ) -> None:
     """Find batch size, compilation and precision of a deployment file by measuring; write the file with the figures."""
-    from vlagents_ray.bench.tuning.choice import Goal, choose, chosen_settings, default_point, figures
+    from vlagents_ray.bench.tuning.choice import TuningGoal, choose, chosen_settings, default_point, figures
     from vlagents_ray.bench.tuning.deployment_text import with_comments, with_settings_in_text
     from vlagents_ray.bench.tuning.picture import plot_latency
     from vlagents_ray.bench.tuning.tuner import TunePlan, Tuner
@@ -68,7 +68,7 @@ def tune_command(
 
     began = time.monotonic()
     with errors():
-        goal = Goal(wanted.value, p99_ms)
+        goal = TuningGoal(wanted.value, p99_ms)
         if file.suffix not in YAML_SUFFIXES:
             raise ConfigError(f"got {str(file)!r}, want a deployment file (.yaml)")
         application = policy_application(str(file), app)
