@@ -94,6 +94,7 @@ class Tuner:
         self._end = time.monotonic() + plan.minutes * 60
         self._wanted: list[np.ndarray] = []  # actions of the file's own settings
         self._sizes: list[TunedSize] = []
+        self._useful: list[int] = []  # sizes of the file's own settings up to which the rate rises
         self._failed: list[Variant] = []
 
     def measure(self) -> list[MeasuredPoint]:
@@ -108,8 +109,7 @@ class Tuner:
                 frames = Path(folder) / "frames.npz"
                 save_observations(recorded_observations(self._plan.frames, FRAMES), frames)
             ready = self._measure_own(frames)
-            measured = [size.sessions for size in self._sizes]
-            variants = self._variants(ready, measured)
+            variants = self._variants(ready, self._useful)
             for number, variant in enumerate(variants):
                 self._try(variant, frames, parts=len(variants) - number)
         return [size.point() for size in self._sizes]
@@ -211,9 +211,11 @@ class Tuner:
         for size in sizes:
             if not self._worth_more(found) or not self._add(process, variant, size, found, until):
                 break
-        default = self._plan.args.batch.max_size
-        if self._plan.goal.kind == "throughput" and not variant.changes and default not in [s.sessions for s in found]:
-            self._add(process, variant, default, found, self._end)
+        if not variant.changes:
+            self._useful = [measured.sessions for measured in found]
+            default = self._plan.args.batch.max_size
+            if self._plan.goal.kind == "throughput" and default not in self._useful:
+                self._add(process, variant, default, found, (time.monotonic() + self._end) / 2)
         turn_s = sum(measured.took_s for measured in found)
         for _ in range(_TURNS - 1):
             if time.monotonic() + turn_s > until:
