@@ -84,14 +84,22 @@ class TunedSize:
 
 
 class Tuner:
-    """Measures what the plan says; what it leaves out is in `left_out`, a sentence each."""
+    """Measures what the plan says; what it leaves out is in `left_out`, a sentence each.
 
-    def __init__(self, plan: TunePlan, progress: Callable[[str], None] = lambda _: None) -> None:
+    Args:
+        plan: The plan.
+        progress: Called with a line for each step.
+        began: The time from which the plan's minutes count, s, as `time.monotonic` says it; None: now.
+    """
+
+    def __init__(
+        self, plan: TunePlan, progress: Callable[[str], None] = lambda _: None, began: float | None = None
+    ) -> None:
         self.left_out: list[str] = []
         self.device = ""
         self.fixed: Sequence[int] | None = None  # `batch_sizes` of the file's own settings, by itself or by default
         self._plan, self._progress = plan, progress
-        self._end = time.monotonic() + plan.minutes * 60
+        self._end = (time.monotonic() if began is None else began) + plan.minutes * 60
         self._wanted: list[np.ndarray] = []  # actions of the file's own settings
         self._sizes: list[TunedSize] = []
         self._useful: list[int] = []  # sizes of the file's own settings up to which the rate rises

@@ -59,6 +59,7 @@ def tune_command(
     ] = [],  # noqa: B006
 ) -> None:
     """Find batch size, compilation and precision of a deployment file by measuring; write the file with the figures."""
+    began = time.monotonic()
     from vlagents_ray.bench.tuning.choice import TuningGoal, choose, chosen_settings, default_point, figures
     from vlagents_ray.bench.tuning.deployment_text import with_comments, with_settings_in_text
     from vlagents_ray.bench.tuning.picture import plot_latency
@@ -66,7 +67,6 @@ def tune_command(
     from vlagents_ray.serve.config.deployment import ServerArgs
     from vlagents_ray.serve.launch.deployment_file import policy_application
 
-    began = time.monotonic()
     with errors():
         goal = TuningGoal(wanted.value, p99_ms)
         if file.suffix not in YAML_SUFFIXES:
@@ -77,7 +77,7 @@ def tune_command(
             args, goal, max_batch, minutes, seconds, tolerance, None if dtypes is None else parse_list(dtypes), frames,
             image, parse_dims(state, "--state"),
         )  # fmt: skip
-        tuner = Tuner(plan, progress)
+        tuner = Tuner(plan, progress, began)
         points = tuner.measure()
         _show(points, tuner.left_out, f"{args.policy} on {tuner.device}")
         chosen, default = choose(points, goal), default_point(points, goal, args.batch.max_size)
