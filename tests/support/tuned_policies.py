@@ -22,6 +22,7 @@ class TunableConfig(BaseModel, extra="forbid"):
     dtype: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
     batch_sizes: list[int] | None = None
     eager_ms: float = 60.0  # of a batch that is not compiled
+    row_ms: float = 0.0  # of each of its rows
     off: float = 0.0  # of all numbers, in bfloat16
     most_rows: int | None = None  # larger batches have no memory
     compiles: bool = True
@@ -52,7 +53,7 @@ class Tunable(Agent):
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:
         if self.config.most_rows is not None and len(obs) > self.config.most_rows:
             raise MemoryError(f"{len(obs)} rows")
-        time.sleep(0 if self.config.compile else self.config.eager_ms / 1000)
+        time.sleep(0 if self.config.compile else (self.config.eager_ms + self.config.row_ms * len(obs)) / 1000)
         off = self.config.off if self.config.dtype == "bfloat16" else 0.0
         return [
             Act(np.tile(one.state["joints"] + session.seed + one.cameras["front"].mean() + off, (3, 1)))  # type: ignore[attr-defined]

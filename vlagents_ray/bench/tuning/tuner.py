@@ -24,7 +24,7 @@ from vlagents_ray.bench.tuning.recorded import recorded_observations
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.serve.config.deployment import ServerArgs
 
-_RISING = 1.05  # how much a larger batch must add to the rate for a still larger one to be measured
+_RISING = 1.05  # how much two larger batches must add to the rate for a still larger one to be measured
 _TURNS = 3
 _END_S = 2.0  # that a process may take to end; then it is killed
 
@@ -102,7 +102,6 @@ class Tuner:
         self._end = (time.monotonic() if began is None else began) + plan.minutes * 60
         self._wanted: list[np.ndarray] = []  # actions of the file's own settings
         self._sizes: list[TunedSize] = []
-        self._useful: list[int] = []  # sizes of the file's own settings up to which the rate rises
         self._failed: list[Variant] = []
 
     def measure(self) -> list[MeasuredPoint]:
@@ -117,7 +116,7 @@ class Tuner:
                 frames = Path(folder) / "frames.npz"
                 save_observations(recorded_observations(self._plan.frames, FRAMES), frames)
             ready = self._measure_own(frames)
-            variants = self._variants(ready, self._useful)
+            variants = self._variants(ready, self._useful())
             for number, variant in enumerate(variants):
                 self._try(variant, frames, parts=len(variants) - number)
         return [size.point() for size in self._sizes]
@@ -158,6 +157,12 @@ class Tuner:
             compiled = [{"compile": True} | ({"batch_sizes": list(sizes)} if has.get("batch_sizes", 0) is None else {})]
         both = [one | other for other in compiled for one in dtypes]
         return [Variant(changes) for changes in [*dtypes, *compiled, *both]]
+
+    def _useful(self) -> list[int]:
+        """Return the measured sizes; for throughput, up to the one with the largest rate."""
+        rates = {size.sessions: statistics.median(size.rates) for size in self._sizes}
+        most = max(rates, key=rates.__getitem__) if self._plan.goal.kind == "throughput" else max(rates)
+        return sorted(size for size in rates if size <= most)
 
     def _try(self, variant: Variant, frames: Path | None, parts: int) -> None:
         """Measure a variant; if that fails, say so."""
@@ -219,11 +224,9 @@ class Tuner:
         for size in sizes:
             if not self._worth_more(found) or not self._add(process, variant, size, found, until):
                 break
-        if not variant.changes:
-            self._useful = [measured.sessions for measured in found]
-            default = self._plan.args.batch.max_size
-            if self._plan.goal.kind == "throughput" and default not in self._useful:
-                self._add(process, variant, default, found, (time.monotonic() + self._end) / 2)
+        default = self._plan.args.batch.max_size
+        if self._plan.goal.kind == "throughput" and not variant.changes and default not in [s.sessions for s in found]:
+            self._add(process, variant, default, found, (time.monotonic() + self._end) / 2)
         turn_s = sum(measured.took_s for measured in found)
         for _ in range(_TURNS - 1):
             if time.monotonic() + turn_s > until:
@@ -235,7 +238,8 @@ class Tuner:
         """Whether a larger batch may serve the goal better than those that were measured, ascending."""
         if found and self._plan.goal.p99_ms is not None:
             return found[-1].point().round_trip_ms <= self._plan.goal.p99_ms
-        return len(found) < 2 or found[-1].rates[0] >= _RISING * found[-2].rates[0]
+        rates = [measured.rates[0] for measured in found]
+        return len(rates) < 3 or max(rates[-2:]) >= _RISING * max(rates[:-2])  # one may have been disturbed
 
     def _add(self, process: LineProcess, variant: Variant, size: int, found: list[TunedSize], until: float) -> bool:
         """Compare the actions of a batch size, and measure it once; return False if it is left out, and say why."""
