@@ -34,7 +34,7 @@ class Tunable(Agent):
     Config: ClassVar[type] = TunableConfig
     shared: ClassVar[tuple[str, ...]] = ("config",)
     contract = Contract(
-        cameras={"front": CameraSpec(8, 8)}, state={"joints": StateSpec(2)}, action=ActionSpec(dim=2), chunk=3
+        cameras={"front": CameraSpec(16, 16)}, state={"joints": StateSpec(2)}, action=ActionSpec(dim=2), chunk=3
     )
 
     def __init__(self, config: TunableConfig) -> None:

@@ -14,9 +14,9 @@ from vlagents_ray.evaluate import Trajectory
 from vlagents_ray.images.mp4 import Mp4
 
 
-def record(file: Path, first: float, steps: int = 5, frames: int = 6) -> None:
+def record(file: Path, first: float, steps: int = 5, frames: int = 6, part: str = "arm/joints") -> None:
     """Observation i has first + i as its joints, and an image as bright as 20 i."""
-    state = {"arm/joints": first + np.arange(steps + 1, dtype=np.float32)[:, None] * np.ones(2, np.float32)}
+    state = {part: first + np.arange(steps + 1, dtype=np.float32)[:, None] * np.ones(2, np.float32)}
     trajectory = Trajectory(
         np.zeros((steps, 2), np.float32), np.zeros(steps), np.zeros(steps, bool), state,
         np.linspace(0, 1, steps + 1, dtype=np.float32), ("front",),

@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from tests.bench.tuning.test_recorded import record
 from vlagents_ray.bench.tuning.choice import TuningGoal, choose
 from vlagents_ray.bench.tuning.tuner import TunePlan, Tuner, VariantFailed
 from vlagents_ray.errors import ConfigError
@@ -86,6 +87,14 @@ def test_variants_that_cannot_be_loaded_leave_the_file_as_it_is() -> None:
 def test_a_policy_that_is_random_in_itself_cannot_be_compared() -> None:
     with pytest.raises(VariantFailed, match="same observations and seeds"):
         tuner("Unseeded").measure()
+
+
+def test_recorded_observations_are_acted_on_if_they_fit(tmp_path: Path) -> None:
+    record(tmp_path / "ep0.npz", 1.0, part="joints")
+    assert {one.variant.name for one in tuner(frames=tmp_path, compile=True).measure()} == {"own settings"}
+    record(tmp_path / "ep0.npz", 1.0)
+    with pytest.raises(VariantFailed, match=r"own settings: .*joints"):
+        tuner(frames=tmp_path).measure()
 
 
 def test_a_policy_without_such_settings_gets_a_batch_size() -> None:
