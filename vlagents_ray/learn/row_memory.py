@@ -41,7 +41,8 @@ class RowMemory:
         number = len(block) // row_bytes
         lent = np.frombuffer(block, np.uint8, number * row_bytes)  # all views of it refer to this array
         weakref.finalize(lent, self._take_back, block).atexit = False
-        return lent.view(dtype).reshape(number, *shape)
+        rows: np.ndarray = lent.view(dtype).reshape(number, *shape)
+        return rows
 
     def _take_back(self, block: bytearray) -> None:
         if len(self._free) < self._most_free:
