@@ -1,7 +1,8 @@
 """Steps a second of `Rollouts` against a plain loop of the same environments and policy in one process, in turns.
 
 The loop is what a learner writes first: environments stepped one after another, one call of the policy for all of them,
-arrays of what came of it. `Rollouts` steps as many environments in all, in workers, and asks a server.
+arrays of what came of it. `Rollouts` steps as many environments in all, in workers, and asks a server. With
+`--torchrl`, TorchRL's collector with its inference server takes its turns, too.
 """
 
 from __future__ import annotations
@@ -92,6 +93,19 @@ def served(policy: str, config: dict[str, Any], patience: float, **settings: Any
         yield measure
 
 
+@contextlib.contextmanager
+def torchrl_collector(layout: str, policy: str, **settings: Any) -> Iterator[Callable[[int], float]]:
+    """Yield a function that returns the steps a second of TorchRL's collector; see `collected`."""
+    try:
+        from benchmarks.torchrl_collector import collected
+    except ModuleNotFoundError as error:
+        raise typer.BadParameter(f"TorchRL is not installed ({error}): pip install torchrl") from error
+    slow = policy == "slow"
+    name, config = _POLICIES[policy]
+    with collected(name, config, grouped=layout == "grouped", whole_batches=slow, images=slow, **settings) as measure:
+        yield measure
+
+
 def main(
     policy: Annotated[str, typer.Argument(help=f"one of {', '.join(_POLICIES)}")] = "tiny",
     workers: Annotated[int, typer.Option(help="Workers of the rollouts.")] = 2,
@@ -101,22 +115,37 @@ def main(
     patience: Annotated[float, typer.Option(help="`batch.patience` of the server.")] = 0.5,
     size: Annotated[int, typer.Option(help="Pixels a side.")] = 224,
     images: Annotated[bool, typer.Option(help="Whether images are kept.")] = True,
+    torchrl: Annotated[
+        str,
+        typer.Option(help="TorchRL's collector, too: 'grouped' in as many workers, or 'processes', one for each env."),
+    ] = "",
 ) -> None:
-    """Print the steps a second of both, and their ratio in each round."""
+    """Print the steps a second of each way, and the ratios in each round."""
+    if torchrl not in ("", "grouped", "processes"):
+        raise typer.BadParameter(f"--torchrl: got {torchrl!r}, want 'grouped' or 'processes'")
     name, config = _POLICIES[policy]
     options = {"width": size, "height": size}
     agent = policy_class(name).from_config(config)
     agent.initialize()
-    ratios = []
-    with served(
-        name, config, patience, workers=workers, num_envs=num_envs, images=images, env_options=options
-    ) as measure:
+    ratios: dict[str, list[float]] = {}
+
+    def plain(episodes: int) -> float:
+        return loop(agent, workers * num_envs, episodes, options, images=images)
+
+    with contextlib.ExitStack() as stack:
+        settings = {"workers": workers, "num_envs": num_envs}
+        ways: dict[str, Callable[[int], float]] = {"loop": plain}
+        if torchrl:  # first, so that its processes are started before Ray
+            ways["torchrl"] = stack.enter_context(torchrl_collector(torchrl, policy, options=options, **settings))
+        measure = stack.enter_context(served(name, config, patience, images=images, env_options=options, **settings))
         for _ in range(rounds):
-            plain = loop(agent, workers * num_envs, episodes, options, images=images)
+            rates = {way: rate(episodes) for way, rate in ways.items()}
             ours = measure(episodes)
-            ratios.append(ours / plain)
-            out.print(f"loop {plain:.0f} steps/s, rollouts {ours:.0f} steps/s: {ratios[-1]:.2f}")
-    out.print(f"median {statistics.median(ratios):.2f}")
+            for way, rate in rates.items():
+                ratios.setdefault(way, []).append(ours / rate)
+                out.print(f"{way} {rate:.0f} steps/s, rollouts {ours:.0f} steps/s: {ratios[way][-1]:.2f}")
+    for way, found in ratios.items():
+        out.print(f"median against {way} {statistics.median(found):.2f}")
 
 
 if __name__ == "__main__":

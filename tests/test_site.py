@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from html.parser import HTMLParser
 from pathlib import Path
+from urllib.parse import unquote, urldefrag, urljoin
 
 import pytest
 from browser import Page, browser
@@ -14,14 +16,47 @@ PAGES = [
     "index.html",
     "tutorials/robot.html",
     "reference/vlagents_ray.html",
+    "reference/policies.html",
     "troubleshooting.html",
     "measured.html",
     "ARCHITECTURE.html",
 ]
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(not (SITE / "index.html").is_file(), reason="the site is not built: make docs"),
-]
+pytestmark = pytest.mark.skipif(not (SITE / "index.html").is_file(), reason="the site is not built: make docs")
+
+
+class PageLinks(HTMLParser):
+    """Where a page leads to, and the anchors in it."""
+
+    def __init__(self, page: Path) -> None:
+        super().__init__()
+        self.targets: set[str] = set()
+        self.anchors: set[str] = {""}
+        self._page = page.as_uri()
+        self.feed(page.read_text())
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        self.anchors.add(values.get("id") or "")
+        if tag == "a" and values.get("href"):
+            self.targets.add(urljoin(self._page, values["href"]))
+
+
+def test_every_link_within_the_site_leads_to_a_file_and_an_anchor_in_it() -> None:
+    pages = {page: PageLinks(page) for page in SITE.rglob("*.html") if page.name != "404.html"}  # of a server's root
+    broken = set()
+    for links in pages.values():
+        for target in links.targets:
+            url, anchor = urldefrag(target)
+            path = Path(unquote(url.removeprefix("file://")))
+            found = pages[path].anchors if path in pages else {anchor} if path.is_file() else set()
+            if url.startswith("file:") and unquote(anchor) not in found:
+                broken.add(target)
+    assert sum(len(links.targets) for links in pages.values()) > len(pages)
+    assert broken == set()
+
+
+# The lines of the module's path that heads a page of the reference.
+LINES_OF_A_PATH = "document.querySelector('h1 code')?.getClientRects().length"
 
 
 @pytest.fixture(scope="module")
@@ -30,6 +65,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
         yield found
 
 
+@pytest.mark.browser
 @pytest.mark.parametrize(("width", "scheme"), [(1280, "light"), (1280, "dark"), (360, "light")])
 def test_pages_fit_and_ask_for_nothing_outside_of_the_site(page: Page, width: int, scheme: str) -> None:
     page.asked.clear()
@@ -38,11 +74,13 @@ def test_pages_fit_and_ask_for_nothing_outside_of_the_site(page: Page, width: in
         page.open(SITE / name, width=width, scheme=scheme)
         assert page.value("document.body.dataset.mdColorScheme") == ("slate" if scheme == "dark" else "default")
         assert page.value("document.documentElement.scrollWidth") <= width, name
+        assert page.value(LINES_OF_A_PATH) in (1, None), name
         assert page.value("[...document.images].filter(one => !one.naturalWidth).map(one => one.src)") == []
     assert [url for url in page.asked if not url.startswith((SITE.as_uri(), "data:", "blob:", "about:"))] == []
     assert page.said == []
 
 
+@pytest.mark.browser
 def test_the_search_finds_pages_without_a_server(page: Page) -> None:
     page.open(SITE / "index.html", width=1280, scheme="light")
     page.value('document.querySelector(".md-search__input").focus()')

@@ -24,15 +24,14 @@ from vlagents_ray.errors import (
 from vlagents_ray.images.codecs import JPEG, RAW, ImageCodec
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import Act, Obs
+from vlagents_ray.protocol.arrays import Buffer
 from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.frame_layout import pack
 from vlagents_ray.protocol.frames import (
     decode_replies,
     decode_reply,
-    decode_request,
     decode_requests,
     encode_replies,
-    encode_reply,
     encode_request,
     encode_requests,
 )
@@ -43,6 +42,16 @@ from vlagents_ray.protocol.messages import (
     Reply,
     Request,
 )
+
+
+def decode_request(frame: Buffer, limits: Limits = DEFAULT_LIMITS) -> Request:
+    """The only request of a frame; raises why it is refused."""
+    [request] = decode_requests(frame, Budget(limits))
+    if isinstance(request, Reply):
+        assert request.error is not None
+        raise request.error
+    return request
+
 
 names = st.text(min_size=1, max_size=8).filter(lambda name: name != "$")
 arrays = hnp.arrays(
@@ -95,7 +104,7 @@ def test_a_request_comes_back_as_it_was(obs: Obs, instruction: str | None, kwarg
 
 @given(hnp.arrays(np.float32, hnp.array_shapes(min_dims=1, max_dims=2)), st.booleans(), infos)
 def test_a_reply_comes_back_as_it_was(action: np.ndarray, done: bool, info: dict) -> None:
-    got = decode_reply(encode_reply(Reply("r1", Act(action, done, info), timing={"queue_ms": 0.5})))
+    got = decode_reply(encode_replies([Reply("r1", Act(action, done, info), timing={"queue_ms": 0.5})]))
     assert got.act is not None
     assert same(action, got.act.action)
     assert (got.request_id, got.act.done, got.timing) == ("r1", done, {"queue_ms": 0.5})
@@ -104,7 +113,7 @@ def test_a_reply_comes_back_as_it_was(action: np.ndarray, done: bool, info: dict
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), float("-inf"), np.float32("nan")])
 def test_the_header_is_json_for_every_parser_though_a_policy_says_nan(value: float) -> None:
-    frame = encode_reply(Reply("r1", Act(np.zeros(2, np.float32), info={"loss": [value]})))
+    frame = encode_replies([Reply("r1", Act(np.zeros(2, np.float32), info={"loss": [value]}))])
     header = frame[8 : 8 + struct.unpack("<I", frame[4:8])[0]]
     json.loads(header, parse_constant=lambda name: pytest.fail(f"{name} is not JSON"))
     got = decode_reply(frame).act
@@ -114,7 +123,7 @@ def test_the_header_is_json_for_every_parser_though_a_policy_says_nan(value: flo
 
 def test_a_step_is_text_since_some_parsers_round_it() -> None:
     step = 2**61 + 1
-    for frame in (encode_request(Request("act", Obs(), step=step)), encode_reply(Reply("r1", info={}, step=step))):
+    for frame in (encode_request(Request("act", Obs(), step=step)), encode_replies([Reply("r1", info={}, step=step)])):
         assert json.loads(frame[8 : 8 + struct.unpack("<I", frame[4:8])[0]])["step"] == str(step)
         assert (decode_request(frame) if b'"op"' in frame else decode_reply(frame)).step == step
     for said in (3, "3"):
@@ -139,7 +148,7 @@ def test_half_of_a_surrogate_pair_is_malformed() -> None:
 
 
 def test_an_error_comes_back_as_its_own_class() -> None:
-    got = decode_reply(encode_reply(Reply("r1", error=MissingCamera("wrist", have=["front"]))))
+    got = decode_reply(encode_replies([Reply("r1", error=MissingCamera("wrist", have=["front"]))]))
     assert type(got.error) is MissingCamera
     assert "wrist" in str(got.error)
 

@@ -50,7 +50,7 @@ from vlagents_ray.protocol.frames import (
     decode_replies,
     decode_reply,
     decode_requests,
-    encode_reply,
+    encode_replies,
 )
 from vlagents_ray.protocol.messages import (
     DEFAULT_LIMITS,
@@ -373,7 +373,7 @@ def test_a_message_that_will_never_fit_is_not_told_to_wait() -> None:
 def test_how_long_to_wait_travels_with_the_refusal() -> None:
     for error in (TooManyRequests("x"), Overloaded("x")):
         error.retry_after_s = 2.5
-        told = decode_reply(encode_reply(Reply(error=error))).error
+        told = decode_reply(encode_replies([Reply(error=error)])).error
         assert type(told) is type(error)
         assert told.retry_after_s == 2.5  # type: ignore[union-attr]
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from vlagents_ray.envs import EvalEnv
-from vlagents_ray.evaluate.episode.episode import run_episode
+from vlagents_ray.envs.batch import SequentialBatch
+from vlagents_ray.errors import VLAgentsError
+from vlagents_ray.evaluate.episode.episode import run_episodes
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import Act, Agent, Obs
@@ -22,6 +25,34 @@ class Always(Agent):
 
     def act(self, obs: Obs) -> Act:
         return Act(self.action.copy())
+
+
+def run_episode(
+    env: EvalEnv,
+    agent: Agent,
+    key: EpisodeKey,
+    *,
+    record: Callable[[Obs], None] = lambda _obs: None,
+    executed: Callable[[np.ndarray, float, bool], None] = lambda _action, _reward, _success: None,
+    **options: Any,
+) -> EpisodeResult:
+    """`run_episodes` with a batch of one, which stays open, and the agent as its only session.
+
+    Raises:
+        VLAgentsError: An error that is not the policy's.
+    """
+    [outcome] = run_episodes(
+        SequentialBatch([env]),
+        agent,
+        [agent],
+        [key],
+        record=lambda _i, obs: record(obs),
+        executed=lambda _i, *done: executed(*done),
+        **options,
+    )
+    if isinstance(outcome, VLAgentsError):
+        raise outcome
+    return outcome
 
 
 def play(env: EvalEnv, name: str, agent: Agent | None = None, *, seed: int = 0, **options: Any) -> EpisodeResult:

@@ -12,12 +12,12 @@ from pathlib import Path
 
 import yaml
 from eval_fakes import HURRY, LINE, PYTHONPATH, Line, Unhurried, wait_for
+from in_process_episode import run_episode
 
 from benchmarks.hosts import Host, RayCluster, ray_cluster
 from vlagents_ray.client.credentials import KEY_VARIABLE
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import Results
-from vlagents_ray.evaluate.episode.episode import run_episode
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.results.reader import Attempt
 from vlagents_ray.serve.access.key_store import new_key

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import threading
-import time
 from dataclasses import dataclass
 
 from vlagents_ray.interface import Act, Agent, Obs
@@ -17,7 +16,6 @@ class AsyncAnswer:
 
     tick: int  # the tick of its observation
     result: Act | Exception
-    came_at: float  # s, of `time.monotonic`
 
 
 class AsyncCaller:
@@ -81,7 +79,7 @@ class AsyncCaller:
             except Exception as error:  # noqa: BLE001 - raised or reported where the answer is taken
                 result = error
             with self._changed:
-                self._answer = AsyncAnswer(tick, result, time.monotonic())
+                self._answer = AsyncAnswer(tick, result)
                 self._job = None  # last: `idle` takes no lock
                 self._changed.notify_all()
         self._agent.close()

@@ -24,6 +24,7 @@ from vlagents_ray.evaluate.workers.pool import WorkerPool
 from vlagents_ray.evaluate.workers.rollout import Report
 from vlagents_ray.interface import Agent
 from vlagents_ray.learn.columns import EXTRA
+from vlagents_ray.learn.row_memory import RowMemory
 from vlagents_ray.learn.transitions import WANTED, TransitionRecorder
 from vlagents_ray.registry import require
 
@@ -31,6 +32,7 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 POLL_S = 0.25  # longest wait for a report, after which workers that are needed are started
+_BLOCKS = 4  # of memory for images that a worker keeps for each of its environments
 _CURE = "mend this, and go on with `first=rollouts.position`"
 
 
@@ -142,7 +144,8 @@ class Rollouts:
         require_envs(config)
         self._config, self._cells = config, cells(config)
         self._factory = agents(config, None if isinstance(policy, str) else policy)
-        self._recorders = functools.partial(TransitionRecorder, want=tuple(want), images=images)
+        memory = RowMemory(_BLOCKS * num_envs)  # each worker gets one of its own
+        self._recorders = functools.partial(TransitionRecorder, want=tuple(want), images=images, memory=memory)
         self._groups, self._seed, self._max_lag = groups, seed, max_lag
         self._block = math.lcm(groups, num_envs)  # episodes that are queued together
         self._ahead = self._block * max(2, math.ceil(2 * workers * num_envs / self._block))

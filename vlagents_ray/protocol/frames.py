@@ -92,12 +92,6 @@ def _write_request(request: Request, writer: ValueWriter, codec: ImageCodec) -> 
     return node
 
 
-def decode_request(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> Request:
-    """Return the request in a frame. Its arrays are views of `data`; nothing in it is executed or unpickled."""
-    header, blobs = unpack(data, limits)
-    return _read_request(header, ValueReader(blobs, Budget(limits)), limits)
-
-
 def decode_requests(data: Buffer, budget: Budget, ops: Sequence[Op] = OPS) -> list[Request | Reply]:
     """Return the requests in a frame, each one of `ops`; a refused request is replaced by the reply with its error.
 
@@ -180,11 +174,6 @@ def check_request(request: Request, limits: Limits) -> Request:
     if request.deadline_ms is not None and not (is_number(request.deadline_ms) and request.deadline_ms > 0):
         raise MalformedMessage(f"deadline_ms: got {str(request.deadline_ms)[:40]}, want a positive number")
     return request
-
-
-def encode_reply(reply: Reply) -> bytes:
-    """Encode a reply as one frame."""
-    return encode_replies([reply])
 
 
 def encode_replies(replies: Sequence[Reply], *, arrived: float | None = None) -> bytes:

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 from eval_fakes import Line, ToZero
+from in_process_episode import run_episode
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs import EvalEnv
@@ -21,7 +22,6 @@ from vlagents_ray.errors import (
     UnknownSession,
     VLAgentsError,
 )
-from vlagents_ray.evaluate.episode.episode import run_episode
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import HIGH_RES, Act, Agent, Obs
 

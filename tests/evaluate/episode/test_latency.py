@@ -10,13 +10,13 @@ import pytest
 from eval_fakes import Line, ToZero
 from hypothesis import given
 from hypothesis import strategies as st
+from in_process_episode import run_episode
 from pydantic import ValidationError
 
 from vlagents_ray.chunking.fallback import neutral
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate.episode.episode import run_episode
 from vlagents_ray.evaluate.episode.latency import ChunkExecutor
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.config import ClockConfig

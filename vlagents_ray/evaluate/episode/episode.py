@@ -18,8 +18,7 @@ import numpy as np
 
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract
-from vlagents_ray.envs.base import BatchEnv, Environment, EvalEnv
-from vlagents_ray.envs.batch import SequentialBatch
+from vlagents_ray.envs.base import BatchEnv, Environment
 from vlagents_ray.errors import CheckpointFailed, ConfigError, InvalidAction, PolicyFailed, VLAgentsError
 from vlagents_ray.evaluate.episode.env_outputs import EnvStep, checked_instruction, checked_obs, checked_step
 from vlagents_ray.evaluate.episode.failures import env_side, policy_side
@@ -39,51 +38,6 @@ Acted = Callable[[int, Act, int], None]  # the same, each answer of the policy, 
 Executed = Callable[[int, np.ndarray, float, bool], None]  # the same, each action, (D,), its reward, and success
 
 _ACTING, _STEPPING = policy_side("act"), env_side("step")  # entered at each step
-
-
-def run_episode(
-    env: EvalEnv,
-    agent: Agent,
-    key: EpisodeKey,
-    *,
-    execute: int | None = None,
-    clock: ClockConfig | None = None,
-    reset_options: Mapping[str, Any] | None = None,
-    policy_options: Mapping[str, Any] | None = None,
-    watch: Watch = lambda _phase, _steps: None,
-    record: Callable[[Obs], None] = lambda _obs: None,
-    images: bool = True,
-    executed: Callable[[np.ndarray, float, bool], None] = lambda _action, _reward, _success: None,
-) -> EpisodeResult:
-    """Play the episode `key` in a single environment, which stays open: `run_episodes` with a batch of one.
-
-    `agent` is the policy and its only session; the other arguments are those of `run_episodes`.
-
-    Returns:
-        The result. A policy that raises or returns an unusable action ends its episode with status "policy_error".
-
-    Raises:
-        VLAgentsError: An error that is not the policy's: `EnvFailed` for the simulator, `PolicyUnavailable`,
-            `DeadlineExceeded` and similar errors for the connection to the policy, and `CheckpointFailed`, as a
-            checkpoint that did not load has played no episode.
-    """
-    [outcome] = run_episodes(
-        SequentialBatch([env]),
-        agent,
-        [agent],
-        [key],
-        execute=execute,
-        clock=clock,
-        reset_options=reset_options,
-        policy_options=policy_options,
-        watch=watch,
-        record=lambda _i, obs: record(obs),
-        images=images,
-        executed=lambda _i, *done: executed(*done),
-    )
-    if isinstance(outcome, VLAgentsError):
-        raise outcome
-    return outcome
 
 
 def run_episodes(

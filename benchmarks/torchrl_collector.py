@@ -1,0 +1,143 @@
+"""TorchRL's collector with its inference server, for `benchmarks.rollouts`: `pip install torchrl`."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import itertools
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModule
+from torchrl.collectors import AsyncBatchedCollector
+from torchrl.data import Bounded, Categorical, Composite, Unbounded
+from torchrl.envs import EnvBase
+from torchrl.modules.inference_server import InferenceServerConfig
+
+from vlagents_ray.envs.tabletop import Tabletop
+from vlagents_ray.interface import Act, Obs
+from vlagents_ray.registry import policy_class
+
+_TIMEOUT_S = 0.02  # longest wait of its server for a whole batch
+
+
+class TorchTabletop(EnvBase):  # type: ignore[misc]
+    """The tabletop as TorchRL's collector wants it."""
+
+    def __init__(self, first_seed: int, options: dict[str, Any]) -> None:
+        super().__init__(device="cpu", batch_size=())
+        self._env, self._seeds = Tabletop(**options), itertools.count(first_seed, 1000)
+        flag = Categorical(2, shape=(1,), dtype=torch.bool)
+        self.observation_spec = Composite(
+            pixels=Unbounded((options["height"], options["width"], 3), dtype=torch.uint8), state=Unbounded((7,))
+        )
+        self.action_spec, self.reward_spec = Bounded(-1.0, 1.0, (4,)), Unbounded((1,))
+        self.done_spec = Composite(done=flag, terminated=flag.clone(), truncated=flag.clone())
+
+    def _reset(self, _: TensorDictBase | None = None, **__: Any) -> TensorDict:
+        obs, _ = self._env.reset(seed=next(self._seeds))
+        return TensorDict(_tensors(obs), ())
+
+    def _step(self, acts: TensorDictBase) -> TensorDict:
+        obs, reward, terminated, truncated, _ = self._env.step(Act(acts["action"].numpy()))
+        flags = {"terminated": terminated, "truncated": truncated, "done": terminated or truncated}
+        return TensorDict(
+            {
+                **_tensors(obs),
+                "reward": torch.tensor([reward]),
+                **{name: torch.tensor([flag]) for name, flag in flags.items()},
+            },
+            (),
+        )
+
+    def _set_seed(self, seed: int | None) -> None:
+        pass
+
+
+def _tensors(obs: Obs) -> dict[str, torch.Tensor]:
+    state = np.array((*obs.state["xyzrpy"], obs.gripper), np.float32)
+    return {"pixels": torch.from_numpy(obs.cameras["front"]), "state": torch.from_numpy(state)}
+
+
+class TorchPolicy(torch.nn.Module):  # type: ignore[misc]
+    """A policy of the benchmark, which is called with as many rows as TorchRL's server has requests."""
+
+    def __init__(self, name: str, config: dict[str, Any]) -> None:
+        super().__init__()
+        self._agent = policy_class(name).from_config(config)
+        self._agent.initialize()
+
+    def forward(self, state: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
+        rows = state.numpy().reshape(-1, 7)
+        seen = [Obs(state={"xyzrpy": row[:6]}, gripper=row[6]) for row in rows]
+        acts = self._agent.act_batch(seen, [self._agent] * len(seen))
+        return torch.from_numpy(np.stack([act.action for act in acts])).reshape(*state.shape[:-1], 4)
+
+
+def _module(name: str, config: dict[str, Any], in_keys: list[str]) -> TensorDictModule:
+    return TensorDictModule(TorchPolicy(name, config), in_keys=in_keys, out_keys=["action"])
+
+
+@contextlib.contextmanager
+def collected(
+    policy: str,
+    config: dict[str, Any],
+    options: dict[str, Any],
+    *,
+    workers: int,
+    num_envs: int,
+    grouped: bool,
+    whole_batches: bool,
+    images: bool,
+) -> Iterator[Callable[[int], float]]:
+    """Yield a function that returns the steps a second of so many episodes of TorchRL's collector.
+
+    Args:
+        policy: The policy's name.
+        config: Its settings.
+        options: The options of the environments.
+        workers: Processes of environments.
+        num_envs: Environments of each of these.
+        grouped: Whether these are the processes, which its coordinator in this process steps; if not, each environment
+            has a process of its own, which asks a process of the server itself.
+        whole_batches: Whether the server waits for the requests of all environments.
+        images: Whether the policy gets the images.
+    """
+    total, steps = workers * num_envs, Tabletop(**options).max_steps
+    server = InferenceServerConfig(
+        max_batch_size=total, min_batch_size=total if whole_batches else 1, timeout=_TIMEOUT_S if whole_batches else 0.0
+    )
+    collector = AsyncBatchedCollector(
+        [functools.partial(TorchTabletop, i, options) for i in range(total)],
+        policy_factory=functools.partial(_module, policy, config, ["state", "pixels"] if images else ["state"]),
+        frames_per_batch=total * steps,
+        env_backend="multiprocessing",
+        envs_per_worker=num_envs if grouped else 1,
+        transport="driver" if grouped else "auto",
+        transition_chunk_size="auto" if grouped else steps,
+        server_config=server,
+    )
+    batches = iter(collector)
+    next(batches)  # processes start
+    with contextlib.ExitStack() as paused:
+        paused.enter_context(collector.pause(None))
+
+        def measure(episodes: int) -> float:
+            paused.close()
+            for _ in range(3):  # it has collected ahead, at most two episodes of each environment
+                next(batches)
+            begun = time.perf_counter()
+            frames: int = sum(next(batches).numel() for _ in range(episodes // total))
+            rate = frames / (time.perf_counter() - begun)
+            paused.enter_context(collector.pause(None))
+            return rate
+
+        try:
+            yield measure
+        finally:
+            paused.close()
+            collector.shutdown()
