@@ -240,7 +240,7 @@ def test_half_a_message_is_not_waited_for() -> None:
         good, bad = keyed.stream(token), keyed.stream(token)
         bad._socket.sendall(half(2**20))
         wait_for(lambda: len(keyed.own._clients) == 1)
-        assert sum(len(client._protocol.reader.buffer) for client in keyed.own._clients) == 0
+        assert sum(client._received.size for client in keyed.own._clients) == 0
         good.send(bytes_probe(100), 5)
         assert good.recv(5)
 

@@ -94,7 +94,7 @@ class Pi0(ModelPolicy):
     """The policy π0: chunks by flow matching, with one forward pass for all sessions of a batch."""
 
     Config: ClassVar[type] = Pi0Config
-    trainable: ClassVar[str | None] = "model.network"
+    trainable = network = "model.network"
     config: Pi0Config
     model: LoadedPi0 | None
 

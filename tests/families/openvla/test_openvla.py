@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from pushed_weights import check_pushed_weights
 from transformers import AutoTokenizer
 
 from tests.families.openvla.conftest import LIBRARIES, WORDS, begun, seen
@@ -100,6 +101,17 @@ def test_an_instruction_longer_than_the_model_was_trained_for_is_refused(policy:
 def test_an_unknown_dataset_is_refused_when_an_episode_begins(policy: OpenVLA) -> None:
     with pytest.raises(InvalidObservation, match=r"got 'aloha', want one of .*bridge_orig.*libero_spatial_no_noops"):
         begun(policy, 0, unnorm_key="aloha")
+
+
+def test_it_acts_with_pushed_weights(loaded: Callable[..., Any]) -> None:
+    policy = loaded("openvla", seed=1)  # nobody else's
+    check_pushed_weights(policy, lambda: begun(policy, 0).act(seen(0)).action)
+
+
+def test_quantized_it_acts_from_weights_of_8_bits(loaded: Callable[..., Any]) -> None:
+    quantized = loaded("openvla", quantization="int8")
+    assert begun(quantized, 0).act(seen(0)).action.shape == (1, 7)
+    assert type(quantized.model.base.network.language_model.lm_head.weight).__name__ == "Int8Tensor"
 
 
 def test_samples_are_drawn_from_the_distribution_whose_moments_are_stated(policy: OpenVLA) -> None:

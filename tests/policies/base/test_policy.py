@@ -148,6 +148,11 @@ def test_deterministic_actions_do_not_change_with_the_batch() -> None:
         cls.from_config({"checkpoint": "none", "deterministic": True, "batch_sizes": [1]}).initialize()
 
 
+def test_a_policy_that_names_no_network_cannot_be_quantized() -> None:
+    with pytest.raises(ConfigError, match=r"quantization: .* does not offer it"):
+        loaded(quantization="int8")
+
+
 def test_a_deterministic_pass_encodes_every_row_also_those_of_samples() -> None:
     policy = CountsViews.from_config({"checkpoint": "none", "deterministic": True, "batch_sizes": [4]})
     policy.initialize()

@@ -175,7 +175,7 @@ def test_who_stays_after_a_wrong_message_is_cut_off(
 def test_a_client_that_takes_no_replies_holds_up_nobody(
     endpoint: WebSocketServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("vlagents_ray.serve.endpoints.send_buffer._SLOW_S", 0.5)
+    monkeypatch.setattr("vlagents_ray.serve.endpoints.buffers._SLOW_S", 0.5)
     slow, other = stream(endpoint), stream(endpoint)
     for client in (slow, other):
         ask(client, "reset")

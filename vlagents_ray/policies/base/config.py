@@ -8,7 +8,7 @@ from pydantic import BaseModel, Field, field_validator, model_validator
 from typing_extensions import Self
 
 from vlagents_ray.policies.base.checkpoint import STEP
-from vlagents_ray.policies.compilation import CompileMode
+from vlagents_ray.policies.compilation import CompileMode, Quantization
 
 COMPILED_SIZES = [1, 2, 4, 8, 16]
 DType = Literal["auto", "float32", "bfloat16", "float16"]
@@ -34,6 +34,11 @@ class ModelConfig(BaseModel, extra="forbid"):
     checkpoint_step: int | None = Field(default=None, ge=0, description="the training step that replaces `{step}`")
     device: str = Field(default="auto", description="'auto' (an accelerator if there is one), 'cpu', 'cuda', 'cuda:1'")
     dtype: DType = Field(default="auto", description="of the weights; 'auto': the family's own choice")
+    quantization: Quantization | None = Field(
+        default=None,
+        description="keep the weights of linear layers in 8 bits (torchao): a quarter to a half of their memory, and "
+        "other actions, so compare them before use",
+    )
     compile: CompileMode = Field(
         default=False,
         description="compile the forward pass for each of `batch_sizes`, as CUDA graphs on a GPU; what cannot be "

@@ -18,7 +18,7 @@ from vlagents_ray.errors import InvalidAction, InvalidObservation, NotReset, Pol
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, Act, Agent, Obs
 from vlagents_ray.policies.base.config import ModelConfig
 from vlagents_ray.policies.base.model_inputs import count_in, leftover_plan, wanted_behaviour, wanted_samples
-from vlagents_ray.policies.compilation import Compilation
+from vlagents_ray.policies.compilation import Compilation, quantize, require_whole
 from vlagents_ray.policies.determinism import require_deterministic
 from vlagents_ray.policies.loading import report_progress
 from vlagents_ray.validation import check_action
@@ -83,6 +83,7 @@ class ModelPolicy(Agent, abc.ABC):
     """
 
     shared: ClassVar[tuple[str, ...]] = ("config", "model", "compilation")
+    network: ClassVar[str | None] = None  # the attribute whose linear layers `quantization` may keep in 8 bits
 
     def __init__(self, config: Any) -> None:
         self.config: ModelConfig = config
@@ -129,6 +130,8 @@ class ModelPolicy(Agent, abc.ABC):
     def initialize(self) -> None:
         """Load the checkpoint; with `batch_sizes`, run each of them once, or compile the model's cores for it."""
         self.model = self.load()
+        if self.config.quantization:
+            quantize(self, self.config.quantization)
         sizes = self.config.batch_sizes or ()
         for number, size in enumerate(sizes, 1):
             report_progress(
@@ -188,6 +191,10 @@ class ModelPolicy(Agent, abc.ABC):
     def close(self) -> None:
         """Free the weights, and the programs that compute with them."""
         self.model, self.compilation = None, Compilation(self.config.compile)
+
+    def _trainable(self) -> Any:
+        require_whole(self.config.quantization)
+        return super()._trainable()
 
     def _begin(self, instruction: str, seed: int) -> None:
         # numpy accepts no negative seed; each int64 maps to its own number modulo 2**64

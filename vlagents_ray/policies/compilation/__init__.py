@@ -1,5 +1,6 @@
-"""Compiled forward passes of torch policies: cores, CUDA graphs, and programs that are kept on disk."""
+"""Faster forward passes of torch policies: compiled cores, CUDA graphs, kept programs, and weights of 8 bits."""
 
 from vlagents_ray.policies.compilation.cores import Compilation, CompileMode
+from vlagents_ray.policies.compilation.quantization import Quantization, quantize, require_whole
 
-__all__ = ["Compilation", "CompileMode"]
+__all__ = ["Compilation", "CompileMode", "Quantization", "quantize", "require_whole"]

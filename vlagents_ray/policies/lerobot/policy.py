@@ -64,7 +64,7 @@ class LeRobot(ModelPolicy):
     """A policy that LeRobot 0.4.4 loads, by the `type` in its checkpoint."""
 
     Config: ClassVar[type] = LeRobotConfig
-    trainable: ClassVar[str | None] = "model.kind.policy"
+    trainable = network = "model.kind.policy"
     config: LeRobotConfig
 
     @property

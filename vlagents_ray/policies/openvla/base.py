@@ -54,6 +54,7 @@ class PrismaticPolicy(ModelPolicy):
     """Computes all valid rows of a batch together, each in the units of its own dataset."""
 
     config: Any
+    network = "model.base.network"
 
     @property
     @abc.abstractmethod

@@ -43,6 +43,7 @@ class OpenVLA(PrismaticPolicy):
     Config = OpenVLAConfig
     config: OpenVLAConfig
     model: TokenDecoder
+    trainable = "model.base.network"
 
     def __init__(self, config: OpenVLAConfig) -> None:
         super().__init__(config)

@@ -23,7 +23,7 @@ from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, TooManyRequ
 from vlagents_ray.protocol.frames import decode_requests
 from vlagents_ray.protocol.messages import STREAM_BYTES, Limits, Reply, Request
 from vlagents_ray.serve.access.api_keys import Caller, Identity
-from vlagents_ray.serve.endpoints.send_buffer import SendBuffer
+from vlagents_ray.serve.endpoints.buffers import READ_BYTES, ReceiveBuffer, SendBuffer, receive
 from vlagents_ray.serve.engine import arrival
 from vlagents_ray.serve.engine.admission import MessageAdmission, NeedsDecodingThread, decode_in_background, image_bytes
 from vlagents_ray.serve.engine.dispatch import Dispatcher
@@ -32,7 +32,6 @@ from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
 
 logger = logging.getLogger(__name__)
 
-_READ_BYTES = 256 * 1024
 _HANDSHAKE_BYTES = 16 * 1024  # maximum size of a handshake
 _HANDSHAKE_S = 5.0  # maximum time of a handshake
 _END_OF_HEADERS = b"\r\n\r\n"
@@ -69,6 +68,7 @@ class WebSocketConnection:
         self._sender: Dispatcher | None = None  # None until the handshake is accepted
         self.caller: Identity | None = None  # None until the handshake is accepted
         self._sending = threading.Lock()  # guards the protocol and the sending: other threads send replies
+        self._received = ReceiveBuffer()
         self._out = SendBuffer(connection, self._sending, STREAM_BYTES)
         self._ended = False
         self._polled = True  # whether the batch queue polls the connection
@@ -92,8 +92,7 @@ class WebSocketConnection:
 
     def _read(self) -> None:
         try:
-            most = _HANDSHAKE_BYTES if self._sender is None else _READ_BYTES
-            data, control, _, _ = self._connection.recvmsg(most, arrival.SPACE)
+            data, control = receive(self._connection, _HANDSHAKE_BYTES if self._sender is None else READ_BYTES)
             self._arrived = time.perf_counter() - arrival.waited_s(control)
         except BlockingIOError:
             return
@@ -121,11 +120,11 @@ class WebSocketConnection:
                 return
         self._receive(data)
 
-    def _receive(self, data: bytes) -> None:
+    def _receive(self, data: bytes | memoryview) -> None:
         """Process bytes that follow the handshake; empty `data` means that the connection has ended."""
         with self._sending:
             if data:
-                self._protocol.receive_data(data)
+                self._received.parse(data)
             else:
                 self._protocol.receive_eof()
             events = self._protocol.events_received()
@@ -188,7 +187,7 @@ class WebSocketConnection:
             return _POLICY_VIOLATION, reason
         if self._messages != self._seen or self._unanswered or not self._polled:
             self._seen, self._quiet_since, self._part_since = self._messages, now, float("inf")
-        if not self._protocol.reader.buffer:
+        if not self._received.size:
             self._part_since = float("inf")
         elif self._part_since > now:
             self._part_since = now
@@ -230,6 +229,7 @@ class WebSocketConnection:
             self._flush()
         if self._protocol.state is not State.OPEN or self.caller is None:
             return False
+        self._received.attach(self._protocol)
         self._sender = Dispatcher(self._engine, self.name, caller=self.caller)
         return True
 

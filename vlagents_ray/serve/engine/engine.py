@@ -317,13 +317,13 @@ class Engine:
             agents += padding
         rows = len(observations)
         call = model.call("act", rows if self._batch_sizes else None)
-        results: Sequence[Act | Exception]
         try:
             with model.busy, call:
                 model.require_open()
                 model.parameters.use(weights)
-                Preparations.finish([(ticket.preparation, session.agent) for ticket, session in acting])
-                results = model.agent.act_batch(observations, agents)  # type: ignore[arg-type]
+                if self.queue.window.slow:
+                    Preparations.finish([(ticket.preparation, session.agent) for ticket, session in acting])
+                results: Sequence[Act | Exception] = model.agent.act_batch(observations, agents)  # type: ignore[arg-type]
                 synchronise()
             if len(results) != rows:
                 raise PolicyFailed(f"act_batch: got {rows} observations, returned {len(results)} actions")

@@ -82,6 +82,9 @@ class BatchWindow:
         self._duration = 0.0  # duration of the last batch, s
         self._mean_s = 0.0  # mean duration of recent batches, s
         self.slow = False  # whether batches take longer than `SLOW_S`; if not, the window keeps no records
+        # Whether it pays that other threads work on the next requests while a batch runs: batches are slow, and the
+        # last two were not both for one session, nor the last one if no other is known.
+        self.overlaps = False
         self._cost = BatchCost()
         self._missing: set[str] = set()
         self._until = 0.0
@@ -89,6 +92,9 @@ class BatchWindow:
     def record_start(self, batch: Sequence[PendingRequest]) -> None:
         """Record that a batch begins."""
         self._previous, self._last = self._last, _AnsweredBatch(batch) if self.slow else self._no_batch
+        last, previous = self._last, self._previous
+        one_session = last.lone != "" and (previous is self._no_batch or previous.lone == last.lone)
+        self.overlaps = self.slow and not one_session
 
     def record_end(self, now: float, duration: float) -> None:
         """Record that the batch ended at `now`, s, after `duration` s."""
@@ -97,16 +103,6 @@ class BatchWindow:
         self._last.ended, self._duration = now, duration
         if self._last.acts:
             self._cost.add(self._last.acts, duration)
-
-    @property
-    def overlaps(self) -> bool:
-        """Whether it pays that other threads work on the next requests while a batch runs.
-
-        Batches then take milliseconds, and the last two were not both for one session, nor the last one if no other is
-        known.
-        """
-        last, previous = self._last, self._previous
-        return self.slow and not (last.lone != "" and (previous is self._no_batch or previous.lone == last.lone))
 
     def record_arrival(self, ticket: PendingRequest) -> None:
         """Estimate the return time of the session that sent the request.

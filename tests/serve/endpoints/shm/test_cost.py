@@ -65,10 +65,12 @@ def serving(agent: Agent) -> Iterator[ShmTransport]:
     transport = ShmTransport(asdict(endpoint.address))
     transport.connect(5)
     transport.call([Request("reset", OBS, request_id="reset")], 5)
-    yield transport
-    transport.close()
-    engine.close()
-    endpoint.close()
+    try:
+        yield transport
+    finally:
+        transport.close()
+        engine.close()
+        endpoint.close()
 
 
 def test_a_lone_act_costs_the_server_few_calls() -> None:
