@@ -32,7 +32,7 @@ from vlagents_ray.testing.observations import random_observation
 from vlagents_ray.validation import check_observation
 
 FRAMES = 8  # episodes whose first actions are compared
-_TUNED = ("compile", "dtype", "batch_sizes")  # settings of a policy
+_TUNED = ("compile", "dtype", "quantization", "batch_sizes")  # settings of a policy
 
 
 @dataclass(frozen=True, slots=True)

@@ -44,7 +44,7 @@ def tune_command(
     seconds: Annotated[float, typer.Option(min=0.1, help="Of each measurement.")] = 2.0,
     dtypes: Annotated[
         str | None,
-        typer.Option(help="To try, as bfloat16,float16; default: the one that suits the accelerator, if any."),
+        typer.Option(help="To try, as bfloat16,int8; default: the one that suits the accelerator, if any."),
     ] = None,
     tolerance: Annotated[
         float, typer.Option(min=0, help="How far actions may be off, as a share of their range.")
