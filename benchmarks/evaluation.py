@@ -34,7 +34,7 @@ import vlagents_ray
 from benchmarks.environments import TIMED_TABLETOP, read_episode_times
 from vlagents_ray.bench.line_process import LineProcess, ProcessFailed, our_environment
 from vlagents_ray.bench.peers import SCRIPTS, peer_clients
-from vlagents_ray.bench.report import evaluation_outcomes
+from vlagents_ray.bench.report.section import evaluation_outcomes
 from vlagents_ray.cli.bench import DEFAULT_PEERS_PYTHON, Json, PeersPython, show_outcomes, show_skipped
 from vlagents_ray.cli.console import errors, out, progress, save, table
 from vlagents_ray.cli.options import parse_list

@@ -25,7 +25,7 @@ import numpy as np
 import typer
 
 from benchmarks.environments import TIMED_TABLETOP, EpisodeTimes, read_episode_times
-from vlagents_ray.bench.report import Outcome, unmeasured
+from vlagents_ray.bench.report.section import Outcome, unmeasured
 from vlagents_ray.cli.bench import Json, show_outcomes
 from vlagents_ray.cli.console import errors, out, progress, save
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Results, SilentProgress, SuiteConfig, evaluate

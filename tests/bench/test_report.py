@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from vlagents_ray.bench.report import BEGIN, DEFAULT, END, JPEG, outcomes, replaced, section
+from vlagents_ray.bench.report.section import BEGIN, DEFAULT, END, JPEG, outcomes, replaced, section
 from vlagents_ray.errors import ConfigError
 
 

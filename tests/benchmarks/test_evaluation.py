@@ -22,7 +22,7 @@ from benchmarks.evaluation import (
 )
 from vlagents_ray.bench.line_process import ProcessFailed
 from vlagents_ray.bench.peers import SCRIPTS
-from vlagents_ray.bench.report import evaluation_outcomes
+from vlagents_ray.bench.report.section import evaluation_outcomes
 from vlagents_ray.envs import make_env
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Act

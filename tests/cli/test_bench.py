@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import importlib.util
+import json
+import re
+from pathlib import Path
 
 import pytest
 from typer.testing import CliRunner
@@ -53,3 +56,13 @@ def test_what_is_no_user_measurement_any_more_names_the_module_to_run(words: lis
 
 def test_every_command_that_moved_is_a_module_of_benchmarks() -> None:
     assert all(importlib.util.find_spec(f"benchmarks.{module}") for module in _MOVED.values())
+
+
+def test_two_runs_stand_side_by_side(tmp_path: Path) -> None:
+    for name, ms in (("old", 2.0), ("new", 1.0)):
+        figures = {"ways": [{"way": "shm", "median_ms": ms, "ci95_ms": [ms, ms]}], "versions": {"ray": name}}
+        (tmp_path / f"{name}.json").write_text(json.dumps(figures))
+    done = CliRunner().invoke(app, ["bench", "compare", str(tmp_path / "old.json"), str(tmp_path / "new.json")])
+    assert done.exit_code == 0
+    assert re.search(r"shm / median_ms\W+2\W+1\W+0\.50\W+apart", done.output)
+    assert "differs: ray: old before, new now" in done.output

@@ -12,11 +12,11 @@ import typer
 from rich.text import Text
 
 from vlagents_ray.cli.console import errors, out, progress, save, table
-from vlagents_ray.cli.options import parse_counts, parse_dims, parse_list
+from vlagents_ray.cli.options import parse_counts, parse_dims, parse_list, parse_policy
 from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
-    from vlagents_ray.bench.report import Outcome
+    from vlagents_ray.bench.report.section import Outcome
     from vlagents_ray.bench.throughput import ThroughputPlan
 
 bench = typer.Typer(no_args_is_help=True, help="Measure on this machine what the README claims.")
@@ -47,10 +47,12 @@ def bench_rtt(
 ) -> None:
     """Round trips to a `noop` policy on this machine: every transport, and other policy servers, interleaved."""
     from vlagents_ray.bench.figures import check_plot_file, plot_round_trips
+    from vlagents_ray.bench.report.machine import measured_on
     from vlagents_ray.bench.rtt import measure_rtt
 
     with errors():
         check_plot_file(plot)
+        origin = measured_on()
         found = measure_rtt(
             calls,
             transports=parse_list(transports),
@@ -59,7 +61,7 @@ def bench_rtt(
             progress=progress,
         ).to_json()
         show_round_trips(found, "round trip of one act on this machine")
-        save(found, json_file)
+        save(_joined(origin, found), json_file)
         if plot is not None:
             plot_round_trips(found, plot)
 
@@ -77,15 +79,17 @@ def bench_link(
     """Round trips over a link of 1 Gbit/s between two network namespaces on this machine."""
     from vlagents_ray.bench.figures import check_plot_file, plot_round_trips
     from vlagents_ray.bench.link import measure_link
+    from vlagents_ray.bench.report.machine import measured_on
 
     with errors():
         check_plot_file(plot)
+        origin = measured_on()
         found = measure_link(
             calls, rate=rate, delay=delay, peers=parse_list(peers), peers_python=peers_python, progress=progress
         )  # fmt: skip
         title = f"round trip of one act over {found['link']['measured_mbit_per_s']:.0f} Mbit/s"
         show_round_trips(found, title)
-        save(found, json_file)
+        save(_joined(origin, found), json_file)
         if plot is not None:
             plot_round_trips(found, plot, title)
 
@@ -114,10 +118,12 @@ def bench_throughput(
     json_file: Json = None,
 ) -> None:
     """Actions a second of many clients on one replica, against the ideal, or the bare policy in the same run."""
+    from vlagents_ray.bench.report.machine import measured_on
     from vlagents_ray.bench.throughput import ThroughputPlan, measure_throughput
 
     with errors():
-        chosen = _policy(policy, config, model, device)
+        origin = measured_on()
+        chosen = parse_policy(policy, config, model, device)
         counts = parse_counts(clients, "--clients")
         gpus = float(device.startswith("cuda")) if num_gpus is None else num_gpus
         plan: ThroughputPlan = ThroughputPlan(
@@ -126,7 +132,7 @@ def bench_throughput(
         )  # fmt: skip
         found = measure_throughput(plan, progress)
     show_throughput(found)
-    save(found, json_file)
+    save(_joined(origin, found), json_file)
 
 
 @bench.command("policy")
@@ -144,15 +150,38 @@ def bench_policy(
 ) -> None:
     """Actions a second of one policy alone, by batch size: bare, and behind its batch queue; without Ray."""
     from vlagents_ray.bench.policy import PolicyPlan, measure_policy
+    from vlagents_ray.bench.report.machine import measured_on
     from vlagents_ray.serve.launch.deployment_file import server_args
 
     with errors():
-        args, batches = server_args(file, app), parse_counts(batch, "--batch")
+        origin, args, batches = measured_on(), server_args(file, app), parse_counts(batch, "--batch")
         found = measure_policy(
             PolicyPlan(args, batches, seconds, rounds, image, parse_dims(state, "--state")), progress
         )  # fmt: skip
     show_policy(found)
-    save(found, json_file)
+    save(_joined(origin, found), json_file)
+
+
+@bench.command("compare")
+def bench_compare(
+    old: Annotated[Path, typer.Argument(help="A file of `bench … --json`.")],
+    new: Annotated[Path, typer.Argument(help="Another one, of the same command.")],
+) -> None:
+    """Two runs side by side: each figure of both, and in what their machines and versions differ."""
+    from vlagents_ray.bench.report.comparison import compare_figures, read_figures
+
+    with errors():
+        found = compare_figures(read_figures(old), read_figures(new))
+    rows = table("figure", "old", "new", "new / old", "95 % intervals")
+    for one in found.figures:
+        intervals = {True: "overlap", False: "apart", None: ""}[one.overlap]
+        rows.add_row(one.name, f"{one.old:.4g}", f"{one.new:.4g}", f"{one.ratio:.2f}", intervals)
+    out.print(rows)
+    for title, lines in (
+        ("differs", found.circumstances), (f"only in {old}", found.only_old), (f"only in {new}", found.only_new),
+    ):  # fmt: skip
+        for line in lines:
+            out.print(f"{title}: {line}", style="yellow")
 
 
 @bench.command("peers-setup")
@@ -180,7 +209,7 @@ def bench_report(
     from_json: Annotated[bool, typer.Option("--from-json", help="Measure nothing: use the figures in --json.")] = False,
 ) -> None:
     """Measure everything, and write the README's benchmark section anew."""
-    from vlagents_ray.bench.report import collect, replaced, write
+    from vlagents_ray.bench.report.section import collect, replaced, write
     from vlagents_ray.bench.throughput import ThroughputPlan
 
     with errors():
@@ -222,25 +251,9 @@ for _name, _module in _MOVED.items():
     bench.command(_name, hidden=True, context_settings=_ANY, help=f"Moved: python -m benchmarks.{_module}")(_moved)
 
 
-def _policy(policy: str | None, config: str, model: str | None, device: str) -> dict[str, Any]:
-    try:
-        settings = json.loads(config)
-    except ValueError as error:
-        raise ConfigError(f"--config: got {config!r}, want JSON ({error})") from error
-    if not isinstance(settings, dict):
-        raise ConfigError(f"--config: got {config!r}, want a JSON object")
-    if model is not None:
-        if policy is not None:
-            raise ConfigError("--policy and --model exclude each other; keep one")
-        return {
-            "policy": "vlagents_ray.bench.model:SizedPolicy",
-            "config": {"size": model, "device": device, **settings},
-        }
-    if policy is not None:
-        return {"policy": policy, "config": settings}
-    if settings:
-        raise ConfigError("--config: is for --policy or --model; name one")
-    return {}
+def _joined(origin: Mapping[str, Any], found: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the figures with what they depend on, where peers' versions are among the versions."""
+    return {**origin, **found, "versions": {**origin["versions"], **found.get("versions", {})}}
 
 
 def show_round_trips(found: Mapping[str, Any], title: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import json
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated, Any
@@ -100,3 +101,25 @@ def read_run_file(file: Path, kind: str, keys: str) -> dict[str, Any]:
     if not isinstance(document, dict):
         raise ConfigError(f"{file}: got {type(document).__name__}, want a mapping with {keys}")
     return {"out": Path("runs") / file.stem} | document
+
+
+def parse_policy(policy: str | None, config: str, model: str | None, device: str) -> dict[str, Any]:
+    """Return policy and settings of `--policy`, or of `--model`; none of them for neither."""
+    try:
+        settings = json.loads(config)
+    except ValueError as error:
+        raise ConfigError(f"--config: got {config!r}, want JSON ({error})") from error
+    if not isinstance(settings, dict):
+        raise ConfigError(f"--config: got {config!r}, want a JSON object")
+    if model is not None:
+        if policy is not None:
+            raise ConfigError("--policy and --model exclude each other; keep one")
+        return {
+            "policy": "vlagents_ray.bench.model:SizedPolicy",
+            "config": {"size": model, "device": device, **settings},
+        }
+    if policy is not None:
+        return {"policy": policy, "config": settings}
+    if settings:
+        raise ConfigError("--config: is for --policy or --model; name one")
+    return {}

@@ -5,17 +5,14 @@ Figures of `python -m benchmarks.evaluation --report FILE` in the same file are 
 
 from __future__ import annotations
 
-import datetime
-import importlib.metadata
 import json
-import os
-import platform
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from vlagents_ray.bench import link
+from vlagents_ray.bench.report.machine import measured_on
 from vlagents_ray.bench.rtt import measure_rtt
 from vlagents_ray.bench.throughput import ThroughputPlan, measure_throughput
 from vlagents_ray.errors import ConfigError
@@ -42,11 +39,8 @@ def collect(
 ) -> dict[str, Any]:
     """Measure round trips with all peers, the link if this machine can make one, and throughput, as JSON values."""
     results: dict[str, Any] = {
-        "date": datetime.datetime.now(datetime.timezone.utc).date().isoformat(),
+        **measured_on(),
         "command": COMMAND,
-        "machine": machine(),
-        "versions": {name: importlib.metadata.version(name) for name in ("vlagents-ray", "ray", "numpy")}
-        | {"Python": platform.python_version()},
         "skipped": {},
     }
     results["rtt"] = measure_rtt(calls, peers=["all"], peers_python=peers_python, progress=progress).to_json()
@@ -58,23 +52,6 @@ def collect(
         results["skipped"]["link"] = str(error)
     results["throughput"] = measure_throughput(plan or ThroughputPlan(), progress)
     return results
-
-
-def machine() -> dict[str, Any]:
-    """Return what the figures depend on, without host or user names."""
-    cpu = platform.processor() or platform.machine()
-    for line in Path("/proc/cpuinfo").read_text().splitlines():
-        if line.startswith("model name"):
-            cpu = line.partition(":")[2].strip()
-            break
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return {
-        "cpu": cpu,
-        "cores": os.cpu_count(),
-        "memory_gb": round(memory / 2**30),
-        "kernel": platform.release().partition("-")[0],
-        "load": os.getloadavg()[0],
-    }
 
 
 def write(results: Mapping[str, Any], readme: Path, json_file: Path | None) -> None:
