@@ -97,7 +97,6 @@ _POLICY_REQUIREMENTS = {
     "huggingface_hub": ("diffusion_policy", "hf", "lerobot", "octo", "openpi", "openvla"),
     "safetensors": ("hf", "lerobot", "openpi", "openvla"),
     "timm": ("hf", "openvla"),
-    "torchao": ("hf", "lerobot", "openvla"),
     "lerobot": ("lerobot",),
     "prismatic": ("openvla",),
     "diffusers": ("diffusion_policy",),

@@ -1,7 +1,8 @@
 """On CI a test that skips itself has failed: `VLAGENTS_FAIL_ON_SKIP=1` makes it so.
 
-CI installs all that tests need but a GPU, sources and assets that are on no package index, and a browser where apt has
-none: only tests marked `gpu`, `source`, `assets` and `browser` may be skipped there.
+CI installs all that tests need but a GPU, sources and assets that are on no package index, a browser where apt has
+none, and libraries that others load wherever they are installed: only tests marked `gpu`, `source`, `assets`, `browser`
+and `library` may be skipped there.
 tests/conftest.py takes the two hooks from here.
 """
 
@@ -13,7 +14,7 @@ from typing import TypeVar
 
 import pytest
 
-_MAY_BE_MISSING = ("gpu", "source", "assets", "browser")
+_MAY_BE_MISSING = ("gpu", "source", "assets", "browser", "library")
 Report = TypeVar("Report", pytest.CollectReport, pytest.TestReport)
 
 

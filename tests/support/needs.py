@@ -5,6 +5,7 @@ So `make check`, which leaves out whatever is marked, is sure to start no Ray an
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import sys
@@ -43,6 +44,10 @@ def skip_what_is_missing(item: pytest.Item) -> None:
         [variable] = marker.args
         if not os.environ.get(variable):
             pytest.skip(f"{variable} names no checkout of this family's source")
+    for marker in item.iter_markers("library"):
+        [name] = marker.args
+        if importlib.util.find_spec(name) is None:
+            pytest.skip(f"{name} is not installed")
     for marker in item.iter_markers("assets"):
         [simulator] = marker.args
         if assets(simulator) is None:

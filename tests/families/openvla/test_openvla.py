@@ -108,6 +108,7 @@ def test_it_acts_with_pushed_weights(loaded: Callable[..., Any]) -> None:
     check_pushed_weights(policy, lambda: begun(policy, 0).act(seen(0)).action)
 
 
+@pytest.mark.library("torchao")
 def test_quantized_it_acts_from_weights_of_8_bits(loaded: Callable[..., Any]) -> None:
     quantized = loaded("openvla", quantization="int8")
     assert begun(quantized, 0).act(seen(0)).action.shape == (1, 7)

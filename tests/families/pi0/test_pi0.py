@@ -252,6 +252,7 @@ def test_it_acts_with_pushed_weights(folder: Path) -> None:
     check_pushed_weights(policy, lambda: begun(policy, 0).act(seen(0)).action)
 
 
+@pytest.mark.library("torchao")
 @pytest.mark.parametrize(("kind", "error"), [("int8", 0.02), ("float8", 0.1)])
 def test_quantized_it_acts_nearly_alike_from_less_memory(loaded: Pi0, folder: Path, kind: str, error: float) -> None:
     quantized = Pi0.from_config({"checkpoint": str(folder), "quantization": kind})
