@@ -66,6 +66,11 @@ def test_a_missing_simulator_is_cured_by_its_extra() -> None:
     assert cure("mani_skill.envs") == "pip install 'vlagents-ray[maniskill]'"
 
 
+@pytest.mark.usefixtures("nothing_installed")
+def test_a_package_that_no_requirements_file_installs_is_cured_by_pip() -> None:
+    assert "`pip install torchao` in the policy's environment" in cure("torchao.quantization")
+
+
 def required() -> Iterator[str]:
     """The top-level packages that the code imports through `require`."""
     for path in (ROOT / "vlagents_ray").rglob("*.py"):

@@ -111,6 +111,9 @@ _POLICY_REQUIREMENTS = {
     "openpi": ("openpi",),
 }
 
+# packages that a key of a policy's configuration needs, and that no file in requirements/ installs
+_POLICY_ADDITIONS = frozenset({"torchao"})
+
 # import name -> its file in requirements/, for an environment that runs the workers of an evaluation
 _SIMULATOR_REQUIREMENTS = {"rcs": "rcs", "duobench": "rcs"}
 
@@ -154,6 +157,8 @@ def _install(package: str, extra: str | None = None) -> str:
             f"run `vlagents-ray env make requirements/{'FILE' if family else files[0]}` and name the environment in "
             f"the deployment's `environment`{family}"
         )
+    if package in _POLICY_ADDITIONS:
+        return f"run `pip install {package}` in the policy's environment; its requirements file leaves it out"
     return f"install the package that provides {package!r}"
 
 
