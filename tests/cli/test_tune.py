@@ -8,8 +8,10 @@ import pytest
 from typer.testing import CliRunner
 
 from vlagents_ray.bench.tuning import picture
+from vlagents_ray.cli.evaluation.command import read_run
 from vlagents_ray.cli.main import app
 from vlagents_ray.errors import MissingDependency
+from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.serve.launch.deployment_file import server_args
 
 FILE = """\
@@ -88,3 +90,27 @@ def test_mistakes_are_told_in_a_line(file: Path, words: list[str], text: str, mo
     assert done.exit_code == 2, done.output
     assert text in done.stderr
     assert "Traceback" not in done.output
+
+
+@pytest.mark.ray
+@pytest.mark.server
+def test_a_file_of_runs_gets_workers_and_environments(tmp_path: Path) -> None:
+    file = tmp_path / "runs.yaml"
+    file.write_text(
+        "# mine\npolicies: [{source: scripted}]\nsuites: [{envs: [tabletop], env_options: {max_steps: 5}}]\n"
+    )
+    done = CliRunner().invoke(app, ["tune", str(file), "--max-workers", "1", "--minutes", "0.2"])
+    assert done.exit_code == 0, done.output
+    text = file.with_name("runs.tuned.yaml").read_text()
+    assert text.startswith("# Tuned on ")
+    assert "# chosen: 1 worker with " in text
+    assert "# mine\npolicies: [{source: scripted}]\n" in text
+    assert EvalConfig.model_validate(read_run(file.with_name("runs.tuned.yaml"))).workers == 1
+
+
+def test_options_of_deployment_files_are_refused_for_a_file_of_runs(tmp_path: Path) -> None:
+    file = tmp_path / "runs.yaml"
+    file.write_text("policies: [{source: noop}]\nsuites: [{envs: [tabletop]}]\n")
+    done = CliRunner().invoke(app, ["tune", str(file), "--dtypes", "int8"])
+    assert done.exit_code == 2
+    assert "are of deployment files" in done.output

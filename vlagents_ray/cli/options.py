@@ -103,6 +103,15 @@ def read_run_file(file: Path, kind: str, keys: str) -> dict[str, Any]:
     return {"out": Path("runs") / file.stem} | document
 
 
+def is_run_file(file: Path) -> bool:
+    """Return whether a YAML file is a file of runs, and no deployment file."""
+    try:
+        document = yaml.safe_load(file.read_text())
+    except (OSError, yaml.YAMLError):
+        return False  # who reads it as a deployment file says what is wrong
+    return isinstance(document, dict) and "suites" in document
+
+
 def parse_policy(policy: str | None, config: str, model: str | None, device: str) -> dict[str, Any]:
     """Return policy and settings of `--policy`, or of `--model`; none of them for neither."""
     try:

@@ -1,4 +1,4 @@
-"""`vlagents-ray tune`: settings of a deployment file, measured on this machine."""
+"""`vlagents-ray tune`: settings of a deployment file or a file of runs, measured on this machine."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vlagents_ray.cli.console import errors, out, progress, table
-from vlagents_ray.cli.options import YAML_SUFFIXES, parse_dims, parse_list
+from vlagents_ray.cli.options import YAML_SUFFIXES, is_run_file, parse_dims, parse_list
 from vlagents_ray.errors import ConfigError, MissingDependency
 
 if TYPE_CHECKING:
@@ -29,17 +29,18 @@ class Wanted(str, Enum):
 
 
 def tune_command(
-    file: Annotated[Path, typer.Argument(help="A deployment file.")],
+    file: Annotated[Path, typer.Argument(help="A deployment file, or a file of runs of `vlagents-ray eval`.")],
     wanted: Annotated[
         Wanted, typer.Option("--for", help="The most actions a second, or the most robots within --p99-ms.")
     ] = Wanted.throughput,
     p99_ms: Annotated[
         float | None, typer.Option("--p99-ms", min=0, help="Of robots: the longest round trip of 99 in 100, ms.")
     ] = None,
-    out_file: Annotated[
-        Path | None, typer.Option("--out", help="The tuned deployment file; default: FILE.tuned.yaml.")
-    ] = None,
+    out_file: Annotated[Path | None, typer.Option("--out", help="The tuned file; default: FILE.tuned.yaml.")] = None,
     minutes: Annotated[float, typer.Option(min=0.1, help="That all of it may take.")] = 5.0,
+    max_workers: Annotated[
+        int | None, typer.Option(min=1, help="Of a file of runs: the most workers to try; default: twice the cores.")
+    ] = None,
     max_batch: Annotated[int, typer.Option(min=1, help="The largest batch to try.")] = 32,
     seconds: Annotated[float, typer.Option(min=0.1, help="Of each measurement.")] = 2.0,
     dtypes: Annotated[
@@ -58,19 +59,31 @@ def tune_command(
         list[str], typer.Option(metavar="PART=N", help="Numbers in a part for which the policy does not say.")
     ] = [],  # noqa: B006
 ) -> None:
-    """Find batch size, compilation and precision of a deployment file by measuring; write the file with the figures."""
+    """Find the best settings of a file by measuring, and write it with the figures.
+
+    Of a deployment file: batch size, compilation and precision. Of a file of runs: workers, and environments a worker.
+    """
     began = time.monotonic()
     from vlagents_ray.bench.tuning.choice import TuningGoal, choose, chosen_settings, default_point, figures
-    from vlagents_ray.bench.tuning.deployment_text import with_comments, with_settings_in_text
     from vlagents_ray.bench.tuning.picture import plot_latency
     from vlagents_ray.bench.tuning.tuner import TunePlan, Tuner
+    from vlagents_ray.bench.tuning.yaml_text import with_comments, with_settings_in_text
+    from vlagents_ray.cli.tune.evaluation import tune_evaluation
     from vlagents_ray.serve.config.deployment import ServerArgs
     from vlagents_ray.serve.launch.deployment_file import policy_application
 
     with errors():
         goal = TuningGoal(wanted.value, p99_ms)
         if file.suffix not in YAML_SUFFIXES:
-            raise ConfigError(f"got {str(file)!r}, want a deployment file (.yaml)")
+            raise ConfigError(f"got {str(file)!r}, want a deployment file or a file of runs (.yaml)")
+        where = out_file or file.with_suffix(f".tuned{file.suffix}")
+        if is_run_file(file):
+            if goal.kind != "throughput" or dtypes or frames or app or state:
+                raise ConfigError(
+                    "--for, --dtypes, --frames, --app and --state are of deployment files; leave them out"
+                )
+            tune_evaluation(file, where, minutes=minutes, max_workers=max_workers, began=began)
+            return
         application = policy_application(str(file), app)
         args = ServerArgs(**application.args)
         plan = TunePlan(
@@ -92,7 +105,6 @@ def tune_command(
             f"Tuned on {datetime.date.today()} in {took} on {tuner.device}, by vlagents-ray {shlex.join(sys.argv[1:])}"
         )
         left_out = [f"left out: {sentence}" for sentence in tuner.left_out]
-        where = out_file or file.with_suffix(f".tuned{file.suffix}")
         where.write_text(with_comments(text, [head, *lines, *left_out], figures(points, chosen)))
         out.print(f"wrote {where}, after {took}")
         picture = where.with_suffix(".svg")

@@ -1,4 +1,4 @@
-"""Settings written into the text of a deployment file, whose other lines and comments stay as they are."""
+"""Values written into the text of a YAML file, whose other lines and comments stay as they are."""
 
 from __future__ import annotations
 
@@ -11,25 +11,46 @@ import yaml
 from vlagents_ray.errors import ConfigError
 
 Settings = Mapping[tuple[str, str], Any]  # by section and key below `args`, such as ("batch", "max_size")
+Place = tuple[str | int, ...]  # keys of mappings and indices of lists, from the top
 
 
 def with_settings_in_text(text: str, app: str, settings: Settings) -> str:
-    """Return the text of a deployment file with other settings of one application.
-
-    A text whose places cannot be edited, such as one with an alias for `args`, is written anew, without its comments.
+    """Return the text of a deployment file with other settings of one application; see `with_values_in_text`.
 
     Args:
         text: The YAML text.
         app: The application's name.
         settings: The settings.
+
+    Raises:
+        ConfigError: There is no such application.
+    """
+    applications = yaml.safe_load(text)["applications"]
+    number = next((i for i, one in enumerate(applications) if one.get("name", "default") == app), None)
+    if number is None:
+        raise ConfigError(f"got no application {app!r} in the text of the deployment file")
+    places: dict[Place, Any] = {("applications", number, "args", *place): value for place, value in settings.items()}
+    return with_values_in_text(text, places)
+
+
+def with_values_in_text(text: str, values: Mapping[Place, Any]) -> str:
+    """Return a YAML text with other values at some places; all other lines and comments stay.
+
+    A text whose places cannot be edited, such as one with an alias on the way, is written anew, without its comments.
+
+    Args:
+        text: The YAML text.
+        values: The values by place; mappings on the way to the last key may be missing.
     """
     wanted = yaml.safe_load(text)
-    application = _application(wanted["applications"], app)
-    args = application["args"] = dict(application["args"])  # its own, if it was an alias
-    for (section, key), value in settings.items():
-        args[section] = {**(args.get(section) or {}), key: value}
-    for (section, key), value in settings.items():
-        text = _edited(text, app, section, key, _flow(value))
+    for place, value in values.items():
+        node: Any = wanted
+        for part in place[:-1]:
+            inner = node[part] if isinstance(part, int) else node.get(part)
+            node[part] = list(inner) if isinstance(inner, list) else dict(inner or {})  # its own, if it was an alias
+            node = node[part]
+        node[place[-1]] = value
+        text = _edited(text, place, _flow(value))
     try:
         if yaml.safe_load(text) == wanted:
             return text
@@ -45,26 +66,22 @@ def with_comments(text: str, lines: Sequence[str], table: Sequence[Sequence[str]
     return "".join(f"# {line}".rstrip() + "\n" for line in [*lines, *rows]) + "\n" + text
 
 
-def _application(applications: list[dict[str, Any]], app: str) -> dict[str, Any]:
-    for one in applications:
-        if one.get("name", "default") == app:
-            return one
-    raise ConfigError(f"got no application {app!r} in the text of the deployment file")
-
-
-def _edited(text: str, app: str, section: str, key: str, value: str) -> str:
-    applications = _value(yaml.compose(text, yaml.SafeLoader), "applications")
-    args = next(
-        _value(one, "args") for one in applications.value if getattr(_value(one, "name"), "value", "default") == app
-    )
-    inner = _value(args, section)
-    if inner is None:
-        return _inserted(text, args, section, f"{{{key}: {value}}}")
-    if not isinstance(inner, yaml.MappingNode):  # nothing, or null
-        return _replaced(text, args, section, f"{{{key}: {value}}}")
-    if _value(inner, key) is None:
-        return _inserted(text, inner, key, value)
-    return _replaced(text, inner, key, value)
+def _edited(text: str, place: Place, value: str) -> str:
+    node: Any = yaml.compose(text, yaml.SafeLoader)
+    for depth, part in enumerate(place):
+        if isinstance(part, int):
+            node = node.value[part]
+            continue
+        rest = value
+        for key in reversed(place[depth + 1 :]):
+            rest = f"{{{key}: {rest}}}"
+        inner = _value(node, part)
+        if inner is None:
+            return _inserted(text, node, part, rest)
+        if depth == len(place) - 1 or not isinstance(inner, yaml.CollectionNode):  # the last key, or nothing, or null
+            return _replaced(text, node, part, rest)
+        node = inner
+    raise ValueError(f"place: got {place}, want a key at its end")
 
 
 def _value(mapping: Any, key: str) -> Any:

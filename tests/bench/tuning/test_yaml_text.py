@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import yaml
 
-from vlagents_ray.bench.tuning.deployment_text import Settings, with_comments, with_settings_in_text
+from vlagents_ray.bench.tuning.yaml_text import Settings, with_comments, with_settings_in_text
 from vlagents_ray.errors import ConfigError
 
 FILE = """\
