@@ -21,6 +21,7 @@ from vlagents_ray.registry import require
 PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
 ACTION = "action"
 _DEVICE, _RENAME, _TOKENIZER = "device_processor", "rename_observations_processor", "tokenizer_processor"
+_STATE_IN_PROMPT = ("pi05", "pi0_fast")  # their prompts differ at each act
 _STATISTICS = {
     "MEAN_STD": ("mean", "std"),
     "MIN_MAX": ("min", "max"),
@@ -56,7 +57,8 @@ class Processors:
                 f"checkpoint {folder}: its processors do not load ({type(error).__name__}: {error}); a tokenizer that "
                 f"is not here is replaced by processors: {{{_TOKENIZER}: {{tokenizer_name: …}}}}"
             ) from error
-        self._keep_tokens()
+        if settings.type not in _STATE_IN_PROMPT:
+            self._keep_tokens()
         self._back = self._inverse()
 
     def statistics(self, key: str) -> dict[str, list[float]]:
