@@ -14,12 +14,14 @@ from vlagents_ray.dataset_contract import BYTES, STATISTICS, DatasetContract
 from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base.model_code import CURE
+from vlagents_ray.policies.base.token_cache import cached_tokenizer
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
 from vlagents_ray.registry import require
 
 PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
 ACTION = "action"
 _DEVICE, _RENAME, _TOKENIZER = "device_processor", "rename_observations_processor", "tokenizer_processor"
+_STATE_IN_PROMPT = ("pi05", "pi0_fast")  # their prompts differ at each act
 _STATISTICS = {
     "MEAN_STD": ("mean", "std"),
     "MIN_MAX": ("min", "max"),
@@ -55,6 +57,8 @@ class Processors:
                 f"checkpoint {folder}: its processors do not load ({type(error).__name__}: {error}); a tokenizer that "
                 f"is not here is replaced by processors: {{{_TOKENIZER}: {{tokenizer_name: …}}}}"
             ) from error
+        if settings.type not in _STATE_IN_PROMPT:
+            self._keep_tokens()
         self._back = self._inverse()
 
     def statistics(self, key: str) -> dict[str, list[float]]:
@@ -111,6 +115,17 @@ class Processors:
     def width(self, dim: int) -> int:
         """Return D', the number of values of the robot's actions, for a policy with `dim` of its own."""
         return int(self._after(require("torch").zeros(1, dim)).shape[-1])
+
+    def _keep_tokens(self) -> None:
+        """Have the tokens of instructions kept, where they do not depend on the others of a batch."""
+        for step in self._before.steps:
+            if type(step) is require("lerobot.processor").TokenizerProcessorStep and step.padding == "max_length":
+                step._tokenize_text = cached_tokenizer(
+                    step.input_tokenizer,
+                    max_length=step.max_length,
+                    truncation=step.truncation,
+                    padding_side=step.padding_side,
+                )
 
     def _inverse(self) -> Any:
         """Make the inverse of the post-processor, if it only unnormalises."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,6 +15,7 @@ from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.policies.base import ModelConfig
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
+from vlagents_ray.policies.base.token_cache import TokenCache
 from vlagents_ray.policies.openvla.sources import model_classes
 from vlagents_ray.policies.openvla.statistics import Bounds, Statistics
 from vlagents_ray.registry import require
@@ -43,23 +44,26 @@ class Prismatic:
     dtype: Any
     deterministic: bool  # whether longer prompts than that are refused
     padded_tokens: int  # the length to which shorter prompts are padded; 0: that of the longest one
+    prompts: TokenCache[list[int]] = field(default_factory=lambda: TokenCache(_size), repr=False)
 
     def pixels(self, image: np.ndarray) -> Any:
         """Convert an (H, W, 3) uint8 image to an input of the checkpoint's backbones, (C, S, S) float32 on the CPU."""
         return self.processor.apply_transform(require("PIL.Image").fromarray(image))
 
     def tokens(self, instruction: str) -> list[int]:
-        """Return the prompt for an instruction.
+        """Return the prompt for an instruction, which the caller must not change.
 
         Raises `InvalidObservation` if it is longer than in the model's training, or than all are padded to.
         """
-        ids: list[int] = self.tokenizer(self.prompt.format(instruction.lower())).input_ids
-        if ids[-1] != _SPACE:
-            ids.append(_SPACE)
+        [ids] = self.prompts.of([instruction], self._tokenized)
         most = self.padded_tokens if self.deterministic else self.network.config.llm_max_length
         if len(ids) > most:
             raise InvalidObservation(f"instruction: got {len(ids)} tokens with the prompt, want {most} at most")
         return ids
+
+    def _tokenized(self, instructions: Sequence[str]) -> list[list[int]]:
+        prompts = [self.tokenizer(self.prompt.format(text.lower())).input_ids for text in instructions]
+        return [ids if ids[-1] == _SPACE else [*ids, _SPACE] for ids in prompts]
 
     def to_device(self, arrays: Sequence[Any]) -> Any:
         """Stack tensors of one shape to a batch in the model's dtype; the copy to a GPU is asynchronous."""
@@ -73,6 +77,10 @@ class Prismatic:
         """Return the embeddings of tokens, (L, D)."""
         torch = require("torch")
         return self.network.get_input_embeddings()(torch.tensor(tokens, device=self.device))
+
+
+def _size(ids: list[int]) -> int:
+    return 36 * len(ids)  # 8 bytes in the list, 28 of the number
 
 
 def load_prismatic(config: PrismaticConfig, bounds: Bounds = "q99") -> Prismatic:
