@@ -9,6 +9,7 @@ import json
 import os
 import platform
 import sys
+import tempfile
 import time
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import asdict, dataclass
@@ -36,7 +37,8 @@ class WarmCluster:
     ray_address: str  # host:port
     keeper: int  # id of the process that keeps it
     folder: Path  # of its files
-    versions: Mapping[str, str]  # of Python, Ray, this package, and the environment's folder
+    temporary_files: str  # folder of temporary files, where it was started
+    conditions: Mapping[str, str]  # of its start, which a command that uses it shares: `start_conditions`
 
     @property
     def is_kept(self) -> bool:
@@ -46,9 +48,8 @@ class WarmCluster:
 
 
 def warm_cluster() -> WarmCluster | None:
-    """Return the warm cluster of this user on this machine; None if there is none."""
-    found = next(announced(_FILE), None)
-    return None if found is None else _cluster(found[0])
+    """Return the warm cluster of this user, and of this RAY_TMPDIR or TMPDIR, on this machine; None if there is none."""
+    return next((cluster for cluster, _ in _found()), None)
 
 
 def this_warm_cluster() -> WarmCluster | None:
@@ -64,9 +65,9 @@ def this_warm_cluster() -> WarmCluster | None:
 def announce_warm(url: str, ray_address: str) -> None:
     """Write the file by which commands of this user find the cluster that this process keeps, which is ready."""
     folder = Path(os.environ[MARK])
-    cluster = WarmCluster(url, ray_address, os.getpid(), folder, versions())
+    cluster = WarmCluster(url, ray_address, os.getpid(), folder, _temporary_files(), start_conditions())
     new = folder / f"{_FILE}.new"
-    new.write_text(json.dumps(asdict(cluster) | {"folder": str(folder)}))
+    new.write_text(json.dumps(asdict(cluster), default=str))
     new.replace(folder / _FILE)
 
 
@@ -77,19 +78,17 @@ def join_warm(**options: Any) -> WarmCluster:
         options: Further options of `ray.init`.
 
     Raises:
-        ConfigError: There is none, it is not kept any longer, or other versions or API keys were set at its start.
+        ConfigError: There is none, it is not kept any longer, or it was started under other conditions or with other
+            API keys.
     """
-    found = next(announced(_FILE), None)
-    if found is None:
+    cluster, environment = next(_found(), (None, {}))
+    if cluster is None:
         raise ConfigError("no warm cluster of this user runs on this machine; start one with `vlagents-ray up`")
-    cluster, environment = _cluster(found[0]), found[1]
     if not cluster.is_kept:
         raise ConfigError(f"the process that kept the warm cluster ({cluster.keeper}) has ended; {AGAIN}")
-    here = versions()
-    other = [f"{name} {cluster.versions.get(name)}" for name in here if cluster.versions.get(name) != here[name]]
-    if other:
-        wanted = ", ".join(f"{name} {version}" for name, version in here.items())
-        raise ConfigError(f"the warm cluster was started with {', '.join(other)}, want {wanted}: {AGAIN}")
+    for name, here in start_conditions().items():
+        if (there := cluster.conditions.get(name)) != here:
+            raise ConfigError(f"{name}: the warm cluster was started with {there}, got {here} here; {AGAIN}")
     for name in _KEYS:
         if environment.get(name) != os.environ.get(name):
             raise ConfigError(
@@ -100,13 +99,18 @@ def join_warm(**options: Any) -> WarmCluster:
     return cluster
 
 
-def versions() -> dict[str, str]:
-    """Return what a command and a warm cluster must have in common: the workers have imported it already."""
+def start_conditions() -> dict[str, str]:
+    """Return what a command and a warm cluster must have in common.
+
+    Processes of the cluster have imported this package already, and look up relative paths and modules of the user
+    where the cluster was started.
+    """
     return {
-        "Python": platform.python_version(),
+        "Python": f"{platform.python_version()} in {sys.prefix}",
         "Ray": importlib.metadata.version("ray"),
-        "vlagents_ray": f"{importlib.metadata.version('vlagents-ray')} at {Path(__file__).parents[1]}",
-        "environment": sys.prefix,
+        "vlagents_ray": f"{importlib.metadata.version('vlagents-ray')} in {Path(__file__).parents[1]}",
+        "working directory": os.getcwd(),
+        "PYTHONPATH": os.environ.get("PYTHONPATH", ""),
     }
 
 
@@ -166,5 +170,20 @@ def abandoned_apps(folder: Path) -> Iterator[list[str]]:
             file.unlink(missing_ok=True)
 
 
-def _cluster(content: Mapping[str, Any]) -> WarmCluster:
-    return WarmCluster(**{**content, "folder": Path(content["folder"])})
+def _found() -> Iterator[tuple[WarmCluster, dict[str, str]]]:
+    """Find the warm clusters whose temporary files are where this process's are: jobs of a scheduler share none."""
+    for content, environment in announced(_FILE):
+        cluster = WarmCluster(
+            str(content.get("url")),
+            content["ray_address"],
+            int(content.get("keeper", 0)),
+            Path(environment[MARK]),
+            str(content.get("temporary_files")),
+            content.get("conditions", {}),  # another version of this package may have written something else
+        )
+        if cluster.temporary_files == _temporary_files():
+            yield cluster, environment
+
+
+def _temporary_files() -> str:
+    return os.environ.get("RAY_TMPDIR") or tempfile.gettempdir()

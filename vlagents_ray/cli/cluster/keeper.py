@@ -65,11 +65,11 @@ def idle_workers(folder: str, variables: Mapping[str, str]) -> dict[str, int]:
     found = {"replica": 0, "evaluation": 0}
     for process in marked(folder):
         try:
-            command = Path(f"/proc/{process}/cmdline").read_bytes()
+            words = Path(f"/proc/{process}/cmdline").read_bytes().split(b"\0")
             environment = set(Path(f"/proc/{process}/environ").read_bytes().split(b"\0"))
         except OSError:  # it has ended
             continue
-        if command.startswith(b"ray::IDLE") or b"default_worker.py" in command:
+        if words[0].startswith(b"ray::IDLE") or any(word.endswith(b"/default_worker.py") for word in words):
             found["evaluation" if pairs <= environment else "replica"] += 1
     return found
 

@@ -40,6 +40,8 @@ def warm_ray(port: int, imports: Sequence[str], idle: int) -> Iterator[Any]:
         "RAY_preload_python_modules": ",".join(imports),
         "RAY_num_workers_soft_limit": str(idle),
         "RAY_prestart_worker_first_driver": "0",
+        # For so long Serve gives the port of a replica that has ended to no other one, and there are 200.
+        "RAY_SERVE_HAPROXY_HARD_STOP_AFTER_S": "3600",
     }
     cpus = max(os.cpu_count() or 1, _CPUS)
     with contextlib.ExitStack() as stack:
