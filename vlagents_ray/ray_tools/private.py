@@ -9,12 +9,15 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import logging
 import pickle
 import sys
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
+
+log = logging.getLogger(__name__)
 
 # The loggers of what Ray and Serve say in the process that started them.
 LOGGERS = ("ray.serve", "ray._private.worker", "ray._private.authentication.authentication_token_setup")
@@ -129,10 +132,8 @@ def start_workers_ahead(number: int, env_vars: Mapping[str, str]) -> None:
     Args:
         number: Of processes; the daemon starts no more at once than there are cores.
         env_vars: Environment variables of the runtime environment of the actors that may use them.
-
-    Raises:
-        grpc.RpcError: The daemon does not answer.
     """
+    import grpc
     import ray
     from ray._private.grpc_utils import init_grpc_channel
     from ray.core.generated.common_pb2 import Language
@@ -146,7 +147,10 @@ def start_workers_ahead(number: int, env_vars: Mapping[str, str]) -> None:
         request.runtime_env_info.serialized_runtime_env = RuntimeEnv(env_vars=dict(env_vars)).serialize()
         request.runtime_env_info.runtime_env_config.setup_timeout_seconds = _SETUP_S
     with init_grpc_channel(f"{node['NodeManagerAddress']}:{node['NodeManagerPort']}") as channel:
-        NodeManagerServiceStub(channel).PrestartWorkers(request, timeout=_ANSWER_S)
+        try:
+            NodeManagerServiceStub(channel).PrestartWorkers(request, timeout=_ANSWER_S)
+        except grpc.RpcError as error:  # the next actors start without
+            log.warning("no process was started ahead: %s", error)
 
 
 def gpus_here() -> float:

@@ -48,7 +48,7 @@ class WarmCluster:
 
 
 def warm_cluster() -> WarmCluster | None:
-    """Return the warm cluster of this user, and of this RAY_TMPDIR or TMPDIR, on this machine; None if there is none."""
+    """Return the warm cluster of this user on this machine, with this RAY_TMPDIR or TMPDIR; None if there is none."""
     return next((cluster for cluster, _ in _found()), None)
 
 
@@ -84,11 +84,7 @@ def join_warm(**options: Any) -> WarmCluster:
     cluster, environment = next(_found(), (None, {}))
     if cluster is None:
         raise ConfigError("no warm cluster of this user runs on this machine; start one with `vlagents-ray up`")
-    if not cluster.is_kept:
-        raise ConfigError(f"the process that kept the warm cluster ({cluster.keeper}) has ended; {AGAIN}")
-    for name, here in start_conditions().items():
-        if (there := cluster.conditions.get(name)) != here:
-            raise ConfigError(f"{name}: the warm cluster was started with {there}, got {here} here; {AGAIN}")
+    require_usable(cluster)
     for name in _KEYS:
         if environment.get(name) != os.environ.get(name):
             raise ConfigError(
@@ -97,6 +93,15 @@ def join_warm(**options: Any) -> WarmCluster:
     serves = {name: value for name, value in environment.items() if name.startswith(_SERVE)}
     enter(f"the warm cluster at {cluster.url}", cluster.ray_address, environment, serves, **options)
     return cluster
+
+
+def require_usable(cluster: WarmCluster) -> None:
+    """Raise `ConfigError` if a warm cluster is not kept any longer, or was started under other conditions."""
+    if not cluster.is_kept:
+        raise ConfigError(f"the process that kept the warm cluster ({cluster.keeper}) has ended; {AGAIN}")
+    for name, here in start_conditions().items():
+        if (there := cluster.conditions.get(name)) != here:
+            raise ConfigError(f"{name}: the warm cluster was started with {there}, got {here} here; {AGAIN}")
 
 
 def start_conditions() -> dict[str, str]:

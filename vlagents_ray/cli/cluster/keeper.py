@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import logging
 import os
 import sys
 import threading
 from collections.abc import Mapping
 from pathlib import Path
 
-import grpc
-
 from vlagents_ray.cli.console import errors
 from vlagents_ray.cli.ray_session import quiet_ray
+from vlagents_ray.client.credentials import withheld
 from vlagents_ray.evaluate.plan.config import WorkerConfig
 from vlagents_ray.evaluate.workers.cluster import worker_variables
 from vlagents_ray.ray_tools.head_monitor import HeadMonitor
@@ -20,8 +18,6 @@ from vlagents_ray.ray_tools.private import start_workers_ahead
 from vlagents_ray.ray_tools.reaper import MARK, marked
 from vlagents_ray.ray_tools.signals import stop_signals
 from vlagents_ray.serve.launch.warm import remove_abandoned, warm_ray
-
-log = logging.getLogger(__name__)
 
 _REPLICAS = 1  # processes that are kept ready for policies
 _LOOK_S = 1.0
@@ -79,21 +75,24 @@ def main() -> None:
     port, workers = int(sys.argv[1]), int(sys.argv[2])
     variables = worker_variables(WorkerConfig().threads, gpus=False)
     idle = IdleWorkers({"replica": _REPLICAS, "evaluation": workers}, {"replica": {}, "evaluation": variables})
-    with errors(), stop_signals() as stop, quiet_ray(None), warm_ray(port, _IMPORTS, _REPLICAS + workers) as client:
-        head = HeadMonitor("`vlagents-ray up` starts another warm cluster")
-        _keep(head, idle, variables, client, stop)
+    with (
+        errors(),
+        stop_signals() as stop,
+        quiet_ray(None),
+        withheld(),  # workers get the key of their run when they are ready
+        warm_ray(port, _IMPORTS, _REPLICAS + workers) as client,
+    ):
+        _keep(HeadMonitor("`vlagents-ray up` starts another warm cluster"), idle, variables, client, stop)
 
 
 def _keep(
     head: HeadMonitor, idle: IdleWorkers, variables: Mapping[str, str], client: object, stop: threading.Event
 ) -> None:
+    """Do what is due once a second, until `stop`."""
     while not stop.wait(_LOOK_S):
         head.answers()
         remove_abandoned(client)
-        try:
-            idle.refill(idle_workers(os.environ[MARK], variables))
-        except grpc.RpcError as error:  # the next commands start without
-            log.warning("no process was started ahead: %s", error)
+        idle.refill(idle_workers(os.environ[MARK], variables))
 
 
 if __name__ == "__main__":

@@ -174,8 +174,8 @@ def _deploy(client: Any, config: ServeDeploySchema, *, own: bool, warm: bool, in
     plain = ours and config.model_fields_set <= _OUR_KEYS and all(keys <= _OUR_APP_KEYS for keys in stated)
     if warm and not plain:
         raise ConfigError(
-            "the deployment file has settings that Serve itself applies, and then Serve would remove the other servers of "
-            "the warm cluster; leave out --address"
+            "the deployment file has settings that Serve itself applies, and then Serve would remove the other servers "
+            "of the warm cluster; leave out --address"
         )
     if not plain or not (own or warm):
         client.deploy_apps(config)
