@@ -81,7 +81,11 @@ def test_it_is_one_of_this_user_alone(cluster: WarmCluster) -> None:
 
 def listening(pid: int) -> list[str]:
     try:
-        return [one.laddr.ip for one in psutil.Process(pid).net_connections("tcp") if one.status == "LISTEN"]
+        return [
+            one.laddr.ip.removeprefix("::ffff:")
+            for one in psutil.Process(pid).net_connections("tcp")
+            if one.status == "LISTEN"
+        ]
     except psutil.Error:
         return []
 

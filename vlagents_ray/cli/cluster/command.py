@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import select
 import shutil
 import signal
 import subprocess
@@ -73,15 +74,24 @@ def down_command() -> None:
         cluster = warm_cluster()
         if cluster is None:
             raise ConfigError("no warm cluster of yours is up on this machine; `vlagents-ray up` starts one")
-        if cluster.is_kept:
-            os.kill(cluster.keeper, signal.SIGTERM)
-            deadline = time.monotonic() + _END_S
-            while cluster.is_kept and time.monotonic() < deadline:
-                time.sleep(_LOOK_S)
-            if cluster.is_kept:
-                os.kill(cluster.keeper, signal.SIGKILL)
+        with contextlib.suppress(OSError):  # it has ended
+            _end_keeper(cluster)
         _clear(cluster)
         out.print("down")
+
+
+def _end_keeper(cluster: WarmCluster) -> None:
+    """Let the keeper end its cluster, if it still keeps it."""
+    process = os.pidfd_open(cluster.keeper)  # which stays that of the keeper if another process gets its id
+    try:
+        if not cluster.is_kept:
+            return
+        signal.pidfd_send_signal(process, signal.SIGTERM)
+        ended, _, _ = select.select([process], [], [], _END_S)
+        if not ended:
+            signal.pidfd_send_signal(process, signal.SIGKILL)
+    finally:
+        os.close(process)
 
 
 def _started(keeper: subprocess.Popen[bytes], log: Path) -> WarmCluster:
