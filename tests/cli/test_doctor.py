@@ -58,10 +58,12 @@ def test_every_check_gives_a_row_of_its_own_and_none_breaks() -> None:
     assert [row for row in rows if row.status != "ok" and not row.cure] == []
 
 
-def test_a_warm_cluster_that_cannot_be_used_from_here_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_warm_cluster_that_cannot_be_used_from_here_is_a_warning(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.setattr(doctor, "warm_cluster", lambda: None)
     assert doctor.warm().status == "ok"
-    cluster = WarmCluster("http://127.0.0.1:8000", "127.0.0.1:1", 5, Path("/nowhere"), "/tmp", {})
+    cluster = WarmCluster("http://127.0.0.1:8000", "127.0.0.1:1", 5, tmp_path, str(tmp_path), {})
     monkeypatch.setattr(doctor, "warm_cluster", lambda: cluster)
     row = doctor.warm()
     assert row.status == "warn"
