@@ -12,6 +12,7 @@ from pathlib import Path
 import psutil
 import pytest
 from eval_fakes import wait_for
+from listening_sockets import listeners
 from ray_processes import processes, ray_folder
 from serve_command import healthy
 
@@ -74,20 +75,9 @@ def test_it_is_one_of_this_user_alone(cluster: WarmCluster) -> None:
     again = run("up")
     assert again.returncode == 2
     assert f"is up already, at {cluster.url}" in again.stderr
-    connections = [one for pid in processes(cluster.folder) for one in listening(pid)]
-    assert connections
-    assert set(connections) <= {"127.0.0.1", "::1"}
-
-
-def listening(pid: int) -> list[str]:
-    try:
-        return [
-            one.laddr.ip.removeprefix("::ffff:")
-            for one in psutil.Process(pid).net_connections("tcp")
-            if one.status == "LISTEN"
-        ]
-    except psutil.Error:
-        return []
+    found = {one for one in listeners(psutil.Process(cluster.keeper)) if one.kind == "tcp"}
+    assert found
+    assert {one for one in found if not one.is_local} == set()
 
 
 def test_processes_wait_for_a_server_and_for_a_worker_of_an_evaluation(cluster: WarmCluster) -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-import sys
 import threading
 from collections.abc import Mapping
 from pathlib import Path
+
+import typer
 
 from vlagents_ray.cli.console import errors
 from vlagents_ray.cli.ray_session import quiet_ray
@@ -70,9 +71,8 @@ def idle_workers(folder: str, variables: Mapping[str, str]) -> dict[str, int]:
     return found
 
 
-def main() -> None:
+def main(port: int, workers: int) -> None:
     """Keep a warm cluster until SIGTERM, or until its Ray is lost."""
-    port, workers = int(sys.argv[1]), int(sys.argv[2])
     variables = worker_variables(WorkerConfig().threads, gpus=False)
     idle = IdleWorkers({"replica": _REPLICAS, "evaluation": workers}, {"replica": {}, "evaluation": variables})
     with (
@@ -96,4 +96,4 @@ def _keep(
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)
