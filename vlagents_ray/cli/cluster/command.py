@@ -103,9 +103,8 @@ def _started(keeper: subprocess.Popen[bytes], log: Path) -> WarmCluster:
             return cluster
         if keeper.poll() is not None:
             lines = log.read_text(errors="replace").strip().splitlines()
-            raise ConfigError(
-                f"the warm cluster did not start: {lines[-1].removeprefix('error ') if lines else 'no reason given'} (log: {log})"
-            )
+            reason = lines[-1].removeprefix("error ") if lines else "no reason given"
+            raise ConfigError(f"the warm cluster did not start: {reason} (log: {log})")
         time.sleep(_LOOK_S)
     raise PolicyUnavailable(f"the warm cluster did not start within {_START_S:g} s; log: {log}")
 
