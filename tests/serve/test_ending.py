@@ -9,7 +9,7 @@ import ray
 from ray.exceptions import ActorDiedError, GetTimeoutError
 from ray.serve._private.router import SharedRouterLongPollClient
 
-from vlagents_ray.serve.launch import server
+from vlagents_ray.serve.launch import serve_client
 
 
 @pytest.mark.parametrize(("error", "said"), [(ActorDiedError(), False), (GetTimeoutError(), True)])
@@ -25,7 +25,7 @@ def test_a_controller_that_ends_or_that_does_not_answer_is_no_error(
         _controller=controller, handle_cache={}, shutdown_cached_handles=lambda: None, _shutdown=False
     )
     monkeypatch.setattr(ray, "get", fail)
-    server._shutdown(client)
+    serve_client.shut_down(client)
     assert client._shutdown
     assert ("has not ended within" in caplog.text) is said
 
@@ -40,5 +40,5 @@ def test_a_controller_that_is_about_to_end_is_asked_for_no_more_news(monkeypatch
         _router=SimpleNamespace(_asyncio_router=SimpleNamespace(long_poll_client=own, _event_loop=1))
     )
     unused = SimpleNamespace(_router=None)
-    server._stop_long_polls(SimpleNamespace(_controller=None, handle_cache={"used": used, "unused": unused}))
+    serve_client._stop_long_polls(SimpleNamespace(_controller=None, handle_cache={"used": used, "unused": unused}))
     assert stopped == ["own", "shared"]

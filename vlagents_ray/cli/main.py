@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from vlagents_ray.cli.bench import bench
+from vlagents_ray.cli.cluster.command import down_command, up_command
 from vlagents_ray.cli.console import errors, fresh, out, progress
 from vlagents_ray.cli.evaluation.command import evaluate_command
 from vlagents_ray.cli.evaluation.results import export_command, merge_command, replay_command, report_command
@@ -50,6 +51,8 @@ def demo(
         run_evaluation(EvalConfig(policies=[policy], suites=[suite], workers=2, video="all", out=fresh(out_dir)))
 
 
+app.command("up")(up_command)
+app.command("down")(down_command)
 app.command("eval")(evaluate_command)
 app.command("export")(export_command)
 app.command("merge")(merge_command)

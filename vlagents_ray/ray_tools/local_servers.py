@@ -50,25 +50,44 @@ def join(server: str | None = None, **options: Any) -> LocalServer:
         ConfigError: No server of this user is ready on this machine, several are and `server` is None, or this process
             is in another Ray cluster.
     """
-    chosen, variables = _chosen(server)
+    chosen, environment = _chosen(server)
+    enter(chosen.url, chosen.ray_address, environment, {}, **options)
+    return chosen
+
+
+def enter(
+    name: str, ray_address: str, environment: Mapping[str, str], variables: Mapping[str, str], **options: Any
+) -> None:
+    """Connect this process to a Ray of this user on the loopback address, unless it is connected to it.
+
+    Args:
+        name: The cluster's name, for messages.
+        ray_address: Its address, host:port.
+        environment: The environment of its daemon, from which come the variables of Ray's token.
+        variables: Further environment variables to set here.
+        options: Further options of `ray.init`.
+
+    Raises:
+        ConfigError: This process is in another Ray cluster, or is to use no token.
+    """
     import ray
 
     from vlagents_ray.ray_tools.private import reread_authentication_mode, use_loopback
 
     if ray.is_initialized():
-        if ray.get_runtime_context().gcs_address == chosen.ray_address:
-            return chosen
+        if ray.get_runtime_context().gcs_address == ray_address:
+            return
         raise ConfigError(
             f"got a process in another Ray cluster, {ray.get_runtime_context().gcs_address}; want it in that of "
-            f"{chosen.url}: call ray.shutdown() before, or join() in place of ray.init()"
+            f"{name}: call ray.shutdown() before, or join() in place of ray.init()"
         )
     if os.environ.get(_MODE, "token").lower() != "token":
-        raise ConfigError(f"{_MODE}={os.environ[_MODE]}: the Ray of {chosen.url} wants its token; unset {_MODE}")
-    os.environ.update(variables)
+        raise ConfigError(f"{_MODE}={os.environ[_MODE]}: the Ray of {name} wants its token; unset {_MODE}")
+    tokens = {one: environment[one] for one in _TOKENS if environment.get(one)}
+    os.environ.update({_MODE: "token", _ALONE: "0"} | tokens | dict(variables))
     use_loopback(True)  # Ray read the variables when it was imported
     reread_authentication_mode()
-    ray.init(chosen.ray_address, **{"log_to_driver": True, "logging_level": "WARNING"} | options)
-    return chosen
+    ray.init(ray_address, **{"log_to_driver": True, "logging_level": "WARNING"} | options)
 
 
 def announce(url: str, apps: Mapping[str, str], ray_address: str) -> None:
@@ -90,7 +109,7 @@ def local_servers() -> list[LocalServer]:
 
 
 def _chosen(wanted: str | None) -> tuple[LocalServer, dict[str, str]]:
-    """Return the server that `wanted` names, and the environment variables of a process that joins it."""
+    """Return the server that `wanted` names, and the environment of its Ray's daemon."""
     found = list(_found())
     fitting = [one for one in found if wanted is None or wanted.rstrip("/") == one[0].url or wanted in one[0].apps]
     if len(fitting) == 1:
@@ -107,21 +126,30 @@ def _chosen(wanted: str | None) -> tuple[LocalServer, dict[str, str]]:
 
 
 def _found() -> Iterator[tuple[LocalServer, dict[str, str]]]:
+    for content, environment in announced(_FILE):
+        yield LocalServer(content["url"], tuple(content["apps"]), content["ray_address"]), environment
+
+
+def announced(name: str) -> Iterator[tuple[dict[str, Any], dict[str, str]]]:
+    """Find the Ray clusters of this user on this machine that have announced themselves.
+
+    Args:
+        name: The file in a cluster's private folder: JSON with "ray_address", which is host:port.
+
+    Yields:
+        The content of the file, and the environment of the cluster's daemon.
+    """
     for process in Path("/proc").glob("[0-9]*"):
         try:
             words = (process / "cmdline").read_bytes().split(b"\0")
-            if Path(os.fsdecode(words[0])).name != os.fsdecode(_DAEMON):
+            if Path(os.fsdecode(words[0])).name != os.fsdecode(_DAEMON) or process.stat().st_uid != os.getuid():
                 continue
             pairs = (one.partition(b"=") for one in (process / "environ").read_bytes().split(b"\0"))
-            environment = {os.fsdecode(name): os.fsdecode(value) for name, _, value in pairs}
-            file = Path(environment[MARK]) / _FILE
-            server = LocalServer(**json.loads(file.read_text()))
-        except (OSError, KeyError, ValueError, TypeError):  # it has ended, is another user's, or not of a server
+            environment = {os.fsdecode(key): os.fsdecode(value) for key, _, value in pairs}
+            content = json.loads((Path(environment[MARK]) / name).read_text())
+            address = f"{_ADDRESS.decode()}{content['ray_address']}"
+        except (OSError, KeyError, ValueError, TypeError):  # it has ended, is another user's, or not announced
             continue
-        # A killed server may have left the folder, and another one may use it now.
-        if any(f"{_ADDRESS.decode()}{server.ray_address}" in os.fsdecode(word) for word in words):
-            tokens = {name: environment[name] for name in _TOKENS if environment.get(name)}
-            yield (
-                LocalServer(server.url, tuple(server.apps), server.ray_address),
-                {_MODE: "token", _ALONE: "0"} | tokens,
-            )
+        # What was killed may have left the folder, and another cluster may use it now.
+        if any(address in os.fsdecode(word) for word in words):
+            yield content, environment

@@ -18,6 +18,7 @@ from vlagents_ray.ray_tools.local_servers import join, local_servers
 from vlagents_ray.ray_tools.private import address_of_ray_start, node_that_failed, only_needed_processes
 from vlagents_ray.ray_tools.reaper import MARK, reaped
 from vlagents_ray.ray_tools.signals import own_sigterm
+from vlagents_ray.ray_tools.warm_cluster import join_warm, warm_cluster
 
 log = logging.getLogger(__name__)
 
@@ -39,8 +40,8 @@ def joined(address: str | None = None, **options: Any) -> Iterator[None]:
 
     Args:
         address: The address of the cluster. None is the cluster of RAY_ADDRESS, or of this machine. The URL of a server
-            on this machine stands for its Ray cluster, as does "auto" if there is no other one. "local" starts a
-            cluster that ends with the context.
+            on this machine stands for its Ray cluster. "auto" is the cluster of `vlagents-ray up`; without one, that
+            of `ray start`; without that, a server's. "local" starts a cluster that ends with the context.
         options: Further options of `ray.init`.
 
     Raises:
@@ -58,6 +59,10 @@ def joined(address: str | None = None, **options: Any) -> Iterator[None]:
                 folder = stack.enter_context(ray_folder())
                 with _marked(folder):
                     start_ray(_temp_dir=str(folder / FILES), **options)
+            elif (address or os.environ.get("RAY_ADDRESS")) == "auto" and warm_cluster() is not None:
+                stack.enter_context(_restored_environment())
+                with own_sigterm():
+                    join_warm(**options)
             elif (server := _local_server(address or os.environ.get("RAY_ADDRESS"))) is not None:
                 with own_sigterm():
                     join(server or None, **options)
@@ -72,6 +77,17 @@ def joined(address: str | None = None, **options: Any) -> Iterator[None]:
             ) from error
         stack.push(unless_lost(ray.shutdown))
         yield
+
+
+@contextlib.contextmanager
+def _restored_environment() -> Iterator[None]:
+    """Undo at the end of the context what was changed in the environment of this process."""
+    before = dict(os.environ)
+    try:
+        yield
+    finally:
+        os.environ.clear()
+        os.environ.update(before)
 
 
 def _local_server(address: str | None) -> str | None:

@@ -8,30 +8,26 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import logging
 import os
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from ray.serve.schema import ServeDeploySchema
 
-from vlagents_ray.errors import ConfigError, PolicyUnavailable
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.ray_tools.local_servers import announce
 from vlagents_ray.ray_tools.private import (
     build_app,
-    end_controller,
-    forget_serve,
     gpus_here,
-    long_polls,
     node_of_this_process,
     proxies_now,
-    proxy_timeout_s,
     start_serve,
 )
 from vlagents_ray.ray_tools.session import joined, unless_lost
+from vlagents_ray.ray_tools.warm_cluster import owned_apps, this_warm_cluster
 from vlagents_ray.serve.access.api_keys import require_access, warn_of_plain_http
 from vlagents_ray.serve.access.tls import Tls
 from vlagents_ray.serve.config.deployment import AccessArgs, ServerArgs
@@ -39,15 +35,13 @@ from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH, with_gateways
 from vlagents_ray.serve.launch.haproxy import PublicListener, wait_for_haproxy
 from vlagents_ray.serve.launch.private_cluster import own_ray
 from vlagents_ray.serve.launch.readiness import wait_until_ready
+from vlagents_ray.serve.launch.serve_client import remove_apps, shut_down, wait_for_proxies
+from vlagents_ray.serve.launch.warm import listener_of, require_routes
 from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK, free_port, keep
 
 __all__ = ["Server", "free_port", "running_server", "spread_over_gpus"]
 
-log = logging.getLogger(__name__)
-
 _START_S, _GROW_S = 600.0, 3600.0  # time for a policy to get ready: here; on a cluster that may add a machine first
-_SHUTDOWN_S = 30.0
-_LOOK_S = 0.2  # between two looks at the proxies that Serve has
 _END_S = 0.1  # period at which a replica that ends checks for remaining requests; Serve's own is 2 s
 # Keys of a deployment file, and of an application in it, that Serve does not have to apply.
 _OUR_KEYS = {"applications", "http_options", "proxy_location"}
@@ -84,7 +78,8 @@ def running_server(
     started, unless this process is connected to one. `timeout_s` defaults to 600 s, with an `address` to 3600 s.
     `keys_file`, `insecure` and `plain_http` replace those of `access` in the applications' args; unless `host` is a
     loopback address, one of the first two must be set somewhere. Without `ingress` a Ray that is started here serves
-    only its own processes, at `serve://APP`, and nothing over HTTP, which makes start and end faster.
+    only its own processes, at `serve://APP`, and nothing over HTTP, which makes start and end faster. In the cluster of
+    `vlagents-ray up` the server listens where that cluster does, and its applications alone are ended.
     Raises `ConfigError` if the deployment fails, `PolicyUnavailable` if it takes too long.
     """
     config = with_gateways_at(config, host)
@@ -96,7 +91,6 @@ def running_server(
         tls.check()
     for app in _our_apps(config):
         keep(*(one.port for one in ServerArgs(**app.args).dialects.gateways().values()))
-    port = port or free_port(host)
     import ray
     from ray import serve
 
@@ -104,30 +98,44 @@ def running_server(
     if own:
         _require_gpus(config, gpus_here())
     with contextlib.ExitStack() as stack:
-        ingress = ingress or not own or len(_our_apps(config)) < len(config.applications)
-        http = stack.enter_context(_ray(address, host, port, tls, num_cpus, show_logs, ingress))
+        with_http = ingress or len(_our_apps(config)) < len(config.applications)
+        ingress = with_http or not own
+        http = stack.enter_context(_ray(address, host, port or free_port(host), tls, num_cpus, show_logs, ingress))
+        warm = this_warm_cluster()
+        if warm is not None:
+            ingress = with_http
+            http = listener_of(warm, host, port)
+            stack.enter_context(owned_apps(warm, [app.name for app in config.applications]))
+        port = http["port"] if warm is not None or not port else port
         location = "Disabled" if not ingress else "HeadOnly" if address is None else "EveryNode"
         client, proxies = start_serve(http, location)
-        if running := sorted(serve.status().applications):
-            raise ConfigError(
-                f"Serve runs {running} on this cluster already; use their URL (serve://{running[0]} inside the "
-                f"cluster), or `serve deploy` one file that holds those and yours"
-            )
-        stack.push(unless_lost(lambda: _shutdown(client)))
-        _require_gpus(config)
+        if warm is not None:
+            require_routes(client, config, ingress=ingress)
+            names = [app.name for app in config.applications]
+            stack.push(unless_lost(lambda: remove_apps(client, names, wait=ingress)))
+            _require_gpus(config, ray.cluster_resources().get("GPU", 0.0))
+        else:
+            if running := sorted(serve.status().applications):
+                raise ConfigError(
+                    f"Serve runs {running} on this cluster already; use their URL (serve://{running[0]} inside the "
+                    f"cluster), or `serve deploy` one file that holds those and yours"
+                )
+            stack.push(unless_lost(lambda: shut_down(client)))
+            _require_gpus(config)
+        here = address is None or warm is not None
         remind = functools.partial(_missing_gpus, config)
-        _deploy(client, config, own=own, ends_at_once=not ingress)
+        _deploy(client, config, own=own, warm=warm is not None, ingress=ingress)
         url = f"{'http' if tls is None else 'https'}://{LOOPBACK if host == EVERYWHERE else host}:{port}"
         paths = {app.name: (app.route_prefix or "").rstrip("/") for app in config.applications}
         if timeout_s is None:
-            timeout_s = _START_S if address is None else _GROW_S
+            timeout_s = _START_S if here else _GROW_S
         deadline = time.monotonic() + timeout_s
         inside = _internal_url(http)
         ours = {app.name for app in _our_apps(config)}
         urls = {name: inside + path if ingress else None for name, path in paths.items()}
-        _wait_for_proxies(proxies, lambda: proxies_now(client))
+        wait_for_proxies(proxies, lambda: proxies_now(client))
         wait_until_ready(serve, urls, ours, deadline, remind)
-        if ingress and address is None and (stats_port := os.environ.get("RAY_SERVE_HAPROXY_STATS_PORT")):
+        if ingress and here and (stats_port := os.environ.get("RAY_SERVE_HAPROXY_STATS_PORT")):
             wait_for_haproxy(serve, paths, int(stats_port), deadline)
         if own and ingress:
             announce(url, paths, ray.get_runtime_context().gcs_address)
@@ -150,25 +158,33 @@ def _access(config: ServeDeploySchema, keys_file: Path | None, insecure: bool, p
     return changed
 
 
-def _deploy(client: Any, config: ServeDeploySchema, *, own: bool, ends_at_once: bool) -> None:
+def _deploy(client: Any, config: ServeDeploySchema, *, own: bool, warm: bool, ingress: bool) -> None:
     """Deploy the applications, without waiting for them.
 
     Serve starts a process for a deployment file, which imports the server once more. On our `own` Ray, applications of
     this package are built here instead, unless their file has settings that Serve must apply: such a file may also be
-    deployed again, and Serve would replace all replicas of an application that it did not build.
-    `ends_at_once` ends replicas without a wait for requests: their clients have ended before.
+    deployed again, and Serve would replace all replicas of an application that it did not build. In a `warm` cluster
+    such a file is refused, as Serve would remove the applications of others.
+    Without `ingress` replicas end without a wait for requests: their clients have ended before.
     """
     from vlagents_ray.serve.replica.app import build
 
     stated = [app.model_dump(exclude_defaults=True).keys() for app in config.applications]
     ours = len(_our_apps(config)) == len(config.applications)
-    if not (own and ours and config.model_fields_set <= _OUR_KEYS and all(keys <= _OUR_APP_KEYS for keys in stated)):
+    plain = ours and config.model_fields_set <= _OUR_KEYS and all(keys <= _OUR_APP_KEYS for keys in stated)
+    if warm and not plain:
+        raise ConfigError(
+            "the deployment file has settings that Serve itself applies, and then Serve would remove the other servers "
+            "of the warm cluster; leave out --address"
+        )
+    if not plain or not (own or warm):
         client.deploy_apps(config)
         return
-    changes = {"graceful_shutdown_wait_loop_s": _END_S} if ends_at_once else {}
+    changes = {} if ingress else {"graceful_shutdown_wait_loop_s": _END_S}
     built = []
     for app in config.applications:
-        one = build_app(build(ServerArgs(**app.args)), name=app.name, route_prefix=app.route_prefix)
+        route = app.route_prefix if ingress or own else None  # the ingress of a warm cluster would have it, too
+        one = build_app(build(ServerArgs(**app.args)), name=app.name, route_prefix=route)
         one.deployments[:] = [part.options(**changes) for part in one.deployments]
         built.append(one)
     client.deploy_applications(built, wait_for_ingress_deployment_creation=False, wait_for_applications_running=False)
@@ -261,27 +277,6 @@ def _ray(
         yield {"host": host, "port": port}
 
 
-def _wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) -> None:
-    """Wait until each of the proxies listens; raise the error of one that cannot.
-
-    Serve kills a proxy that does not start within some seconds, as on a busy node, and starts another one.
-    """
-    import ray
-
-    timeout_s = proxy_timeout_s()
-    deadline = time.monotonic() + timeout_s
-    while True:
-        try:
-            ray.get(proxies, timeout=max(deadline - time.monotonic(), 0.0))
-        except (ray.exceptions.GetTimeoutError, ray.exceptions.RayActorError) as error:
-            if time.monotonic() >= deadline:
-                raise PolicyUnavailable(f"Serve's proxies do not listen within {timeout_s:g} s") from error
-            time.sleep(_LOOK_S)
-            proxies = look_again()
-        else:
-            return
-
-
 def spread_over_gpus(parts: Mapping[str, ServeDeploySchema], *, kept: float = 0.0) -> dict[str, ServeDeploySchema]:
     """Return deployments that share the GPUs of the connected cluster equally, except for `kept` GPUs."""
     import ray
@@ -305,29 +300,3 @@ def _internal_url(http: Mapping[str, Any]) -> str:
     """Return Serve's own URL, for a process on its node."""
     scheme = "https" if http.get("ssl_certfile") else "http"
     return f"{scheme}://{LOOPBACK if http['host'] == EVERYWHERE else http['host']}:{http['port']}"
-
-
-def _stop_long_polls(client: Any) -> None:
-    """Stop long polling of the controller: Ray would report a call in progress at its end as a failed task."""
-    for poll in long_polls(client):
-        poll.stop()
-
-
-def _shutdown(client: Any) -> None:
-    """End Serve, so that replicas drain and HAProxy stops, like `serve.shutdown`, but without its error message.
-
-    The controller ends itself during this call, which Ray would report as a failed task that will be
-    retried.
-    """
-    import ray
-
-    _stop_long_polls(client)
-    client.shutdown_cached_handles()
-    last = end_controller(client)
-    try:
-        ray.get(last, timeout=_SHUTDOWN_S)
-    except ray.exceptions.RayActorError:
-        pass
-    except ray.exceptions.GetTimeoutError:
-        log.warning("Serve has not ended within %g s; nobody waits for it any longer", _SHUTDOWN_S)
-    forget_serve(client)

@@ -1,0 +1,169 @@
+"""Which warm cluster a command finds, under which conditions it uses it, and who owns what runs there."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.ray_tools import warm_cluster as module
+from vlagents_ray.ray_tools.reaper import MARK
+from vlagents_ray.ray_tools.warm_cluster import (
+    abandoned_apps,
+    announce_warm,
+    join_warm,
+    kept,
+    locked,
+    owned_apps,
+    warm_cluster,
+)
+
+ADDRESS = "127.0.0.1:1"
+HOLD = "import sys; from pathlib import Path; from vlagents_ray.ray_tools.warm_cluster import locked\n"
+HOLD += "with locked(Path(sys.argv[1])) as mine: print(mine, flush=True); sys.stdin.read()"
+
+
+@contextlib.contextmanager
+def raylet(folder: Path, **environment: str) -> Iterator[None]:
+    """A process that looks like Ray's daemon of the cluster in `folder`."""
+    words = ["/ray/raylet", "-c", "read forever", "raylet", f"--gcs-address={ADDRESS}"]
+    with subprocess.Popen(
+        words, executable="/bin/sh", env={MARK: str(folder)} | environment, stdin=subprocess.PIPE
+    ) as process:
+        try:
+            yield
+        finally:
+            process.kill()
+
+
+@contextlib.contextmanager
+def held(file: Path) -> Iterator[subprocess.Popen[str]]:
+    """Another process that has locked a file."""
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLD, str(file)], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "True\n"
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of a warm cluster that is announced; no other one of this machine is found."""
+    monkeypatch.setenv("RAY_TMPDIR", str(tmp_path))
+    monkeypatch.setenv(MARK, str(tmp_path))
+    monkeypatch.setattr(module, "enter", lambda name, *_: pytest.fail(f"joined {name}"))
+    announce_warm("http://127.0.0.1:8000", ADDRESS)
+    return tmp_path
+
+
+def test_it_is_found_as_long_as_its_ray_runs(folder: Path) -> None:
+    assert warm_cluster() is None
+    with raylet(folder):
+        found = warm_cluster()
+        assert found is not None
+        assert (found.url, found.ray_address, found.keeper) == ("http://127.0.0.1:8000", ADDRESS, os.getpid())
+    assert warm_cluster() is None
+    with pytest.raises(ConfigError, match="start one with `vlagents-ray up`"):
+        join_warm()
+
+
+def test_one_of_another_user_is_not_found(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Root could read its files."""
+    with raylet(folder):
+        assert warm_cluster() is not None
+        me = os.getuid()
+        monkeypatch.setattr(os, "getuid", lambda: me + 1)
+        assert warm_cluster() is None
+
+
+def test_one_with_temporary_files_elsewhere_is_not_found(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As those of two jobs of a scheduler on one node."""
+    with raylet(folder):
+        monkeypatch.setenv("RAY_TMPDIR", "/elsewhere")
+        assert warm_cluster() is None
+
+
+def test_one_without_keeper_is_refused(folder: Path) -> None:
+    with raylet(folder), pytest.raises(ConfigError, match=r"kept the warm cluster .* has ended; `vlagents-ray down`"):
+        join_warm()
+
+
+def test_it_is_used_under_the_conditions_of_its_start_only(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    with raylet(folder), held(folder / "keeper.lock"):
+        with pytest.raises(pytest.fail.Exception, match="joined the warm cluster"):
+            join_warm()
+        with monkeypatch.context() as patch:
+            elsewhere = tmp_path_factory.mktemp("elsewhere")
+            patch.chdir(elsewhere)
+            with pytest.raises(ConfigError, match=rf"working directory: .*started with .*got {elsewhere} here; `vlag"):
+                join_warm()
+        with monkeypatch.context() as patch:
+            patch.setattr(sys, "prefix", "/another")
+            with pytest.raises(ConfigError, match=r"Python: .*got .* in /another here; .*`vlagents-ray up`"):
+                join_warm()
+        with monkeypatch.context() as patch:
+            patch.setenv("VLAGENTS_RAY_KEYS", "a secret")
+            with pytest.raises(ConfigError, match="VLAGENTS_RAY_KEYS is not what it was") as refused:
+                join_warm()
+            assert "a secret" not in str(refused.value)
+
+
+def test_what_another_version_announced_is_refused(folder: Path) -> None:
+    (folder / "warm.json").write_text(
+        json.dumps({"ray_address": ADDRESS, "temporary_files": str(folder), "what": "another version writes"})
+    )
+    with raylet(folder), held(folder / "keeper.lock"), pytest.raises(ConfigError, match="was started with None, got"):
+        join_warm()
+
+
+def test_an_application_is_owned_by_one_process_until_it_ends(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_LOCK_S", 0.0)
+    with raylet(folder):
+        cluster = warm_cluster()
+    assert cluster is not None
+    with held(folder / "app-noop") as owner:
+        with abandoned_apps(folder) as names:
+            assert names == []
+        with pytest.raises(ConfigError, match="another command serves 'noop'"), owned_apps(cluster, ["noop"]):
+            pytest.fail("owned it")
+        owner.kill()
+        owner.wait()
+        with abandoned_apps(folder) as names:
+            assert names == ["noop"]
+    with owned_apps(cluster, ["noop"]), abandoned_apps(folder) as names:
+        assert names == []
+    assert not (folder / "app-noop").exists()
+
+
+def test_a_keeper_is_known_by_its_lock(folder: Path) -> None:
+    with raylet(folder):
+        cluster = warm_cluster()
+    assert cluster is not None
+    assert not cluster.is_kept
+    with kept():
+        assert cluster.is_kept
+
+
+def test_the_lock_of_a_removed_file_is_none(tmp_path: Path) -> None:
+    """Else two processes would each have locked a file of that name."""
+    file = tmp_path / "lock"
+    with locked(file) as mine:
+        assert mine
+        file.unlink()
+        with locked(file) as again:
+            assert again
+    with locked(tmp_path / "no" / "folder") as mine:
+        assert not mine

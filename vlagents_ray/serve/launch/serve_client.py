@@ -1,0 +1,82 @@
+"""Serve as the process sees it that started it: its proxies, its applications, and its end."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Collection
+from typing import Any
+
+from vlagents_ray.errors import PolicyUnavailable
+from vlagents_ray.ray_tools.private import end_controller, forget_serve, long_polls, proxy_timeout_s
+
+log = logging.getLogger(__name__)
+
+_SHUTDOWN_S = 30.0
+_LOOK_S = 0.2  # between two looks at the proxies, or the applications, that Serve has
+
+
+def wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) -> None:
+    """Wait until each of the proxies listens; raise the error of one that cannot.
+
+    Serve kills a proxy that does not start within some seconds, as on a busy node, and starts another one.
+    """
+    import ray
+
+    timeout_s = proxy_timeout_s()
+    deadline = time.monotonic() + timeout_s
+    while True:
+        try:
+            ray.get(proxies, timeout=max(deadline - time.monotonic(), 0.0))
+        except (ray.exceptions.GetTimeoutError, ray.exceptions.RayActorError) as error:
+            if time.monotonic() >= deadline:
+                raise PolicyUnavailable(f"Serve's proxies do not listen within {timeout_s:g} s") from error
+            time.sleep(_LOOK_S)
+            proxies = look_again()
+        else:
+            return
+
+
+def remove_apps(client: Any, names: Collection[str], *, wait: bool) -> None:
+    """Remove applications from a Serve that goes on; `wait` until their replicas have ended.
+
+    Args:
+        client: Serve's client.
+        names: The applications.
+        wait: Whether to wait. Else Serve ends the replicas by itself.
+    """
+    from ray import serve
+
+    client.delete_apps(list(names), blocking=False)
+    deadline = time.monotonic() + _SHUTDOWN_S
+    while wait and not serve.status().applications.keys().isdisjoint(names):
+        if time.monotonic() > deadline:
+            log.warning("%s have not ended within %g s; Serve goes on with it", sorted(names), _SHUTDOWN_S)
+            return
+        time.sleep(_LOOK_S)
+
+
+def _stop_long_polls(client: Any) -> None:
+    """Stop long polling of the controller: Ray would report a call in progress at its end as a failed task."""
+    for poll in long_polls(client):
+        poll.stop()
+
+
+def shut_down(client: Any) -> None:
+    """End Serve, so that replicas drain and HAProxy stops, like `serve.shutdown`, but without its error message.
+
+    The controller ends itself during this call, which Ray would report as a failed task that will be
+    retried.
+    """
+    import ray
+
+    _stop_long_polls(client)
+    client.shutdown_cached_handles()
+    last = end_controller(client)
+    try:
+        ray.get(last, timeout=_SHUTDOWN_S)
+    except ray.exceptions.RayActorError:
+        pass
+    except ray.exceptions.GetTimeoutError:
+        log.warning("Serve has not ended within %g s; nobody waits for it any longer", _SHUTDOWN_S)
+    forget_serve(client)
