@@ -72,7 +72,7 @@ def test_the_rows_come_one_by_one(way: str, serving: Serve) -> None:
     stream = None
     agent = serving(policy, way)
     assert agent.act_parts == "exact"
-    stream = agent.act_stream(Obs(info={"value": 5.0}))
+    stream = agent.act_stream(Obs(info={"value": 5.0, "done": True}))
     for row in range(ROWS):
         policy.gate.release()
         part = next(stream)

@@ -27,7 +27,7 @@ class InParts(Agent):
     """Row r of an observation with the value v is [v, r]; a part is a row. With a gate, each part takes a permit.
 
     `info["fail_at"]` names the row at which it fails, `info["broken_at"]` a row that is NaN, and `info["ends_at"]` one
-    before which it stops without a word.
+    before which it stops without a word; with `info["done"]` the last part says `done`.
     """
 
     shared: ClassVar[tuple[str, ...]] = ("gate", "record")
@@ -61,7 +61,7 @@ class InParts(Agent):
                 last = row == ROWS - 1
                 self.acts += last
                 rows = np.array([[obs.info.get("value", 0.0), number]], np.float32)
-                yield Act(rows, done=last, info={"acts": self.acts}, more=not last)
+                yield Act(rows, done=last and bool(obs.info.get("done")), info={"acts": self.acts}, more=not last)
                 given += 1
         finally:
             self.record.closed.append(given)

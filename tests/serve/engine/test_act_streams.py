@@ -79,7 +79,7 @@ def test_the_parts_of_an_act_are_one_step_whose_last_reply_says_the_rest(
     policy: Agent, serving: Callable[..., Engine]
 ) -> None:
     caller = Caller(serving(policy))
-    first, second = caller.act(value=1.0), caller.act(value=2.0)
+    first, second = caller.act(value=1.0, done=True), caller.act(value=2.0)
     assert rows(first) == [[1.0, row] for row in range(ROWS)]
     assert rows(second) == [[2.0, row] for row in range(ROWS)]
     assert [reply.act.more for reply in first if reply.act] == [True, True, True, False]
