@@ -18,7 +18,8 @@ from tests.simulation.clients import Robot, Violation, play
 from tests.simulation.world import Replica, World
 from vlagents_ray.errors import UnknownSession, VLAgentsError
 from vlagents_ray.protocol.messages import Reply, Request
-from vlagents_ray.serve.engine.dispatch import Dispatcher, ReplyCollector
+from vlagents_ray.serve.engine.dispatch import Dispatcher
+from vlagents_ray.serve.engine.responses import ReplyCollector
 from vlagents_ray.serve.scaling import held_sessions, session_migration
 from vlagents_ray.serve.sessions import Session
 

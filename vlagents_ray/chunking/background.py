@@ -3,23 +3,45 @@
 from __future__ import annotations
 
 import threading
+from collections import deque
+from collections.abc import Generator
 from dataclasses import dataclass
 
+from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Act, Agent, Obs
 
 _CLOSE_S = 2.0
 
 
+def parts_of(agent: Agent, obs: Obs) -> Generator[Act, None, None]:
+    """Yield the parts of the policy's chunk, if it gives parts, or the whole chunk.
+
+    Raises:
+        PolicyFailed: The policy ends without a last part.
+    """
+    if agent.act_parts is None:
+        yield agent.act(obs)
+        return
+    stream = agent.act_stream(obs)
+    for part in stream:
+        if not part.more:
+            stream.close()  # so that nothing of it is left to run when the caller has the last part
+            yield part
+            return
+        yield part
+    raise PolicyFailed("act_stream: it ended without a last part, i.e. one without `more`")
+
+
 @dataclass(frozen=True, slots=True)
 class AsyncAnswer:
-    """The policy's answer to a request, or its error."""
+    """The policy's answer to a request, or a part of it, or its error."""
 
     tick: int  # the tick of its observation
     result: Act | Exception
 
 
 class AsyncCaller:
-    """A thread that calls `agent.act`, so that the caller's own thread never waits for it.
+    """A thread that calls `agent.act` or `act_stream`, so that the caller's own thread never waits for it.
 
     Nothing else may use the agent during a request; `settle` waits for its end.
     """
@@ -28,7 +50,7 @@ class AsyncCaller:
         self._agent = agent
         self._changed = threading.Condition()
         self._job: tuple[int, Obs] | None = None
-        self._answer: AsyncAnswer | None = None
+        self._answers: deque[AsyncAnswer] = deque()
         self._closing = False
         self._thread = threading.Thread(target=self._run, name="vlagents-ray-caller", daemon=True)
         self._thread.start()
@@ -36,7 +58,7 @@ class AsyncCaller:
     @property
     def idle(self) -> bool:
         """Whether there is neither a request in progress nor an answer to be taken."""
-        return self._job is None and self._answer is None
+        return self._job is None and not self._answers
 
     def ask(self, tick: int, obs: Obs) -> None:
         """Begin a request, only while `idle`. The caller must not change `obs` afterwards."""
@@ -45,19 +67,18 @@ class AsyncCaller:
             self._changed.notify_all()
 
     def take(self, wait_s: float = 0.0) -> AsyncAnswer | None:
-        """Return the answer if one comes within `wait_s` seconds, else None."""
-        if self._answer is None and wait_s > 0:
+        """Return the answer, or its next part, if that comes within `wait_s` seconds, else None."""
+        if not self._answers and wait_s > 0:
             with self._changed:
-                self._changed.wait_for(lambda: self._answer is not None, wait_s)
+                self._changed.wait_for(lambda: self._answers, wait_s)
         with self._changed:
-            answer, self._answer = self._answer, None
-        return answer
+            return self._answers.popleft() if self._answers else None
 
     def settle(self) -> None:
         """Wait for the end of the request in progress, however long that takes, and drop its answer."""
         with self._changed:
             self._changed.wait_for(lambda: self._job is None)
-            self._answer = None
+            self._answers.clear()
 
     def close(self) -> None:
         """Close the agent as soon as its request is over; wait for that for two seconds at most."""
@@ -75,11 +96,15 @@ class AsyncCaller:
                 break
             tick, obs = job
             try:
-                result: Act | Exception = self._agent.act(obs)
+                for part in parts_of(self._agent, obs):
+                    self._note(AsyncAnswer(tick, part), last=not part.more)
             except Exception as error:  # noqa: BLE001 - raised or reported where the answer is taken
-                result = error
-            with self._changed:
-                self._answer = AsyncAnswer(tick, result)
-                self._job = None  # last: `idle` takes no lock
-                self._changed.notify_all()
+                self._note(AsyncAnswer(tick, error), last=True)
         self._agent.close()
+
+    def _note(self, answer: AsyncAnswer, *, last: bool) -> None:
+        with self._changed:
+            self._answers.append(answer)
+            if last:
+                self._job = None  # after the answer: `idle` takes no lock
+            self._changed.notify_all()

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vlagents_ray.errors import ConfigError, PolicyFailed
-from vlagents_ray.interface import DELAY, LEFTOVER
+from vlagents_ray.interface import AGE, DELAY, LEFTOVER, SILENT, Act
 
 Merge = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """(D,) of the older chunks and (D,) of a newer one -> (D,), for one tick."""
@@ -46,6 +46,7 @@ class Chunk(NamedTuple):
     info: Mapping[str, Any] = MappingProxyType({})  # the info of the policy's Act
     tick: int = 0  # the tick of the observation
     seen_at: float = 0.0  # s, of `time.monotonic`: when the observation was captured
+    more: bool = False  # whether further rows will come, see `ChunkBuffer.extend`
 
     @property
     def end(self) -> int:
@@ -59,6 +60,13 @@ class Step(NamedTuple):
     action: np.ndarray  # (D,) float32
     chunk: Chunk  # the newest chunk that the action comes from
     row: int  # the row of that chunk
+
+    def played(self, action: np.ndarray, tick: int, silent_s: float) -> Act:
+        """Return `action` in place of the planned one, for a tick, with what is known of its chunk."""
+        chunk = self.chunk
+        about = {AGE: tick - chunk.tick, "chunk": chunk.number, "row": self.row, SILENT: silent_s}
+        done = chunk.done and self.row == len(chunk.rows) - 1
+        return Act(action.copy(), done, {**chunk.info, **about})
 
 
 class ChunkBuffer:
@@ -96,14 +104,14 @@ class ChunkBuffer:
         If there is nothing else, the last row may be executed one step late: an answer with a single action has no
         other row, and comes when the action before it has been executed.
         """
-        while self._chunks and self._chunks[0].end <= self.executed:
-            self._chunks.popleft()
-        if chunk.end == self.executed and self.next is None:
+        if chunk.end == self.executed and self.next is None and not chunk.more:
             chunk = chunk._replace(step=chunk.step + 1)
-        if chunk.end <= self.executed:
-            return False
-        self._chunks.append(chunk)
-        return True
+        return self._append(chunk)
+
+    def extend(self, chunk: Chunk) -> bool:
+        """Replace the chunk of the same number by this one, which has further rows; return as `add`."""
+        self._chunks = deque(one for one in self._chunks if one.number != chunk.number)
+        return self._append(chunk)
 
     @property
     def next(self) -> Step | None:
@@ -149,6 +157,14 @@ class ChunkBuffer:
         if dropped:
             self._chunks = deque(kept)
         return dropped
+
+    def _append(self, chunk: Chunk) -> bool:
+        while self._chunks and self._chunks[0].end <= self.executed:
+            self._chunks.popleft()
+        if chunk.end <= self.executed:
+            return False
+        self._chunks.append(chunk)
+        return True
 
     def _at(self, place: int) -> Step | None:
         for newest in reversed(self._chunks):

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
 
 from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.interface import CAPTURED, Obs
@@ -38,3 +41,8 @@ class CaptureClock:
             age_s = time.time() - stamp
             self._stamp, self._at = stamp, now - max(age_s, 0.0) if age_s >= -SKEW_S else -math.inf
         return self._at
+
+
+def stamped(obs: Obs, extras: Mapping[str, Any]) -> Obs:
+    """Return a copy of the observation with its capture time and the `extras` of the request."""
+    return replace(obs, info={CAPTURED: time.time(), **obs.info, **extras})

@@ -12,6 +12,16 @@ from vlagents_ray.errors import ConfigError, InvalidAction
 from vlagents_ray.interface import Obs
 
 SafeName = Literal["auto", "hold", "zero"]
+# The reasons of safe actions.
+WAITING = "waiting for an answer: the last one's rows are executed"
+LATE = "the answer came so late that others had been executed in place of all its rows"
+OLD = "what was planned is older than max_age_s"
+STALE = (
+    "the observation is older than max_age_s, or of a clock that is ahead: look for a camera that hangs, for robot and "
+    "sensors with different clocks, or for an info['captured_at'] that is not time.time()"
+)
+STOPPED = "the robot was stopped since the observation that was answered last"
+
 Safe = SafeName | np.ndarray | Callable[[Obs], np.ndarray]
 
 

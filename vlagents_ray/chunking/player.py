@@ -5,33 +5,25 @@ from __future__ import annotations
 import contextlib
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import replace
 from typing import Any, Literal, get_args
 
 import numpy as np
 
-from vlagents_ray.chunking.background import AsyncAnswer, AsyncCaller
+from vlagents_ray.chunking.background import AsyncAnswer, AsyncCaller, parts_of
 from vlagents_ray.chunking.buffer import DELAYS, ENSEMBLE, ENSEMBLE_M, Chunk, ChunkBuffer, Merge, Step
-from vlagents_ray.chunking.capture_clock import CaptureClock
-from vlagents_ray.chunking.fallback import Safe, SafeAction
+from vlagents_ray.chunking.capture_clock import CaptureClock, stamped
+from vlagents_ray.chunking.fallback import LATE, OLD, STALE, STOPPED, WAITING, Safe, SafeAction
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidAction, InvalidInput, NotReset, VLAgentsError
-from vlagents_ray.interface import AGE, CAPTURED, DEADLINE, SAFE, SILENT, Act, Agent, Obs, copied
+from vlagents_ray.interface import DEADLINE, SAFE, SILENT, Act, Agent, Obs, copied
 from vlagents_ray.validation import check_action
 
 Mode = Literal["open_loop", "ensemble", "async"]
 Check = Callable[[np.ndarray, "np.ndarray | None"], np.ndarray]
 """The action and the one before it, (D,) each -> the action to be taken, or `InvalidAction`."""
 
-_WAITING = "waiting for an answer: the last one's rows are executed"
-_LATE = "the answer came so late that others had been executed in place of all its rows"
-_OLD = "what was planned is older than max_age_s"
-_STALE = (
-    "the observation is older than max_age_s, or of a clock that is ahead: look for a camera that hangs, for robot and "
-    "sensors with different clocks, or for an info['captured_at'] that is not time.time()"
-)
-_STOPPED = "the robot was stopped since the observation that was answered last"
 _Motion = Literal["stopped", "moving", "held"]
 
 
@@ -124,8 +116,10 @@ class ChunkPlayer(Agent):
         self._chunks = 0
         # The last request: its tick, step of the plan, and capture time of its observation (s, of `time.monotonic`).
         self._asked, self._asked_step, self._seen_at = -1, 0, 0.0
+        self._parts: list[np.ndarray] = []  # rows of its answer so far, (h, D) each, while further parts are to come
+        self._rest: Generator[Act, None, None] | None = None  # without a deadline, the parts that are to be read
         self._waiting_since: float | None = None
-        self._trouble = _WAITING
+        self._trouble = WAITING
         self._captured = CaptureClock()
         self._since = 0  # tick; answers to earlier observations are not executed
         self._delays: deque[int] = deque(maxlen=DELAYS)
@@ -153,7 +147,7 @@ class ChunkPlayer(Agent):
         if self._asker is not None:
             self._asker.settle()
         self._begin()
-        obs = _stamped(obs, {})
+        obs = stamped(obs, {})
         self._captured(obs)  # before the reset of the policy, which may take long
         info = self._agent.reset(obs, instruction, **kwargs)
         self._choose_safe()
@@ -172,8 +166,9 @@ class ChunkPlayer(Agent):
         at which the watchdog has the robot stopped; call it in your own loop when you stop or take over the robot.
         """
         self._plan.drop()
+        self._rest = None
         self._since = self._tick or 0
-        self._trouble = _STOPPED
+        self._trouble = STOPPED
         self._last = self._before
         self._motion = "stopped"
 
@@ -181,6 +176,8 @@ class ChunkPlayer(Agent):
         """Show the policy an observation for which no action is needed."""
         if self._asker is not None:
             self._asker.settle()
+        while self._rest is not None:
+            self._read_part(self._rest, self._tick or 0)
         self._agent.observe(obs)
 
     def act(self, obs: Obs) -> Act:
@@ -190,9 +187,11 @@ class ChunkPlayer(Agent):
             raise NotReset("act before reset; reset first")
         begun = time.monotonic()
         if self._asker is None or self._deadline_s is None:
-            if self._wants(tick, obs):
+            while (wanted := self._wants(tick, obs)) and self._rest is not None:
+                self._read_part(self._rest, tick)
+            if wanted:
                 self._note_asked(tick, obs)
-                self._take(tick, self._agent.act(_stamped(obs, self._extras())), tick)
+                self._read_part(parts_of(self._agent, stamped(obs, self._extras())), tick)
         else:
             self._ask_in_time(self._asker, obs, tick, begun + self._deadline_s)
         self._tick = tick + 1
@@ -216,6 +215,14 @@ class ChunkPlayer(Agent):
 
     def _note_asked(self, tick: int, obs: Obs) -> None:
         self._asked, self._asked_step, self._seen_at = tick, self._plan.executed, self._captured(obs)
+        self._chunks += bool(self._parts)  # an answer that broke off
+        self._parts = []
+
+    def _read_part(self, parts: Generator[Act, None, None], tick: int) -> None:
+        self._rest = None  # after an error nothing follows
+        act = next(parts)
+        self._take(self._asked, act, tick)
+        self._rest = parts if act.more else None
 
     def _is_old(self, seen_at: float) -> bool:
         return self._max_age_s is not None and seen_at < time.monotonic() - self._max_age_s
@@ -223,7 +230,7 @@ class ChunkPlayer(Agent):
     def _next(self) -> Step | None:
         """Return the action for now from chunks that are young enough."""
         if self._max_age_s is not None and self._plan.drop(time.monotonic() - self._max_age_s):
-            self._trouble = _OLD
+            self._trouble = OLD
         return self._plan.next
 
     def _wants(self, tick: int, obs: Obs) -> bool:
@@ -242,14 +249,15 @@ class ChunkPlayer(Agent):
 
     def _ask_in_time(self, asker: AsyncCaller, obs: Obs, tick: int, deadline: float) -> None:
         """Take an answer, send a request if one is due, and wait for its answer as long as allowed and needed."""
-        self._receive(asker.take(), tick)
+        while (answer := asker.take()) is not None:
+            self._receive(answer, tick)
         if asker.idle and self._wants(tick, obs):
             self._note_asked(tick, obs)
             if self._waiting_since is None:
                 self._waiting_since = time.monotonic()
-            asker.ask(tick, _stamped(copied(obs), self._extras()))
+            asker.ask(tick, stamped(copied(obs), self._extras()))
         while not asker.idle and (left_s := deadline - time.monotonic()) > 0:
-            fresh = self._mode != "async" and self._asked == tick
+            fresh = self._mode != "async" and self._asked == tick and not self._parts
             if not fresh and self._next() is not None:
                 break
             self._receive(asker.take(left_s), tick)
@@ -261,7 +269,7 @@ class ChunkPlayer(Agent):
             try:
                 if answer.tick >= self._since:
                     self._take(answer.tick, answer.result, tick)
-                self._waiting_since = None
+                self._waiting_since = time.monotonic() if answer.result.more else None
             except InvalidAction as error:
                 self._trouble = str(error)
             return
@@ -270,13 +278,16 @@ class ChunkPlayer(Agent):
         self._trouble = f"{answer.result.code}: {answer.result}"
 
     def _take(self, asked: int, act: Act, now: int) -> None:
-        rows = Act(check_action(act.action, self._contract)).rows()[: self._horizon]
-        if self._mode == "open_loop" and act.done and self._execute is not None:
-            rows = rows[: self._execute]
-        chunk = Chunk(self._chunks, self._asked_step, rows, act.done, act.info, asked, self._seen_at)
-        self._trouble = _WAITING if self._plan.add(chunk) else _LATE
-        self._chunks += 1
-        self._delays.append(now - asked)
+        self._parts.append(Act(check_action(act.action, self._contract)).rows())
+        execute = self._execute if self._mode == "open_loop" and act.done else None
+        rows = np.concatenate(self._parts)[: self._horizon][:execute]
+        chunk = Chunk(self._chunks, self._asked_step, rows, act.done, act.info, asked, self._seen_at, act.more)
+        if len(self._parts) == 1:
+            self._delays.append(now - asked)
+        added = self._plan.add(chunk) if len(self._parts) == 1 else self._plan.extend(chunk)
+        self._trouble = WAITING if added or act.more else LATE
+        if not act.more:
+            self._chunks, self._parts = self._chunks + 1, []
 
     def _extras(self) -> dict[str, Any]:
         extras: dict[str, Any] = {}
@@ -289,14 +300,14 @@ class ChunkPlayer(Agent):
     def _chosen(self, obs: Obs, tick: int) -> Act:
         step = self._next()
         silent_s = 0.0 if self._waiting_since is None else time.monotonic() - self._waiting_since
-        reason = _STALE if self._is_old(self._captured(obs)) else self._trouble
+        reason = STALE if self._is_old(self._captured(obs)) else self._trouble
         self._before = self._last
         if step is not None:
             try:
                 self._last = self._passed(step.action, obs)
                 self._motion = "moving"
                 self._plan.advance()
-                return _played(self._last, step, tick, silent_s)
+                return step.played(self._last, tick, silent_s)
             except InvalidAction as error:
                 self._plan.drop()  # the rest was planned from where this action would have led
                 reason = str(error)
@@ -337,14 +348,3 @@ class ChunkPlayer(Agent):
         if action.ndim != 1:
             raise InvalidAction(f"action: got {action.shape}, want (D,), a single row")
         return action if self.check is None else self.check(action, last)
-
-
-def _played(action: np.ndarray, step: Step, tick: int, silent_s: float) -> Act:
-    chunk = step.chunk
-    about = {AGE: tick - chunk.tick, "chunk": chunk.number, "row": step.row, SILENT: silent_s}
-    return Act(action.copy(), chunk.done and step.row == len(chunk.rows) - 1, {**chunk.info, **about})
-
-
-def _stamped(obs: Obs, extras: dict[str, Any]) -> Obs:
-    """Return a copy of the observation with its capture time and the `extras` of the request."""
-    return replace(obs, info={CAPTURED: time.time(), **obs.info, **extras})

@@ -6,7 +6,7 @@ import math
 import os
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +25,7 @@ from vlagents_ray.errors import (
     UnknownSession,
 )
 from vlagents_ray.images.codecs import RAW, ImageCodec
-from vlagents_ray.interface import DEADLINE, Act, Agent, Obs, copied
+from vlagents_ray.interface import DEADLINE, Act, Agent, Obs, Parts, copied
 from vlagents_ray.protocol.messages import (
     RANKS,
     RankName,
@@ -244,6 +244,36 @@ class RemoteAgent(Agent):
         replies = self._call(siblings, requests, min(self._connection.timeout_s, _deadline_s(obs)))
         round_trip_ms = (time.perf_counter() - begun) * 1e3
         return [self._take(*each, round_trip_ms) for each in zip(siblings, obs, replies, strict=True)]
+
+    @property
+    def act_parts(self) -> Parts | None:
+        """Whether the policy gives its chunks in parts over this connection; see `Agent.act_parts`."""
+        self._connection.open()
+        found: Parts | None = (self._connection.metadata or {}).get("act_parts")
+        return found
+
+    def act_stream(self, obs: Obs) -> Generator[Act, None, None]:
+        """Yield the rows of the next chunk as they come; the last part is without `more`, and has the `timing`.
+
+        The whole chunk is the only part where the policy gives no parts (`act_parts`), and over HTTP and Serve
+        handles. Read all parts, or close the generator, before the next call on this connection. The act counts when
+        its last part has come; an error after the first part ends it, and is not retried.
+        """
+        begun = time.perf_counter()
+        session = self._session
+        request = session.act(obs)
+        request.parts = self.act_parts is not None
+        timeout_s = min(self._connection.timeout_s, _deadline_s([obs]))
+        [reply] = self._call([session], [request], timeout_s)
+        if reply.act is not None and reply.act.more and session.episode is not None:
+            session.episode.step = None  # if the caller stops here, the policy may have acted or not
+        while reply.act is not None and reply.act.more:
+            yield reply.act
+            reply = self._connection.call_on(request, timeout_s - (time.perf_counter() - begun))
+        act = self._take(session, obs, reply, (time.perf_counter() - begun) * 1e3)
+        if isinstance(act, Exception):
+            raise act
+        yield act
 
     def close(self) -> None:
         """End the session. A later `reset` begins another one."""

@@ -126,6 +126,18 @@ class Connection:
             replies = [Reply(request.request_id, error=error) for request in requests]
         if len(replies) == len(requests) and not any(map(_changes_connection, replies)):
             return replies
+        return self._noted(requests, replies)
+
+    def call_on(self, request: Request, timeout_s: float) -> Reply:
+        """Return the next part of the reply to an act, after one whose `Act.more` is set; or the error on the way."""
+        try:
+            reply = self.transport.call_on(request, max(1e-3, timeout_s))
+        except VLAgentsError as error:
+            reply = Reply(request.request_id, error=error)
+        return self._noted([request], [reply])[0]
+
+    def _noted(self, requests: Sequence[Request], replies: list[Reply]) -> list[Reply]:
+        """Note errors and whether to connect again; return a reply for each request."""
         for reply in replies:
             if isinstance(reply.error, UnknownApp):  # it existed: the server is stopping or restarting
                 reply.error = PolicyUnavailable(f"{self.url}: the application is gone ({reply.error})")

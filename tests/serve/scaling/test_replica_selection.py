@@ -11,8 +11,8 @@ import pytest
 from in_process_replicas import Replicas
 
 from vlagents_ray import Act, Agent, Obs
-from vlagents_ray.serve.engine.connection_drain import DrainList
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.session_transfer import DrainList
 from vlagents_ray.serve.scaling import rebalancer as balancing
 from vlagents_ray.serve.scaling.rebalancer import Rebalancer
 from vlagents_ray.serve.scaling.replica_selection import (

@@ -25,7 +25,14 @@ from vlagents_ray.client.transports.codec_selection import CodecChoice
 from vlagents_ray.client.transports.direct_websocket import Stream
 from vlagents_ray.client.transports.http import HttpTransport, http_url, refusal
 from vlagents_ray.client.transports.probe import is_answer as is_probe_answer
-from vlagents_ray.errors import ConnectionLost, DeadlineExceeded, MalformedMessage, MessageTooLarge, PolicyUnavailable
+from vlagents_ray.errors import (
+    ConnectionLost,
+    DeadlineExceeded,
+    MalformedMessage,
+    MessageTooLarge,
+    PolicyUnavailable,
+    VLAgentsError,
+)
 from vlagents_ray.protocol.frames import decode_replies, decode_reply, encode_requests
 from vlagents_ray.protocol.messages import (
     SERVERS_MACHINE,
@@ -151,16 +158,25 @@ class WebSocketTransport:
         connection = self._stream(timeout_s)
         try:
             connection.send(frame, timeout_s)
-            while True:
-                data = connection.recv(max(0.0, deadline - time.monotonic()))
-                replies = decode_replies(data)
-                if is_answer(replies, requests):
-                    return replies
-        except TimeoutError as error:
-            raise DeadlineExceeded(f"{self._url}: no answer within {timeout_s:g} s") from error
+            return _await(connection, requests, deadline)
         except (ConnectionClosed, OSError) as error:
-            self.close()
-            raise ConnectionLost(f"{self._url}: {error}; reset before the next act") from error
+            raise self._failure(error, timeout_s) from error
+
+    def call_on(self, request: Request, timeout_s: float) -> Reply:
+        """See `RequestChannel`."""
+        if self._socket is None:
+            raise ConnectionLost(f"{self._url}: closed between two parts of a chunk; reset before the next act")
+        try:
+            return _await(self._socket, [request], time.monotonic() + timeout_s)[0]
+        except (ConnectionClosed, OSError) as error:
+            raise self._failure(error, timeout_s) from error
+
+    def _failure(self, error: Exception, timeout_s: float) -> VLAgentsError:
+        """Return the error of a call that failed, and close a connection that broke."""
+        if isinstance(error, TimeoutError):
+            return DeadlineExceeded(f"{self._url}: no answer within {timeout_s:g} s")
+        self.close()
+        return ConnectionLost(f"{self._url}: {error}; reset before the next act")
 
     def _probe(self, probe: bytes, timeout_s: float) -> None:
         connection = self._stream(timeout_s)
@@ -223,3 +239,11 @@ class WebSocketTransport:
                 if silent:
                     attempt_s *= 2
             time.sleep(_PAUSE_S)
+
+
+def _await(connection: _Socket, requests: Sequence[Request], deadline: float) -> list[Reply]:
+    """Return the next replies to these requests; those to earlier ones are dropped. Raises what `recv` raises."""
+    while True:
+        replies = decode_replies(connection.recv(max(0.0, deadline - time.monotonic())))
+        if is_answer(replies, requests):
+            return replies

@@ -199,17 +199,30 @@ class _HttpEndpoint:
                 message = await socket.receive()
                 if message["type"] == "websocket.disconnect":
                     return
-                await socket.send_bytes(await self._reply_to(sender, message.get("bytes")))
+                await self._reply(socket, sender, message.get("bytes"))
                 await asyncio.sleep(sender.throttled_s())
         except WebSocketDisconnect:
             return
         finally:
             sender.release()
 
-    async def _reply_to(self, sender: Dispatcher, message: bytes | None) -> bytes:
-        if message is None or not is_probe(message):
-            trace = RequestTrace(self._engine.stats, "websocket")
-            return trace.frame(await self._answer(sender, message, trace))
+    async def _reply(self, socket: WebSocket, sender: Dispatcher, message: bytes | None) -> None:
+        """Answer one message of a client, with several if it is an act whose chunk comes in parts."""
+        if message is not None and is_probe(message):
+            await socket.send_bytes(self._probed(sender, message))
+            return
+        trace = RequestTrace(self._engine.stats, "websocket")
+        sending: asyncio.Future[None] | None = None  # the last part
+
+        def send_part(part: Reply) -> None:
+            nonlocal sending
+            sending = asyncio.ensure_future(_send_after(sending, socket, trace.part(part)))
+
+        loop = asyncio.get_running_loop()
+        replies = await self._answer(sender, message, trace, lambda part: loop.call_soon_threadsafe(send_part, part))
+        await _send_after(sending, socket, trace.frame(replies))
+
+    def _probed(self, sender: Dispatcher, message: bytes) -> bytes:
         admission = sender.admission(self._limits, len(message), "simulation")
         try:
             read_probe(message, admission)
@@ -218,14 +231,16 @@ class _HttpEndpoint:
             admission.count_unreadable()
             return encode_replies([Reply(error=error)])
 
-    async def _answer(self, sender: Dispatcher, frame: bytes | None, trace: RequestTrace) -> list[Reply]:
+    async def _answer(
+        self, sender: Dispatcher, frame: bytes | None, trace: RequestTrace, part: Callable[[Reply], object]
+    ) -> list[Reply]:
         admission = sender.admission(self._limits, 0 if frame is None else len(frame))
         try:
             if frame is None:
                 raise MalformedMessage("stream: got a text message, want a binary frame")
             requests = await self._requests.decode(frame, admission)
             trace.decoded(requests)
-            return await sender.ask(requests, admission)
+            return await sender.ask(requests, admission, part)
         except VLAgentsError as error:
             admission.count_unreadable()
             return [Reply(error=error)]
@@ -233,6 +248,13 @@ class _HttpEndpoint:
             name = uuid.uuid4().hex
             logger.exception("stream failed (request %s)", name)
             return [Reply(name, error=VLAgentsError("internal error; the server's log has the details"))]
+
+
+async def _send_after(before: asyncio.Future[None] | None, socket: WebSocket, message: bytes) -> None:
+    """Send a message once the one `before` is sent."""
+    if before is not None:
+        await before
+    await socket.send_bytes(message)
 
 
 def _timed(http: HttpRequest, trace: RequestTrace) -> HttpRequest:

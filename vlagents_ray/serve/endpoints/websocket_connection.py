@@ -139,13 +139,8 @@ class WebSocketConnection:
             return
         with self._sending:
             self._paused = self._is_backlogged() and self._protocol.state is State.OPEN
-        if self._paused or self._must_wait:
+        if self._paused or self._decoding or self._throttled:
             self._stop_polling()
-
-    @property
-    def _must_wait(self) -> bool:
-        """Whether the next frames have to wait."""
-        return self._decoding or self._throttled
 
     def disconnect(self) -> None:
         """Stop polling the connection and close it; call it on the thread that polls."""
@@ -159,7 +154,7 @@ class WebSocketConnection:
             self._engine.queue.unwatch(self._connection)
 
     def _resume_polling(self) -> None:
-        if not self._ended and not self._polled and not (self._paused or self._must_wait):
+        if not self._ended and not self._polled and not (self._paused or self._decoding or self._throttled):
             self._polled = True
             self._engine.queue.watch(self._connection, self.ready)
 
@@ -245,7 +240,7 @@ class WebSocketConnection:
 
     def _process_frames(self) -> None:
         """Process the received frames in order, until one has to wait."""
-        while self._frames and not self._must_wait and not self._ended:
+        while self._frames and not (self._decoding or self._throttled or self._ended):
             self._process(*self._frames.popleft())
 
     def _continue(self) -> None:
@@ -302,7 +297,12 @@ class WebSocketConnection:
         with self._sending:
             self._unanswered += 1
             self._unanswered_bytes += size
-        message.sender.send(requests, lambda replies: self._answer(trace, replies, size), admission=message.admission)
+        message.sender.send(
+            requests,
+            lambda replies: self._answer(trace, replies, size),
+            admission=message.admission,
+            part=lambda reply: self._send(trace.part(reply)),
+        )
 
     def _decoded(self, message: _Message, result: Callable[[], Sequence[Request | Reply]]) -> None:
         """Take a message that another thread has decoded; called on the thread that polls."""

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import asyncio
-import threading
 import uuid
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
 from vlagents_ray.errors import (
-    DeadlineExceeded,
     NotReset,
-    OutcomeUnknown,
     PolicyUnavailable,
     TooManyRequests,
     UnknownSession,
@@ -22,12 +19,11 @@ from vlagents_ray.protocol.messages import Limits, Reply, Request
 from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey, throttled_s
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.arrival import count_wait
+from vlagents_ray.serve.engine.responses import Done, ReplyCollector
 from vlagents_ray.serve.queue.batch_queue import PendingRequest
 
 if TYPE_CHECKING:
     from vlagents_ray.serve.engine.engine import Engine
-
-Done = Callable[[list[Reply]], None]
 
 
 class Dispatcher:
@@ -102,6 +98,7 @@ class Dispatcher:
         done: Done,
         arrived: float | None = None,
         admission: MessageAdmission | None = None,
+        part: Callable[[Reply], object] | None = None,
     ) -> ReplyCollector:
         """Queue the requests of a frame.
 
@@ -110,10 +107,13 @@ class Dispatcher:
             done: Receives all replies at once, in order, on the thread that completes the last one.
             arrived: Time at which the deadlines begin, s of the engine's clock; by default now.
             admission: Admission of the message, which has already counted the requests for the key.
+            part: Receives the replies before the last to a lone act that asks for its chunk in parts; None if the
+                endpoint sends only whole chunks.
         """
         if admission is not None and admission.holds:
             done = partial(_release, admission, done)
         collector = ReplyCollector(items, done, self._asks_to_reconnect, self._engine.withdraw)
+        collector.part = part if len(items) == 1 else None
         ready: list[PendingRequest] = []
         for index, item in enumerate(items):
             if isinstance(item, Reply):
@@ -128,8 +128,13 @@ class Dispatcher:
         self._put(ready)
         return collector
 
-    async def ask(self, items: Sequence[Request | Reply], admission: MessageAdmission | None = None) -> list[Reply]:
-        """Send requests, and wait for the replies until the requests' deadlines.
+    async def ask(
+        self,
+        items: Sequence[Request | Reply],
+        admission: MessageAdmission | None = None,
+        part: Callable[[Reply], object] | None = None,
+    ) -> list[Reply]:
+        """Send requests, and wait for the replies until the requests' deadlines; see `send` for `part`.
 
         The time that a request may have waited during a pause of the process counts towards its deadline.
         When the caller stops waiting (deadline, disconnect), its requests are cancelled, unless their batch is
@@ -139,7 +144,7 @@ class Dispatcher:
             count_wait(items, waited_s)
         loop = asyncio.get_running_loop()
         future: asyncio.Future[list[Reply]] = loop.create_future()
-        collector = self.send(items, lambda replies: _deliver(loop, future, replies), admission=admission)
+        collector = self.send(items, lambda replies: _deliver(loop, future, replies), admission=admission, part=part)
         deadlines = [item.deadline_ms for item in items if isinstance(item, Request)]
         timer = None
         if None not in deadlines and deadlines:
@@ -213,6 +218,7 @@ class Dispatcher:
             quota=None if self._caller is None else (self._prefix, self._caller.sessions),
             arrived=arrived,
         )
+        ticket.part = collector.part if request.parts else None
         if self._owner:
             if request.op == "close":
                 self._sessions.discard(session_id)
@@ -259,80 +265,6 @@ class Dispatcher:
             if self._engine.draining:  # the replica has handed over its sessions
                 error = PolicyUnavailable("the replica is stopping; connect again, or send the same request again")
         collector.put(index, Reply(request.request_id, error=error))
-
-
-class ReplyCollector:
-    """Collects the replies to the requests of one frame, and passes them to `done` once all are there."""
-
-    __slots__ = (
-        "_asks_to_reconnect",
-        "_done",
-        "_items",
-        "_lock",
-        "_missing",
-        "_replies",
-        "_withdraw",
-        "over",
-        "tickets",
-    )
-
-    def __init__(
-        self,
-        items: Sequence[Request | Reply],
-        done: Done,
-        asks_to_reconnect: Callable[[], bool],
-        withdraw: Callable[..., None],
-    ) -> None:
-        """Create the collector of one frame.
-
-        Args:
-            items: The requests of the frame, and the replies to unreadable ones.
-            done: Called once with all replies.
-            asks_to_reconnect: Returns whether the replies ask the client to reconnect.
-            withdraw: `Engine.withdraw`.
-        """
-        self.tickets: dict[int, PendingRequest] = {}  # the latest ticket of each request, by the request's identity
-        self.over = False  # whether the caller no longer waits, so that nothing more is queued
-        self._withdraw = withdraw
-        self._items = items
-        self._replies: list[Reply | None] = [None] * len(items)
-        self._missing = len(items)
-        self._done = done
-        self._asks_to_reconnect = asks_to_reconnect
-        self._lock = threading.Lock()
-
-    def put(self, index: int, reply: Reply) -> None:
-        """Store the reply to one of the requests; a second reply to it is ignored."""
-        with self._lock:
-            if self._replies[index] is not None:
-                return
-            self._replies[index] = reply
-            self._missing -= 1
-            if self._missing:
-                return
-        self.tickets.clear()  # each refers to this: a reference cycle would make the garbage collector pause the policy
-        asks_to_reconnect = self._asks_to_reconnect()
-        for each in self._replies:
-            each.draining = asks_to_reconnect  # type: ignore[union-attr]
-        self._done(self._replies)  # type: ignore[arg-type]
-
-    def expire(self) -> None:
-        """Answer the requests without a reply: their deadlines have passed, and those not begun are withdrawn."""
-        self.over = True  # set before the tickets are copied: a concurrent new ticket is either copied, or not queued
-        tickets = dict(self.tickets)
-        self._withdraw(*tickets.values())
-        for index, item in enumerate(self._items):
-            if isinstance(item, Request) and self._replies[index] is None:
-                late = DeadlineExceeded(f"no action within {item.deadline_ms:g} ms: not acted on, and never will be")
-                if id(item) in tickets and tickets[id(item)].begun:
-                    late = OutcomeUnknown(f"no action within {item.deadline_ms:g} ms, but the policy is at work on it")
-                self.put(index, Reply(item.request_id, error=late))
-
-    def cancel(self) -> None:
-        """Cancel all requests, since the caller no longer waits for the replies."""
-        self.over = True
-        for ticket in list(self.tickets.values()):
-            ticket.cancelled = True
 
 
 def _release(admission: MessageAdmission, done: Done, replies: list[Reply]) -> None:

@@ -21,13 +21,13 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.interface import Act, Agent
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Reply, Request
+from vlagents_ray.serve.engine.act_streams import Acting, ActStreams
 from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.arrival import PauseDetector
-from vlagents_ray.serve.engine.connection_drain import DrainList
 from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
 from vlagents_ray.serve.engine.resets import Resets
 from vlagents_ray.serve.engine.responses import build_reply, public_error, timing
-from vlagents_ray.serve.engine.session_transfer import SessionTransfer
+from vlagents_ray.serve.engine.session_transfer import DrainList, SessionTransfer
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.models.loaded_model import LoadedModel, Loader, synchronise
 from vlagents_ray.serve.models.model_manager import ModelManager
@@ -38,8 +38,6 @@ from vlagents_ray.serve.queue.preparation import Preparations
 from vlagents_ray.serve.sessions import Session, SessionFinder, SessionTable
 from vlagents_ray.serve.weights.updates import WeightUpdates, follows
 from vlagents_ray.serve.weights.versions import WeightsVersion
-
-_Acting = tuple[PendingRequest, Session[LoadedModel]]
 
 logger = logging.getLogger(__name__)
 
@@ -79,8 +77,7 @@ class Engine:
         self.sessions: SessionTable[LoadedModel] = SessionTable(
             session_limit, session_idle_s, wall_clock, self._session_ended
         )
-        self.calls = PolicyCalls(limits, clock)
-        self.pauses = PauseDetector(clock)
+        self.calls, self.pauses = PolicyCalls(limits, clock), PauseDetector(clock)
         loader = Loader(self._source, version, batch_sizes, check, self.calls)
         self.models = ModelManager(self._source, loader, self.sessions)
         self.stats, self.admission = MetricsBuffer(), Admission(in_flight_bytes)
@@ -106,6 +103,7 @@ class Engine:
         self.weights = WeightUpdates(lambda: self.models.own_weights, self.sessions.all)
         self.transfer = SessionTransfer(self.sessions, self.models, self.require_ready)
         self._resets = Resets(self.sessions, self.models, self.queue, finder, clock, reply_bytes)
+        self._streams = ActStreams(self.sessions, self.queue, self.stats, clock, batch_sizes, reply_bytes)
 
     def start(self, *, threaded: bool = True) -> None:
         """Initialize the agent, and return when it can act; raises `PolicyFailed` if it does not load.
@@ -257,12 +255,13 @@ class Engine:
 
     def _run(self, batch: Sequence[PendingRequest]) -> None:
         """Answer every ticket of a batch. Called on the policy's thread."""
-        acting: dict[tuple[LoadedModel, WeightsVersion], list[_Acting]] = {}
+        acting: dict[tuple[LoadedModel, WeightsVersion, bool], list[Acting]] = {}
         for ticket in batch:
             try:
                 if ticket.request.op == "act":
                     session, model, weights = self._ready(ticket)
-                    acting.setdefault((model, weights), []).append((ticket, session))
+                    in_parts = ticket.part is not None and model.agent.act_parts is not None
+                    acting.setdefault((model, weights, in_parts), []).append((ticket, session))
                 elif ticket.request.op == "reset":
                     self._resets.run(ticket)
                 elif ticket.request.op == "export":
@@ -280,8 +279,8 @@ class Engine:
             except Exception as error:  # noqa: BLE001 - becomes the reply
                 ticket.begun = ticket.begun and ticket.request.op != "act"  # the policy has not received this act
                 ticket.answer(Reply(ticket.request.request_id, error=public_error(error, ticket)))
-        for (model, weights), group in acting.items():
-            self._act(model, weights, group)
+        for (model, weights, in_parts), group in acting.items():
+            (self._streams.run if in_parts else self._act)(model, weights, group)
 
     def _ready(self, ticket: PendingRequest) -> tuple[Session[LoadedModel], LoadedModel, WeightsVersion]:
         session = self.sessions.get(ticket.session_id)
@@ -305,7 +304,7 @@ class Engine:
         ticket.request.obs = None
         ticket.answer(Reply(ticket.request.request_id, info={}))
 
-    def _act(self, model: LoadedModel, weights: WeightsVersion, acting: list[_Acting]) -> None:
+    def _act(self, model: LoadedModel, weights: WeightsVersion, acting: list[Acting]) -> None:
         """Answer the act requests of sessions with one version of one model's weights."""
         observations = [ticket.request.obs for ticket, _ in acting]
         agents = [session.agent for _, session in acting]
@@ -339,7 +338,7 @@ class Engine:
         unsent = []
         for (ticket, session), result in zip(acting, results, strict=True):
             reply = build_reply(ticket, session, result, model.contract, self._reply_bytes, weights.info)
-            reply.timing = timing(ticket.arrived, call)
+            reply.timing = timing(ticket.arrived, call.began, call.ended)
             reply.timing["batch_size"] = len(acting)
             if defer and ticket.rank is not Rank.ROBOT:
                 unsent.append((ticket, reply))

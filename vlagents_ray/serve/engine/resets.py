@@ -95,7 +95,7 @@ class Resets:
             for obs in request.history:
                 agent.observe(obs)
         info = {**info, **model.identity}
-        spent = timing(ticket.arrived, call)
+        spent = timing(ticket.arrived, call.began, call.ended)
         require_serializable(info, self._reply_bytes)
         session.agent = agent
         model.padding.record_reset(request)

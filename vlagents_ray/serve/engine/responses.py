@@ -1,26 +1,35 @@
-"""Replies from a policy's results and errors, checked and bounded before they leave the server."""
+"""Replies from a policy's results and errors: checked, bounded, and collected for the frame that holds them."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+import threading
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import InvalidInput, MessageTooLarge, PolicyFailed, VLAgentsError
+from vlagents_ray.errors import (
+    DeadlineExceeded,
+    InvalidInput,
+    MessageTooLarge,
+    OutcomeUnknown,
+    PolicyFailed,
+    VLAgentsError,
+)
 from vlagents_ray.interface import Act
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Reply
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Reply, Request
 from vlagents_ray.protocol.values import ValueWriter
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.queue.batch_queue import PendingRequest
-from vlagents_ray.serve.queue.call_limits import PolicyCall
 from vlagents_ray.serve.sessions import Session
 from vlagents_ray.validation import check_action
 
 logger = logging.getLogger(__name__)
+
+Done = Callable[[list[Reply]], None]
 
 
 def build_reply(
@@ -30,6 +39,8 @@ def build_reply(
     contract: Contract | None,
     limit: int = DEFAULT_LIMITS.reply_bytes,
     policy: Mapping[str, Any] = MappingProxyType({}),
+    *,
+    more: bool = False,
 ) -> Reply:
     """Build the reply to an act request, and count the step of its session if the result is valid.
 
@@ -40,6 +51,7 @@ def build_reply(
         contract: The policy's contract, if it has one; the action is checked against it.
         limit: Largest size of action and info together, bytes.
         policy: Version of the weights that acted, for the info, unless the policy itself names one (as a proxy does).
+        more: Whether further parts of the result follow, with the last of which the step counts.
 
     Returns:
         The reply; with an error if the policy raised one, or if its result is invalid or too large.
@@ -52,7 +64,7 @@ def build_reply(
             raise PolicyFailed(f"act: the policy returned {type(result).__name__}, want an Act")
         if (size := getattr(result.action, "nbytes", 0)) > limit:  # before it is copied and checked
             raise PolicyFailed(_too_large("action", size, limit))
-        act = Act(check_action(result.action, contract), bool(result.done), result.info)
+        act = Act(check_action(result.action, contract), bool(result.done), result.info, more)
         if act.action.nbytes > limit:  # the policy may return a list of numbers, which has no `nbytes`
             raise PolicyFailed(_too_large("action", act.action.nbytes, limit))
         if act.info:
@@ -60,6 +72,8 @@ def build_reply(
         act.info = {**policy, **(act.info or {})}  # policies without info may say None
     except Exception as error:  # noqa: BLE001 - becomes the reply
         return Reply(request_id, error=public_error(error, ticket))
+    if more:
+        return Reply(request_id, act=act, step=session.steps + 1)
     session.steps += 1
     return Reply(request_id, act=act, step=session.steps)
 
@@ -78,9 +92,12 @@ def public_error(error: Exception, ticket: PendingRequest) -> VLAgentsError:
     )
 
 
-def timing(arrived: float, call: PolicyCall) -> dict[str, Any]:
-    """Return the stages of a request that the engine measures, ms: the wait for the policy's call, and the call."""
-    return {"queue_ms": (call.began - arrived) * 1e3, "inference_ms": (call.ended - call.began) * 1e3}
+def timing(arrived: float, began: float, ended: float) -> dict[str, Any]:
+    """Return the stages of a request that the engine measures, ms: the wait for the policy's call, and the call.
+
+    The arguments are times of the engine's clock, s: of the request's arrival, the call's begin, and its end.
+    """
+    return {"queue_ms": (began - arrived) * 1e3, "inference_ms": (ended - began) * 1e3}
 
 
 def require_serializable(info: dict[str, Any], limit: int = DEFAULT_LIMITS.reply_bytes) -> None:
@@ -134,3 +151,79 @@ class _BoundedWriter(ValueWriter):
 
 def _too_large(what: str, got: int, limit: int) -> str:
     return f"{what}: got {got} bytes, want {limit} at most (`limits.reply_bytes`); return less"
+
+
+class ReplyCollector:
+    """Collects the replies to the requests of one frame, and passes them to `done` once all are there."""
+
+    __slots__ = (
+        "_asks_to_reconnect",
+        "_done",
+        "_items",
+        "_lock",
+        "_missing",
+        "_replies",
+        "_withdraw",
+        "over",
+        "part",
+        "tickets",
+    )
+
+    def __init__(
+        self,
+        items: Sequence[Request | Reply],
+        done: Done,
+        asks_to_reconnect: Callable[[], bool],
+        withdraw: Callable[..., None],
+    ) -> None:
+        """Create the collector of one frame.
+
+        Args:
+            items: The requests of the frame, and the replies to unreadable ones.
+            done: Called once with all replies.
+            asks_to_reconnect: Returns whether the replies ask the client to reconnect.
+            withdraw: `Engine.withdraw`.
+        """
+        self.tickets: dict[int, PendingRequest] = {}  # the latest ticket of each request, by the request's identity
+        self.over = False  # whether the caller no longer waits, so that nothing more is queued
+        self.part: Callable[[Reply], object] | None = None  # receives the replies before the last to the only request
+        self._withdraw = withdraw
+        self._items = items
+        self._replies: list[Reply | None] = [None] * len(items)
+        self._missing = len(items)
+        self._done = done
+        self._asks_to_reconnect = asks_to_reconnect
+        self._lock = threading.Lock()
+
+    def put(self, index: int, reply: Reply) -> None:
+        """Store the reply to one of the requests; a second reply to it is ignored."""
+        with self._lock:
+            if self._replies[index] is not None:
+                return
+            self._replies[index] = reply
+            self._missing -= 1
+            if self._missing:
+                return
+        self.tickets.clear()  # each refers to this: a reference cycle would make the garbage collector pause the policy
+        asks_to_reconnect = self._asks_to_reconnect()
+        for each in self._replies:
+            each.draining = asks_to_reconnect  # type: ignore[union-attr]
+        self._done(self._replies)  # type: ignore[arg-type]
+
+    def expire(self) -> None:
+        """Answer the requests without a reply: their deadlines have passed, and those not begun are withdrawn."""
+        self.over = True  # set before the tickets are copied: a concurrent new ticket is either copied, or not queued
+        tickets = dict(self.tickets)
+        self._withdraw(*tickets.values())
+        for index, item in enumerate(self._items):
+            if isinstance(item, Request) and self._replies[index] is None:
+                late = DeadlineExceeded(f"no action within {item.deadline_ms:g} ms: not acted on, and never will be")
+                if id(item) in tickets and tickets[id(item)].begun:
+                    late = OutcomeUnknown(f"no action within {item.deadline_ms:g} ms, but the policy is at work on it")
+                self.put(index, Reply(item.request_id, error=late))
+
+    def cancel(self) -> None:
+        """Cancel all requests, since the caller no longer waits for the replies."""
+        self.over = True
+        for ticket in list(self.tickets.values()):
+            ticket.cancelled = True

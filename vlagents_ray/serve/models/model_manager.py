@@ -17,7 +17,7 @@ from typing import Any
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import PolicyUnavailable, UnknownSession, VLAgentsError
-from vlagents_ray.interface import Agent
+from vlagents_ray.interface import Agent, Parts
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.models.loaded_model import (
     LoadedModel,
@@ -48,6 +48,7 @@ class ModelManager:
 
     def __init__(self, source: Checkpoints, loader: Loader, sessions: SessionTable[LoadedModel]) -> None:
         """Manage models from `loader` for `sessions`; a model's sessions are closed when it is evicted at once."""
+        self.act_parts: Parts | None = None  # whether that model gives chunks in parts
         self.contract: Contract | None = None  # contract of the deployment's own model that was loaded last
         self.weights: dict[str, str | None] | None = None  # weights of the deployment's own model that was loaded last
         self.step = ""  # the step of a long first load, such as "compiling 4 rows (3 of 5)"
@@ -236,6 +237,7 @@ class ModelManager:
 
     def _set_own_model(self, model: LoadedModel) -> None:
         self.contract, self._fingerprint = model.contract, model.version[1]
+        self.act_parts = model.agent.act_parts
         self.weights = model.weights
 
     def _loop(self) -> None:

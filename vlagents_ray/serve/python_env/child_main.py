@@ -114,6 +114,7 @@ def run() -> None:
             "local": asdict(server.address),
             "contract": contract,
             "weights": models.weights,
+            "act_parts": models.act_parts,
             "uncompiled": models.uncompiled,
         }
     )

@@ -177,6 +177,7 @@ class PolicyReplica(ReplicaWeights, ClientApi, SiblingApi):
             "checkpoints": models.describe(),
             "config": models.config,
             "contract": None if contract is None else contract.to_json(),
+            "act_parts": models.act_parts,
             "protocol": PROTOCOL_VERSION,
             "version": importlib.metadata.version("vlagents-ray"),
             "code": None if self._code is None else self._code.to_json(),
@@ -189,15 +190,14 @@ class PolicyReplica(ReplicaWeights, ClientApi, SiblingApi):
         stream = self._args.stream
         if not stream.enabled:
             return None
-        slow_s, idle_s = self._args.limits.slow_s, self._args.sessions.idle_s
         return WebSocketServer(
             self._engine,
             self._limits,
             _plain_host(),
             stream.ports,
             self._admit(),
-            slow_s=slow_s,
-            idle_s=idle_s,
+            slow_s=self._args.limits.slow_s,
+            idle_s=self._args.sessions.idle_s,
             hosts=self._args.access.hosts,
         )
 

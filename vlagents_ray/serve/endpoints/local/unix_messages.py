@@ -28,14 +28,7 @@ from vlagents_ray.errors import PolicyUnavailable, VLAgentsError
 from vlagents_ray.images import cpu_affinity
 from vlagents_ray.protocol import shm_layout
 from vlagents_ray.protocol.frames import decode_requests, encode_replies
-from vlagents_ray.protocol.messages import (
-    OPS,
-    Limits,
-    LocalAddress,
-    Op,
-    Reply,
-    Request,
-)
+from vlagents_ray.protocol.messages import OPS, Limits, LocalAddress, Op, Reply, Request
 from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey
 from vlagents_ray.serve.endpoints.acceptor import Acceptor
 from vlagents_ray.serve.engine import arrival
@@ -251,7 +244,12 @@ class UnixConnection:
         trace.decoded(requests)
         if waited_s:
             arrival.count_wait(requests, waited_s)
-        sender.send(requests, lambda replies: self._answer(trace, replies), admission=admission)
+        sender.send(
+            requests,
+            lambda replies: self._answer(trace, replies),
+            admission=admission,
+            part=lambda reply: self._send(trace.part(reply), compact_form=False),
+        )
 
     def _pause(self) -> None:
         """Stop polling the client until `_resume` was called as many times."""

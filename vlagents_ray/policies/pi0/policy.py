@@ -6,9 +6,10 @@ Physical Intelligence's own code and checkpoints are `vlagents_ray.policies.open
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -17,8 +18,8 @@ from pydantic import Field
 
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidObservation, PolicyFailed
-from vlagents_ray.interface import Obs
-from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
+from vlagents_ray.interface import Obs, Parts
+from vlagents_ray.policies.base import ModelConfig, Prediction, Row, shared_frames
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, from_pretrained
 from vlagents_ray.policies.base.config import NoiseLevel
@@ -32,7 +33,9 @@ from vlagents_ray.policies.base.model_inputs import (
     state_vector,
 )
 from vlagents_ray.policies.base.realtime import Guide
-from vlagents_ray.policies.flow import OFFERED, RandomSteps
+from vlagents_ray.policies.flow import OFFERED, RandomSteps, row_times
+from vlagents_ray.policies.pi0.passes import FlowCores, encode, flow_velocity, row_velocity_of, velocity_of
+from vlagents_ray.policies.streaming import StreamingPolicy
 from vlagents_ray.registry import require
 
 CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")  # openpi's names, in the order of the image tokens
@@ -53,14 +56,13 @@ class Pi0Config(ModelConfig):
     max_tokens: int = Field(default=48, ge=1, description="tokens of an instruction, as in training; more are refused")
     guidance: float = Field(default=5.0, gt=0, description="real-time chunking: largest weight of the old plan")
     noise_level: NoiseLevel = 0.0
-
-
-@dataclass(frozen=True)
-class FlowCores:
-    """The two passes of the network, which are functions of tensors: `encode` and `velocity_of`, or compiled forms."""
-
-    encode: Callable[..., Any]
-    velocity: Callable[..., Any]
+    early_rows: float | None = Field(
+        default=None,
+        gt=0,
+        le=1,
+        description="for clients that take a chunk in parts: the exponent of a schedule that finishes the first row "
+        "after one step of the flow (FASTER, arXiv 2603.19199, whose models have 0.6); unset: whole chunks",
+    )
 
 
 @dataclass(frozen=True)
@@ -81,16 +83,16 @@ class LoadedPi0:
         return replace(row, leftover=(row.leftover - mean) / std)
 
     def actions(self, flow: np.ndarray) -> np.ndarray:
-        """Convert the model's output, (H, max_action_dim), to actions (H, D) in the robot's units."""
+        """Convert the model's output, (..., max_action_dim), to actions (..., D) in the robot's units."""
         mean, std = self._statistics()
-        return np.asarray(flow[:, : len(mean)] * std + mean)
+        return np.asarray(flow[..., : len(mean)] * std + mean)
 
     def _statistics(self) -> tuple[np.ndarray, np.ndarray]:
         mean, std = self.processor.actions_mean, self.processor.actions_std
         return np.asarray(mean, np.float32), np.asarray(std, np.float32) + np.float32(_EPSILON)
 
 
-class Pi0(ModelPolicy):
+class Pi0(StreamingPolicy):
     """The policy π0: chunks by flow matching, with one forward pass for all sessions of a batch."""
 
     Config: ClassVar[type] = Pi0Config
@@ -121,6 +123,10 @@ class Pi0(ModelPolicy):
     @property
     def state_dim(self) -> int | None:
         return None if self.model is None else len(self.model.processor.state_mean)
+
+    @property
+    def act_parts(self) -> Parts | None:
+        return "approximate" if self.config.early_rows and self.config.actions == "chunk" else None
 
     def load(self) -> LoadedPi0:
         """Load the model with every parameter of the checkpoint, and its processor with all statistics."""
@@ -187,6 +193,27 @@ class Pi0(ModelPolicy):
             stated = {} if random is None else random.stated(self.config.execute, len(model.processor.actions_mean))
         return [Prediction(model.actions(one), behaviour=stated.get(i, {})) for i, one in enumerate(flow.cpu().numpy())]
 
+    def predict_parts(self, rows: Sequence[Row]) -> Generator[np.ndarray, None, None]:
+        """Yield the rows of all chunks that a step of the flow finishes; their velocities are not compiled."""
+        model, torch = self._loaded(), require("torch")
+        shape = (model.network.config.chunk_size, model.network.config.max_action_dim)
+        times = row_times(self._steps, shape[0], self.config.early_rows or 1.0)
+        cores = replace(model.cores, velocity=partial(row_velocity_of, model.network))
+        with torch.inference_mode():
+            actions = torch.from_numpy(np.stack([row.noise(*shape) for row in rows])).to(model.device)
+            velocity = self._velocity(rows, cores)
+        finished = 0
+        for now, later in pairwise(times):
+            with torch.inference_mode():  # not while another thread or the caller has its turn
+                at = torch.from_numpy(now).to(model.device)
+                change = torch.from_numpy(later - now).to(model.device)
+                actions = actions + change[:, None] * velocity(actions, at)
+                ready = int((later == 0).sum())
+                part = actions[:, finished:ready].cpu().numpy()
+            if ready > finished:
+                finished = ready
+                yield model.actions(part)
+
     @property
     def _steps(self) -> int:
         return int(self.config.steps or self._loaded().network.config.num_inference_steps)
@@ -205,13 +232,13 @@ class Pi0(ModelPolicy):
             for key, value in batch.items()
         }
 
-    def _velocity(self, rows: Sequence[Row]) -> Callable[[Any, float], Any]:
+    def _velocity(self, rows: Sequence[Row], cores: FlowCores | None = None) -> Callable[[Any, Any], Any]:
         """Return the flow's velocity for the rows; what the samples of a session see is encoded once."""
         model = self._loaded()
         firsts, owners = shared_frames(rows)
         inputs = self._inputs([rows[i] for i in firsts])
         shared = owners if len(firsts) < len(rows) else None
-        return flow_velocity(model.network, inputs, model.dtype, shared, model.cores)
+        return flow_velocity(model.network, inputs, model.dtype, shared, cores or model.cores)
 
     def _follow(
         self, velocity: Callable[[Any, float], Any], noise: Any, guide: Guide | None, random: RandomSteps | None
@@ -239,73 +266,6 @@ def _cameras(chosen: Mapping[str, str] | None) -> dict[str, str]:
     known = [name for name in CAMERAS if name in asked] if asked and set(asked) <= set(CAMERAS) else CAMERAS
     mapping = choose_cameras(chosen, USUAL_CAMERAS, known)
     return {name: mapping[name] for name in known}
-
-
-def flow_velocity(
-    network: Any,
-    inputs: Mapping[str, Any],
-    dtype: Any,
-    owners: Sequence[int] | None = None,
-    cores: FlowCores | None = None,
-) -> Callable[[Any, float], Any]:
-    """Return the flow's velocity as a function of noisy actions (B, H, D) and time; inputs are encoded once.
-
-    Args:
-        network: The `PI0ForConditionalGeneration`.
-        inputs: Tokens, images and states of P observations, as `PI0Processor` returns them, on the network's device.
-        dtype: The type in which the network computes.
-        owners: The observation of each of the B rows; None: row i is of observation i.
-        cores: The passes of the network, if they are compiled.
-
-    Returns:
-        The function, whose result is (B, H, D) float32.
-    """
-    torch = require("torch")
-    cores = cores or FlowCores(partial(encode, network), partial(velocity_of, network))
-    mask, state = inputs["attention_mask"], inputs["state"]
-    encoded = cores.encode(inputs["input_ids"], inputs["pixel_values"], inputs["pixel_attention_mask"], mask)
-    if owners is not None:
-        index = torch.tensor(owners, device=mask.device)
-        encoded, mask, state = encoded[index], mask[index], state[index]
-
-    def velocity(actions: Any, time: float) -> Any:
-        times = torch.full((len(actions),), time, dtype=torch.float32, device=actions.device)
-        return cores.velocity(encoded, mask, state, actions.to(dtype), times)
-
-    return velocity
-
-
-def encode(network: Any, tokens: Any, images: Any, cameras: Any, mask: Any) -> Any:
-    """Return the keys and values (P, layers, 2, heads, L, E) of tokens (P, L) and images, of which `mask` is not 0.
-
-    Args:
-        network: The `PI0ForConditionalGeneration`.
-        tokens: (P, L) int64.
-        images: (P, cameras, 3, S, S).
-        cameras: (P, cameras) bool, which of the images are there.
-        mask: (P, L), 0 for padding.
-    """
-    import torch  # the compiler follows a statement, and not `require`
-
-    layers = network.model.vlm(
-        inputs_embeds=network.model.embed_prefix(tokens, images, cameras),
-        attention_mask=mask,
-        position_ids=mask.cumsum(-1) - 1,
-        token_type_ids=torch.zeros_like(mask),
-        use_cache=True,
-    ).past_key_values.layers
-    return torch.stack([torch.stack([layer.keys, layer.values], 1) for layer in layers], 1)
-
-
-def velocity_of(network: Any, encoded: Any, mask: Any, state: Any, actions: Any, times: Any) -> Any:
-    """Return the velocity (B, H, D) float32 of noisy actions (B, H, D) at times (B,); see `encode` for the others."""
-    from transformers import DynamicCache
-
-    cache = DynamicCache()  # of this step alone: later ones must not attend to it
-    for number, layer in enumerate(encoded.unbind(1)):
-        cache.update(layer[:, 0], layer[:, 1], number)
-    output = network(state=state, noise=actions, timestep=times, attention_mask=mask, past_key_values=cache)
-    return output.logits.float()
 
 
 def _network(path: Path, device: Any, dtype: Any) -> Any:
