@@ -30,6 +30,8 @@ RUN = {"vlagents-ray doctor", "vlagents-ray policies"}
 NOT_RUN = {
     "vlagents-ray envs": "a block of docs/evaluation/index.md runs it",
     "vlagents-ray slurm eval": "the name of a command",
+    "vlagents-ray up": "tests/integration/test_warm_cluster.py runs it with free ports",
+    "vlagents-ray down": "tests/integration/test_warm_cluster.py runs it",
     "vlagents-ray serve my_policies:Reach --set gain=0.3": "test_served_pages.py serves it",
     "vlagents-ray bench report": "minutes of measuring",
     "vlagents-ray env make requirements/hf.txt --into .venv-hf": "it downloads packages",

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from fake_raylet import raylet
 
 from vlagents_ray import ConfigError, join
 from vlagents_ray.ray_tools.local_servers import announce, local_servers
@@ -32,20 +32,6 @@ def environ(process: Path) -> bytes:
     with contextlib.suppress(OSError):
         return (process / "environ").read_bytes()
     return b""
-
-
-@contextlib.contextmanager
-def raylet(folder: Path, ray_address: str, **environment: str) -> Iterator[None]:
-    """A process that looks like Ray's daemon of the server in `folder`."""
-    folder.mkdir(exist_ok=True)
-    words = ["/ray/raylet", "-c", "read forever", "raylet", f"--gcs-address={ray_address}", "--node_id=1"]
-    with subprocess.Popen(
-        words, executable="/bin/sh", env={MARK: str(folder)} | environment, stdin=subprocess.PIPE
-    ) as process:
-        try:
-            yield
-        finally:
-            process.kill()
 
 
 def ready(monkeypatch: pytest.MonkeyPatch, folder: Path, url: str, app: str, ray_address: str) -> None:

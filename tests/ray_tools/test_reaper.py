@@ -58,7 +58,7 @@ def test_a_driver_that_was_killed_or_has_lost_ray_takes_its_cluster_along(tmp_pa
         assert driver.stdout is not None
         child, proxy, agent = map(int, driver.stdout.readline().split())
         wait_for(lambda: set(about(str(folder))) == {proxy, agent})
-        assert set(marked(str(folder))) == {child, proxy, agent}
+        wait_for(lambda: set(marked(str(folder))) == {child, proxy, agent})
         if end == "killed":
             driver.send_signal(signal.SIGKILL)
         else:

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from fake_raylet import raylet
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.ray_tools import warm_cluster as module
@@ -28,19 +29,6 @@ from vlagents_ray.ray_tools.warm_cluster import (
 ADDRESS = "127.0.0.1:1"
 HOLD = "import sys; from pathlib import Path; from vlagents_ray.ray_tools.warm_cluster import locked\n"
 HOLD += "with locked(Path(sys.argv[1])) as mine: print(mine, flush=True); sys.stdin.read()"
-
-
-@contextlib.contextmanager
-def raylet(folder: Path, **environment: str) -> Iterator[None]:
-    """A process that looks like Ray's daemon of the cluster in `folder`."""
-    words = ["/ray/raylet", "-c", "read forever", "raylet", f"--gcs-address={ADDRESS}"]
-    with subprocess.Popen(
-        words, executable="/bin/sh", env={MARK: str(folder)} | environment, stdin=subprocess.PIPE
-    ) as process:
-        try:
-            yield
-        finally:
-            process.kill()
 
 
 @contextlib.contextmanager
@@ -69,7 +57,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_it_is_found_as_long_as_its_ray_runs(folder: Path) -> None:
     assert warm_cluster() is None
-    with raylet(folder):
+    with raylet(folder, ADDRESS):
         found = warm_cluster()
         assert found is not None
         assert (found.url, found.ray_address, found.keeper) == ("http://127.0.0.1:8000", ADDRESS, os.getpid())
@@ -80,7 +68,7 @@ def test_it_is_found_as_long_as_its_ray_runs(folder: Path) -> None:
 
 def test_one_of_another_user_is_not_found(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Root could read its files."""
-    with raylet(folder):
+    with raylet(folder, ADDRESS):
         assert warm_cluster() is not None
         me = os.getuid()
         monkeypatch.setattr(os, "getuid", lambda: me + 1)
@@ -89,20 +77,23 @@ def test_one_of_another_user_is_not_found(folder: Path, monkeypatch: pytest.Monk
 
 def test_one_with_temporary_files_elsewhere_is_not_found(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As those of two jobs of a scheduler on one node."""
-    with raylet(folder):
+    with raylet(folder, ADDRESS):
         monkeypatch.setenv("RAY_TMPDIR", "/elsewhere")
         assert warm_cluster() is None
 
 
 def test_one_without_keeper_is_refused(folder: Path) -> None:
-    with raylet(folder), pytest.raises(ConfigError, match=r"kept the warm cluster .* has ended; `vlagents-ray down`"):
+    with (
+        raylet(folder, ADDRESS),
+        pytest.raises(ConfigError, match=r"kept the warm cluster .* has ended; `vlagents-ray down`"),
+    ):
         join_warm()
 
 
 def test_it_is_used_under_the_conditions_of_its_start_only(
     folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    with raylet(folder), held(folder / "keeper.lock"):
+    with raylet(folder, ADDRESS), held(folder / "keeper.lock"):
         with pytest.raises(pytest.fail.Exception, match="joined the warm cluster"):
             join_warm()
         with monkeypatch.context() as patch:
@@ -125,13 +116,17 @@ def test_what_another_version_announced_is_refused(folder: Path) -> None:
     (folder / "warm.json").write_text(
         json.dumps({"ray_address": ADDRESS, "temporary_files": str(folder), "what": "another version writes"})
     )
-    with raylet(folder), held(folder / "keeper.lock"), pytest.raises(ConfigError, match="was started with None, got"):
+    with (
+        raylet(folder, ADDRESS),
+        held(folder / "keeper.lock"),
+        pytest.raises(ConfigError, match="was started with None, got"),
+    ):
         join_warm()
 
 
 def test_an_application_is_owned_by_one_process_until_it_ends(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(module, "_LOCK_S", 0.0)
-    with raylet(folder):
+    with raylet(folder, ADDRESS):
         cluster = warm_cluster()
     assert cluster is not None
     with held(folder / "app-noop") as owner:
@@ -149,7 +144,7 @@ def test_an_application_is_owned_by_one_process_until_it_ends(folder: Path, monk
 
 
 def test_a_keeper_is_known_by_its_lock(folder: Path) -> None:
-    with raylet(folder):
+    with raylet(folder, ADDRESS):
         cluster = warm_cluster()
     assert cluster is not None
     assert not cluster.is_kept

@@ -14,8 +14,8 @@ from vlagents_ray.dataset_contract import BYTES, STATISTICS, DatasetContract
 from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base.model_code import CURE
-from vlagents_ray.policies.base.token_cache import cached_tokenizer
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
+from vlagents_ray.policies.token_cache import cached_tokenizer
 from vlagents_ray.registry import require
 
 PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")

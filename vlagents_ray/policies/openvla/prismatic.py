@@ -15,9 +15,9 @@ from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.policies.base import ModelConfig
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
-from vlagents_ray.policies.base.token_cache import TokenCache
 from vlagents_ray.policies.openvla.sources import model_classes
 from vlagents_ray.policies.openvla.statistics import Bounds, Statistics
+from vlagents_ray.policies.token_cache import TokenCache
 from vlagents_ray.registry import require
 
 _NEEDS = ("config.json", "preprocessor_config.json", "tokenizer_config.json", "*.safetensors")

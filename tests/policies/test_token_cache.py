@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from vlagents_ray.policies.base.token_cache import TokenCache, cached_tokenizer
+from vlagents_ray.policies.token_cache import TokenCache, cached_tokenizer
 
 
 class Counted:
