@@ -51,7 +51,7 @@ class MyEnv(Tabletop):
 
 
 def test_modules_of_ones_own_are_served_and_evaluated_from_their_folder(tmp_path: Path) -> None:
-    [policy] = [block for block in blocks((DOCS / "own_policy.md").read_text()) if block.not_run is None]
+    policy = next(block for block in blocks((DOCS / "own_policy.md").read_text()) if block.not_run is None)
     (tmp_path / "my_policies.py").write_text(policy.source.replace("ActionSpec(dim=3)", "ActionSpec(dim=4)"))
     (tmp_path / "my_policies.py").write_text(
         (tmp_path / "my_policies.py").read_text().replace("Act(action", "Act(np.append(action, 1)")

@@ -100,13 +100,14 @@ def running_server(
     with contextlib.ExitStack() as stack:
         with_http = ingress or len(_our_apps(config)) < len(config.applications)
         ingress = with_http or not own
-        http = stack.enter_context(_ray(address, host, port or free_port(host), tls, num_cpus, show_logs, ingress))
+        public = port or free_port(host)
+        http = stack.enter_context(_ray(address, host, public, tls, num_cpus, show_logs, ingress))
         warm = this_warm_cluster()
         if warm is not None:
             ingress = with_http
             http = listener_of(warm, host, port)
+            public = http["port"]
             stack.enter_context(owned_apps(warm, [app.name for app in config.applications]))
-        port = http["port"] if warm is not None or not port else port
         location = "Disabled" if not ingress else "HeadOnly" if address is None else "EveryNode"
         client, proxies = start_serve(http, location)
         if warm is not None:
@@ -125,7 +126,7 @@ def running_server(
         here = address is None or warm is not None
         remind = functools.partial(_missing_gpus, config)
         _deploy(client, config, own=own, warm=warm is not None, ingress=ingress)
-        url = f"{'http' if tls is None else 'https'}://{LOOPBACK if host == EVERYWHERE else host}:{port}"
+        url = f"{'http' if tls is None else 'https'}://{LOOPBACK if host == EVERYWHERE else host}:{public}"
         paths = {app.name: (app.route_prefix or "").rstrip("/") for app in config.applications}
         if timeout_s is None:
             timeout_s = _START_S if here else _GROW_S
