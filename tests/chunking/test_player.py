@@ -585,7 +585,7 @@ def test_an_asker_is_not_idle_between_its_request_and_the_answer() -> None:
 
     agent = Counting()
     asker = Watched(agent)
-    asker.ask(0, obs(0))
+    asker.ask(obs(0))
     assert asker.take(30) is not None
     asker.close()
     assert idle

@@ -48,6 +48,24 @@ class TestIdleWorkers:
         self.refill((0, 2), (0, 2), (0, 2), (1, 2), (1, 2))
         assert started == [(1, {})]
 
+    @pytest.mark.parametrize("looks", [2, 30])
+    def test_those_that_take_long_to_appear_are_not_started_again(
+        self, looks: int, started: list[tuple[int, Mapping[str, str]]]
+    ) -> None:
+        """Ray's daemon is asked for so many more each time, and they stay for ever."""
+        self.refill(*[(1, 0)] * (looks + 1))
+        assert started == [(2, {"A": "1"})]
+
+    def test_those_that_never_appear_are_started_again(self, started: list[tuple[int, Mapping[str, str]]]) -> None:
+        from vlagents_ray.cli.cluster.keeper import _LOOKS
+
+        self.refill(*[(1, 0)] * (_LOOKS + 3))
+        assert started == [(2, {"A": "1"})] * 2
+
+    def test_what_is_taken_while_others_appear_is_replaced(self, started: list[tuple[int, Mapping[str, str]]]) -> None:
+        self.refill((1, 0), (1, 0), (0, 0), (0, 1), (0, 2), (0, 2))
+        assert started == [(2, {"A": "1"}), (1, {})]
+
     def test_there_are_never_more_than_wanted(self, started: list[tuple[int, Mapping[str, str]]]) -> None:
         """Though they may be taken for another kind, whose environment Ray's title has overwritten."""
         self.refill((3, 0), (3, 0))

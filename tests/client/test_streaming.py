@@ -6,6 +6,7 @@ import contextlib
 import queue
 from collections.abc import Callable, Iterator
 from dataclasses import asdict
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,10 @@ from eval_fakes import wait_for
 from streaming_agents import ROWS, InParts
 
 from vlagents_ray import Act, Agent, ConnectionLost, DeadlineExceeded, Obs, PolicyFailed, RemoteAgent
-from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Limits
+from vlagents_ray.chunking.background import parts_of
+from vlagents_ray.client import connection as connection_module
+from vlagents_ray.errors import MalformedMessage
+from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Limits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
@@ -171,3 +175,62 @@ def test_parts_wait_for_a_caller_that_is_busy_with_the_first_ones(serving: Serve
     taken.put(next(stream))
     wait_for(lambda: len(policy.record.closed) == 1)  # all parts are on their way
     assert rows([taken.get(), *stream]) == [[0.0, row] for row in range(ROWS)]
+
+
+@pytest.mark.parametrize("parts", ["exact", None])
+def test_in_an_episode_connecting_again_takes_no_longer_than_an_act_may(
+    parts: Any, serving: Serve, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in `act`; else a control loop would stand still for `connect_timeout_s`."""
+    policy = InParts()
+    policy.act_parts = parts
+    agent = serving(policy, "shm", timeout_s=60.0, connect_timeout_s=1e6)
+    connection, limits = agent._connection, list[float | None]()
+    connect = connection.open
+
+    def limited(timeout_s: float | None = None) -> None:
+        limits.append(timeout_s)
+        connect(timeout_s)
+
+    monkeypatch.setattr(connection, "open", limited)
+    for ask in (agent.act_stream, partial(parts_of, agent)):
+        connection._must_reconnect = True
+        assert sum(len(part.rows()) for part in ask(Obs())) == ROWS
+    assert len(limits) == 2
+    assert all(limit is not None and limit <= 60.0 for limit in limits)
+
+
+def test_a_replica_that_stops_between_two_parts_is_left_like_one_that_answers_nothing(
+    serving: Serve, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connection_module, "SILENT_S", 0.0)
+    agent = serving(InParts(), "shm")
+    stream = agent.act_stream(Obs())
+    next(stream)
+
+    def silent(request: Request, timeout_s: float) -> Reply:
+        raise DeadlineExceeded("no answer")
+
+    monkeypatch.setattr(agent._connection.transport, "call_on", silent)
+    with pytest.raises(DeadlineExceeded):
+        next(stream)
+    silent_one = agent._connection.transport
+    assert len(list(agent.act_stream(Obs()))) == ROWS
+    assert agent._connection.transport is not silent_one
+
+
+def test_a_server_that_sends_a_part_unasked_is_refused(serving: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The rest of the chunk would be missing."""
+    agent = serving(InParts(), "shm")
+    call = agent._connection.transport.call
+
+    def one_part(requests: Any, timeout_s: float) -> list[Reply]:
+        replies = call(requests, timeout_s)
+        for reply in replies:
+            assert reply.act is not None
+            reply.act.more = True
+        return replies
+
+    monkeypatch.setattr(agent._connection.transport, "call", one_part)
+    with pytest.raises(MalformedMessage, match="want a whole one"):
+        agent.act(Obs())

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import json
 import os
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from fake_raylet import raylet
 
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.ray_tools import session
 from vlagents_ray.ray_tools import warm_cluster as module
 from vlagents_ray.ray_tools.reaper import MARK
 from vlagents_ray.ray_tools.warm_cluster import (
@@ -22,6 +27,7 @@ from vlagents_ray.ray_tools.warm_cluster import (
     join_warm,
     kept,
     locked,
+    only_keeper,
     owned_apps,
     warm_cluster,
 )
@@ -150,6 +156,83 @@ def test_a_keeper_is_known_by_its_lock(folder: Path) -> None:
     assert not cluster.is_kept
     with kept():
         assert cluster.is_kept
+
+
+def test_several_processes_may_look_at_once_whether_it_is_kept(folder: Path) -> None:
+    with raylet(folder, ADDRESS):
+        cluster = warm_cluster()
+    assert cluster is not None
+    with kept():
+        pass
+    with (folder / "keeper.lock").open() as another:
+        fcntl.flock(another, fcntl.LOCK_SH)
+        assert not cluster.is_kept
+
+
+def test_a_cluster_that_has_ended_with_its_folder_is_not_kept(folder: Path) -> None:
+    with raylet(folder, ADDRESS):
+        cluster = warm_cluster()
+    assert cluster is not None
+    assert not replace(cluster, folder=folder / "removed").is_kept
+
+
+def test_two_are_not_started_at_once(folder: Path) -> None:
+    """Else both might listen at one port, and commands would find either."""
+    lock = folder / f"vlagents-ray-up-{os.getuid()}.lock"
+    with held(lock), pytest.raises(ConfigError, match="another `vlagents-ray up` starts or keeps"), only_keeper():
+        pytest.fail("started another one")
+    with only_keeper():
+        assert lock.exists()
+    assert not lock.exists()
+
+
+def test_an_application_is_owned_again_only_when_the_old_one_is_removed(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However long that takes."""
+    monkeypatch.setattr(module, "_LOCK_S", 0.0)
+    with raylet(folder, ADDRESS):
+        cluster = warm_cluster()
+    assert cluster is not None
+    (folder / "app-noop").touch()  # of a command that was killed
+    looked, events = threading.Event(), list[str]()
+    exists = Path.exists
+
+    def look(path: Path, **options: Any) -> bool:
+        there = exists(path, **options)
+        if there and path.name == "removed-noop":
+            looked.set()
+        return there
+
+    monkeypatch.setattr(Path, "exists", look)
+
+    def own() -> None:
+        with owned_apps(cluster, ["noop"]):
+            events.append("owned")
+
+    owner = threading.Thread(target=own)
+    with abandoned_apps(folder) as names:
+        assert names == ["noop"]
+        owner.start()
+        assert looked.wait(60)
+        events.append("removed")
+    owner.join(60)
+    assert events == ["removed", "owned"]
+
+
+def test_only_what_the_cluster_set_is_undone_in_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("SET_BY_JOIN", "CHANGED_BY_JOIN", "SET_BY_USER"):
+        monkeypatch.setenv(name, "before")
+        if name != "CHANGED_BY_JOIN":
+            monkeypatch.delenv(name)
+    monkeypatch.setattr(session, "warm_cluster", lambda: "a cluster")
+    monkeypatch.setattr(session, "join_warm", lambda **_: os.environ.update(SET_BY_JOIN="1", CHANGED_BY_JOIN="1"))
+    with session.joined("auto"):
+        assert os.environ["SET_BY_JOIN"] == "1"
+        os.environ["SET_BY_USER"] = "1"
+    assert "SET_BY_JOIN" not in os.environ
+    assert os.environ["CHANGED_BY_JOIN"] == "before"
+    assert os.environ["SET_BY_USER"] == "1"
 
 
 def test_the_lock_of_a_removed_file_is_none(tmp_path: Path) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Generator
-from dataclasses import dataclass
+from dataclasses import replace
 
 from vlagents_ray.errors import PolicyFailed
 from vlagents_ray.interface import Act, Agent, Obs
@@ -20,7 +20,7 @@ def parts_of(agent: Agent, obs: Obs) -> Generator[Act, None, None]:
         PolicyFailed: The policy ends without a last part.
     """
     if agent.act_parts is None:
-        yield agent.act(obs)
+        yield replace(agent.act(obs), more=False)
         return
     stream = agent.act_stream(obs)
     for part in stream:
@@ -32,14 +32,6 @@ def parts_of(agent: Agent, obs: Obs) -> Generator[Act, None, None]:
     raise PolicyFailed("act_stream: it ended without a last part, i.e. one without `more`")
 
 
-@dataclass(frozen=True, slots=True)
-class AsyncAnswer:
-    """The policy's answer to a request, or a part of it, or its error."""
-
-    tick: int  # the tick of its observation
-    result: Act | Exception
-
-
 class AsyncCaller:
     """A thread that calls `agent.act` or `act_stream`, so that the caller's own thread never waits for it.
 
@@ -49,8 +41,8 @@ class AsyncCaller:
     def __init__(self, agent: Agent) -> None:
         self._agent = agent
         self._changed = threading.Condition()
-        self._job: tuple[int, Obs] | None = None
-        self._answers: deque[AsyncAnswer] = deque()
+        self._job: Obs | None = None
+        self._answers: deque[Act | Exception] = deque()
         self._closing = False
         self._thread = threading.Thread(target=self._run, name="vlagents-ray-caller", daemon=True)
         self._thread.start()
@@ -60,14 +52,14 @@ class AsyncCaller:
         """Whether there is neither a request in progress nor an answer to be taken."""
         return self._job is None and not self._answers
 
-    def ask(self, tick: int, obs: Obs) -> None:
+    def ask(self, obs: Obs) -> None:
         """Begin a request, only while `idle`. The caller must not change `obs` afterwards."""
         with self._changed:
-            self._job = tick, obs
+            self._job = obs
             self._changed.notify_all()
 
-    def take(self, wait_s: float = 0.0) -> AsyncAnswer | None:
-        """Return the answer, or its next part, if that comes within `wait_s` seconds, else None."""
+    def take(self, wait_s: float = 0.0) -> Act | Exception | None:
+        """Return the policy's answer, its next part, or its error, if one comes within `wait_s` seconds; else None."""
         if not self._answers and wait_s > 0:
             with self._changed:
                 self._changed.wait_for(lambda: self._answers, wait_s)
@@ -94,15 +86,14 @@ class AsyncCaller:
                 job = self._job
             if job is None:
                 break
-            tick, obs = job
             try:
-                for part in parts_of(self._agent, obs):
-                    self._note(AsyncAnswer(tick, part), last=not part.more)
+                for part in parts_of(self._agent, job):
+                    self._note(part, last=not part.more)
             except Exception as error:  # noqa: BLE001 - raised or reported where the answer is taken
-                self._note(AsyncAnswer(tick, error), last=True)
+                self._note(error, last=True)
         self._agent.close()
 
-    def _note(self, answer: AsyncAnswer, *, last: bool) -> None:
+    def _note(self, answer: Act | Exception, *, last: bool) -> None:
         with self._changed:
             self._answers.append(answer)
             if last:

@@ -11,8 +11,9 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from vlagents_ray.chunking.background import AsyncAnswer, AsyncCaller, parts_of
-from vlagents_ray.chunking.buffer import DELAYS, ENSEMBLE, ENSEMBLE_M, Chunk, ChunkBuffer, Merge, Step
+from vlagents_ray.chunking.answer import LastAnswer
+from vlagents_ray.chunking.background import AsyncCaller, parts_of
+from vlagents_ray.chunking.buffer import DELAYS, ENSEMBLE, ENSEMBLE_M, ChunkBuffer, Merge, Step
 from vlagents_ray.chunking.capture_clock import CaptureClock, stamped
 from vlagents_ray.chunking.fallback import LATE, OLD, STALE, STOPPED, WAITING, Safe, SafeAction
 from vlagents_ray.contract import ActionSpec, Contract
@@ -113,15 +114,10 @@ class ChunkPlayer(Agent):
     def _begin(self) -> None:
         self._plan.drop()
         self._tick: int | None = None  # tick of the next `act`; None outside an episode
-        self._chunks = 0
-        # The last request: its tick, step of the plan, and capture time of its observation (s, of `time.monotonic`).
-        self._asked, self._asked_step, self._seen_at = -1, 0, 0.0
-        self._parts: list[np.ndarray] = []  # rows of its answer so far, (h, D) each, while further parts are to come
-        self._rest: Generator[Act, None, None] | None = None  # without a deadline, the parts that are to be read
+        self._answer = LastAnswer()
         self._waiting_since: float | None = None
         self._trouble = WAITING
         self._captured = CaptureClock()
-        self._since = 0  # tick; answers to earlier observations are not executed
         self._delays: deque[int] = deque(maxlen=DELAYS)
         self._last: np.ndarray | None = None  # the last commanded action
         self._before: np.ndarray | None = None  # the action before it
@@ -153,7 +149,7 @@ class ChunkPlayer(Agent):
         self._choose_safe()
         if self._deadline_s is not None:
             self._note_asked(0, obs)
-            self._take(0, self._agent.act(obs), 0)
+            self._take(self._agent.act(obs), 0)
             if self._asker is None:
                 self._asker = AsyncCaller(self._agent)
         self._tick = 0
@@ -166,8 +162,7 @@ class ChunkPlayer(Agent):
         at which the watchdog has the robot stopped; call it in your own loop when you stop or take over the robot.
         """
         self._plan.drop()
-        self._rest = None
-        self._since = self._tick or 0
+        self._answer.drop()
         self._trouble = STOPPED
         self._last = self._before
         self._motion = "stopped"
@@ -176,8 +171,8 @@ class ChunkPlayer(Agent):
         """Show the policy an observation for which no action is needed."""
         if self._asker is not None:
             self._asker.settle()
-        while self._rest is not None:
-            self._read_part(self._rest, self._tick or 0)
+        while self._answer.rest is not None:
+            self._read_part(self._answer.rest, self._tick or 0)
         self._agent.observe(obs)
 
     def act(self, obs: Obs) -> Act:
@@ -187,8 +182,8 @@ class ChunkPlayer(Agent):
             raise NotReset("act before reset; reset first")
         begun = time.monotonic()
         if self._asker is None or self._deadline_s is None:
-            while (wanted := self._wants(tick, obs)) and self._rest is not None:
-                self._read_part(self._rest, tick)
+            while (wanted := self._wants(tick, obs)) and self._answer.rest is not None:
+                self._read_part(self._answer.rest, tick)
             if wanted:
                 self._note_asked(tick, obs)
                 self._read_part(parts_of(self._agent, stamped(obs, self._extras())), tick)
@@ -199,12 +194,12 @@ class ChunkPlayer(Agent):
 
     def close(self) -> None:
         """Close the policy, at once or as soon as the request in progress is over."""
-        if self._asker is not None:
-            self._asker.close()
-            self._asker = None
+        asker, self._asker = self._asker, None
+        self._begin()  # before the policy is closed, so that nothing of its last answer is left to be read
+        if asker is not None:
+            asker.close()
         else:
             self._agent.close()
-        self._begin()
 
     def _choose_safe(self) -> None:
         """Choose the safe action; raises `ConfigError` if it does not fit the policy's actions."""
@@ -214,15 +209,13 @@ class ChunkPlayer(Agent):
             self._safe = SafeAction(self._safe_choice, spec, self._grippers)
 
     def _note_asked(self, tick: int, obs: Obs) -> None:
-        self._asked, self._asked_step, self._seen_at = tick, self._plan.executed, self._captured(obs)
-        self._chunks += bool(self._parts)  # an answer that broke off
-        self._parts = []
+        self._answer.ask(tick, self._plan.executed, self._captured(obs))
 
     def _read_part(self, parts: Generator[Act, None, None], tick: int) -> None:
-        self._rest = None  # after an error nothing follows
+        self._answer.rest = None  # after an error nothing follows
         act = next(parts)
-        self._take(self._asked, act, tick)
-        self._rest = parts if act.more else None
+        self._take(act, tick)
+        self._answer.rest = parts if act.more else None
 
     def _is_old(self, seen_at: float) -> bool:
         return self._max_age_s is not None and seen_at < time.monotonic() - self._max_age_s
@@ -245,7 +238,7 @@ class ChunkPlayer(Agent):
         if self._mode == "open_loop":
             return self._execute is not None and step.row >= self._execute
         last = step.chunk.end == self._plan.executed + 1  # also true for each answer of a single action
-        return last or tick - self._asked >= (self._execute or 1)
+        return last or tick - self._answer.tick >= (self._execute or 1)
 
     def _ask_in_time(self, asker: AsyncCaller, obs: Obs, tick: int, deadline: float) -> None:
         """Take an answer, send a request if one is due, and wait for its answer as long as allowed and needed."""
@@ -255,39 +248,44 @@ class ChunkPlayer(Agent):
             self._note_asked(tick, obs)
             if self._waiting_since is None:
                 self._waiting_since = time.monotonic()
-            asker.ask(tick, stamped(copied(obs), self._extras()))
+            asker.ask(stamped(copied(obs), self._extras()))
         while not asker.idle and (left_s := deadline - time.monotonic()) > 0:
-            fresh = self._mode != "async" and self._asked == tick and not self._parts
+            fresh = self._mode != "async" and self._answer.tick == tick and not self._answer.parts
             if not fresh and self._next() is not None:
                 break
             self._receive(asker.take(left_s), tick)
 
-    def _receive(self, answer: AsyncAnswer | None, tick: int) -> None:
+    def _receive(self, answer: Act | Exception | None, tick: int) -> None:
         if answer is None:
             return
-        if isinstance(answer.result, Act):
+        if isinstance(answer, Act):
             try:
-                if answer.tick >= self._since:
-                    self._take(answer.tick, answer.result, tick)
-                self._waiting_since = time.monotonic() if answer.result.more else None
+                if not self._answer.dropped:
+                    self._take(answer, tick)
+                self._waiting_since = time.monotonic() if answer.more else None
             except InvalidAction as error:
                 self._trouble = str(error)
             return
-        if isinstance(answer.result, InvalidInput) or not isinstance(answer.result, VLAgentsError):
-            raise answer.result
-        self._trouble = f"{answer.result.code}: {answer.result}"
+        if isinstance(answer, InvalidInput) or not isinstance(answer, VLAgentsError):
+            raise answer
+        self._trouble = f"{answer.code}: {answer}"
 
-    def _take(self, asked: int, act: Act, now: int) -> None:
-        self._parts.append(Act(check_action(act.action, self._contract)).rows())
-        execute = self._execute if self._mode == "open_loop" and act.done else None
-        rows = np.concatenate(self._parts)[: self._horizon][:execute]
-        chunk = Chunk(self._chunks, self._asked_step, rows, act.done, act.info, asked, self._seen_at, act.more)
-        if len(self._parts) == 1:
-            self._delays.append(now - asked)
-        added = self._plan.add(chunk) if len(self._parts) == 1 else self._plan.extend(chunk)
+    def _take(self, act: Act, now: int) -> None:
+        answer = self._answer
+        try:
+            rows = Act(check_action(act.action, self._contract)).rows()
+        except InvalidAction:
+            self._answer.drop()  # rows that follow would be executed in place of these
+            raise
+        chunk = answer.add(act, rows, self._horizon)
+        if self._mode == "open_loop" and chunk.done and self._execute is not None:
+            # One more row if it is known only now that the task is done: the last row says so.
+            most = max(self._execute, self._plan.executed + 1 - answer.step)
+            chunk = chunk._replace(rows=chunk.rows[:most])
+        if answer.parts == 1:
+            self._delays.append(now - answer.tick)
+        added = self._plan.add(chunk) if answer.parts == 1 else self._plan.extend(chunk)
         self._trouble = WAITING if added or act.more else LATE
-        if not act.more:
-            self._chunks, self._parts = self._chunks + 1, []
 
     def _extras(self) -> dict[str, Any]:
         extras: dict[str, Any] = {}
@@ -310,6 +308,8 @@ class ChunkPlayer(Agent):
                 return step.played(self._last, tick, silent_s)
             except InvalidAction as error:
                 self._plan.drop()  # the rest was planned from where this action would have led
+                if self._answer.parts:
+                    self._answer.drop()
                 reason = str(error)
                 if self._safe is None:
                     raise

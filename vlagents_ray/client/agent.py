@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from vlagents_ray.client.connection import Connection
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.session import ClientSession, EpisodeState, call_with_recovery
+from vlagents_ray.client.transports.base import no_parts
 from vlagents_ray.client.transports.codec_selection import CodecChoice, CodecName, LinkSpeed
 from vlagents_ray.client.transports.select import TransportName, select_transport
 from vlagents_ray.contract import Contract
@@ -248,9 +249,9 @@ class RemoteAgent(Agent):
     @property
     def act_parts(self) -> Parts | None:
         """Whether the policy gives its chunks in parts over this connection; see `Agent.act_parts`."""
-        self._connection.open()
-        found: Parts | None = (self._connection.metadata or {}).get("act_parts")
-        return found
+        if self._session.episode is None:  # in an episode, only a call with a timeout may connect again
+            self._connection.open()
+        return self._connection.act_parts
 
     def act_stream(self, obs: Obs) -> Generator[Act, None, None]:
         """Yield the rows of the next chunk as they come; the last part is without `more`, and has the `timing`.
@@ -262,7 +263,7 @@ class RemoteAgent(Agent):
         begun = time.perf_counter()
         session = self._session
         request = session.act(obs)
-        request.parts = self.act_parts is not None
+        request.parts = self._connection.act_parts is not None
         timeout_s = min(self._connection.timeout_s, _deadline_s([obs]))
         [reply] = self._call([session], [request], timeout_s)
         if reply.act is not None and reply.act.more and session.episode is not None:
@@ -301,6 +302,8 @@ class RemoteAgent(Agent):
             elif isinstance(reply.error, (ConnectionLost, UnknownSession)) and not self._resume:
                 session.episode = None
             return reply.error or PolicyFailed("act: the server's reply holds no action")
+        if reply.act.more:
+            return no_parts(self.transport)
         session.acted(obs, reply)
         timing = reply.act.info["timing"] = reply.timing
         timing["round_trip_ms"] = round_trip_ms

@@ -60,8 +60,7 @@ def joined(address: str | None = None, **options: Any) -> Iterator[None]:
                 with _marked(folder):
                     start_ray(_temp_dir=str(folder / FILES), **options)
             elif (address or os.environ.get("RAY_ADDRESS")) == "auto" and warm_cluster() is not None:
-                stack.enter_context(_restored_environment())
-                with own_sigterm():
+                with own_sigterm(), _undone_by(stack):
                     join_warm(**options)
             elif (server := _local_server(address or os.environ.get("RAY_ADDRESS"))) is not None:
                 with own_sigterm():
@@ -80,14 +79,22 @@ def joined(address: str | None = None, **options: Any) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _restored_environment() -> Iterator[None]:
-    """Undo at the end of the context what was changed in the environment of this process."""
+def _undone_by(stack: contextlib.ExitStack) -> Iterator[None]:
+    """Let the end of `stack` undo what this context changes in the environment of this process, and nothing else."""
     before = dict(os.environ)
     try:
         yield
     finally:
-        os.environ.clear()
-        os.environ.update(before)
+        for name in before.keys() | os.environ.keys():
+            if os.environ.get(name) != before.get(name):
+                stack.callback(_set_variable, name, before.get(name))
+
+
+def _set_variable(name: str, value: str | None) -> None:
+    if value is None:
+        os.environ.pop(name, None)
+    else:
+        os.environ[name] = value
 
 
 def _local_server(address: str | None) -> str | None:
@@ -132,10 +139,7 @@ def _marked(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        if before is None:
-            del os.environ[MARK]
-        else:
-            os.environ[MARK] = before
+        _set_variable(MARK, before)
 
 
 def start_ray(**options: Any) -> None:

@@ -23,7 +23,10 @@ from vlagents_ray.ray_tools.reaper import MARK
 _FILE = "warm.json"  # written to the private folder of the cluster when it is ready
 _KEEPER = "keeper.lock"  # locked by the keeper, in the same folder
 _APP = "app-"  # what the name of a file begins with that is locked by the command that serves an application
-_LOCK_S = 5.0  # for the keeper to let go of an application that it removes
+_REMOVED = "removed-"  # the same, once the command was killed and the keeper removes the application
+_LOCK_S = 5.0  # for the keeper to find out that an application which is just being locked was not abandoned
+_REMOVAL_S = 120.0  # for the keeper to remove an application
+_LOOK_S = 0.05
 _SERVE = "RAY_SERVE_"  # variables that Serve reads in a driver as well
 _KEYS = ("VLAGENTS_RAY_KEYS_FILE", "VLAGENTS_RAY_KEYS")  # read where a replica runs
 AGAIN = "`vlagents-ray down`, then `vlagents-ray up`; or leave out --address"
@@ -43,8 +46,17 @@ class WarmCluster:
     @property
     def is_kept(self) -> bool:
         """Whether its keeper runs; without it nothing ends the cluster in order, or starts processes ahead."""
-        with locked(self.folder / _KEEPER) as free:
-            return not free
+        try:
+            descriptor = os.open(self.folder / _KEEPER, os.O_RDONLY)
+        except OSError:  # the cluster has ended, with its folder
+            return False
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)  # which others that look at the same time share
+        except BlockingIOError:
+            return True
+        finally:
+            os.close(descriptor)
+        return False
 
 
 def warm_cluster() -> WarmCluster | None:
@@ -127,7 +139,7 @@ def locked(file: Path) -> Iterator[bool]:
     """
     with contextlib.ExitStack() as stack:
         try:
-            descriptor = os.open(file, os.O_CREAT | os.O_RDWR, 0o600)
+            descriptor = os.open(file, os.O_CREAT | os.O_RDWR | os.O_NOFOLLOW, 0o600)
             stack.callback(os.close, descriptor)
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             mine = os.stat(file).st_ino == os.fstat(descriptor).st_ino  # else it was removed meanwhile
@@ -137,9 +149,32 @@ def locked(file: Path) -> Iterator[bool]:
 
 
 @contextlib.contextmanager
+def only_keeper() -> Iterator[None]:
+    """Exclude that another process of this user starts or keeps a warm cluster that would be found in place of ours.
+
+    Raises:
+        ConfigError: Another process does.
+    """
+    Path(_temporary_files()).mkdir(parents=True, exist_ok=True)
+    file = Path(_temporary_files()) / f"vlagents-ray-up-{os.getuid()}.lock"
+    with locked(file) as mine:
+        if not mine:
+            raise ConfigError(
+                f"another `vlagents-ray up` starts or keeps a warm cluster and has locked {file}: wait for it, or end "
+                f"it with `vlagents-ray down`"
+            )
+        try:
+            yield
+        finally:
+            file.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
 def kept() -> Iterator[None]:
     """Make this process the keeper of the warm cluster whose folder it has marked."""
-    with locked(Path(os.environ[MARK]) / _KEEPER):
+    with locked(Path(os.environ[MARK]) / _KEEPER) as mine:
+        if not mine:
+            raise ConfigError(f"{os.environ[MARK]}: another process keeps the warm cluster of this folder")
         yield
 
 
@@ -148,7 +183,7 @@ def owned_apps(cluster: WarmCluster, names: Collection[str]) -> Iterator[None]:
     """Own applications of these names in a warm cluster; its keeper removes them if this process is killed.
 
     Raises:
-        ConfigError: Another process owns one of them.
+        ConfigError: Another process owns one of them, or the keeper does not get one removed that was abandoned.
     """
     with contextlib.ExitStack() as stack:
         deadline = time.monotonic() + _LOCK_S
@@ -160,19 +195,27 @@ def owned_apps(cluster: WarmCluster, names: Collection[str]) -> Iterator[None]:
                         f"another command serves {name!r} in the warm cluster: stop it, use its server, or leave out "
                         f"--address for a Ray of this command's own"
                     )
-                time.sleep(0.05)
+                time.sleep(_LOOK_S)
             stack.callback(file.unlink, missing_ok=True)
+        deadline = time.monotonic() + _REMOVAL_S
+        while left := [name for name in names if (cluster.folder / f"{_REMOVED}{name}").exists()]:
+            if time.monotonic() > deadline:
+                raise ConfigError(f"{left} of a command that was killed are still in the warm cluster: {AGAIN}")
+            time.sleep(_LOOK_S)
         yield
 
 
 @contextlib.contextmanager
 def abandoned_apps(folder: Path) -> Iterator[list[str]]:
-    """Yield the names of the applications whose owners were killed, and lock them for the length of the context."""
-    with contextlib.ExitStack() as stack:
-        found = [file for file in folder.glob(f"{_APP}*") if stack.enter_context(locked(file))]
-        yield [file.name.removeprefix(_APP) for file in found]
-        for file in found:
-            file.unlink(missing_ok=True)
+    """Yield the names of the applications whose owners were killed; others own them after the context."""
+    found = []
+    for file in folder.glob(f"{_APP}*"):
+        with locked(file) as mine:
+            if mine:
+                found.append(file.rename(folder / f"{_REMOVED}{file.name.removeprefix(_APP)}"))
+    yield [file.name.removeprefix(_REMOVED) for file in found]
+    for file in found:
+        file.unlink(missing_ok=True)
 
 
 def _found() -> Iterator[tuple[WarmCluster, dict[str, str]]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import queue
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from typing import Any
 
 import numpy as np
@@ -11,12 +11,14 @@ import pytest
 from eval_fakes import wait_for
 from streaming_agents import ROWS, InParts, InPartsAtOnce
 
-from vlagents_ray.errors import InvalidAction, PolicyFailed
+from vlagents_ray.errors import InvalidAction, NotReset, PolicyFailed
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.responses import ReplyCollector
+from vlagents_ray.serve.models import padding
 
 
 class Caller:
@@ -201,13 +203,62 @@ def test_a_closed_session_stops_its_act(serving: Callable[..., Engine]) -> None:
     caller.next()
     caller.dispatcher.release()
     policy.gate.release()
-    wait_for(lambda: policy.record.closed != [])
+    assert rows([caller.next()]) == [[0.0, 1.0]]
+    assert isinstance(caller.next().error, NotReset)  # and no failure of the policy, for the metrics
     assert policy.record.computed == [0, 1]
+    assert policy.record.closed == [1]
+
+
+def test_a_part_that_comes_after_the_answer_is_not_sent() -> None:
+    """As after the deadline, or once the policy counts as hung, on another thread."""
+    request = Request("act", Obs(), parts=True)
+    sent: list[Reply] = []
+    collector = ReplyCollector([request], sent.extend, lambda: False, lambda *_: None)
+    collector.part = sent.append
+    first, answer, late = Reply(step=1), Reply(step=2), Reply(step=3)
+    collector.put_part(first)
+    collector.put(0, answer)
+    collector.put_part(late)
+    assert sent == [first, answer]
 
 
 def test_with_padded_batches_only_the_sessions_get_parts(serving: Callable[..., Engine]) -> None:
     caller = Caller(serving(InPartsAtOnce(), batch_sizes=[4], max_batch_size=4))
     assert rows(caller.act(value=3.0)) == [[3.0, row] for row in range(ROWS)]
+
+
+class Padded(InPartsAtOnce):
+    """Counts its resets; a session that is not of a caller may fail."""
+
+    shared = (*InPartsAtOnce.shared, "resets", "fails")
+
+    def __init__(self, *, fails: bool) -> None:
+        super().__init__()
+        self.resets, self.fails = [0], fails
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self.resets[0] += 1
+        return super().reset(obs, instruction, **kwargs)
+
+    def act_batch_stream(self, obs: Any, sessions: Any) -> Generator[list[Act | Exception | None], None, None]:
+        padding = [RuntimeError("broken")] * (len(obs) - 1) if self.fails else [None] * (len(obs) - 1)
+        for part in InParts.act_stream(sessions[0], obs[0]):
+            yield [part, *padding]
+
+
+@pytest.mark.parametrize(("fails", "life"), [(True, 1000), (False, 2)])
+def test_sessions_of_the_padding_are_replaced_as_without_parts(
+    fails: bool, life: int, serving: Callable[..., Engine], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A broken one would stay so, and one that lives long would keep every observation."""
+    monkeypatch.setattr(padding, "_LIFE", life)
+    policy = Padded(fails=fails)
+    caller = Caller(serving(policy, batch_sizes=[2], max_batch_size=2))
+    caller.act()
+    before = policy.resets[0]
+    for _ in range(2):
+        caller.act()
+    assert policy.resets[0] == before + (2 if fails else 1)
 
 
 def test_an_agent_without_parts_of_its_own_gives_one() -> None:

@@ -18,10 +18,12 @@ from vlagents_ray.ray_tools.head_monitor import HeadMonitor
 from vlagents_ray.ray_tools.private import start_workers_ahead
 from vlagents_ray.ray_tools.reaper import MARK, marked
 from vlagents_ray.ray_tools.signals import stop_signals
+from vlagents_ray.ray_tools.warm_cluster import only_keeper
 from vlagents_ray.serve.launch.warm import remove_abandoned, warm_ray
 
 _REPLICAS = 1  # processes that are kept ready for policies
 _LOOK_S = 1.0
+_LOOKS = 60  # within which processes that were started ahead appear, also on a busy machine
 # What the processes of servers and of evaluations import; simulators are not among it, as users choose them.
 _IMPORTS = (
     "vlagents_ray.serve.replica.app",
@@ -38,17 +40,22 @@ class IdleWorkers:
         """Keep `wanted` processes of each kind, whose runtime environments have `env_vars`."""
         self._wanted = dict(wanted)
         self._env_vars = env_vars
-        self._seen: dict[str, int] | None = None
+        self._seen: dict[str, int] = {}
+        self._expected = self._looks = 0  # how many there will be, and in how many looks at most
 
     def refill(self, found: Mapping[str, int]) -> None:
         """Start what is missing, if nobody has taken a process since the last call: who did has the cores now."""
+        there = sum(found.values())
+        self._expected -= max(sum(self._seen.values()) - there, 0)  # what was taken
         settled, self._seen = self._seen == found, dict(found)
-        if not settled or sum(found.values()) >= sum(self._wanted.values()):
+        self._looks = 0 if there >= self._expected else max(self._looks - 1, 0)
+        if not settled or self._looks or there >= sum(self._wanted.values()):
             return
+        self._expected, self._looks = there, _LOOKS
         for kind, number in self._wanted.items():
             if found[kind] < number:
                 start_workers_ahead(number - found[kind], self._env_vars[kind])
-                self._seen = None  # they appear within the next looks
+                self._expected += number - found[kind]
 
 
 def idle_workers(folder: str, variables: Mapping[str, str]) -> dict[str, int]:
@@ -77,6 +84,7 @@ def main(port: int, workers: int) -> None:
     idle = IdleWorkers({"replica": _REPLICAS, "evaluation": workers}, {"replica": {}, "evaluation": variables})
     with (
         errors(),
+        only_keeper(),
         stop_signals() as stop,
         quiet_ray(None),
         withheld(),  # workers get the key of their run when they are ready

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from vlagents_ray.errors import PolicyFailed
-from vlagents_ray.interface import Act
+from vlagents_ray.errors import NotReset, PolicyFailed
+from vlagents_ray.interface import Act, Agent
 from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
 from vlagents_ray.serve.engine.responses import build_reply, timing
 from vlagents_ray.serve.models.loaded_model import LoadedModel
@@ -45,12 +45,14 @@ class ActStreams:
         """
         observations = [ticket.request.obs for ticket, _ in acting]
         agents = [session.agent for _, session in acting]
+        padding: list[Agent] = []
         if self._batch_sizes:
             with model.call("reset", "padding"):
                 padding = model.padding.sessions(len(acting))
             observations += observations[-1:] * len(padding)
             agents += padding
         rows = len(observations)
+        padded: list[Act | Exception | None] = [None] * len(padding)  # the last results of the padding
         waiting = dict(enumerate(acting))  # those that get further parts, by their place in the batch
         left_bytes = [self._reply_bytes] * len(acting)
         call = model.call("act_stream", rows if self._batch_sizes else None)
@@ -83,14 +85,16 @@ class ActStreams:
                         raise PolicyFailed(f"act_batch_stream: got {rows} observations, yielded {len(parts)} parts")
                     if not any(self._goes_on(*waiting[i], parts[i]) for i in waiting):
                         stream.close()  # before the last replies, so that the observations are free
+                    padded = [new or old for old, new in zip(padded, parts[len(acting) :], strict=True)]
                     for i, part in enumerate(parts[: len(acting)]):
                         if part is not None and i in waiting:
                             send(i, part)
-            failure: Exception = PolicyFailed("act_stream: it ended without a last part, i.e. one without `more`")
+            failure: Exception | None = None
         except Exception as error:  # noqa: BLE001 - becomes the replies
-            failure = error
-        for i in list(waiting):
-            send(i, failure)
+            failure, padded = error, [error] * len(padding)
+        for i, (ticket, _) in list(waiting.items()):
+            send(i, failure or self._unfinished(ticket))
+        model.padding.check_results(padded)
         self._stats.batch(len(acting), rows)
 
     def _goes_on(self, ticket: PendingRequest, session: Session[LoadedModel], part: Act | Exception | None) -> bool:
@@ -98,3 +102,9 @@ class ActStreams:
         if ticket.cancelled or ticket.session_id not in self._sessions:
             return False
         return part is None or (isinstance(part, Act) and part.more)
+
+    def _unfinished(self, ticket: PendingRequest) -> Exception:
+        """Return the error of an act whose stream has ended without its last part."""
+        if ticket.session_id not in self._sessions:
+            return NotReset(f"session {ticket.session_id!r}: was closed during its act; reset first")
+        return PolicyFailed("act_stream: it ended without a last part, i.e. one without `more`")

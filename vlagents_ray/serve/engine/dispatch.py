@@ -218,7 +218,7 @@ class Dispatcher:
             quota=None if self._caller is None else (self._prefix, self._caller.sessions),
             arrived=arrived,
         )
-        ticket.part = collector.part if request.parts else None
+        ticket.part = collector.put_part if request.parts and collector.part is not None else None
         if self._owner:
             if request.op == "close":
                 self._sessions.discard(session_id)

@@ -210,6 +210,12 @@ class ReplyCollector:
             each.draining = asks_to_reconnect  # type: ignore[union-attr]
         self._done(self._replies)  # type: ignore[arg-type]
 
+    def put_part(self, reply: Reply) -> None:
+        """Pass on a reply before the last to the only request, unless the last one is there already."""
+        with self._lock:
+            if self.part is not None and self._replies[0] is None:
+                self.part(reply)
+
     def expire(self) -> None:
         """Answer the requests without a reply: their deadlines have passed, and those not begun are withdrawn."""
         self.over = True  # set before the tickets are copied: a concurrent new ticket is either copied, or not queued
