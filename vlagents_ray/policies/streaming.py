@@ -5,7 +5,6 @@ from __future__ import annotations
 import abc
 import copy
 from collections.abc import Generator, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -68,5 +67,5 @@ class StreamingPolicy(ModelPolicy):
                 return
 
 
-def _needs_whole(obs: Obs) -> Any:
-    return obs.info.get(SAMPLES) or obs.info.get(WANT) or obs.info.get(LEFTOVER) is not None
+def _needs_whole(obs: Obs) -> bool:
+    return bool(obs.info.get(SAMPLES) or obs.info.get(WANT)) or obs.info.get(LEFTOVER) is not None
