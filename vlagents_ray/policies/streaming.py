@@ -10,6 +10,7 @@ import numpy as np
 
 from vlagents_ray.interface import LEFTOVER, SAMPLES, WANT, Act, Agent, Obs
 from vlagents_ray.policies.base import ModelPolicy, Row
+from vlagents_ray.policies.determinism import require_deterministic
 
 
 class StreamingPolicy(ModelPolicy):
@@ -25,6 +26,12 @@ class StreamingPolicy(ModelPolicy):
 
         A row's result must not depend on the others.
         """
+
+    def initialize(self) -> None:
+        """See `ModelPolicy.initialize`; with `deterministic`, the parts are checked as the whole chunks are."""
+        super().initialize()
+        if self.config.deterministic and self.act_parts is not None:
+            require_deterministic(self._joined, self._example, self.config.rows)
 
     def act_batch_stream(
         self, obs: Sequence[Obs], sessions: Sequence[Agent]
@@ -53,6 +60,11 @@ class StreamingPolicy(ModelPolicy):
                 for i, action in zip(some, actions, strict=True):
                     parts[i] = Act(action, more=more)
                 yield parts
+
+    def _joined(self, rows: Sequence[Row]) -> list[np.ndarray]:
+        """Return the chunks of rows, computed in parts."""
+        parts = [actions for actions, _ in self._parts(list(rows))]
+        return [np.concatenate(of_row) for of_row in zip(*parts, strict=True)]
 
     def _parts(self, rows: list[Row]) -> Generator[tuple[list[np.ndarray], bool], None, None]:
         """Yield the next rows of each chunk that are used, (h, D) float32, and whether more follow."""
