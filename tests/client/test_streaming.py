@@ -18,7 +18,7 @@ from streaming_agents import ROWS, InParts
 from vlagents_ray import Act, Agent, ConnectionLost, DeadlineExceeded, Obs, PolicyFailed, RemoteAgent
 from vlagents_ray.chunking.background import parts_of
 from vlagents_ray.client import connection as connection_module
-from vlagents_ray.errors import MalformedMessage
+from vlagents_ray.errors import MalformedMessage, NotReset
 from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Limits, Reply, Request
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
@@ -234,3 +234,17 @@ def test_a_server_that_sends_a_part_unasked_is_refused(serving: Serve, monkeypat
     monkeypatch.setattr(agent._connection.transport, "call", one_part)
     with pytest.raises(MalformedMessage, match="want a whole one"):
         agent.act(Obs())
+
+
+@pytest.mark.parametrize(("resume", "error"), [(True, DeadlineExceeded), (False, NotReset)])
+def test_a_session_that_ends_between_two_parts_is_resumed_by_the_next_act(
+    resume: bool, error: type[Exception], serving: Serve, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As one that ends before an act: a control loop takes safe actions meanwhile, and goes on."""
+    agent = serving(InParts(), "shm", resume=resume)
+    stream = agent.act_stream(Obs())
+    next(stream)
+    ended = Reply(error=NotReset("was closed during its act"))
+    monkeypatch.setattr(agent._connection.transport, "call_on", lambda *_: ended)
+    with pytest.raises(error):
+        next(stream)

@@ -22,6 +22,7 @@ from vlagents_ray.errors import (
     ConnectionLost,
     DeadlineExceeded,
     InvalidObservation,
+    NotReset,
     PolicyFailed,
     UnknownSession,
 )
@@ -271,6 +272,8 @@ class RemoteAgent(Agent):
         while reply.act is not None and reply.act.more:
             yield reply.act
             reply = self._connection.call_on(request, timeout_s - (time.perf_counter() - begun))
+            if self._resume and isinstance(reply.error, (NotReset, UnknownSession)):  # which ask for a reset
+                reply.error = DeadlineExceeded("the session ended between two parts of a chunk; the next act begins it")
         act = self._take(session, obs, reply, (time.perf_counter() - begun) * 1e3)
         if isinstance(act, Exception):
             raise act
