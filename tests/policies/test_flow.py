@@ -9,7 +9,7 @@ import pytest
 from normal_steps import logprob_of_steps
 
 from vlagents_ray.policies.base import Row
-from vlagents_ray.policies.flow import RandomSteps, chain_entropy, logprob_of_chain, step_mean, step_std
+from vlagents_ray.policies.flow import RandomSteps, chain_entropy, follow, logprob_of_chain, step_mean, step_std
 
 torch = pytest.importorskip("torch")
 torch.set_num_threads(1)  # tensors this small are faster in one
@@ -28,18 +28,16 @@ def row(seed: int, *want: str) -> Row:
     return Row((), "go", np.random.default_rng(seed), want=want)
 
 
-def follow(rows: list[Row], level: float = LEVEL) -> tuple[Any, RandomSteps | None]:
+def followed(rows: list[Row], level: float = LEVEL) -> tuple[Any, RandomSteps | None]:
     """The actions of rows, and their random steps."""
     actions = torch.from_numpy(np.stack([one.noise(HORIZON, DIM) for one in rows]))
     random = RandomSteps.of(rows, SHAPE, level, torch.from_numpy)
-    for step in range(STEPS):
-        change = velocity(actions, 1.0 - step / STEPS)
-        actions = actions - (change if random is None else random.velocity(change, actions)) / STEPS
+    actions = follow(velocity, actions, STEPS, *([] if random is None else [random.change]))
     return actions, random
 
 
 def stated(*rows: Row, execute: int | None = None, dim: int = DIM) -> dict[int, dict[str, Any]]:
-    _, random = follow(list(rows))
+    _, random = followed(list(rows))
     assert random is not None
     return random.stated(execute, dim)
 
@@ -82,7 +80,7 @@ def test_a_replayed_chain_has_the_log_probability_that_was_stated() -> None:
 
 def test_a_chain_begins_with_the_noise_and_ends_with_the_actions() -> None:
     rows = [row(0, "replay")]
-    actions, random = follow(rows)
+    actions, random = followed(rows)
     assert random is not None
     chain = random.stated(None, DIM)[0]["replay"]["chain"]
     assert chain.shape == (STEPS + 1, HORIZON, DIM)
@@ -105,9 +103,9 @@ def test_a_step_of_a_learner_makes_a_chain_likelier() -> None:
 
 
 def test_neighbours_neither_change_what_is_drawn_nor_are_changed() -> None:
-    alone, _ = follow([row(3, "logprob")])
-    plain, nothing = follow([row(4)])
-    together, _ = follow([row(4), row(5, "entropy"), row(3, "logprob")])
+    alone, _ = followed([row(3, "logprob")])
+    plain, nothing = followed([row(4)])
+    together, _ = followed([row(4), row(5, "entropy"), row(3, "logprob")])
     assert nothing is None
     np.testing.assert_array_equal(together[2], alone[0])
     np.testing.assert_array_equal(together[0], plain[0])

@@ -28,6 +28,29 @@ OFFERED = ("logprob", "entropy", "replay")  # of chunks that come out of random 
 _LOG_2_PI = math.log(2 * math.pi)
 
 
+Change = Callable[[Any, Any, float], Any]
+"""The velocity (B, H, D), noisy actions (B, H, D) and flow time of a step -> the velocity that it takes."""
+
+
+def follow(velocity: Callable[[Any, float], Any], noise: Any, steps: int, *changes: Change) -> Any:
+    """Integrate noise (B, H, D) to actions in Euler steps, from flow time 1 to 0.
+
+    Args:
+        velocity: Returns the flow's velocity (B, H, D) at noisy actions (B, H, D) and a flow time in (0, 1].
+        noise: The actions at time 1.
+        steps: The number of steps.
+        changes: Applied to the velocity of each step, one after another.
+    """
+    actions = noise
+    for step in range(steps):
+        time = 1.0 - step / steps
+        taken = velocity(actions, time)
+        for change in changes:
+            taken = change(taken, actions, time)
+        actions = actions - taken / steps
+    return actions
+
+
 def normal_logprob(values: Any, mean: Any, std: float) -> Any:
     """Return the log-density of each value under a normal distribution, nats."""
     return -0.5 * ((values - mean) / std) ** 2 - math.log(std) - 0.5 * _LOG_2_PI
@@ -123,7 +146,7 @@ class RandomSteps:
         """Return the random steps of a batch; None if there are none, in which case nothing is drawn."""
         return cls(rows, shape, noise_level, convert) if noise_level and any(row.want for row in rows) else None
 
-    def velocity(self, velocity: Any, actions: Any) -> Any:
+    def change(self, velocity: Any, actions: Any, time: float) -> Any:
         """Return the velocity (B, H, D) of the next step, which leads the wanted rows to actions that are drawn."""
         step, before = len(self._means), actions[self._index]
         mean = step_mean(before, velocity[self._index], step, self._steps, self._level)

@@ -56,11 +56,6 @@ def test_a_policy_without_a_flow_has_no_noise_level(made: Made) -> None:
         LeRobot.from_config({"checkpoint": str(made("act")), "noise_level": LEVEL}).initialize()
 
 
-def test_random_steps_are_not_compiled() -> None:
-    with pytest.raises(ConfigError, match="compile and noise_level: got both"):
-        LeRobot.from_config({"checkpoint": "any", "noise_level": LEVEL, "compile": True})
-
-
 def test_acts_of_which_nothing_is_wanted_are_those_without_random_steps(loaded: Load, learnt: LeRobot) -> None:
     acts = [begun(policy, 1).act(view(1)) for policy in (loaded("smolvla"), learnt)]
     np.testing.assert_array_equal(acts[0].action, acts[1].action)

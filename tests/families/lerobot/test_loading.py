@@ -162,7 +162,6 @@ def test_a_step_that_takes_code_from_the_hub_by_itself_is_refused(
         ({"processors": {"tokenizer_processor": {}}}, "normalizer_processor"),
         ({"processors": {"normalizer_processor": {"nonsense": 1}}}, "processors do not load"),
         ({"dtype": "bfloat16"}, "'act' takes"),
-        ({"compile": True}, "compile_model"),
         ({"device": "cuda:77"}, "cuda:77"),
         ({"temperature": 1}, "temperature"),
     ],

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from counting_compiler import counting_compiler
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from normal_steps import logprob_of_steps
 from safetensors.torch import load_file, save_file
@@ -138,6 +139,22 @@ def test_random_steps_have_the_log_probability_of_the_networks_own_steps(
 
 
 @pytest.mark.parametrize("kind", KINDS)
+def test_compiled_passes_act_as_without(kind: str, made: Callable[[str], Path]) -> None:
+    plain = _loaded(made(kind))
+    with counting_compiler() as programs:
+        compiled = _loaded(made(kind), compile="require", batch_sizes=[2])
+        assert programs.rows == [2, 2]  # what is seen, and a step of the flow
+        for size in (1, 2, 3):
+            views = [view(i) for i in range(size)]
+            found = [policy.act_batch(views, [begun(policy, i) for i in range(size)]) for policy in (plain, compiled)]
+            for one, other in zip(*found, strict=True):
+                assert isinstance(one, Act)
+                assert isinstance(other, Act)
+                np.testing.assert_allclose(one.action, other.action, atol=ATOL)
+        assert programs.rows == [2, 2]
+
+
+@pytest.mark.parametrize("kind", KINDS)
 def test_weights_that_lerobot_would_replace_by_random_ones_are_an_error(kind: str, made: Callable[[str], Path]) -> None:
     file = made(kind) / "model.safetensors"
     whole = load_file(file)
@@ -146,7 +163,7 @@ def test_weights_that_lerobot_would_replace_by_random_ones_are_an_error(kind: st
         with pytest.raises(ConfigError, match="action_out_proj"):
             _loaded(made(kind))
         file.write_bytes(b"not a checkpoint")
-        with pytest.raises(ConfigError, match="whole"):
+        with pytest.raises(ConfigError, match="is it complete"):
             _loaded(made(kind))
         save_file({name.removeprefix("model."): tensor for name, tensor in whole.items()}, file)  # as openpi names them
         _loaded(made(kind))

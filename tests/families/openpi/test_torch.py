@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from counting_compiler import counting_compiler
 from normal_steps import logprob_of_steps
 
 from tests.families.openpi.marks import MARKS
@@ -60,6 +61,21 @@ def test_actions_are_those_of_openpis_own_policy_alone_and_in_company(port: Path
         with torch.inference_mode():
             want = upstream.infer({**theirs("pi0", i), "prompt": WORDS[i]}, noise=noise)["actions"]
         np.testing.assert_allclose(act.action, want, atol=10 * BATCHED)
+
+
+@patched
+def test_compiled_passes_act_as_without(port: Path) -> None:
+    plain = made(port)
+    with counting_compiler() as programs:
+        compiled = made(port, compile="require", batch_sizes=[2])
+        assert programs.rows == [2, 2]  # what is seen, and a step of the flow
+        for size in (1, 2, 3):
+            views = [seen("pi0", i) for i in range(size)]
+            for one, other in zip(
+                *(p.act_batch(views, [begun(p, "pi0", i) for i in range(size)]) for p in (plain, compiled)), strict=True
+            ):
+                np.testing.assert_allclose(one.action, other.action, atol=BATCHED)
+        assert programs.rows == [2, 2]
 
 
 @patched

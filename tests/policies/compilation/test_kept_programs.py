@@ -41,16 +41,23 @@ def test_programs_are_kept_where_only_the_user_may_write(
     if chosen is not None:
         monkeypatch.setenv(TORCH, chosen)
     keep_torch_programs()
-    keep_jax_programs(jax := jax_with(None))
+    keep_jax_programs(jax := jax_with(None), "gpu")
     for folder in (Path(os.environ[TORCH]), Path(jax.config.jax_compilation_cache_dir)):
         assert folder.is_relative_to(cache)
         assert folder.stat().st_mode & 0o777 == 0o700
 
 
+def test_programs_of_jax_for_a_cpu_are_not_kept(cache: Path) -> None:
+    """JAX 0.5.3 computes something else with one that it has read."""
+    keep_jax_programs(jax := jax_with(None), "cpu")
+    assert jax.config.jax_compilation_cache_dir is None
+    assert not cache.exists()
+
+
 def test_a_folder_that_the_user_named_is_kept(cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(TORCH, "/mine")
     keep_torch_programs()
-    keep_jax_programs(jax := jax_with("/mine"))
+    keep_jax_programs(jax := jax_with("/mine"), "gpu")
     assert os.environ[TORCH] == jax.config.jax_compilation_cache_dir == "/mine"
     assert not cache.exists()
 

@@ -42,20 +42,19 @@ def torch_dtype(name: DType, device: Any, preferred: str = "bfloat16") -> Any:
 def jax_device(name: str = "auto") -> Any:
     """Return the JAX device of a name; "auto" takes the first one; raises `ConfigError` for a missing device.
 
-    From then on, the programs that JAX compiles are kept for the next start.
+    From then on, the programs that JAX compiles for a device that is no CPU are kept for the next start.
     """
     jax = require("jax")
-    keep_jax_programs(jax)
-    if name == "auto":
-        return jax.devices()[0]
     kind, _, index = name.partition(":")
     try:
-        return jax.devices(kind)[int(index or 0)]
+        device = jax.devices()[0] if name == "auto" else jax.devices(kind)[int(index or 0)]
     except (RuntimeError, IndexError, ValueError) as error:
         raise ConfigError(
             f"device {name!r}: not here, JAX sees {jax.devices()}; use 'auto' or 'cpu', or install the jaxlib of your "
             f"accelerator and give the replica a GPU with resources: {{num_gpus: 1}}"
         ) from error
+    keep_jax_programs(jax, device.platform)
+    return device
 
 
 def ensure_torchvision() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field, field_validator, model_validator
 from typing_extensions import Self
@@ -24,8 +24,6 @@ NoiseLevel = Annotated[
 
 class ModelConfig(BaseModel, extra="forbid"):
     """The settings of a model: its checkpoint, its device, its inputs, and how its chunks become actions."""
-
-    whole_flow: ClassVar[bool] = False  # whether `compile` makes one program of all steps of a flow
 
     checkpoint: str = Field(
         min_length=1,
@@ -92,12 +90,6 @@ class ModelConfig(BaseModel, extra="forbid"):
                 f"checkpoint {self.checkpoint!r} and checkpoint_step {self.checkpoint_step}: give both the place "
                 f"{STEP} and the step that belongs there, or neither"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _random_steps_are_not_compiled(self) -> Self:
-        if self.compile and self.whole_flow and getattr(self, "noise_level", None):
-            raise ValueError("compile and noise_level: got both, want one of them; random steps are not compiled")
         return self
 
     @model_validator(mode="after")

@@ -48,6 +48,10 @@ class Guide:
         """Convert the arrays to another library, or move them to another device."""
         return Guide(convert(self.plan), convert(self.frozen), convert(self.weight))
 
+    def change(self, noise: Any, *, steps: int, limit: float) -> Callable[[Any, Any, float], Any]:
+        """Return `steer` for a flow from some noise (B, H, D), as a function of velocity, noisy actions and time."""
+        return lambda velocity, actions, time: self.steer(velocity, actions, noise, time, steps=steps, limit=limit)
+
     def steer(
         self,
         velocity: Any,

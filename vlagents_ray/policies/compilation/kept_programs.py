@@ -1,8 +1,9 @@
 """The folders in which compiled programs are kept, so that the next start, and the next replica, finds them.
 
 They hold machine code, which is executed when it is read. They are therefore in the home of the user, where nobody else
-may write; torch's own choice is a folder of a known name in /tmp. The compilers recognise programs of another model,
-library or processor by themselves, and write each file at once, so that replicas may share a folder.
+may write; torch's own choice is a folder of a known name in /tmp. The compilers recognise programs of another model or
+library by themselves, and write each file at once, so that replicas may share a folder. JAX's programs for a CPU are
+not kept: with JAX 0.5.3, openpi's own loop of π0 computes other actions once its program was read from a file.
 """
 
 from __future__ import annotations
@@ -27,8 +28,15 @@ def keep_torch_programs() -> None:
         os.environ[_TORCH] = str(folder)
 
 
-def keep_jax_programs(jax: Any) -> None:
-    """Let JAX keep its programs in the user's cache, unless `JAX_COMPILATION_CACHE_DIR` names another folder."""
+def keep_jax_programs(jax: Any, platform: str) -> None:
+    """Let JAX keep its programs in the user's cache, unless `JAX_COMPILATION_CACHE_DIR` names another folder.
+
+    Args:
+        jax: The module.
+        platform: Of the device for which it compiles, such as "gpu"; nothing is kept for "cpu".
+    """
+    if platform == "cpu":
+        return
     chosen = getattr(jax.config, "jax_compilation_cache_dir", "an older JAX, without this setting")
     if chosen is None and (folder := _folder("jax")) is not None:
         jax.config.update("jax_compilation_cache_dir", str(folder))

@@ -114,10 +114,6 @@ def _prepare(settings: Any, config: LeRobotConfig, device: Any) -> bool:
     settings.device = str(device)
     if hasattr(settings, "pretrained_backbone_weights"):
         settings.pretrained_backbone_weights = None  # they would be downloaded, only to be replaced
-    if config.compile and not hasattr(settings, "compile_model"):
-        raise ConfigError(f"compile: LeRobot's {settings.type!r} has no compile_model; leave it out")
-    if config.compile:
-        settings.compile_model = True
     if issubclass(KINDS.get(settings.type, object), Flow):
         rtc = settings.rtc_config or require("lerobot.policies.rtc.configuration_rtc").RTCConfig()
         settings.rtc_config = dataclasses.replace(rtc, enabled=True, debug=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 from pydantic import Field
 
@@ -17,8 +17,6 @@ class LeRobotConfig(ModelConfig):
     `n_action_steps`, a queue if it needs several observations. So is `dtype: auto`.
     """
 
-    whole_flow: ClassVar[bool] = True
-    compile: bool = Field(default=False, description="LeRobot's own compile_model, for policies that have it")
     overrides: dict[str, Any] = Field(
         default={},
         description="overrides the checkpoint's config.json, as LeRobot's --policy.KEY=VALUE: num_inference_steps: 10",

@@ -8,47 +8,47 @@ https://arxiv.org/abs/2506.07339, multiply the correction by the Jacobian of x1,
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import Any
 
-from vlagents_ray.policies.flow import RandomSteps
+from vlagents_ray.policies.flow import Change
+from vlagents_ray.registry import require
 
 
 class Guidance:
-    """Replaces the `RTCProcessor` of a flow-matching policy of LeRobot."""
+    """Guides chunks as the `RTCProcessor` of a flow-matching policy of LeRobot does, whose settings it has."""
 
     def __init__(self, processor: Any) -> None:
         self._processor = processor  # its settings and schedule are used
 
-    def weights(self, delay: int, leftover: int, chunk: int) -> Any:
+    def towards(self, plans: Sequence[Any], delays: Sequence[int], shape: tuple[int, int], device: Any) -> Change:
+        """Return the change of velocities that leads chunks to the leftovers of their sessions.
+
+        Args:
+            plans: The leftover of each of the B rows in the policy's units, (H', D'), or None.
+            delays: The number of rows of each that will have been executed.
+            shape: Rows and numbers of a chunk, (H, D).
+            device: The policy's device.
+        """
+        torch = require("torch")
+        target, weights = torch.zeros(len(plans), *shape), torch.zeros(len(plans), shape[0], 1)
+        for i, (plan, delay) in enumerate(zip(plans, delays, strict=True)):
+            if plan is not None:
+                part = plan[: shape[0]]
+                target[i, : len(part), : part.shape[1]] = part
+                weights[i, :, 0] = self._weights(delay, len(part), shape[0])
+        target, weights = target.to(device), weights.to(device)
+
+        def change(velocity: Any, actions: Any, time: float) -> Any:
+            end = actions - time * velocity
+            return velocity - self._strength(time) * weights * (target - end)
+
+        return change
+
+    def _weights(self, delay: int, leftover: int, chunk: int) -> Any:
         """Return the weight of the leftover in each row of a chunk, (chunk,) float32 in [0, 1]."""
         horizon = min(self._processor.rtc_config.execution_horizon, leftover)
         return self._processor.get_prefix_weights(max(delay, 0), horizon, chunk)
-
-    def denoise_step(
-        self,
-        x_t: Any,
-        prev_chunk_left_over: Any,
-        inference_delay: Any,
-        time: float,
-        original_denoise_step_partial: Callable[[Any], Any],
-        execution_horizon: RandomSteps | None = None,
-    ) -> Any:
-        """Compute the guided velocity, (B, T, D).
-
-        `prev_chunk_left_over` is (B, T, D), or None for a batch without leftovers; `inference_delay` is the
-        weights, (B, T, 1), 0 for a row without one; `execution_horizon` is the random steps of rows without a leftover,
-        or None. The policy passes them by these names.
-        """
-        velocity = original_denoise_step_partial(x_t)
-        if prev_chunk_left_over is not None:
-            end = x_t - time * velocity
-            velocity = velocity - self._strength(time) * inference_delay * (prev_chunk_left_over - end)
-        return velocity if execution_horizon is None else execution_horizon.velocity(velocity, x_t)
-
-    def is_debug_enabled(self) -> bool:
-        """Return False, as nothing is tracked."""
-        return False
 
     def _strength(self, time: float) -> float:
         """Return g for LeRobot's time, which runs from 1 (noise) to 0."""

@@ -95,7 +95,12 @@ class LeRobot(ModelPolicy):
     def _loaded(self, folder: Path) -> LoadedLeRobot:
         policy = checkpoint.load(folder, self.config, torch_device(self.config.device))
         settings = policy.config
-        kind = KINDS.get(settings.type, Kind)(policy)
+        kind = KINDS.get(settings.type, Kind)(policy, self.compilation)
+        if self.config.compile and not self.compilation.cores:
+            raise ConfigError(
+                f"compile: not for LeRobot's {settings.type!r}; leave it out, or have LeRobot compile it, where its "
+                f"config has that: overrides: {{compile_model: true}}"
+            )
         if isinstance(kind, Flow):
             kind.noise_level = self.config.noise_level
         elif self.config.noise_level:

@@ -13,8 +13,11 @@ import numpy as np
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base import Row, shared_frames
-from vlagents_ray.policies.flow import RandomSteps
+from vlagents_ray.policies.compilation import Compilation
+from vlagents_ray.policies.flow import Change, RandomSteps
+from vlagents_ray.policies.flow_passes import FlowPasses, Pi0Passes
 from vlagents_ray.policies.lerobot.guidance import Guidance
+from vlagents_ray.policies.lerobot.smolvla import SmolVLAPasses
 from vlagents_ray.registry import require
 
 IMAGES = "observation.images"
@@ -38,7 +41,8 @@ class Kind:
     batched = False
     random: RandomSteps | None = None  # of the last chunks that were drawn
 
-    def __init__(self, policy: Any) -> None:
+    def __init__(self, policy: Any, compilation: Compilation) -> None:
+        """Use a loaded policy, and mark its cores for compilation if its type has any."""
         self.policy, self.config = policy, policy.config
         if type(self) is Kind and self.steps > 1:
             raise ConfigError(
@@ -92,8 +96,19 @@ class ActPolicy(Kind):
 
     batched = True
 
+    def __init__(self, policy: Any, compilation: Compilation) -> None:
+        super().__init__(policy, compilation)
+        self._act = compilation.core("act", self._actions)
+
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
-        return self.policy.predict_action_chunk(batch)
+        return self._act(*(batch[key] for key in (*_vectors(self.config), *self.config.image_features)))
+
+    def _actions(self, *inputs: Any) -> Any:
+        vectors = _vectors(self.config)
+        batch = dict(zip(vectors, inputs, strict=False))
+        if images := inputs[len(vectors) :]:
+            batch[IMAGES] = list(images)
+        return self.policy.model(batch)[0]
 
 
 class Flow(Kind):
@@ -105,10 +120,15 @@ class Flow(Kind):
     batched = True
     noise_level = 0.0  # as for `RandomSteps`
 
-    def __init__(self, policy: Any) -> None:
-        super().__init__(policy)
+    def __init__(self, policy: Any, compilation: Compilation) -> None:
+        super().__init__(policy, compilation)
         self.guidance = Guidance(policy.rtc_processor)
-        policy.model.rtc_processor = self.guidance
+        model = policy.model
+        if policy.name == "smolvla":
+            passes: FlowPasses = SmolVLAPasses(model, compilation)
+        else:
+            passes = Pi0Passes(model, compilation, stated=policy.name == "pi0")
+        model.sample_actions = passes.sample  # which the policy calls between its own preparation of inputs and actions
 
     @property
     def flow_steps(self) -> int:
@@ -117,12 +137,7 @@ class Flow(Kind):
         return int(config.num_steps if config.type == "smolvla" else config.num_inference_steps)
 
     def observations(self, rows: Sequence[Row]) -> list[int]:
-        return self._shared(rows)[0]
-
-    def _shared(self, rows: Sequence[Row]) -> tuple[list[int], list[int]]:
-        """Return `shared_frames`, or each row by itself in a compiled model, which has few sizes of batches."""
-        each = list(range(len(rows)))
-        return (each, each) if self.config.compile_model else shared_frames(rows)
+        return shared_frames(rows)[0]
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
         torch = require("torch")
@@ -131,42 +146,20 @@ class Flow(Kind):
         def convert(array: np.ndarray) -> Any:
             return torch.from_numpy(array).to(self.config.device)
 
-        wanted: dict[str, Any] = {"noise": convert(np.stack([row.noise(*shape) for row in rows]))}
-        if any(left is not None for left in leftovers):
-            wanted |= self._guide(rows, leftovers, shape)
         self.random = RandomSteps.of(rows, (self.flow_steps, *shape), self.noise_level, convert)
-        return self._follow(batch, rows, {**wanted, "execution_horizon": self.random})
-
-    def _follow(self, batch: dict[str, Any], rows: Sequence[Row], wanted: dict[str, Any]) -> Any:
-        firsts, owners = self._shared(rows)
-        if len(firsts) == len(rows):
-            return self.policy.predict_action_chunk(batch, **wanted)
-        model, caches = self.policy.model, list[Any]()
-        step = model.denoise_step
-
-        def denoise_step(x_t: Any, past_key_values: Any, **encoded: Any) -> Any:
-            """Denoise the actions of all rows with what was encoded for their observations."""
-            if not caches:  # in the first of the steps
-                caches.append(_indexed(past_key_values, owners))
-            each = {name: tensor[owners] for name, tensor in encoded.items()}
-            return step(x_t=x_t, past_key_values=caches[0], **each)
-
-        model.denoise_step = denoise_step
-        try:
-            return self.policy.predict_action_chunk(batch, **wanted)
-        finally:
-            del model.denoise_step
-
-    def _guide(self, rows: Sequence[Row], leftovers: Sequence[Any], shape: tuple[int, int]) -> dict[str, Any]:
-        torch = require("torch")
-        target, weights = torch.zeros(len(rows), *shape), torch.zeros(len(rows), shape[0], 1)
-        for i, (row, left) in enumerate(zip(rows, leftovers, strict=True)):
-            if left is not None:
-                part = self._encoded(left)[: shape[0]]
-                target[i, : len(part), : part.shape[1]] = part
-                weights[i, :, 0] = self.guidance.weights(row.delay, len(part), shape[0])
-        device = self.config.device
-        return {"prev_chunk_left_over": target.to(device), "inference_delay": weights.to(device)}
+        changes: list[Change] = []
+        if any(left is not None for left in leftovers):
+            plans = [None if left is None else self._encoded(left) for left in leftovers]
+            changes.append(self.guidance.towards(plans, [row.delay for row in rows], shape, self.config.device))
+        if self.random is not None:
+            changes.append(self.random.change)
+        return self.policy.predict_action_chunk(
+            batch,
+            noise=convert(np.stack([row.noise(*shape) for row in rows])),
+            owners=shared_frames(rows)[1],
+            steps=self.flow_steps,
+            changes=changes,
+        )
 
     def _encoded(self, left: Any) -> Any:
         """Convert a leftover to the units of π0's ALOHA, if SmolVLA was trained in these."""
@@ -202,6 +195,12 @@ class Diffusion(Kind):
 
     batched = True
 
+    def __init__(self, policy: Any, compilation: Compilation) -> None:
+        super().__init__(policy, compilation)
+        unet = policy.diffusion.unet
+        self._denoise, self._look = compilation.core("denoise", unet.forward), compilation.core("look", self._condition)
+        unet.forward = self._forward
+
     @property
     def horizon(self) -> int:
         return int(self.config.horizon - self.steps + 1)
@@ -213,11 +212,18 @@ class Diffusion(Kind):
         noise = np.stack([row.noise(self.config.horizon, self.config.action_feature.shape[0]) for row in rows])
         actions = model.conditional_sample(
             len(rows),
-            global_cond=model._prepare_global_conditioning(_stacked(batch, self.config, len(rows))),
+            global_cond=self._look(*_stacked(batch, self.config, len(rows)).values()),
             generator=[generator_of(row.rng) for row in rows],
             noise=torch.from_numpy(noise).to(self.config.device),
         )
         return actions[:, self.steps - 1 :]
+
+    def _forward(self, sample: Any, times: Any, global_cond: Any) -> Any:
+        return self._denoise(sample, times, global_cond)
+
+    def _condition(self, *inputs: Any) -> Any:
+        names = [*_vectors(self.config), *([IMAGES] if self.config.image_features else [])]
+        return self.policy.diffusion._prepare_global_conditioning(dict(zip(names, inputs, strict=True)))
 
 
 class VqBet(Kind):
@@ -225,8 +231,8 @@ class VqBet(Kind):
 
     batched = True
 
-    def __init__(self, policy: Any) -> None:
-        super().__init__(policy)
+    def __init__(self, policy: Any, compilation: Compilation) -> None:
+        super().__init__(policy, compilation)
         if not policy.vqbet.action_head.vqvae_model.discretized.item():
             raise ConfigError("checkpoint: VQ-BeT's residual VQ is not trained in it; train on, or name a later step")
 
@@ -295,12 +301,10 @@ KINDS: Mapping[str, type[Kind]] = {
 }
 
 
-def _indexed(cache: Any, index: list[int]) -> Any:
-    """Return a cache of keys and values with a row for each of `index`: SmolVLA's, or one of transformers."""
-    if isinstance(cache, dict):
-        return {layer: {name: kept[index] for name, kept in both.items()} for layer, both in cache.items()}
-    cache.batch_select_indices(require("torch").tensor(index))
-    return cache
+def _vectors(config: Any) -> list[str]:
+    """Return the observation keys of the vectors that a policy reads."""
+    features = {FRAMES[0]: config.robot_state_feature, FRAMES[1]: config.env_state_feature}
+    return [key for key, feature in features.items() if feature]
 
 
 def _stacked(batch: dict[str, Any], config: Any, rows: int) -> dict[str, Any]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 from pydantic import Field
 
 from vlagents_ray.policies.base import ModelConfig
@@ -14,8 +12,6 @@ from vlagents_ray.policies.openpi.robots import Layout
 class OpenPiConfig(ModelConfig):
     """Settings of openpi's policies, beside those of all models."""
 
-    whole_flow: ClassVar[bool] = True
-    compile: bool = Field(default=False, description="the config's own pytorch_compile_mode, for PyTorch")
     config: str = Field(
         min_length=1, description="the training config: one of openpi's names, such as pi05_libero, or 'module:NAME'"
     )
@@ -41,5 +37,6 @@ class OpenPiConfig(ModelConfig):
     guidance: float = Field(default=5.0, gt=0, description="real-time chunking: largest weight of the old plan")
     noise_level: NoiseLevel = 0.0
     batch_sizes: list[int] | None = Field(
-        default=None, description="the only numbers of rows to run; unset: [1, 2, 4, 8, 16] for JAX, any for PyTorch"
+        default=None,
+        description="the only numbers of rows to run; unset: [1, 2, 4, 8, 16] for JAX or with `compile`, else any",
     )

@@ -16,7 +16,9 @@ from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base.accelerator import jax_device, torch_device
 from vlagents_ray.policies.base.checkpoint import SavedTensors, require_loaded
 from vlagents_ray.policies.base.realtime import Guide
-from vlagents_ray.policies.flow import RandomSteps
+from vlagents_ray.policies.compilation import Compilation
+from vlagents_ray.policies.flow import Change, RandomSteps
+from vlagents_ray.policies.flow_passes import Pi0Passes
 from vlagents_ray.policies.openpi.config import OpenPiConfig
 from vlagents_ray.registry import require
 
@@ -131,9 +133,11 @@ class JaxTokens(OpenPiModel):
 class TorchFlow(OpenPiModel):
     """openpi's PyTorch port of π0 and π0.5."""
 
-    def __init__(self, network: Any, device: Any, config: OpenPiConfig) -> None:
+    shares = True
+
+    def __init__(self, network: Any, device: Any, config: OpenPiConfig, compilation: Compilation) -> None:
         self._network, self._device = network, device
-        self.shares = not config.compile  # a compiled model has few sizes of batches
+        self._passes = Pi0Passes(network, compilation)
         self._steps, self._limit = config.steps or _STEPS, config.guidance
         self.noise_shape: tuple[int, int] = (network.config.action_horizon, network.config.action_dim)
 
@@ -148,15 +152,14 @@ class TorchFlow(OpenPiModel):
         """Compute actions (B, H, action_dim) float32."""
         jax, torch = require("jax"), require("torch")
         observation = _observation(jax.tree.map(self._convert, batch))
-        start = self._convert(noise)
-        plain = self._network.denoise_step
-        guide = None if guide is None else guide.to(self._convert)
-        self._network.denoise_step = self._changed(plain, start, guide, owners, random)
-        try:
-            with torch.inference_mode():
-                flow = self._network.sample_actions(self._device, observation, noise=start, num_steps=self._steps)
-        finally:
-            self._network.denoise_step = plain
+        start, changes = self._convert(noise), list[Change]()
+        if guide is not None:
+            changes.append(guide.to(self._convert).change(start, steps=self._steps, limit=self._limit))
+        if random is not None:
+            changes.append(random.change)
+        with torch.inference_mode():
+            inputs = self._network._preprocess_observation(observation, train=False)
+            flow = self._passes.sample(*inputs, noise=start, owners=owners, steps=self._steps, changes=changes)
         return np.asarray(flow.float().cpu().numpy())
 
     def random_steps(self, rows: Sequence[Row], noise_level: float) -> RandomSteps | None:
@@ -165,26 +168,6 @@ class TorchFlow(OpenPiModel):
     def _convert(self, array: np.ndarray) -> Any:
         """Return a copy of the array as a tensor on the device."""
         return require("torch").from_numpy(np.array(array)).to(self._device, non_blocking=True)
-
-    def _changed(
-        self, plain: Any, noise: Any, guide: Guide | None, owners: Sequence[int], random: RandomSteps | None
-    ) -> Any:
-        """Return the denoising step of all rows, with what openpi's loop encoded for their observations."""
-        if guide is None and random is None and list(owners) == list(range(len(noise))):
-            return plain
-        index = require("torch").tensor(owners, device=self._device)
-        caches: list[Any] = []
-
-        def step(state: Any, masks: Any, cache: Any, actions: Any, time: Any) -> Any:
-            if not caches:
-                cache.batch_select_indices(index)
-                caches.append(cache)
-            velocity = plain(state[index], masks[index], cache, actions, time[index])
-            if guide is not None:
-                velocity = guide.steer(velocity, actions, noise, float(time[0]), steps=self._steps, limit=self._limit)
-            return velocity if random is None else random.velocity(velocity, actions)
-
-        return step
 
 
 def load_jax(config: Any, folder: Path, settings: OpenPiConfig) -> OpenPiModel:
@@ -216,13 +199,12 @@ def load_jax(config: Any, folder: Path, settings: OpenPiConfig) -> OpenPiModel:
     return kind(network, device, settings)
 
 
-def load_torch(config: Any, folder: Path, settings: OpenPiConfig) -> OpenPiModel:
+def load_torch(config: Any, folder: Path, settings: OpenPiConfig, compilation: Compilation) -> OpenPiModel:
     """Load a PyTorch model; raises `ConfigError` if transformers lacks openpi's patch, or a parameter is missing."""
     device = torch_device(settings.device)
     file = folder / "model.safetensors"
     chosen = settings.dtype if settings.dtype != "auto" else ("float32" if device.type == "cpu" else "bfloat16")
-    mode = config.model.pytorch_compile_mode if settings.compile else None
-    model = dataclasses.replace(config.model, pytorch_compile_mode=mode, dtype=chosen)
+    model = dataclasses.replace(config.model, pytorch_compile_mode=None, dtype=chosen)
     config = dataclasses.replace(config, model=model)
     try:
         network = config.model.load_pytorch(config, str(file))
@@ -230,7 +212,7 @@ def load_torch(config: Any, folder: Path, settings: OpenPiConfig) -> OpenPiModel
         raise ConfigError(f"checkpoint {file}: {str(error)[:600]}") from error
     network.paligemma_with_expert.to_bfloat16_for_selected_params(chosen)
     require_loaded(network, SavedTensors.of(file))
-    return TorchFlow(network.eval().requires_grad_(False).to(device), device, settings)
+    return TorchFlow(network.eval().requires_grad_(False).to(device), device, settings, compilation)
 
 
 def _observation(batch: dict[str, Any]) -> Any:

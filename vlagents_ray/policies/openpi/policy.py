@@ -95,7 +95,7 @@ class OpenPi(ModelPolicy):
         ours = self.config
         robot = choose_robot(config.name, transforms.robot, ours.cameras, ours.state, ours.layout)
         if (folder / "model.safetensors").is_file():
-            model = load_torch(config, folder, self.config)
+            model = load_torch(config, folder, self.config, self.compilation)
         elif (folder / "params").is_dir():
             if self.config.compile:
                 raise ConfigError("compile: openpi's JAX models always are; leave it out")

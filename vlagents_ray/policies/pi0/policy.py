@@ -33,7 +33,7 @@ from vlagents_ray.policies.base.model_inputs import (
     state_vector,
 )
 from vlagents_ray.policies.base.realtime import Guide
-from vlagents_ray.policies.flow import OFFERED, RandomSteps, row_times
+from vlagents_ray.policies.flow import OFFERED, Change, RandomSteps, follow, row_times
 from vlagents_ray.policies.pi0.passes import FlowCores, encode, flow_velocity, row_velocity_of, velocity_of
 from vlagents_ray.policies.streaming import StreamingPolicy
 from vlagents_ray.registry import require
@@ -247,17 +247,12 @@ class Pi0(StreamingPolicy):
 
         The actions are kept in float32 between the steps, also if the model computes in another type, as in openpi.
         """
-        steps = self._steps
-        actions = noise
-        for step in range(steps):
-            time = 1.0 - step / steps
-            change = velocity(actions, time)
-            if guide is not None:
-                change = guide.steer(change, actions, noise, time, steps=steps, limit=self.config.guidance)
-            if random is not None:
-                change = random.velocity(change, actions)
-            actions = actions - change / steps
-        return actions
+        steps, limit, changes = self._steps, self.config.guidance, list[Change]()
+        if guide is not None:
+            changes.append(guide.change(noise, steps=steps, limit=limit))
+        if random is not None:
+            changes.append(random.change)
+        return follow(velocity, noise, steps, *changes)
 
 
 def _cameras(chosen: Mapping[str, str] | None) -> dict[str, str]:
