@@ -90,23 +90,26 @@ class ReadRun:
 
 
 def read_wandb(out: Path) -> ReadRun:
-    from wandb.proto import wandb_internal_pb2
-
-    read = ReadRun()
-    for path in sorted(out.glob("wandb/offline-run-*/*.wandb")):
-        for data in log_records(path.read_bytes()[WANDB_HEADER:]):
-            record = wandb_internal_pb2.Record()
-            record.ParseFromString(data)
-            if record.HasField("history"):
-                items = record.history.item
-                read.rows.append({item.key or "/".join(item.nested_key): json.loads(item.value_json) for item in items})
-            for update in [*record.run.config.update, *record.config.update]:
-                read.config[update.key or update.nested_key[0]] = json.loads(update.value_json)
-            for update in record.summary.update:
-                read.summary[update.key or update.nested_key[0]] = json.loads(update.value_json)
-            for artifact in [record.artifact] if record.HasField("artifact") else []:
-                read.artifacts.append((artifact.type, [entry.path for entry in artifact.manifest.contents]))
+    read, files = ReadRun(), list(out.glob("wandb/offline-run-*/*.wandb"))
+    # wandb's own process writes the files, and may have more to write when `finish` returns.
+    wait_for(lambda: all(records[-1].HasField("exit") for records in map(wandb_records, files)))
+    for record in [one for file in sorted(files) for one in wandb_records(file)]:
+        if record.HasField("history"):
+            items = record.history.item
+            read.rows.append({item.key or "/".join(item.nested_key): json.loads(item.value_json) for item in items})
+        for update in [*record.run.config.update, *record.config.update]:
+            read.config[update.key or update.nested_key[0]] = json.loads(update.value_json)
+        for update in record.summary.update:
+            read.summary[update.key or update.nested_key[0]] = json.loads(update.value_json)
+        for artifact in [record.artifact] if record.HasField("artifact") else []:
+            read.artifacts.append((artifact.type, [entry.path for entry in artifact.manifest.contents]))
     return read
+
+
+def wandb_records(file: Path) -> list[Any]:
+    from wandb.proto.wandb_internal_pb2 import Record
+
+    return [Record.FromString(data) for data in log_records(file.read_bytes()[WANDB_HEADER:])] or [Record()]
 
 
 def log_records(log: bytes) -> Iterator[bytes]:
@@ -117,6 +120,8 @@ def log_records(log: bytes) -> Iterator[bytes]:
             at += left
             continue
         length, kind = struct.unpack_from("<HB", log, at + 4)
+        if at + 7 + length > len(log):  # not yet written to its end
+            return
         record += log[at + 7 : at + 7 + length]
         at += 7 + length
         if kind in (1, 4):  # whole, or its last piece
