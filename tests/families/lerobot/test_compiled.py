@@ -80,6 +80,12 @@ def test_it_acts_with_pushed_weights(both: tuple[LeRobot, LeRobot], programs: li
     assert len(programs) == before
 
 
+@pytest.mark.parametrize("kind", ["diffusion", "smolvla"])
+def test_lerobots_own_compilation_is_refused_where_ours_replaces_it(kind: str, made: Made) -> None:
+    with pytest.raises(ConfigError, match="got compile_model, want `compile: true`"):
+        LeRobot.from_config({"checkpoint": str(made(kind)), "overrides": {"compile_model": True}}).initialize()
+
+
 def test_a_type_without_cores_is_refused(made: Made) -> None:
     with pytest.raises(ConfigError, match=r"compile: not for LeRobot's 'vqbet'; leave it out, .*compile_model: true"):
         LeRobot.from_config({"checkpoint": str(made("vqbet")), "compile": True}).initialize()

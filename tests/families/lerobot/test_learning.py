@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
@@ -60,6 +61,15 @@ def test_acts_of_which_nothing_is_wanted_are_those_without_random_steps(loaded: 
     acts = [begun(policy, 1).act(view(1)) for policy in (loaded("smolvla"), learnt)]
     np.testing.assert_array_equal(acts[0].action, acts[1].action)
     assert BEHAVIOUR not in acts[1].info
+
+
+def test_random_steps_begin_from_the_noise_of_an_act_without_them(learnt: LeRobot) -> None:
+    row = begun(learnt, 1)
+    noise = copy.deepcopy(row.episode.rng).standard_normal(
+        (tiny.CHUNK, learnt.model.kind.config.max_action_dim), dtype=np.float32
+    )
+    chain = row.act(view(1, **{WANT: ["replay"]})).info[BEHAVIOUR]["replay"]["chain"]
+    np.testing.assert_array_equal(chain[0], noise)
 
 
 def test_the_log_probability_is_that_of_the_network_itself(learnt: LeRobot) -> None:

@@ -13,7 +13,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.accelerator import ensure_torchvision
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
-from vlagents_ray.policies.lerobot.policy_types import KINDS, REFUSED, Flow
+from vlagents_ray.policies.lerobot.policy_types import KINDS, REFUSED, Diffusion, Flow
 from vlagents_ray.policies.lerobot.processors import PIPELINES, require_known_steps
 from vlagents_ray.registry import require
 
@@ -114,6 +114,10 @@ def _prepare(settings: Any, config: LeRobotConfig, device: Any) -> bool:
     settings.device = str(device)
     if hasattr(settings, "pretrained_backbone_weights"):
         settings.pretrained_backbone_weights = None  # they would be downloaded, only to be replaced
+    if issubclass(KINDS.get(settings.type, object), (Diffusion, Flow)):  # which `compile` compiles
+        if config.overrides.get("compile_model"):
+            raise ConfigError("overrides: got compile_model, want `compile: true` in its place, which is checked")
+        settings.compile_model = False
     if issubclass(KINDS.get(settings.type, object), Flow):
         rtc = settings.rtc_config or require("lerobot.policies.rtc.configuration_rtc").RTCConfig()
         settings.rtc_config = dataclasses.replace(rtc, enabled=True, debug=False)

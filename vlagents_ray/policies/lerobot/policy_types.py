@@ -146,6 +146,7 @@ class Flow(Kind):
         def convert(array: np.ndarray) -> Any:
             return torch.from_numpy(array).to(self.config.device)
 
+        noise = convert(np.stack([row.noise(*shape) for row in rows]))  # before the steps', which only some rows draw
         self.random = RandomSteps.of(rows, (self.flow_steps, *shape), self.noise_level, convert)
         changes: list[Change] = []
         if any(left is not None for left in leftovers):
@@ -155,7 +156,7 @@ class Flow(Kind):
             changes.append(self.random.change)
         return self.policy.predict_action_chunk(
             batch,
-            noise=convert(np.stack([row.noise(*shape) for row in rows])),
+            noise=noise,
             owners=shared_frames(rows)[1],
             steps=self.flow_steps,
             changes=changes,
