@@ -112,8 +112,8 @@ class Agent:
     the attribute b of the attribute a, which is then shared as a whole.
     """
 
-    weights_id: dict[str, str | None] | None = None
-    """Optional: {"digest": …, "revision": …} that identify the weights loaded by `initialize`.
+    weights_id: dict[str, Any] | None = None
+    """Optional: {"digest": …, "revision": …}, which identify the weights loaded by `initialize`, and more for metadata.
 
     A server reports them, and an evaluation keeps results of different digests apart. If this is None, the server
     computes a digest of the files that `initialize` found through

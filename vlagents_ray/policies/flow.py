@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.policies.base.policy import Row
+from vlagents_ray.policies.base.model_inputs import Row
 
 OFFERED = ("logprob", "entropy", "replay")  # of chunks that come out of random steps
 _LOG_2_PI = math.log(2 * math.pi)

@@ -11,6 +11,7 @@ import inspect
 from collections.abc import Sequence
 from typing import Any
 
+from vlagents_ray.policies.adapters import Adapters
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.flow import Change, follow
 from vlagents_ray.registry import require
@@ -22,6 +23,7 @@ class FlowPasses(abc.ABC):
     def __init__(self, model: Any, compilation: Compilation) -> None:
         """Use the passes of a model of openpi, or of LeRobot, in their compiled form if there is one."""
         self.model = model
+        self.adapters = Adapters()  # of the policy
         self.attention_mask = inspect.getmodule(type(model)).make_att_2d_masks  # type: ignore[union-attr]
         self._encode = compilation.core("encode", self.encode)
         self._velocity = compilation.core("velocity", self.velocity)
@@ -58,6 +60,7 @@ class FlowPasses(abc.ABC):
         owners: Sequence[int],
         steps: int,
         changes: Sequence[Change] = (),
+        fingerprints: Sequence[str] = (),
     ) -> Any:
         """Return actions (B, H, D).
 
@@ -71,18 +74,22 @@ class FlowPasses(abc.ABC):
             owners: The observation of each row.
             steps: Of the flow.
             changes: See `follow`.
+            fingerprints: The adapter of each row, see `Row.adapter`; empty: none has one.
         """
         torch = require("torch")
+        firsts = [list(owners).index(place) for place in range(len(mask))] if fingerprints else []
         if state is None:
             state = mask[:, :0].float()
-        encoded, seen = self._encode(tokens, mask, torch.stack(list(cameras), 1), state, *self.look(images))
+        with self.adapters.rows([fingerprints[i] for i in firsts]):
+            encoded, seen = self._encode(tokens, mask, torch.stack(list(cameras), 1), state, *self.look(images))
         if list(owners) != list(range(len(mask))):
             index = torch.tensor(owners, device=mask.device)
             encoded, seen, state = encoded[index], seen[index], state[index]
 
         def velocity(actions: Any, time: float) -> Any:
             times = torch.full((len(actions),), time, dtype=torch.float32, device=actions.device)
-            return self._velocity(encoded, seen, state, actions, times)
+            with self.adapters.rows(fingerprints):
+                return self._velocity(encoded, seen, state, actions, times)
 
         return follow(velocity, noise, steps, *changes)
 

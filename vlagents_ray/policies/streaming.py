@@ -58,7 +58,7 @@ class StreamingPolicy(ModelPolicy):
             for actions, more in self._parts([rows[i] for i in some]):
                 parts: list[Act | Exception | None] = [None] * len(obs)
                 for i, action in zip(some, actions, strict=True):
-                    parts[i] = Act(action, more=more)
+                    parts[i] = Act(action, info=self.adapters.stated(rows[i].adapter), more=more)
                 yield parts
 
     def _joined(self, rows: Sequence[Row]) -> list[np.ndarray]:

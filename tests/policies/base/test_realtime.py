@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from vlagents_ray.policies.base.policy import Row
+from vlagents_ray.policies.base.model_inputs import Row
 from vlagents_ray.policies.base.realtime import Guide
 
 HORIZON, DIM, STEPS = 8, 3, 10

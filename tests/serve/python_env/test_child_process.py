@@ -94,6 +94,10 @@ def test_what_was_loaded_there_is_known_here(engine: Engine) -> None:
     assert (ask(engine, "weights", "reset").info or {})["weights"] == told["digest"]
 
 
+def test_a_session_with_an_adapter_states_its_own_weights(engine: Engine) -> None:
+    assert (ask(engine, "adapted", "reset", kwargs={"adapter": "stack"}).info or {})["weights"] == "with stack"
+
+
 def info(reply: Reply) -> dict[str, Any]:
     if reply.error is not None:
         raise reply.error

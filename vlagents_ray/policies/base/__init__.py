@@ -1,6 +1,7 @@
 """The common parts of the model families' adapters: settings, checkpoints, sessions of chunked actions."""
 
 from vlagents_ray.policies.base.config import ModelConfig
-from vlagents_ray.policies.base.policy import ModelPolicy, Prediction, Row, shared_frames
+from vlagents_ray.policies.base.model_inputs import Row, shared_frames
+from vlagents_ray.policies.base.policy import ModelPolicy, Prediction
 
 __all__ = ["ModelConfig", "ModelPolicy", "Prediction", "Row", "shared_frames"]

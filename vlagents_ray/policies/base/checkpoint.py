@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.policies.adapters import FILES, Adapter, base_of
+from vlagents_ray.policies.base.checkpoint_files import digest
 from vlagents_ray.registry import require
 
 log = logging.getLogger(__name__)
 
 STEP = "{step}"  # the placeholder in a checkpoint's name
+_HUB_ID = re.compile(r"[\w.-]+/[\w.-]+")
 _INDEX = ".safetensors.index.json"
 _COMPARED = 64  # compared elements of each tensor: enough to tell trained weights from random ones
 _LISTED = 8
@@ -71,6 +75,41 @@ def find_checkpoint(name: str, step: int | None = None, needs: Iterable[str] = (
     if (used := _used.get()) is not None and path not in used:
         used[:] = [*(one for one in used if one not in path.parents), path]
     return path
+
+
+def find_adapter(source: str, checkpoint: str, base: Sequence[Path], digest_of_base: str) -> tuple[Adapter, Path]:
+    """Return a LoRA adapter and its folder, found as `find_checkpoint` does.
+
+    Args:
+        source: The folder or hub id.
+        checkpoint: The base, as the policy's settings name it.
+        base: The files and folders of the base.
+        digest_of_base: Their digest.
+
+    Raises:
+        ConfigError: There is no such adapter, or it was trained on another base.
+    """
+    folder = find_checkpoint(source, needs=FILES)
+    trained_on = base_of(folder)
+    if trained_on is not None and _is_other(trained_on, checkpoint, base, digest_of_base):
+        raise ConfigError(
+            f"{folder}: was trained on {trained_on!r}, want an adapter of {checkpoint!r}, the policy's checkpoint; "
+            f"if these are the same weights, name it so as base_model_name_or_path in its adapter_config.json"
+        )
+    return Adapter.of(source, digest_of_base, digest([folder])), folder
+
+
+def _is_other(trained_on: str, checkpoint: str, base: Sequence[Path], digest_of_base: str) -> bool:
+    """Whether the base that an adapter names is known to be another one than `checkpoint`, at the paths `base`."""
+    path = Path(trained_on).expanduser()
+    if path.exists():
+        ours = {parent for one in base for parent in (one.resolve(), *one.resolve().parents)}
+        return path.resolve() not in ours and digest([path]) != digest_of_base
+    names = [name.partition("@")[0] for name in (trained_on, checkpoint)]
+    if all(_HUB_ID.fullmatch(name) for name in names) and not Path(checkpoint).exists():
+        return names[0] != names[1]
+    log.warning("adapter: whether its base %r is the checkpoint %r cannot be told from their names", *names)
+    return False
 
 
 def _beside(path: Path) -> str:

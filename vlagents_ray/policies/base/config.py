@@ -37,6 +37,11 @@ class ModelConfig(BaseModel, extra="forbid"):
         description="keep the weights of linear layers in 8 bits (torchao): a quarter to a half of their memory, and "
         "other actions, so compare them before use",
     )
+    adapters: dict[str, str] = Field(
+        default={},
+        description="LoRA adapters by name, PEFT's folders or hub ids, that sessions may act with over the checkpoint; "
+        "usually set by the `checkpoints` of a deployment",
+    )
     compile: CompileMode = Field(
         default=False,
         description="compile the forward pass for each of `batch_sizes`, as CUDA graphs on a GPU; what cannot be "
@@ -90,6 +95,16 @@ class ModelConfig(BaseModel, extra="forbid"):
                 f"checkpoint {self.checkpoint!r} and checkpoint_step {self.checkpoint_step}: give both the place "
                 f"{STEP} and the step that belongs there, or neither"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _adapters_are_added_to_eager_whole_layers(self) -> Self:
+        for name, value in (("compile", self.compile), ("quantization", self.quantization)):
+            if self.adapters and value:
+                raise ValueError(
+                    f"adapters and {name}: got both, want one of them; merge an adapter into its base to have "
+                    f"{name} for it"
+                )
         return self
 
     @model_validator(mode="after")

@@ -1,8 +1,11 @@
-"""The inputs of a model from an observation: its cameras, its state vector, and the requests in `Obs.info`."""
+"""The rows of a model, and their inputs from an observation: cameras, state vector, and requests in `Obs.info`."""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +17,55 @@ from vlagents_ray.registry import require
 
 GRIPPER = "gripper"  # the part of the state that is `Obs.gripper`
 CLOSED = "gripper_closed"  # the part that is its closedness: 1 - `Obs.gripper`
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One chunk to compute: a session's own, or a sample of its distribution."""
+
+    frames: tuple[Any, ...]  # the results of `ModelPolicy.perceive` for the last observations, oldest first
+    instruction: str
+    rng: np.random.Generator  # the session's own, so that other rows do not matter
+    leftover: np.ndarray | None = None  # (H', D) float32, real-time chunking: see LEFTOVER in the interface
+    delay: int = 0  # DELAY: the first rows of the chunk, so many, are the leftover's
+    info: Mapping[str, Any] = field(default_factory=dict)  # the observation's info
+    # the session's memory, for families that keep more than frames
+    memory: dict[str, Any] = field(default_factory=dict)
+    want: tuple[str, ...] = ()  # names of what is to be stated of the chunk, out of the contract's `behaviour`
+    # drawn from the distribution, as samples and chunks of which something is wanted are, and not the likeliest chunk
+    sample: bool = False
+    adapter: str = ""  # fingerprint of the session's adapter, see `ModelPolicy.adapters`; empty: none
+
+    def noise(self, *shape: int) -> np.ndarray:
+        """Draw standard normal numbers, float32, the same on every device."""
+        return self.rng.standard_normal(shape, dtype=np.float32)
+
+    def history(self, length: int) -> tuple[Any, ...]:
+        """Return the last `length` frames.
+
+        At the beginning of an episode its first frame stands for the missing ones.
+        """
+        return (self.frames[0],) * (length - len(self.frames)) + self.frames[-length:]
+
+
+def drawn(row: Row, draws: np.random.Generator) -> Row:
+    """Return the row with noise and memory that are separate from the session's."""
+    return replace(row, rng=draws, memory=copy.deepcopy(row.memory), sample=True)
+
+
+def shared_frames(rows: Sequence[Row]) -> tuple[list[int], list[int]]:
+    """Return which rows to encode, as the samples of a session see what its own row sees.
+
+    Returns:
+        The indices of rows with observations of their own, and for each row the place of its observations among them.
+    """
+    places: dict[int, int] = {}
+    firsts: list[int] = []
+    for i, row in enumerate(rows):
+        if id(row.frames) not in places:
+            places[id(row.frames)] = len(firsts)
+            firsts.append(i)
+    return firsts, [places[id(row.frames)] for row in rows]
 
 
 def choose_cameras(chosen: Mapping[str, str] | None, usual: Mapping[str, str], known: Sequence[str]) -> dict[str, str]:

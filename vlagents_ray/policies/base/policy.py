@@ -8,48 +8,32 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from operator import attrgetter
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
 from vlagents_ray.chunking.buffer import ENSEMBLE, Chunk, ChunkBuffer
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import InvalidAction, InvalidObservation, NotReset, PolicyFailed
+from vlagents_ray.errors import ConfigError, InvalidAction, InvalidObservation, NotReset, PolicyFailed
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, Act, Agent, Obs
+from vlagents_ray.policies.adapters import ADAPTER, Adapters, require_base_alone
+from vlagents_ray.policies.base.checkpoint import find_adapter, used_checkpoints
+from vlagents_ray.policies.base.checkpoint_files import weights_of
 from vlagents_ray.policies.base.config import ModelConfig
-from vlagents_ray.policies.base.model_inputs import count_in, leftover_plan, wanted_behaviour, wanted_samples
+from vlagents_ray.policies.base.model_inputs import (
+    Row,
+    count_in,
+    drawn,
+    leftover_plan,
+    wanted_behaviour,
+    wanted_samples,
+)
 from vlagents_ray.policies.compilation import Compilation, quantize, require_whole
 from vlagents_ray.policies.determinism import require_deterministic
 from vlagents_ray.policies.loading import report_progress
 from vlagents_ray.validation import check_action
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    """One chunk to compute: a session's own, or a sample of its distribution."""
-
-    frames: tuple[Any, ...]  # the results of `ModelPolicy.perceive` for the last observations, oldest first
-    instruction: str
-    rng: np.random.Generator  # the session's own, so that other rows do not matter
-    leftover: np.ndarray | None = None  # (H', D) float32, real-time chunking: see LEFTOVER in the interface
-    delay: int = 0  # DELAY: the first rows of the chunk, so many, are the leftover's
-    info: Mapping[str, Any] = field(default_factory=dict)  # the observation's info
-    # the session's memory, for families that keep more than frames
-    memory: dict[str, Any] = field(default_factory=dict)
-    want: tuple[str, ...] = ()  # names of what is to be stated of the chunk, out of the contract's `behaviour`
-    # drawn from the distribution, as samples and chunks of which something is wanted are, and not the likeliest chunk
-    sample: bool = False
-
-    def noise(self, *shape: int) -> np.ndarray:
-        """Draw standard normal numbers, float32, the same on every device."""
-        return self.rng.standard_normal(shape, dtype=np.float32)
-
-    def history(self, length: int) -> tuple[Any, ...]:
-        """Return the last `length` frames.
-
-        At the beginning of an episode its first frame stands for the missing ones.
-        """
-        return (self.frames[0],) * (length - len(self.frames)) + self.frames[-length:]
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +57,7 @@ class PolicyEpisode:
     draws: np.random.Generator  # generator of samples, so that requesting them changes no action
     plan: ChunkBuffer  # the actions still to be returned, where single ones are
     memory: dict[str, Any] = field(default_factory=dict)
+    adapter: str = ""  # fingerprint of its adapter; empty: none
 
 
 class ModelPolicy(Agent, abc.ABC):
@@ -82,14 +67,18 @@ class ModelPolicy(Agent, abc.ABC):
     `config.rows` rows. A session's noise comes from its own generator, seeded by the config's seed and the episode's.
     """
 
-    shared: ClassVar[tuple[str, ...]] = ("config", "model", "compilation")
+    shared: ClassVar[tuple[str, ...]] = ("config", "model", "compilation", "adapters")
     network: ClassVar[str | None] = None  # the attribute whose linear layers `quantization` may keep in 8 bits
+    adaptable: ClassVar[bool] = False  # whether `predict` runs `network` within `self.adapters.rows`
 
     def __init__(self, config: Any) -> None:
         self.config: ModelConfig = config
         self.model: Any = None
         self.compilation = Compilation(self.config.compile)  # `load` marks the model's cores with it
+        self.adapters = Adapters()
         self.episode: PolicyEpisode | None = None
+        if self.config.adapters and not self.adaptable:
+            raise ConfigError(f"adapters: {type(self).__name__} does not offer them; merge each into its base")
 
     @property
     def history(self) -> int:
@@ -129,7 +118,7 @@ class ModelPolicy(Agent, abc.ABC):
 
     def initialize(self) -> None:
         """Load the checkpoint; with `batch_sizes`, run each of them once, or compile the model's cores for it."""
-        self.model = self.load()
+        self.model = self._load_with_adapters() if self.config.adapters else self.load()
         if self.config.quantization:
             quantize(self, self.config.quantization)
         sizes = self.config.batch_sizes or ()
@@ -144,13 +133,14 @@ class ModelPolicy(Agent, abc.ABC):
             require_deterministic(self._chunks, self._example, self.config.rows)
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        """Begin the episode with the seed `kwargs["seed"]` (an int, 0 if not given)."""
+        """Begin the episode with `kwargs["seed"]`, an int, by default 0, and the adapter named `kwargs["adapter"]`."""
         contract = self.contract
         if contract is not None and contract.instruction and not instruction:
             raise InvalidObservation("instruction: got none, want what the robot is to do, in words")
-        self._begin(instruction or "", int(kwargs.get("seed") or 0))
+        adapter = self.adapters.named(kwargs.get(ADAPTER))
+        self._begin(instruction or "", int(kwargs.get("seed") or 0), adapter.fingerprint)
         self.notice(obs)
-        return {}
+        return adapter.identity
 
     def notice(self, obs: Obs) -> None:
         """Update the session's memory from an observation; called for each one, also if no chunk is requested."""
@@ -190,13 +180,36 @@ class ModelPolicy(Agent, abc.ABC):
 
     def close(self) -> None:
         """Free the weights, and the programs that compute with them."""
-        self.model, self.compilation = None, Compilation(self.config.compile)
+        self.model, self.adapters, self.compilation = None, Adapters(), Compilation(self.config.compile)
 
     def _trainable(self) -> Any:
         require_whole(self.config.quantization)
+        require_base_alone(self.config.adapters)
         return super()._trainable()
 
-    def _begin(self, instruction: str, seed: int) -> None:
+    def adapt(self, adapter: str, folder: Path) -> None:
+        """Check what lies beside an adapter in its folder, and keep statistics by which its rows are normalised.
+
+        Args:
+            adapter: The adapter's fingerprint, as in `Row.adapter`.
+            folder: The folder, of which the adapter itself has been read.
+
+        Raises:
+            ConfigError: It is not of the base's inputs and actions.
+        """
+
+    def _load_with_adapters(self) -> Any:
+        with used_checkpoints() as base:
+            self.model = self.load()
+        weights = weights_of(base) or {"digest": ""}
+        find = partial(
+            find_adapter, checkpoint=self.config.checkpoint, base=base, digest_of_base=weights["digest"] or ""
+        )
+        self.adapters.load(attrgetter(self.network or "")(self), self.config.adapters, find, self.adapt)
+        self.weights_id = {**weights, "adapters": self.adapters.ids} if base else None
+        return self.model
+
+    def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
         # numpy accepts no negative seed; each int64 maps to its own number modulo 2**64
         seeds = [self.config.seed, seed % 2**64]
         self.episode = PolicyEpisode(
@@ -205,6 +218,7 @@ class ModelPolicy(Agent, abc.ABC):
             np.random.default_rng(seeds),
             np.random.default_rng([*seeds, 1]),
             ChunkBuffer(ENSEMBLE, self.config.ensemble_m),
+            adapter=adapter,
         )
 
     def _begun(self) -> PolicyEpisode:
@@ -233,22 +247,24 @@ class ModelPolicy(Agent, abc.ABC):
             memory=episode.memory,
             want=want,
             sample=bool(want),
+            adapter=self.adapters.require(episode.adapter),
         )
         if not samples:
             return [own]
         # each with a generator of its own, as they may be computed in several passes
         seeds = episode.draws.integers(2**63, size=samples)
-        return [own, *(_sample(own, np.random.default_rng(seed)) for seed in seeds)]
+        return [own, *(drawn(own, np.random.default_rng(seed)) for seed in seeds)]
 
     def _act(self, session: ModelPolicy, found: list[Prediction | Exception]) -> Act | Exception:
         episode = session._begun()
+        info = self.adapters.stated(episode.adapter)
         if not found:
-            return Act(episode.plan.take().action)
+            return Act(episode.plan.take().action, info=info)
         if (error := next((p for p in found if isinstance(p, Exception)), None)) is not None:
             return error
         own, *samples = found
         chunk = self._used(own.actions)  # type: ignore[union-attr]
-        info: dict[str, Any] = dict(own.info)  # type: ignore[union-attr]
+        info |= own.info  # type: ignore[union-attr]
         if own.behaviour:  # type: ignore[union-attr]
             info[BEHAVIOUR] = own.behaviour  # type: ignore[union-attr]
         if samples:
@@ -317,28 +333,9 @@ class ModelPolicy(Agent, abc.ABC):
             state={name: np.zeros(length, np.float32) for name, length in lengths.items()},
         )
         session = copy.copy(self)
-        session._begin(instruction, seed)
-        return Row((session.perceive(obs),) * self.history, session._begun().instruction, rng)
-
-
-def _sample(row: Row, draws: np.random.Generator) -> Row:
-    """Return the row with noise and memory that are separate from the session's."""
-    return replace(row, rng=draws, memory=copy.deepcopy(row.memory), sample=True)
-
-
-def shared_frames(rows: Sequence[Row]) -> tuple[list[int], list[int]]:
-    """Return which rows to encode, as the samples of a session see what its own row sees.
-
-    Returns:
-        The indices of rows with observations of their own, and for each row the place of its observations among them.
-    """
-    places: dict[int, int] = {}
-    firsts: list[int] = []
-    for i, row in enumerate(rows):
-        if id(row.frames) not in places:
-            places[id(row.frames)] = len(firsts)
-            firsts.append(i)
-    return firsts, [places[id(row.frames)] for row in rows]
+        session._begin(instruction, seed, self.adapters.example(seed))
+        seen = (session.perceive(obs),) * self.history
+        return Row(seen, instruction, rng, adapter=self.adapters.example(seed))
 
 
 def _stacked(stated: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.policies.base.policy import Row
+from vlagents_ray.policies.base.model_inputs import Row
 
 
 @dataclass(frozen=True, slots=True)

@@ -109,7 +109,8 @@ def _prepare(settings: Any, config: LeRobotConfig, device: Any) -> bool:
     """Set the device and types of the policy; returns whether its parameters keep their saved types."""
     if settings.use_peft:
         raise ConfigError(
-            "checkpoint: is a PEFT adapter, want whole weights; merge it (merge_and_unload) and save that"
+            "checkpoint: is a PEFT adapter, want whole weights; merge it (merge_and_unload) and save that, or "
+            "serve its base with the adapter as one of the deployment's `checkpoints`"
         )
     settings.device = str(device)
     if hasattr(settings, "pretrained_backbone_weights"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -36,14 +36,15 @@ from vlagents_ray.policies.lerobot.policy_types import (
     Flow,
     Kind,
 )
-from vlagents_ray.policies.lerobot.processors import Processors
+from vlagents_ray.policies.lerobot.processors import STATE, Processors, own_processors
 from vlagents_ray.registry import require
 
 log = logging.getLogger(__name__)
 
-STATE, ENVIRONMENT = "observation.state", "observation.environment_state"
+ENVIRONMENT = "observation.environment_state"
 JOINTS, ENVIRONMENT_STATE = "joints", "environment_state"  # parts of `Obs.state` that make these, if nothing is known
 _MATCHED = ("min", "max", "mean")  # statistics by which the parts of a state are found in it
+_FLOWS = sorted(name for name in KINDS if issubclass(KINDS[name], Flow))
 _EMPTY = "empty_camera_"  # prefix of cameras that were always masked in training
 
 
@@ -58,6 +59,7 @@ class LoadedLeRobot:
     environment: list[str]  # parts of the environment's state; empty if the policy has none
     contract: Contract
     trained: DatasetContract  # of the dataset; empty if it stated none
+    own: dict[str, Processors] = field(default_factory=dict)  # of adapters that were trained with other statistics
 
 
 class LeRobot(ModelPolicy):
@@ -65,6 +67,7 @@ class LeRobot(ModelPolicy):
 
     Config: ClassVar[type] = LeRobotConfig
     trainable = network = "model.kind.policy"
+    adaptable = True
     config: LeRobotConfig
 
     @property
@@ -102,11 +105,15 @@ class LeRobot(ModelPolicy):
                 f"config has that: overrides: {{compile_model: true}}"
             )
         if isinstance(kind, Flow):
-            kind.noise_level = self.config.noise_level
+            kind.noise_level, kind.passes.adapters = self.config.noise_level, self.adapters
+        elif self.config.adapters:
+            raise ConfigError(
+                f"adapters: got them for LeRobot's {settings.type!r}, want one of {_FLOWS}; merge each into its base"
+            )
         elif self.config.noise_level:
             raise ConfigError(
                 f"noise_level: got {self.config.noise_level} for LeRobot's {settings.type!r}, want 0, as its actions "
-                f"come out of no flow; those of {sorted(name for name in KINDS if issubclass(KINDS[name], Flow))} do"
+                f"come out of no flow; those of {_FLOWS} do"
             )
         self.config = _with_defaults(self.config, kind)
         processors = Processors(folder, settings, self.config)
@@ -131,6 +138,13 @@ class LeRobot(ModelPolicy):
             behaviour=self.offered(OFFERED if self.config.noise_level else ()),
         )
         return LoadedLeRobot(kind, processors, cameras, parts, environment, contract, trained)
+
+    def adapt(self, adapter: str, folder: Path) -> None:
+        """Keep the processors beside an adapter, if there are any, for the state and the actions of its rows."""
+        model: LoadedLeRobot = self.model
+        own = own_processors(folder, model.kind.config, self.config, model.processors)
+        if own is not None:
+            model.own[adapter] = own
 
     def perceive(self, obs: Obs) -> dict[str, np.ndarray]:
         """Return images by the policy's keys, (H, W, 3) uint8, and its state vectors, float32."""
@@ -163,14 +177,29 @@ class LeRobot(ModelPolicy):
         """Compute the chunks of rows, (horizon, D) float32."""
         torch, model = require("torch"), self.model
         kind, settings = model.kind, model.kind.config
-        leftovers = [None if row.leftover is None else model.processors.leftover(row.leftover) for row in rows]
+        leftovers = [
+            None if row.leftover is None else model.own.get(row.adapter, model.processors).leftover(row.leftover)
+            for row in rows
+        ]
         device = torch.device(settings.device).type
         with torch.inference_mode(), torch.autocast(device, enabled=settings.use_amp):
-            inputs = model.processors.observe([rows[i] for i in kind.observations(rows)], kind.steps)
-            chunks = np.asarray(model.processors.actions(kind.draw(inputs, rows, leftovers)))
+            seen = [rows[i] for i in kind.observations(rows)]
+            inputs = model.processors.observe(seen, kind.steps)
+            for adapter, own in model.own.items():
+                if STATE in inputs and (places := _of(adapter, seen)):
+                    inputs[STATE][places] = own.normalised_state([seen[i] for i in places])
+            drawn = kind.draw(inputs, rows, leftovers)
+            chunks = np.array(model.processors.actions(drawn))
+            for adapter, own in model.own.items():
+                if places := _of(adapter, rows):
+                    chunks[places] = own.actions(drawn[places])
             dim = settings.action_feature.shape[0]
             stated = {} if kind.random is None else kind.random.stated(self.config.execute, dim)
         return [Prediction(chunk, behaviour=stated.get(i, {})) for i, chunk in enumerate(chunks)]
+
+
+def _of(adapter: str, rows: Sequence[Row]) -> list[int]:
+    return [i for i, row in enumerate(rows) if row.adapter == adapter]
 
 
 def _with_defaults(config: LeRobotConfig, kind: Kind) -> LeRobotConfig:

@@ -125,10 +125,12 @@ class Flow(Kind):
         self.guidance = Guidance(policy.rtc_processor)
         model = policy.model
         if policy.name == "smolvla":
-            passes: FlowPasses = SmolVLAPasses(model, compilation)
+            self.passes: FlowPasses = SmolVLAPasses(model, compilation)
         else:
-            passes = Pi0Passes(model, compilation, stated=policy.name == "pi0")
-        model.sample_actions = passes.sample  # which the policy calls between its own preparation of inputs and actions
+            self.passes = Pi0Passes(model, compilation, stated=policy.name == "pi0")
+        model.sample_actions = (
+            self.passes.sample
+        )  # which the policy calls between its own preparation of inputs and actions
 
     @property
     def flow_steps(self) -> int:
@@ -158,6 +160,7 @@ class Flow(Kind):
             batch,
             noise=noise,
             owners=shared_frames(rows)[1],
+            fingerprints=[row.adapter for row in rows],
             steps=self.flow_steps,
             changes=changes,
         )

@@ -19,7 +19,7 @@ from vlagents_ray.policies.token_cache import cached_tokenizer
 from vlagents_ray.registry import require
 
 PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
-ACTION = "action"
+STATE, ACTION = "observation.state", "action"
 _DEVICE, _RENAME, _TOKENIZER = "device_processor", "rename_observations_processor", "tokenizer_processor"
 _STATE_IN_PROMPT = ("pi05", "pi0_fast")  # their prompts differ at each act
 _STATISTICS = {
@@ -40,6 +40,7 @@ class Processors:
         unknown = sorted(set(config.processors) - set().union(*saved))
         if unknown:
             raise ConfigError(f"processors: got {unknown}, the checkpoint has {[sorted(steps) for steps in saved]}")
+        self.steps = [list(steps) for steps in saved]  # the registered names, of both pipelines
         own = {_DEVICE: {"device": settings.device}, _RENAME: {"rename_map": {}}}  # `perceive` uses the policy's names
         overrides = {**own, **config.processors}
         trained = saved[0].get(_RENAME, {}).get("rename_map") or {}
@@ -67,6 +68,11 @@ class Processors:
             if found := getattr(step, "_tensor_stats", {}).get(key):
                 return {name: value.flatten().tolist() for name, value in found.items()}
         return {}
+
+    def normalises(self, feature: Any) -> bool:
+        """Whether the pre-processor changes numbers of that feature by their statistics."""
+        maps = [step.norm_map for step in self._before.steps if hasattr(step, "norm_map")]
+        return any(getattr(one.get(feature.type), "name", "IDENTITY") != "IDENTITY" for one in maps)
 
     def dataset(self) -> DatasetContract | None:
         """Return the contract of the dataset of the training; None if it has none."""
@@ -102,6 +108,13 @@ class Processors:
             batch[key] = values.permute(0, 3, 1, 2).float() / 255 if first.ndim == 3 else values
         batch["task"] = [row.instruction for row in rows for _ in range(steps)]
         return {key: value for key, value in self._before(batch).items() if value is not None}
+
+    def normalised_state(self, rows: Sequence[Row]) -> Any:
+        """Return the last states of rows, (B, D) on the policy's device, in the policy's units."""
+        torch = require("torch")
+        states = torch.from_numpy(np.stack([row.frames[-1][STATE] for row in rows])).to(self._device)
+        [step] = [step for step in self._before.steps if hasattr(step, "norm_map")]
+        return step._normalize_observation({STATE: states}, inverse=False)[STATE]
 
     def actions(self, chunks: Any) -> np.ndarray:
         """Convert the policy's actions (B, T, D) to (B, T, D') float32, in the robot's units."""
@@ -145,6 +158,49 @@ class Processors:
             to_transition=converters.policy_action_to_transition,
             to_output=converters.transition_to_policy_action,
         )
+
+
+def own_processors(folder: Path, settings: Any, config: LeRobotConfig, base: Processors) -> Processors | None:
+    """Return the processors beside an adapter, whose dataset may have had other statistics than the base's.
+
+    Args:
+        folder: The adapter's folder.
+        settings: The policy's own config.
+        config: The settings of the policy.
+        base: The processors of the base.
+
+    Returns:
+        The processors; None if there are none, so that the base's are used.
+
+    Raises:
+        ConfigError: They differ from the base's in more than the statistics of state and actions.
+    """
+    if not any((folder / name).is_file() for name in PIPELINES):
+        return None
+    if missing := [name for name in PIPELINES if not (folder / name).is_file()]:
+        raise ConfigError(f"{folder}: misses {missing}, want both pipelines as LeRobot saves them, or none of them")
+    if not config.trust_remote_code:
+        for name in PIPELINES:
+            require_known_steps(folder / name)
+    own = Processors(folder, settings, config)
+    features = {**settings.input_features, **settings.output_features}
+    own.require_statistics(settings, [key for key in features if key != ACTION])
+    changed = {key for key in features if own.normalises(features[key]) and own.statistics(key) != base.statistics(key)}
+    sizes = [[len(one.statistics(key).get("mean", ())) for key in (STATE, ACTION)] for one in (own, base)]
+    allowed = {ACTION} if settings.type in _STATE_IN_PROMPT else {STATE, ACTION}
+    other = {
+        "steps": own.steps != base.steps,
+        f"numbers {sizes[0]} of state and actions, not {sizes[1]}": sizes[0] != sizes[1],
+        f"statistics of {sorted(changed - allowed)}": bool(changed - allowed),
+        "contract of the dataset": own.dataset() not in (None, base.dataset()),
+    }
+    if any(other.values()):
+        said = ", ".join(what for what, differs in other.items() if differs)
+        raise ConfigError(
+            f"{folder}: its processors have other {said} than those of the base, want the same but for the statistics "
+            f"of {sorted(allowed)}; merge the adapter into its base, and serve that as a checkpoint of its own"
+        )
+    return own if changed else None
 
 
 def require_known_steps(file: Path) -> None:

@@ -69,7 +69,7 @@ class SmolVLAPasses(FlowPasses):
             torch, vision = require("torch"), self._vlm.vision_model
             found: list[Any] = []
             hook = vision.embeddings.position_embedding.register_forward_pre_hook(lambda _, given: found.extend(given))
-            with hook:
+            with hook, self.adapters.rows(()):  # this image is of no row
                 patches = [length // vision.patch_size for length in size]
                 vision.embeddings(
                     image[:1].to(vision.dtype), torch.ones(1, *patches, dtype=torch.bool, device=image.device)

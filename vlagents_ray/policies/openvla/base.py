@@ -6,16 +6,17 @@ import abc
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec
-from vlagents_ray.errors import InvalidObservation, NotReset
+from vlagents_ray.errors import ConfigError, InvalidObservation, NotReset
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.base import ModelPolicy, Prediction, Row
 from vlagents_ray.policies.openvla.prismatic import ActionBins, Prismatic
-from vlagents_ray.policies.openvla.statistics import Scale, Statistics
+from vlagents_ray.policies.openvla.statistics import FILE, Scale, Statistics
 
 UNNORM_KEY = "unnorm_key"  # key of reset's options and of an observation's info, as sent by OpenVLA's clients
 OFFERED = ("logprob", "entropy", "replay")  # of action tokens
@@ -72,7 +73,7 @@ class PrismaticPolicy(ModelPolicy):
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin an episode; `kwargs` may contain `unnorm_key`, the dataset of its actions."""
         info = super().reset(obs, instruction, **kwargs)
-        self._begun().memory[UNNORM_KEY] = self._named(kwargs)
+        self._begun().memory[UNNORM_KEY] = self._named(kwargs, self._begun().adapter)
         return info
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
@@ -82,7 +83,8 @@ class PrismaticPolicy(ModelPolicy):
         for i, row in enumerate(rows):
             try:
                 key = self._key(row)
-                prepared[i] = PreparedRow(row, self._statistics.scale(key), self._model_input(row, key))
+                scale = self._statistics(row.adapter).scale(key)
+                prepared[i] = PreparedRow(row, scale, self._model_input(row, key))
             except Exception as error:  # noqa: BLE001 - handed to the session whose request failed
                 results[i] = error
         entries = list(prepared.values())
@@ -95,10 +97,22 @@ class PrismaticPolicy(ModelPolicy):
 
     def _example(self, seed: int, instruction: str = "warm up") -> Row:
         """Return a row of any dataset; sessions may name theirs later."""
-        return replace(
-            super()._example(seed, instruction),
-            memory={UNNORM_KEY: self.config.unnorm_key or self._statistics.names[0]},
-        )
+        row = super()._example(seed, instruction)
+        datasets = self._statistics(row.adapter)
+        return replace(row, memory={UNNORM_KEY: self._default(row.adapter) or datasets.names[0]})
+
+    def adapt(self, adapter: str, folder: Path) -> None:
+        """Keep the statistics of the adapter's datasets, if they lie beside it."""
+        if not (folder / FILE).is_file():
+            return
+        own, base = Statistics.of(folder, self._statistics().bounds), self._statistics()
+        dims = own.action_dims(), base.action_dims(self.config.unnorm_key)
+        if not dims[0] <= dims[1]:
+            raise ConfigError(
+                f"{folder / FILE}: got actions of {sorted(dims[0])} numbers, want {sorted(dims[1])}, as the base's; "
+                f"merge the adapter into its base, and serve that as a checkpoint of its own"
+            )
+        self._checkpoint.own[adapter] = own  # type: ignore[union-attr]
 
     def _decoded(
         self, bins: ActionBins, prepared: Sequence[PreparedRow], tokens: Any, logits: Any
@@ -120,29 +134,33 @@ class PrismaticPolicy(ModelPolicy):
         said = {"logprob": logprob, "entropy": float(entropy.sum()), "replay": {"tokens": tokens.cpu().numpy()}}
         return {name: said[name] for name in entry.row.want}
 
-    @property
-    def _statistics(self) -> Statistics:
+    def _statistics(self, adapter: str = "") -> Statistics:
         checkpoint = self._checkpoint
         if checkpoint is None:
             raise NotReset(f"{type(self).__name__}: not loaded; call initialize() first")
-        return checkpoint.statistics
+        return checkpoint.own.get(adapter, checkpoint.statistics)
 
-    def _named(self, options: Mapping[str, Any]) -> str | None:
+    def _default(self, adapter: str) -> str | None:
+        """Return the dataset of the settings; None for an adapter with datasets of its own."""
+        return None if self._statistics(adapter) is not self._statistics() else self.config.unnorm_key
+
+    def _named(self, options: Mapping[str, Any], adapter: str) -> str | None:
         """Return the dataset that `options` name, or None."""
         key = options.get(UNNORM_KEY)
         if key is None:
             return None
         if not isinstance(key, str):
             raise InvalidObservation(f"unnorm_key: got {type(key).__name__}, want a dataset's name")
-        return self._statistics.key(key)
+        return self._statistics(adapter).key(key)
 
     def _key(self, row: Row) -> str:
         """Return the dataset of a row: the observation's, the episode's, the config's, or the only one."""
-        return self._statistics.key(self._named(row.info) or row.memory.get(UNNORM_KEY) or self.config.unnorm_key)
+        named = self._named(row.info, row.adapter) or row.memory.get(UNNORM_KEY) or self._default(row.adapter)
+        return self._statistics(row.adapter).key(named)
 
     def _action(self) -> ActionSpec:
         """Describe an action: its meaning depends on the dataset, except for the gripper of a single arm."""
-        dims = set() if self._checkpoint is None else self._statistics.action_dims(self.config.unnorm_key)
+        dims = set() if self._checkpoint is None else self._statistics().action_dims(self.config.unnorm_key)
         dim = dims.pop() if len(dims) == 1 else None
         single = dim == _SINGLE_ARM
         return ActionSpec(dim=dim, gripper_open=1.0 if single else None, gripper_closed=0.0 if single else None)

@@ -8,7 +8,7 @@ are one tensor of a fixed length, with a place for each token to come, which is 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from pydantic import Field
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.interface import Obs
+from vlagents_ray.policies.adapters import Adapters
 from vlagents_ray.policies.base import Row, shared_frames
 from vlagents_ray.policies.base.model_inputs import camera_images, camera_specs, choose_cameras
 from vlagents_ray.policies.compilation import Compilation
@@ -44,6 +45,7 @@ class OpenVLA(PrismaticPolicy):
     config: OpenVLAConfig
     model: TokenDecoder
     trainable = "model.base.network"
+    adaptable = True
 
     def __init__(self, config: OpenVLAConfig) -> None:
         super().__init__(config)
@@ -65,7 +67,7 @@ class OpenVLA(PrismaticPolicy):
     def load(self) -> TokenDecoder:
         """Read the checkpoint."""
         base = load_prismatic(self.config)
-        decoder = TokenDecoder(base, max(base.statistics.action_dims(self.config.unnorm_key)))
+        decoder = TokenDecoder(base, max(base.statistics.action_dims(self.config.unnorm_key)), self.adapters)
         decoder.compile_with(self.compilation)
         return decoder
 
@@ -90,7 +92,10 @@ class OpenVLA(PrismaticPolicy):
         for numbers, entry in zip(draws, prepared, strict=True):
             if entry.row.sample:
                 numbers[: entry.scale.dim] = entry.row.rng.random(entry.scale.dim)
-        tokens, logits = self.model.decode([prepared[i].model_input for i in firsts], owners, draws)
+        seen = [prepared[i] for i in firsts]
+        tokens, logits = self.model.decode(
+            [entry.model_input for entry in seen], owners, draws, [entry.row.adapter for entry in seen]
+        )
         return self._decoded(self.model.base.bins, prepared, tokens[:, None], logits[:, None])
 
 
@@ -100,6 +105,7 @@ class TokenDecoder:
 
     base: Prismatic
     longest: int  # the number of tokens of an answer, at most
+    adapters: Adapters = field(default_factory=Adapters)  # of the policy
 
     def compile_with(self, compilation: Compilation) -> None:
         """Mark what of the model is compiled."""
@@ -108,7 +114,11 @@ class TokenDecoder:
         self.continue_from = compilation.core("continue", self.continue_from)  # type: ignore[method-assign]
 
     def decode(
-        self, prompts: Sequence[tuple[Any, list[int]]], owners: Sequence[int], draws: np.ndarray
+        self,
+        prompts: Sequence[tuple[Any, list[int]]],
+        owners: Sequence[int],
+        draws: np.ndarray,
+        fingerprints: Sequence[str] = (),
     ) -> tuple[Any, Any]:
         """Return R answers to P prompts, as tokens (R, S) and the logits (R, S, V) by which they were chosen.
 
@@ -116,12 +126,14 @@ class TokenDecoder:
             prompts: The pixels (C, S, S) and tokens of each prompt.
             owners: (R,), the prompt of each answer; a prompt with several answers is read once.
             draws: (R, S), for `ActionBins.choose`.
+            fingerprints: (P,), the adapter of each prompt, see `Row.adapter`; empty: none has one.
         """
         torch, base, steps = require("torch"), self.base, draws.shape[1]
-        with torch.inference_mode():
+        with torch.inference_mode(), self.adapters.rows(fingerprints):
             uniform = torch.tensor(draws, device=base.device)
             embeddings, mask = self._left_padded(prompts)
             hidden, cache = self.read(embeddings, mask)
+        with torch.inference_mode(), self.adapters.rows([fingerprints[i] for i in owners] if fingerprints else ()):
             index = torch.tensor(owners, device=base.device)
             length, position = mask.shape[1], mask.sum(1)[index]
             # a place for each token but the last one, and one at the end for the token that is being read

@@ -44,6 +44,7 @@ class Prismatic:
     dtype: Any
     deterministic: bool  # whether longer prompts than that are refused
     padded_tokens: int  # the length to which shorter prompts are padded; 0: that of the longest one
+    own: dict[str, Statistics] = field(default_factory=dict)  # of adapters that were trained on other datasets
     prompts: TokenCache[list[int]] = field(default_factory=lambda: TokenCache(_size), repr=False)
 
     def pixels(self, image: np.ndarray) -> Any:

@@ -51,7 +51,7 @@ class Statistics:
 
     def __init__(self, datasets: Mapping[str, Any], bounds: Bounds = "q99") -> None:
         self._datasets = datasets
-        self._bounds = bounds
+        self.bounds = bounds
 
     @classmethod
     def of(cls, checkpoint: Path, bounds: Bounds = "q99") -> Statistics:
@@ -91,7 +91,7 @@ class Statistics:
     def scale(self, key: str, part: Literal["action", "proprio"] = "action") -> Scale:
         """Return the ranges of a dataset's actions or proprioception; raises `ConfigError` if it lacks them."""
         found = self._datasets[key].get(part, {})
-        low, high = _KEYS[self._bounds]
+        low, high = _KEYS[self.bounds]
         if low not in found or high not in found:
             raise ConfigError(
                 f"statistics of {key!r}: {part} has {sorted(found)}, want {low!r} and {high!r}; "

@@ -6,6 +6,7 @@ Physical Intelligence's own code and checkpoints are `vlagents_ray.policies.open
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -42,6 +43,7 @@ CAMERAS = ("base_0_rgb", "left_wrist_0_rgb", "right_wrist_0_rgb")  # openpi's na
 USUAL_CAMERAS = {"base_0_rgb": "front", "left_wrist_0_rgb": "wrist"}
 USUAL_STATE = ("xyz_axis_angle", "gripper_qpos")  # LIBERO
 _EPSILON = 1e-8  # added to a standard deviation by PI0Processor
+_PROCESSOR = "processor_config.json"
 _STATISTICS = ("state_mean", "state_std", "actions_mean", "actions_std")
 
 
@@ -97,6 +99,7 @@ class Pi0(StreamingPolicy):
 
     Config: ClassVar[type] = Pi0Config
     trainable = network = "model.network"
+    adaptable = True
     config: Pi0Config
     model: LoadedPi0 | None
 
@@ -133,7 +136,7 @@ class Pi0(StreamingPolicy):
         path = find_checkpoint(
             self.config.checkpoint,
             self.config.checkpoint_step,
-            needs=["config.json", "processor_config.json", "*.safetensors"],
+            needs=["config.json", _PROCESSOR, "*.safetensors"],
         )
         device = torch_device(self.config.device)
         dtype = torch_dtype(self.config.dtype, device)
@@ -144,6 +147,18 @@ class Pi0(StreamingPolicy):
             self.compilation.core("velocity", partial(velocity_of, network)),
         )
         return LoadedPi0(network, _processor(path), device, dtype, cores)
+
+    def adapt(self, adapter: str, folder: Path) -> None:
+        """Refuse an adapter beside which other statistics lie than those of the base."""
+        file = folder / _PROCESSOR
+        saved = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+        base = self._loaded().processor
+        other = [name for name in _STATISTICS if name in saved and list(saved[name]) != list(getattr(base, name))]
+        if other:
+            raise ConfigError(
+                f"{file}: got other {other} than the base has, want the same; merge the adapter into its base, and "
+                f"serve that as a checkpoint of its own"
+            )
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
         """Begin an episode; an instruction longer than in training is refused, not truncated."""
@@ -189,7 +204,8 @@ class Pi0(StreamingPolicy):
         random = RandomSteps.of(rows, (self._steps, *shape), self.config.noise_level, convert)
         with torch.inference_mode():
             velocity = self._velocity(rows)
-            flow = self._follow(velocity, noise, None if guide is None else guide.to(convert), random)
+            with self.adapters.rows([row.adapter for row in rows]):
+                flow = self._follow(velocity, noise, None if guide is None else guide.to(convert), random)
             stated = {} if random is None else random.stated(self.config.execute, len(model.processor.actions_mean))
         return [Prediction(model.actions(one), behaviour=stated.get(i, {})) for i, one in enumerate(flow.cpu().numpy())]
 
@@ -204,7 +220,8 @@ class Pi0(StreamingPolicy):
             velocity = self._velocity(rows, cores)
         finished = 0
         for now, later in pairwise(times):
-            with torch.inference_mode():  # not while another thread or the caller has its turn
+            # not while another thread or the caller has its turn
+            with torch.inference_mode(), self.adapters.rows([row.adapter for row in rows]):
                 at = torch.from_numpy(now).to(model.device)
                 change = torch.from_numpy(later - now).to(model.device)
                 actions = actions + change[:, None] * velocity(actions, at)
@@ -238,7 +255,8 @@ class Pi0(StreamingPolicy):
         firsts, owners = shared_frames(rows)
         inputs = self._inputs([rows[i] for i in firsts])
         shared = owners if len(firsts) < len(rows) else None
-        return flow_velocity(model.network, inputs, model.dtype, shared, cores or model.cores)
+        with self.adapters.rows([rows[i].adapter for i in firsts]):
+            return flow_velocity(model.network, inputs, model.dtype, shared, cores or model.cores)
 
     def _follow(
         self, velocity: Callable[[Any, float], Any], noise: Any, guide: Guide | None, random: RandomSteps | None
@@ -273,7 +291,7 @@ def _processor(path: Path) -> Any:
     absent = [name for name in _STATISTICS if getattr(processor, name) is None]
     if absent:
         raise ConfigError(
-            f"checkpoint {path}: processor_config.json has no {absent}; want those of the dataset it was trained on: "
+            f"checkpoint {path}: {_PROCESSOR} has no {absent}; want those of the dataset it was trained on: "
             f"PI0Processor(…, {absent[0]}=[…]).save_pretrained(folder) writes them"
         )
     return processor

@@ -10,6 +10,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from vlagents_ray.interface import Agent
+from vlagents_ray.policies.adapters import ADAPTER
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.serve.access.api_keys import Keys, load_keys
 from vlagents_ray.serve.config.dialects import DialectArgs
@@ -57,10 +58,23 @@ class CheckpointArgs(_DeploymentModel):
     """The checkpoints that a session may choose, as in `reset(..., checkpoint="late")` or `checkpoint_step=20000`."""
 
     choices: dict[str, dict[str, Any]] = Field(
-        default_factory=dict, description="by name, the settings that take the place of those in `config`"
+        default_factory=dict,
+        description="by name, the settings that take the place of those in `config`; or `adapter` alone, a PEFT folder "
+        "or hub id (org/name, org/name@COMMIT) of a LoRA adapter over the checkpoint in `config`",
     )
     steps: bool = Field(default=False, description="any step of a checkpoint whose path holds {step}")
     loaded: int = Field(default=2, ge=1, description="checkpoints in the memory of one replica at once, at most")
+
+    @field_validator("choices")
+    @classmethod
+    def _adapters_stand_alone(cls, choices: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+        for name, settings in choices.items():
+            if ADAPTER in settings and (len(settings) > 1 or not isinstance(settings[ADAPTER], str)):
+                raise ValueError(
+                    f"{name}: got {settings}, want {{{ADAPTER}: FOLDER or org/name@COMMIT}} alone; it is used with the "
+                    f"settings in `config`"
+                )
+        return choices
 
     def of(self, make: Callable[[Mapping[str, Any]], Agent], config: Mapping[str, Any]) -> Checkpoints:
         """Return the checkpoints of a policy.

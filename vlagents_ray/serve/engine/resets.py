@@ -94,7 +94,7 @@ class Resets:
                 raise PolicyFailed(f"reset: the policy returned {type(info).__name__}, want a dict")
             for obs in request.history:
                 agent.observe(obs)
-        info = {**info, **model.identity}
+        info = {**model.identity, **info}  # a session with an adapter states both by itself
         spent = timing(ticket.arrived, call.began, call.ended)
         require_serializable(info, self._reply_bytes)
         session.agent = agent

@@ -177,7 +177,7 @@ def stated_contract(config: ServeDeploySchema) -> Contract | None:
     if environment.requirements is not None:
         return None
     offered = args.checkpoints.of(partial(build_agent, args.policy, wrappers=args.wrappers), own)
-    settings = offered.settings(offered.examples()[0], own)
+    settings = offered.settings(offered.examples()[0], offered.config)
     if environment.python is not None:
         return check_policy(environment, args.policy, settings, args.wrappers)
     return unloaded_contract(offered.make(settings))
@@ -244,7 +244,7 @@ def _require_policy(args: ServerArgs, own: dict[str, Any], *, installed: bool, s
     require_packages(args.dialects)
     offered = args.checkpoints.of(partial(build_agent, args.policy, wrappers=args.wrappers), own)
     for choice in offered.examples():
-        settings = offered.settings(choice, own)
+        settings = offered.settings(choice, offered.config)
         if step_follows and STEP_PLACE in str(settings.get(CHOICE)) and settings.get(STEP) is None:
             settings |= {STEP: 0}
         if environment.python is not None:

@@ -2,6 +2,9 @@
 
 A policy's settings name its checkpoint, and optionally a training step of it (`checkpoint: /runs/a/{step}`,
 `checkpoint_step: 20000`). A session chooses among the checkpoints in the deployment file; it never names a path.
+
+A choice may be a LoRA adapter over the deployment's own checkpoint. All adapters are loaded with that, as its setting
+`adapters`, so that sessions with different ones have the same model; which one is an option of their reset.
 """
 
 from __future__ import annotations
@@ -11,10 +14,12 @@ from typing import Any
 
 from vlagents_ray.errors import UnknownCheckpoint
 from vlagents_ray.interface import Agent
+from vlagents_ray.policies.adapters import ADAPTER
 from vlagents_ray.policies.base.checkpoint import at_step
 from vlagents_ray.serve.queue.checkpoint_choice import DEFAULT, CheckpointChoice
 
 CHOICE, STEP = "checkpoint", "checkpoint_step"  # options of a reset, and settings of a policy
+_ADAPTERS = "adapters"  # setting of a policy: its adapters by name
 
 
 class Checkpoints:
@@ -34,15 +39,22 @@ class Checkpoints:
         Args:
             make: Creates an agent from settings, without loading anything.
             config: The deployment's own settings.
-            choices: Settings by the name of each choice; they replace some of the deployment's own.
+            choices: Settings by the name of each choice, which replace some of the deployment's own; or `adapter`
+                alone, the folder or hub id of a LoRA adapter over the deployment's own checkpoint.
             steps: Whether a session may choose the training step.
             loaded: Largest number of checkpoints in memory at once.
         """
         self.make = make
-        self.config = dict(config or {})
         self.limit = loaded
-        self._choices = {name: dict(settings) for name, settings in (choices or {}).items()}
+        offered = choices or {}
+        self._adapters = {name: settings[ADAPTER] for name, settings in offered.items() if ADAPTER in settings}
+        self._choices = {name: dict(settings) for name, settings in offered.items() if name not in self._adapters}
         self._steps = steps
+        self.config = self.own(config or {})
+
+    def own(self, config: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the deployment's own settings `config`, with its adapters."""
+        return {**config, **({_ADAPTERS: self._adapters} if self._adapters else {})}
 
     def split_options(self, options: Mapping[str, Any]) -> tuple[CheckpointChoice, dict[str, Any]]:
         """Split the options of a reset into the chosen checkpoint and the options for the policy.
@@ -52,6 +64,12 @@ class Checkpoints:
         """
         rest = dict(options)
         choice, step = rest.pop(CHOICE, None), rest.pop(STEP, None)
+        if isinstance(choice, str) and choice in self._adapters:
+            if step is not None:
+                raise UnknownCheckpoint(
+                    f"{STEP}: got {step!r} with the adapter {choice!r}, which has none; leave it out"
+                )
+            return DEFAULT, {**rest, ADAPTER: choice}
         if choice is not None and (not isinstance(choice, str) or choice not in self._choices):
             raise UnknownCheckpoint(f"{CHOICE}: got {choice!r}, want {self._offered()}")
         if step is not None:
@@ -64,6 +82,8 @@ class Checkpoints:
     def settings(self, choice: CheckpointChoice, config: Mapping[str, Any]) -> dict[str, Any]:
         """Return the settings of an agent for that choice, based on the deployment's own settings `config`."""
         chosen = {} if choice.name is None else self._choices[choice.name]
+        if self._adapters and choice != DEFAULT:  # they belong to the deployment's own checkpoint
+            config = {name: value for name, value in config.items() if name != _ADAPTERS}
         return {**config, **chosen, **({} if choice.step is None else {STEP: choice.step})}
 
     def examples(self) -> list[CheckpointChoice]:
@@ -73,7 +93,7 @@ class Checkpoints:
     def describe(self, config: Mapping[str, Any]) -> dict[str, Any]:
         """Return the available choices, for the metadata."""
         choices = {name: resolved(self.settings(CheckpointChoice(name), config)) for name in self._choices}
-        return {"choices": choices, "steps": self._steps, "limit": self.limit}
+        return {"choices": choices | self._adapters, "steps": self._steps, "limit": self.limit}
 
     def offers(self, choice: CheckpointChoice, settings: Mapping[str, Any], config: Mapping[str, Any]) -> bool:
         """Return whether the deployment offers that choice, and it results in these settings."""
@@ -81,7 +101,8 @@ class Checkpoints:
         return known and (choice.step is None or self._steps) and self.settings(choice, config) == settings
 
     def _offered(self) -> str:
-        offered = [f"one of {sorted(self._choices)}"] if self._choices else []
+        names = sorted({*self._choices, *self._adapters})
+        offered = [f"one of {names}"] if names else []
         offered += [f"a {STEP}"] if self._steps else []
         return " or ".join([*offered, "none, for its own"]) if offered else "none but its own"
 

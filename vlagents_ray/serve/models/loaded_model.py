@@ -41,7 +41,7 @@ class LoadedModel:
     contract: Contract | None
     copies: AgentCopies
     padding: Padding
-    weights: dict[str, str | None] | None  # digest and revision, see `Agent.weights_id`
+    weights: dict[str, Any] | None  # digest and revision, see `Agent.weights_id`
     version: tuple[str, str]  # equal in replicas that can take over each other's sessions of this model
     calls: PolicyCalls  # running calls of the replica, including those of this agent
     parameters: ModelWeights  # versions of the weights

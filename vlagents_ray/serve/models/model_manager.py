@@ -50,7 +50,7 @@ class ModelManager:
         """Manage models from `loader` for `sessions`; a model's sessions are closed when it is evicted at once."""
         self.act_parts: Parts | None = None  # whether that model gives chunks in parts
         self.contract: Contract | None = None  # contract of the deployment's own model that was loaded last
-        self.weights: dict[str, str | None] | None = None  # weights of the deployment's own model that was loaded last
+        self.weights: dict[str, Any] | None = None  # weights of the deployment's own model that was loaded last
         self.step = ""  # the step of a long first load, such as "compiling 4 rows (3 of 5)"
         self.on_step: Callable[[str], None] = lambda _: None  # called with it, on the thread that loads
         self._source = source
@@ -71,11 +71,12 @@ class ModelManager:
 
     def configure(self, config: Mapping[str, Any]) -> None:
         """Set the deployment's own settings: the first call sets the initial ones, a later one starts a swap."""
+        own = self._source.own(config)
         with self._changed:
             if not self._begun:
-                self._begun, self._cache.config, self._first = True, dict(config), self._source.make(config)
+                self._begun, self._cache.config, self._first = True, own, self._source.make(own)
             else:
-                self._cache.next = None if config == self.config else dict(config)
+                self._cache.next = None if own == self.config else own
                 self._cache.failure = None
                 self._wake()
 

@@ -43,7 +43,7 @@ class Child:
 
     def __init__(self, python: str, settings: Settings, env_vars: Mapping[str, str]) -> None:
         self.contract: Contract | None = None  # contract of the policy, set by `start`
-        self.weights: dict[str, str | None] | None = None  # identity of the weights, set by `start`
+        self.weights: dict[str, Any] | None = None  # identity of the weights, set by `start`
         self.act_parts: Parts | None = None  # whether the policy gives chunks in parts, set by `start`
         self.sessions: set[str] = set()  # names of the sessions in the child
         self._python = python

@@ -1,0 +1,150 @@
+"""LoRA adapters over SmolVLA, chosen by session in one batch, against each one merged into a checkpoint of its own."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from lerobot.policies.factory import make_pre_post_processors
+from peft_adapters import merge, pairs, save
+
+from tests.families.lerobot import tiny
+from tests.families.lerobot.conftest import FILTERS, TASKS, Load, Made, begun, view
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, Act
+from vlagents_ray.policies.lerobot import LeRobot
+from vlagents_ray.serve.models.agent_copies import AgentCopies
+
+pytestmark = FILTERS
+
+ATOL = 1e-4  # of actions of size 1, which four steps of a flow and the merged sums round differently
+# LeRobot's own targets for SmolVLA, then some of the language model and the cameras' encoder
+TARGETS = (
+    r"model\.vlm_with_expert\.lm_expert\..*\.(q|v)_proj|model\.(state_proj|action_(in|out)_proj|action_time_mlp_\w+)"
+)
+SEEING = r"model\.vlm_with_expert\.vlm\.model\.(text_model|vision_model)\..*\.(q_proj|o_proj|out_proj|down_proj|fc1)"
+
+
+def layers(network: Any, pattern: str) -> list[str]:
+    found = [
+        name for name, one in network.named_modules() if type(one) is torch.nn.Linear and re.fullmatch(pattern, name)
+    ]
+    assert len(found) > 3
+    return found
+
+
+@pytest.fixture(scope="module")
+def saved(made: Made, loaded: Load, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Folders of adapters, and under "merged/NAME" of whole checkpoints; "units" has statistics of its own."""
+    root, folders = tmp_path_factory.mktemp("adapters"), {}
+    network = loaded("smolvla").model.kind.policy
+    kinds = [("expert", TARGETS, 4), ("all", f"{TARGETS}|{SEEING}", 2), ("units", TARGETS, 8)]
+    for seed, (name, pattern, rank) in enumerate(kinds):
+        values = {key: 0.3 * value for key, value in pairs(network, layers(network, pattern), rank, seed).items()}
+        folders[name] = save(root / name, values)
+        whole = shutil.copytree(made("smolvla"), root / f"merged-{name}")
+        merged = LeRobot.from_config({"checkpoint": str(whole)})
+        merged.initialize()
+        policy = merged.model.kind.policy
+        merge(policy, values)
+        policy.save_pretrained(whole)
+        if name == "units":
+            dataset = {key: {k: 2 * v + 0.5 for k, v in one.items()} for key, one in tiny.statistics().items()}
+            for pipeline in make_pre_post_processors(policy.config, dataset_stats=dataset):
+                pipeline.save_pretrained(whole)
+                pipeline.save_pretrained(folders[name])
+        folders[f"merged/{name}"] = whole
+    return folders
+
+
+@pytest.fixture(scope="module")
+def adapted(made: Made, saved: dict[str, Path]) -> LeRobot:
+    adapters = {name: str(saved[name]) for name in ("expert", "all", "units")}
+    policy = LeRobot.from_config({"checkpoint": str(made("smolvla")), "adapters": adapters})
+    policy.initialize()
+    return policy
+
+
+def session(policy: LeRobot, number: int, adapter: str | None = None) -> LeRobot:
+    one = AgentCopies(policy).make()
+    one.reset(view(number), TASKS[number % len(TASKS)], seed=number, adapter=adapter)
+    assert isinstance(one, LeRobot)
+    return one
+
+
+@pytest.fixture(scope="module")
+def alone(loaded: Load, saved: dict[str, Path]) -> Callable[[str | None], LeRobot]:
+    """The base, or the whole checkpoint of an adapter."""
+    policies: dict[str | None, LeRobot] = {None: loaded("smolvla")}
+
+    def load(name: str | None) -> LeRobot:
+        if name not in policies:
+            policies[name] = LeRobot.from_config({"checkpoint": str(saved[f"merged/{name}"])})
+            policies[name].initialize()
+        return policies[name]
+
+    return load
+
+
+CHOSEN = ("all", None, "expert", "units", "all", "units")
+
+
+def infos(number: int) -> dict[str, Any]:
+    """Some sessions also want samples, or continue a plan."""
+    if number == 3:
+        return {LEFTOVER: np.full((6, tiny.ACTION), 0.3, np.float32), DELAY: 2}
+    return {SAMPLES: 3 * (number % 2)}
+
+
+def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(
+    adapted: LeRobot, alone: Callable[[str | None], LeRobot]
+) -> None:
+    sessions = [session(adapted, number, name) for number, name in enumerate(CHOSEN)]
+    acts = adapted.act_batch([view(number, **infos(number)) for number in range(len(CHOSEN))], sessions)
+    for number, (name, act) in enumerate(zip(CHOSEN, acts, strict=True)):
+        wanted = begun(alone(name), number).act(view(number, **infos(number)))
+        assert isinstance(act, Act)
+        np.testing.assert_allclose(act.action, wanted.action, atol=ATOL)
+        if DISTRIBUTION in wanted.info:
+            for part in ("mean", "samples"):
+                np.testing.assert_allclose(act.info[DISTRIBUTION][part], wanted.info[DISTRIBUTION][part], atol=ATOL)
+        if name is not None:
+            base = begun(alone(None), number).act(view(number, **infos(number)))
+            assert np.abs(base.action - wanted.action).max() > 100 * ATOL
+
+
+def test_one_forward_pass_serves_all_of_them(adapted: LeRobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, rows = adapted.model.kind.policy.model, []
+    step = model.denoise_step
+    monkeypatch.setattr(model, "denoise_step", lambda **given: (rows.append(len(given["x_t"])), step(**given))[1])
+    sessions = [session(adapted, number, name) for number, name in enumerate(CHOSEN)]
+    adapted.act_batch([view(number) for number in range(len(CHOSEN))], sessions)
+    assert rows == [len(CHOSEN)] * 4  # the steps of the flow
+
+
+def test_types_without_a_flow_take_no_adapters(made: Made, saved: dict[str, Path]) -> None:
+    policy = LeRobot.from_config({"checkpoint": str(made("act")), "adapters": {"expert": str(saved["expert"])}})
+    with pytest.raises(ConfigError, match=r"adapters: got them for LeRobot's 'act', want one of \['pi0'"):
+        policy.initialize()
+
+
+def test_processors_of_another_kind_are_refused(made: Made, saved: dict[str, Path], tmp_path: Path) -> None:
+    folder = shutil.copytree(saved["expert"], tmp_path / "expert")
+    file = shutil.copy(made("smolvla") / "policy_preprocessor.json", folder)
+    config = {"checkpoint": str(made("smolvla")), "adapters": {"expert": str(folder)}}
+    with pytest.raises(ConfigError, match=r"adapter 'expert': .* misses .*'policy_postprocessor.json'.*, want both"):
+        LeRobot.from_config(config).initialize()
+    for other in made("smolvla").glob("policy_*"):
+        shutil.copy(other, folder)
+    pipeline = json.loads(Path(file).read_text())
+    pipeline["steps"] = [step for step in pipeline["steps"] if step["registry_name"] != "to_batch_processor"]
+    Path(file).write_text(json.dumps(pipeline))
+    with pytest.raises(ConfigError, match=r"adapter 'expert': .*other steps than those of the base"):
+        LeRobot.from_config(config).initialize()

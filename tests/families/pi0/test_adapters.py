@@ -1,0 +1,113 @@
+"""LoRA adapters over transformers' π0, chosen by session in one batch, against each one merged into its base."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from peft_adapters import merge, pairs, save
+
+from tests.families.pi0 import tiny
+from tests.families.pi0.test_pi0 import WORDS, seen
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.interface import DISTRIBUTION, POLICY, SAMPLES, Act
+from vlagents_ray.policies.pi0 import Pi0
+from vlagents_ray.serve.models.agent_copies import AgentCopies
+
+torch.set_num_threads(1)  # the model is too small for more: threads would wait for one another
+
+ATOL = 1e-4  # of actions of size 1, which ten steps of a flow and the merged sums round differently
+TARGETS = r".*\.(q_proj|v_proj|down_proj|fc1|fc2|patch_embedding|linear)|action_.*|embed_action_time\..*"
+CHOSEN = ("first", None, "second", "first", "second")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tiny.save(tmp_path_factory.mktemp("pi0"))
+
+
+def load(folder: Path, **config: Any) -> Pi0:
+    policy = Pi0.from_config({"checkpoint": str(folder), **config})
+    policy.initialize()
+    return policy
+
+
+@pytest.fixture(scope="module")
+def saved(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, dict[str, np.ndarray]]]:
+    """Folders and values of adapters."""
+    root, found = tmp_path_factory.mktemp("adapters"), {}
+    network = load(folder).model.network
+    kinds = (torch.nn.Linear, torch.nn.Conv2d)
+    layers = [name for name, one in network.named_modules() if type(one) in kinds and re.fullmatch(TARGETS, name)]
+    assert {type(dict(network.named_modules())[name]) for name in layers} == set(kinds)
+    for seed, (name, rank) in enumerate((("first", 2), ("second", 4))):
+        values = {key: 0.3 * value for key, value in pairs(network, layers, rank, seed).items()}
+        found[name] = save(root / name, values), values
+    return found
+
+
+def session(policy: Pi0, seed: int, **options: Any) -> Pi0:
+    one = AgentCopies(policy).make()
+    one.reset(seen(seed), WORDS[seed % len(WORDS)], seed=seed, **options)
+    assert isinstance(one, Pi0)
+    return one
+
+
+def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(
+    folder: Path, saved: dict[str, tuple[Path, dict[str, np.ndarray]]]
+) -> None:
+    policy = load(folder, adapters={name: str(path) for name, (path, _) in saved.items()})
+    asked = [seen(seed, **{SAMPLES: 3 * (seed % 2)}) for seed in range(len(CHOSEN))]
+    acts = policy.act_batch(asked, [session(policy, seed, adapter=name) for seed, name in enumerate(CHOSEN)])
+    base = load(folder)
+    plain = [session(base, seed).act(asked[seed]).action for seed in range(len(CHOSEN))]
+    for chosen in (None, "first", "second"):
+        alone = load(folder)
+        if chosen is not None:
+            merge(alone.model.network, saved[chosen][1])
+        for seed, act in enumerate(acts):
+            if CHOSEN[seed] != chosen:
+                continue
+            wanted = session(alone, seed).act(asked[seed])
+            assert isinstance(act, Act)
+            np.testing.assert_allclose(act.action, wanted.action, atol=ATOL)
+            if DISTRIBUTION in wanted.info:
+                samples = (one.info[DISTRIBUTION]["samples"] for one in (act, wanted))
+                np.testing.assert_allclose(*samples, atol=ATOL)
+            assert chosen is None or np.abs(wanted.action - plain[seed]).max() > 100 * ATOL
+
+
+def test_parts_of_chunks_say_which_adapter_it_was(
+    folder: Path, saved: dict[str, tuple[Path, dict[str, np.ndarray]]]
+) -> None:
+    policy = load(folder, early_rows=0.6, adapters={name: str(path) for name, (path, _) in saved.items()})
+    sessions = [session(policy, seed, adapter=name) for seed, name in enumerate(("first", "second"))]
+    parts = list(policy.act_batch_stream([seen(0), seen(1)], sessions))
+    one_by_one = [(seen(i), session(policy, i, adapter=name)) for i, name in enumerate(saved)]
+    alone = [list(policy.act_batch_stream([obs], [one])) for obs, one in one_by_one]
+    said = set()
+    for i in range(2):
+        rows = np.concatenate([one[i].action for one in parts])  # type: ignore[union-attr]
+        np.testing.assert_allclose(rows, np.concatenate([one.action for [one] in alone[i]]), atol=ATOL)  # type: ignore[union-attr]
+        said |= {one[i].info[POLICY]["fingerprint"] for one in parts}  # type: ignore[union-attr]
+    assert len(said) == 2
+    assert len(parts) > 1
+
+
+def test_an_adapter_with_other_statistics_is_refused(
+    folder: Path, saved: dict[str, tuple[Path, dict[str, np.ndarray]]], tmp_path: Path
+) -> None:
+    own = shutil.copytree(saved["first"][0], tmp_path / "own")
+    shutil.copy(folder / "processor_config.json", own)
+    load(folder, adapters={"own": str(own)})
+    processor = json.loads((own / "processor_config.json").read_text())
+    processor["state_mean"][0] += 1
+    (own / "processor_config.json").write_text(json.dumps(processor))
+    with pytest.raises(ConfigError, match=r"adapter 'own': .*got other \['state_mean'\] than the base has"):
+        load(folder, adapters={"own": str(own)})

@@ -1,0 +1,330 @@
+"""LoRA adapters chosen by session: one pass for rows of different adapters, each as if merged into the base alone."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from peft_adapters import merge, pairs, save
+
+from vlagents_ray import Obs
+from vlagents_ray.contract import ActionSpec, Contract, StateSpec
+from vlagents_ray.errors import ConfigError, NotTrainable, UnknownCheckpoint, UnknownSession
+from vlagents_ray.interface import DISTRIBUTION, POLICY, SAMPLES, Act
+from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
+from vlagents_ray.policies.base.checkpoint import find_checkpoint
+from vlagents_ray.serve.models.agent_copies import AgentCopies
+
+pytestmark = pytest.mark.torch
+
+HORIZON, DIM, VIEWS = 3, 4, 2
+LAYERS = ("see", "look", "head.0", "head.2")
+RTOL = 1e-5
+
+
+class Small(ModelPolicy):
+    """A network that sees two views of a state at once, as numbers and as images, and adds noise."""
+
+    Config = ModelConfig
+    adaptable = True
+    trainable = network = "model"
+    passes: ClassVar[list[int]] = []
+
+    @property
+    def contract(self) -> Contract:
+        return Contract(state={"joints": StateSpec(DIM)}, action=ActionSpec(dim=DIM), chunk=HORIZON)
+
+    def load(self) -> Any:
+        import torch
+
+        find_checkpoint(self.config.checkpoint)
+        torch.manual_seed(0)
+        head = torch.nn.Sequential(torch.nn.Linear(8, 8), torch.nn.Tanh(), torch.nn.Linear(8, HORIZON * DIM))
+        parts = {"see": torch.nn.Linear(DIM, 8), "look": torch.nn.Conv2d(3, 8, 2, stride=2, padding=1), "head": head}
+        return torch.nn.ModuleDict({**parts, "attention": torch.nn.MultiheadAttention(8, 2)})
+
+    def perceive(self, obs: Obs) -> np.ndarray:
+        return obs.state["joints"].copy()
+
+    def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
+        import torch
+
+        self.passes.append(len(rows))
+        firsts, owners = shared_frames(rows)
+        states = torch.from_numpy(np.stack([rows[i].frames[-1] for i in firsts]))
+        with torch.inference_mode():
+            with self.adapters.rows([rows[i].adapter for i in firsts]):
+                views = torch.stack([states, -states], 1).flatten(0, 1)  # two entries for each observation
+                image = torch.cat([views, -views, views**2], 1).view(-1, 3, 2, 2)
+                both = self.model["see"](views) + self.model["look"](image).mean((2, 3))
+                seen = torch.tanh(both).unflatten(0, (len(firsts), VIEWS)).mean(1)[owners]
+            noise = torch.from_numpy(np.stack([row.noise(8) for row in rows]))
+            with self.adapters.rows([row.adapter for row in rows]):
+                chunks = self.model["head"](seen + noise).unflatten(1, (HORIZON, DIM))
+        return [Prediction(chunk) for chunk in chunks.numpy()]
+
+
+class Plain(Small):
+    adaptable = False
+
+
+def base(tmp_path: Path) -> Path:
+    folder = tmp_path / "base"
+    folder.mkdir(exist_ok=True)
+    (folder / "weights.bin").write_bytes(b"base")
+    return folder
+
+
+def loaded(tmp_path: Path, **config: Any) -> Small:
+    policy = Small.from_config({"checkpoint": str(base(tmp_path)), **config})
+    policy.initialize()
+    return policy
+
+
+def network(tmp_path: Path) -> Any:
+    return loaded(tmp_path).model
+
+
+def at(seed: int, **info: Any) -> Obs:
+    return Obs(state={"joints": np.random.default_rng(seed).normal(size=DIM).astype(np.float32)}, info=info)
+
+
+def begun(policy: Small, seed: int, **options: Any) -> Any:
+    session = AgentCopies(policy).make()
+    session.reset(at(seed), None, seed=seed, **options)
+    return session
+
+
+def three(tmp_path: Path) -> dict[str, dict[str, np.ndarray]]:
+    """Adapters of different ranks and layers, saved."""
+    made = {
+        "stack": pairs(network(tmp_path), LAYERS, 4, seed=1),
+        "pour": pairs(network(tmp_path), LAYERS, 2, seed=2),
+        "fold": pairs(network(tmp_path), LAYERS[3:], 8, seed=3),
+    }
+    for name, values in made.items():
+        save(tmp_path / name, values)
+    return made
+
+
+def paths(tmp_path: Path, *names: str) -> dict[str, str]:
+    return {name: str(tmp_path / name) for name in names}
+
+
+def test_each_row_of_one_pass_acts_as_its_adapter_merged_alone(tmp_path: Path) -> None:
+    made = three(tmp_path)
+    policy = loaded(tmp_path, adapters=paths(tmp_path, *made))
+    chosen = ["stack", None, "pour", "fold", "stack", "fold"]
+    sessions = [begun(policy, seed, adapter=name) for seed, name in enumerate(chosen)]
+    policy.passes.clear()
+    acts = policy.act_batch([at(seed, **{SAMPLES: seed % 3}) for seed in range(len(chosen))], sessions)
+    assert policy.passes == [len(chosen) + sum(seed % 3 for seed in range(len(chosen)))]
+    for seed, (name, act) in enumerate(zip(chosen, acts, strict=True)):
+        alone = loaded(tmp_path)
+        plain = begun(alone, seed).act(at(seed)).action
+        if name is not None:
+            merge(alone.model, made[name])
+        wanted = begun(alone, seed).act(at(seed, **{SAMPLES: seed % 3}))
+        assert isinstance(act, Act)
+        np.testing.assert_allclose(act.action, wanted.action, rtol=RTOL, atol=RTOL)
+        assert name is None or np.abs(act.action - plain).max() > 0.1  # the adapter matters
+        if seed % 3:
+            np.testing.assert_allclose(
+                act.info[DISTRIBUTION]["samples"], wanted.info[DISTRIBUTION]["samples"], rtol=RTOL, atol=RTOL
+            )
+
+
+def test_sessions_without_an_adapter_act_as_the_base_to_the_bit(tmp_path: Path) -> None:
+    three(tmp_path)
+    wanted = begun(loaded(tmp_path), 5).act(at(5)).action
+    policy = loaded(tmp_path, adapters=paths(tmp_path, "stack", "pour"), batch_sizes=[4])
+    mixed = policy.act_batch([at(5), at(6)], [begun(policy, 5), begun(policy, 6, adapter="stack")])
+    single = loaded(tmp_path, batch_sizes=[4])
+    assert isinstance(mixed[0], Act)
+    assert np.array_equal(mixed[0].action, begun(single, 5).act(at(5)).action)
+    np.testing.assert_allclose(mixed[0].action, wanted, rtol=RTOL, atol=RTOL)
+
+
+def test_acts_and_resets_say_which_adapter_it_was(tmp_path: Path) -> None:
+    three(tmp_path)
+    policy = loaded(tmp_path, adapters=paths(tmp_path, "stack", "pour"))
+    said = {name: begun(policy, 0, adapter=name).act(at(0)).info.get(POLICY) for name in (None, "stack", "pour")}
+    assert said[None] is None  # the server states the base's
+    assert said["stack"]["fingerprint"] != said["pour"]["fingerprint"]
+    assert policy.weights_id is not None
+    ids = policy.weights_id["adapters"]
+    for name in ("stack", "pour"):
+        info = begun(policy, 0).reset(at(0), None, adapter=name)
+        assert info == {"checkpoint": str(tmp_path / name), "weights": ids[name]}
+        assert said[name]["fingerprint"] in ids[name]
+    assert "weights" not in begun(policy, 0).reset(at(0), None)
+    without = loaded(tmp_path, adapters=paths(tmp_path, "pour"))
+    assert without.weights_id is not None
+    assert without.weights_id["adapters"] == {"pour": ids["pour"]}  # another adapter beside it changes nothing
+    assert without.weights_id["digest"] == policy.weights_id["digest"]
+
+
+def test_another_base_makes_another_fingerprint(tmp_path: Path) -> None:
+    three(tmp_path)
+    policy = loaded(tmp_path, adapters=paths(tmp_path, "stack"))
+    (tmp_path / "base" / "weights.bin").write_bytes(b"other")
+    other = Small.from_config({"checkpoint": str(tmp_path / "base"), "adapters": paths(tmp_path, "stack")})
+    other.initialize()
+    assert other.weights_id is not None
+    assert policy.weights_id is not None
+    assert other.weights_id["adapters"] != policy.weights_id["adapters"]
+
+
+def test_a_session_without_its_adapter_here_is_unknown(tmp_path: Path) -> None:
+    three(tmp_path)
+    policy = loaded(tmp_path, adapters=paths(tmp_path, "stack", "pour"))
+    here, there = begun(policy, 0, adapter="pour"), begun(policy, 1, adapter="stack")
+    left = loaded(tmp_path, adapters=paths(tmp_path, "pour"))
+    kept, gone = left.act_batch([at(0), at(1)], [here, there])
+    assert isinstance(kept, Act)
+    assert isinstance(gone, UnknownSession)
+
+
+def test_deterministic_rows_do_not_change_with_the_adapters_of_others(tmp_path: Path) -> None:
+    three(tmp_path)
+    policy = loaded(tmp_path, adapters=paths(tmp_path, "stack", "pour"), deterministic=True, batch_sizes=[4])
+    alone = begun(policy, 1, adapter="stack").act(at(1)).action
+    company = [begun(policy, seed, adapter=("pour", "stack", None)[seed]) for seed in range(3)]
+    acts = policy.act_batch([at(seed) for seed in range(3)], company)
+    assert isinstance(acts[1], Act)
+    assert np.array_equal(acts[1].action, alone)
+
+
+def test_an_adapter_that_is_not_offered_is_refused_with_what_is(tmp_path: Path) -> None:
+    three(tmp_path)
+    policy = loaded(tmp_path, adapters=paths(tmp_path, "stack", "pour"))
+    with pytest.raises(UnknownCheckpoint, match=r"got 'fold', want one of \['pour', 'stack'\], or none"):
+        begun(policy, 0, adapter="fold")
+
+
+def test_a_learner_cannot_replace_the_base_of_adapters(tmp_path: Path) -> None:
+    three(tmp_path)
+    with pytest.raises(NotTrainable, match=r"adapters \['stack'\]: they belong to the weights"):
+        loaded(tmp_path, adapters=paths(tmp_path, "stack")).parameters()
+
+
+@pytest.mark.parametrize("setting", [{"compile": True}, {"quantization": "int8"}])
+def test_what_needs_one_set_of_weights_is_refused(tmp_path: Path, setting: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match=f"adapters and {next(iter(setting))}: got both, want one"):
+        Small.from_config({"checkpoint": "any", "adapters": {"stack": "any"}, **setting})
+
+
+def test_a_family_without_adapters_says_so(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="adapters: Plain does not offer them; merge each into its base"):
+        Plain.from_config({"checkpoint": "any", "adapters": {"stack": "any"}})
+
+
+@pytest.mark.parametrize(
+    ("config", "says"),
+    [
+        ({"peft_type": "LOHA"}, "got peft_type 'LOHA', want 'LORA'"),
+        ({"use_dora": True}, "got {'use_dora': True}, want a plain LoRA"),
+        ({"modules_to_save": ["head"]}, "got {'modules_to_save'"),
+        ({"bias": "all"}, "got {'bias': 'all'}"),
+        ({"alpha_pattern": {"see": 3}}, "alpha_pattern"),
+        ({"a_setting_of_later_versions": 1}, "a_setting_of_later_versions"),
+        ({"init_lora_weights": "pissa_niter_4"}, "init_lora_weights"),
+        ({"lora_alpha": None}, "got lora_alpha None, want a number"),
+        ({"base_model_name_or_path": "other/base"}, None),
+    ],
+)
+def test_another_kind_of_adapter_is_refused(tmp_path: Path, config: dict[str, Any], says: str | None) -> None:
+    save(tmp_path / "stack", pairs(network(tmp_path), LAYERS, 2), **config)
+    if says is None:  # a local folder may be a copy of what the hub has under that name
+        loaded(tmp_path, adapters=paths(tmp_path, "stack"))
+        return
+    with pytest.raises(ConfigError, match=f"adapter 'stack': .*{says}"):
+        loaded(tmp_path, adapters=paths(tmp_path, "stack"))
+
+
+def test_rank_stabilised_adapters_have_their_own_scale(tmp_path: Path) -> None:
+    values = pairs(network(tmp_path), LAYERS, 4)
+    save(tmp_path / "stack", values, use_rslora=True, lora_alpha=3)
+    policy, alone = loaded(tmp_path, adapters=paths(tmp_path, "stack")), loaded(tmp_path)
+    merge(alone.model, values, scale=3 / 2)
+    got = begun(policy, 0, adapter="stack").act(at(0)).action
+    np.testing.assert_allclose(got, begun(alone, 0).act(at(0)).action, rtol=RTOL, atol=RTOL)
+
+
+def broken(values: dict[str, np.ndarray], what: str) -> dict[str, np.ndarray]:
+    first = "base_model.model.see.lora_A.weight"
+    changes: dict[str, dict[str, Any]] = {
+        "unknown": {"base_model.model.eye.lora_A.weight": np.ones((2, 4), np.float32)}
+        | {"base_model.model.eye.lora_B.weight": np.ones((8, 2), np.float32)},
+        "half": {"base_model.model.head.1.lora_A.weight": np.ones((2, 4), np.float32)},
+        "shape": {first: np.ones((2, 5), np.float32)},
+        "nan": {first: np.full((2, 4), np.nan, np.float32)},
+        "no linear": {"base_model.model.head.1.lora_A.weight": np.ones((2, 4), np.float32)}
+        | {"base_model.model.head.1.lora_B.weight": np.ones((8, 2), np.float32)},
+        "attention": {"base_model.model.attention.out_proj.lora_A.weight": np.ones((2, 8), np.float32)}
+        | {"base_model.model.attention.out_proj.lora_B.weight": np.ones((8, 2), np.float32)},
+        "changed": {"base_model.model.see.base_layer.weight": np.ones((8, 4), np.float32)},
+        "whole": {"base_model.model.see.weight": np.ones((8, 4), np.float32)},
+    }
+    return {**values, **changes[what]}
+
+
+@pytest.mark.parametrize(
+    ("what", "says"),
+    [
+        ("unknown", r"1 of its 5 layers are not in the network: \['eye'\]; want an adapter that was trained on"),
+        ("half", r"got \['base_model.model.head.1.lora_B.weight'\], want pairs"),
+        ("shape", r"see: got A \(2, 5\) and B \(8, 2\), want them for weights \(8, 4\)"),
+        ("nan", "see: got NaN or infinite values"),
+        ("no linear", "got adapters of {'head.1': 'Tanh'}, want those of linear layers and"),
+        ("attention", "got adapters of {'attention.out_proj': 'NonDynamicallyQuantizableLinear'}"),
+        ("changed", r"got \['base_model.model.see.base_layer.weight'\], want pairs .* and no changes of the base"),
+        ("whole", r"got \['base_model.model.see.weight'\], want pairs"),
+    ],
+)
+def test_an_adapter_that_does_not_fit_is_refused(tmp_path: Path, what: str, says: str) -> None:
+    save(tmp_path / "stack", broken(pairs(network(tmp_path), LAYERS, 2), what))
+    with pytest.raises(ConfigError, match=f"adapter 'stack': .*{says}"):
+        loaded(tmp_path, adapters=paths(tmp_path, "stack"))
+
+
+def test_values_of_the_base_beside_an_adapter_may_only_be_the_same(tmp_path: Path) -> None:
+    made = network(tmp_path)
+    values = pairs(made, LAYERS, 2)
+    same = {"base_model.model.see.base_layer.weight": made["see"].weight.detach().numpy().copy()}
+    save(tmp_path / "stack", values | same)
+    save(tmp_path / "plain", values)
+    policy = loaded(tmp_path, adapters=paths(tmp_path, "stack", "plain"))
+    got, wanted = (begun(policy, 0, adapter=name).act(at(0)).action for name in ("stack", "plain"))
+    assert np.array_equal(got, wanted)
+
+
+def test_a_truncated_or_absent_file_is_refused(tmp_path: Path) -> None:
+    folder = save(tmp_path / "stack", pairs(network(tmp_path), LAYERS, 2))
+    file = folder / "adapter_model.safetensors"
+    file.write_bytes(file.read_bytes()[:-1])
+    with pytest.raises(ConfigError, match=r"adapter 'stack': .*is damaged, or of another format"):
+        loaded(tmp_path, adapters=paths(tmp_path, "stack"))
+    file.rename(folder / "adapter_model.bin")  # a pickle, by its name
+    with pytest.raises(ConfigError, match=r"adapter 'stack': .*misses \['adapter_model.safetensors'\]"):
+        loaded(tmp_path, adapters=paths(tmp_path, "stack"))
+
+
+def test_an_adapter_of_another_base_is_refused(tmp_path: Path) -> None:
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "weights.bin").write_bytes(b"other")
+    folder = save(tmp_path / "stack", pairs(network(tmp_path), LAYERS, 2), base_model_name_or_path=str(other))
+    with pytest.raises(ConfigError, match=r"adapter 'stack': .*was trained on '.*other', want an adapter of '.*base'"):
+        loaded(tmp_path, adapters=paths(tmp_path, "stack"))
+    (other / "weights.bin").write_bytes(b"base")  # a copy of the base
+    loaded(tmp_path, adapters=paths(tmp_path, "stack"))
+    config = json.loads((folder / "adapter_config.json").read_text())
+    (folder / "adapter_config.json").write_text(
+        json.dumps(config | {"base_model_name_or_path": str(tmp_path / "base")})
+    )
+    loaded(tmp_path, adapters=paths(tmp_path, "stack"))
