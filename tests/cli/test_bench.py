@@ -27,6 +27,9 @@ from vlagents_ray.cli.main import app
         (["throughput", "--config", "{"], "JSON"),
         (["throughput", "--config", '{"base_ms": 1}'], "--policy"),
         (["throughput", "--model", "huge"], "size"),
+        (["checkpoint", "smolvl", "made"], "smolvla"),
+        (["checkpoint", "act", "made", "--dtype", "bfloat16"], "float32"),
+        (["checkpoint", "act", "made", "--size", "huge"], "small"),
         (["report", "--readme", "nowhere.md"], "nowhere.md"),
     ],
 )

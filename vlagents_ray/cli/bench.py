@@ -6,7 +6,7 @@ import json
 import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 from rich.text import Text
@@ -160,6 +160,21 @@ def bench_policy(
         )  # fmt: skip
     show_policy(found)
     save(_joined(origin, found), json_file)
+
+
+@bench.command("checkpoint")
+def bench_checkpoint(
+    family: Annotated[str, typer.Argument(help="pi0, smolvla, pi05, act, diffusion or openvla.")],
+    folder: Annotated[Path, typer.Argument(help="A new folder.")],
+    size: Annotated[Literal["full", "small"], typer.Option(help="full: as published; small: for a CPU.")] = "full",
+    dtype: Annotated[str | None, typer.Option(help="Of the weights; default: bfloat16, if the family has it.")] = None,
+) -> None:
+    """Random weights of a family's true size, and a deployment file of them; run it in the family's environment."""
+    from vlagents_ray.bench.checkpoints.recipes import write_checkpoint
+
+    with errors():
+        written = write_checkpoint(family, folder, size, dtype)
+    out.print(f"{written.parameters:,} parameters: vlagents-ray bench policy {folder / 'deployment.yaml'} --json FILE")
 
 
 @bench.command("compare")

@@ -17,11 +17,12 @@ from counting_compiler import counting_compiler
 from lerobot.policies.rtc.configuration_rtc import RTCConfig
 from normal_steps import logprob_of_steps
 from safetensors.torch import load_file, save_file
-from transformers import PreTrainedTokenizerFast
 
 from tests.families.lerobot import tiny
 from tests.families.lerobot.conftest import TASKS, begun, view
 from tests.families.lerobot.test_upstream import Theirs, draws_of
+from vlagents_ray.bench.checkpoints.lerobot import local_tokenizer
+from vlagents_ray.bench.checkpoints.tokenizer import fast_tokenizer
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, WANT, Act
 from vlagents_ray.policies.lerobot import LeRobot
@@ -53,17 +54,12 @@ def shrunk() -> Iterator[pytest.MonkeyPatch]:
 def made(shrunk: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
     """The checkpoint of a kind, with a tokenizer beside it."""
     folder = tmp_path_factory.mktemp("pi")
-    names = {"pad_token": "<pad>", "bos_token": "<bos>", "eos_token": "<eos>"}
-    words = tiny.tokenizer_of(list(names.values()))
-    PreTrainedTokenizerFast(tokenizer_object=words, **names).save_pretrained(folder / "tokenizer")
-    local = {"tokenizer_name": str(folder / "tokenizer")}
+    fast_tokenizer().save_pretrained(folder / "tokenizer")
     for kind in KINDS:
-        processor = importlib.import_module(f"lerobot.policies.{kind}.processor_{kind}")
-        step = processor.TokenizerProcessorStep
-        shrunk.setattr(processor, "TokenizerProcessorStep", lambda step=step, **given: step(**{**given, **local}))
         chunk = {"chunk_size": tiny.CHUNK, "n_action_steps": tiny.EXECUTED, "num_inference_steps": 3}
         (folder / kind).mkdir()
-        tiny.write(folder / kind, tiny.config_of(kind, dtype="float32", image_resolution=(56, 56), **chunk))
+        with local_tokenizer(kind, folder / "tokenizer"):
+            tiny.write(folder / kind, tiny.config_of(kind, dtype="float32", image_resolution=(56, 56), **chunk))
     return lambda kind: folder / kind
 
 

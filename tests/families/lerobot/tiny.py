@@ -20,42 +20,24 @@ from vlagents_ray.policies.base.accelerator import ensure_torchvision
 
 ensure_torchvision()
 
-import numpy as np
 import torch
-from lerobot.configs.types import FeatureType, PolicyFeature
-from lerobot.policies.factory import get_policy_class, make_policy_config, make_pre_post_processors
-from tokenizers import Tokenizer, decoders, models, pre_tokenizers, trainers
-from transformers import (
-    PreTrainedTokenizerFast,
-    SmolVLMConfig,
-    SmolVLMForConditionalGeneration,
-    SmolVLMImageProcessor,
-    SmolVLMProcessor,
-)
-from transformers.models.smolvlm.video_processing_smolvlm import SmolVLMVideoProcessor
+from lerobot.policies.factory import get_policy_class
+from transformers import SmolVLMForConditionalGeneration
+
+from vlagents_ray.bench.checkpoints import lerobot as recipes
+from vlagents_ray.bench.checkpoints.tokenizer import byte_level, fast_tokenizer
 
 STATE, ACTION, SIDE = 6, 6, 64
 CHUNK, EXECUTED = 8, 4
 CAMERA = "top"
 
 
-def inputs(side: int = SIDE, state: int = STATE) -> dict[str, PolicyFeature]:
-    return {
-        f"observation.images.{CAMERA}": PolicyFeature(FeatureType.VISUAL, (3, side, side)),
-        "observation.state": PolicyFeature(FeatureType.STATE, (state,)),
-    }
+def inputs(side: int = SIDE, state: int = STATE) -> dict[str, Any]:
+    return recipes.features([CAMERA], side, state)
 
 
-def statistics(state: int = STATE, action: int = ACTION) -> dict[str, dict[str, np.ndarray]]:
-    """Of a dataset that never was; none of them is the identity."""
-    rng = np.random.default_rng(0)
-
-    def of(*shape: int) -> dict[str, np.ndarray]:
-        mean, spread = rng.uniform(-0.2, 0.2, shape), rng.uniform(0.5, 1.5, shape)
-        bounds = {"min": mean - spread, "max": mean + spread, "q01": mean - spread, "q99": mean + spread}
-        return {name: value.astype(np.float32) for name, value in {"mean": mean, "std": spread, **bounds}.items()}
-
-    return {"observation.state": of(state), "action": of(action), f"observation.images.{CAMERA}": of(3, 1, 1)}
+def statistics(state: int = STATE, action: int = ACTION) -> dict[str, dict[str, Any]]:
+    return recipes.make_statistics(state, action, [f"observation.images.{CAMERA}"])
 
 
 def act(**settings: Any) -> Any:
@@ -70,8 +52,7 @@ def ensemble(**settings: Any) -> Any:
 
 def full_act(**settings: Any) -> Any:
     """Not tiny: ACT of LeRobot's own sizes (52 million parameters), with two cameras of 224 pixels, to be measured."""
-    cameras = {f"observation.images.{name}": inputs(224)[f"observation.images.{CAMERA}"] for name in ("top", "wrist")}
-    features = {**cameras, "observation.state": inputs()["observation.state"]}
+    features = recipes.features(("top", "wrist"), 224, STATE)
     return config_of("act", pretrained_backbone_weights=None, input_features=features, **settings)
 
 
@@ -98,46 +79,38 @@ def sac(**settings: Any) -> Any:
 
 
 def smolvla(folder: Path, **settings: Any) -> Any:
-    vision = {"hidden_size": 32, "intermediate_size": 64, "num_hidden_layers": 1, "num_attention_heads": 2}
-    text = {"hidden_size": 64, "intermediate_size": 96, "num_hidden_layers": 2, "num_attention_heads": 4}
-    model = SmolVLMConfig(
-        image_token_id=3,
-        scale_factor=2,
-        pad_token_id=0,
-        vision_config={**vision, "image_size": 64, "patch_size": 16, "max_image_size": {"longest_edge": 64}},
-        text_config={
-            **text,
-            "model_type": "llama",
+    size = {
+        "scale_factor": 2,
+        "vision": {
+            "hidden_size": 32,
+            "intermediate_size": 64,
+            "num_hidden_layers": 1,
+            "num_attention_heads": 2,
+            "image_size": 64,
+            "patch_size": 16,
+            "max_image_size": {"longest_edge": 64},
+        },
+        "text": {
+            "hidden_size": 64,
+            "intermediate_size": 96,
+            "num_hidden_layers": 2,
+            "num_attention_heads": 4,
             "num_key_value_heads": 2,
             "head_dim": 16,
             "vocab_size": 400,
-            "pad_token_id": 0,
-            "bos_token_id": 1,
-            "eos_token_id": 2,
         },
-    )
-    names = ["<image>", "<fake_token_around_image>", "<global-img>", "<end_of_utterance>"]
-    tokenizer = PreTrainedTokenizerFast(
-        tokenizer_object=tokenizer_of(["<pad>", "<bos>", "<eos>", *names]),
-        **_named("<pad>", "<bos>", "<eos>"),
-        extra_special_tokens=dict(
-            zip(("image_token", "fake_image_token", "global_image_token", "end_of_utterance_token"), names, strict=True)
-        ),
-    )
-    model.save_pretrained(folder / "vlm")
+    }
+    model = recipes.write_smolvlm(folder / "vlm", size)
     if settings.get("load_vlm_weights"):  # the language model is then in bfloat16
         SmolVLMForConditionalGeneration(model).save_pretrained(folder / "vlm")
-    processor = SmolVLMProcessor(SmolVLMImageProcessor(), tokenizer, SmolVLMVideoProcessor(), chat_template=None)
-    processor.save_pretrained(folder / "vlm")
     chunk = {"chunk_size": CHUNK, "n_action_steps": EXECUTED, "num_steps": 4}
     sizes = {"num_vlm_layers": 2, "resize_imgs_with_padding": (64, 64), "load_vlm_weights": False}
     return config_of("smolvla", vlm_model_name=str(folder / "vlm"), **{**sizes, **chunk, **settings})
 
 
 def xvla(folder: Path, **settings: Any) -> Any:
-    tokenizer = PreTrainedTokenizerFast(
-        tokenizer_object=tokenizer_of(["<s>", "<pad>", "</s>"]), **_named("<pad>", "<s>", "</s>")
-    )
+    names = {"bos_token": "<s>", "pad_token": "<pad>", "eos_token": "</s>"}
+    tokenizer = fast_tokenizer(byte_level(list(names.values())), **names)
     tokenizer.save_pretrained(folder / "tokenizer")
     vision = {
         "model_type": "davit",
@@ -197,18 +170,13 @@ def write(folder: Path, config: Any) -> Path:
     if config.type == "vqbet":
         policy.vqbet.action_head.vqvae_model.discretized.fill_(True)
     policy.save_pretrained(folder)
-    dataset = statistics()
-    for key in config.image_features:  # any camera sees what the first one does
-        dataset[key] = dataset[f"observation.images.{CAMERA}"]
-    for pipeline in make_pre_post_processors(config, dataset_stats=dataset):
-        pipeline.save_pretrained(folder)
+    recipes.write_processors(folder, config)
     return folder
 
 
 def config_of(name: str, **settings: Any) -> Any:
     """LeRobot's config of a policy that sees one camera."""
-    features = {"input_features": inputs(), "output_features": {"action": PolicyFeature(FeatureType.ACTION, (ACTION,))}}
-    return make_policy_config(name, device="cpu", push_to_hub=False, **{**features, **settings})
+    return recipes.make_config(name, inputs(), ACTION, **settings)
 
 
 def _unsettle(policy: Any) -> None:
@@ -222,23 +190,6 @@ def _unsettle(policy: Any) -> None:
                 parameter.normal_(std=0.1)
             elif parameter.numel() > 1 and (parameter == parameter.flatten()[0]).all():
                 parameter.add_(0.1 * torch.randn_like(parameter))
-
-
-def _named(pad: str, begin: str, end: str) -> dict[str, str]:
-    return {"pad_token": pad, "bos_token": begin, "eos_token": end}
-
-
-def tokenizer_of(specials: list[str]) -> Tokenizer:
-    """Of bytes and a few words."""
-    tokenizer = Tokenizer(models.BPE())
-    tokenizer.pre_tokenizer = pre_tokenizers.ByteLevel(add_prefix_space=False)
-    tokenizer.decoder = decoders.ByteLevel()
-    alphabet = pre_tokenizers.ByteLevel.alphabet()
-    trainer = trainers.BpeTrainer(
-        vocab_size=300, special_tokens=specials, initial_alphabet=alphabet, show_progress=False
-    )
-    tokenizer.train_from_iterator(["pick up the cube\n", "open the drawer\n"], trainer)
-    return tokenizer
 
 
 if __name__ == "__main__":

@@ -47,7 +47,7 @@ def load(folder: Path, config: LeRobotConfig, device: Any) -> Any:
     ensure_torchvision()
     factory = require("lerobot.policies.factory")
     settings = _settings(folder, config)
-    _require_known(settings.type, folder)
+    require_served(settings.type, folder)
     as_saved = _prepare(settings, config, device)
     try:
         saved = SavedTensors.of(folder / WEIGHTS)
@@ -90,7 +90,8 @@ def _settings(folder: Path, config: LeRobotConfig) -> Any:
         ) from error
 
 
-def _require_known(name: str, folder: Path) -> None:
+def require_served(name: str, folder: Path) -> None:
+    """Raise `ConfigError` unless this environment can load LeRobot's policy of that type, saved in `folder`."""
     if name in REFUSED:
         raise ConfigError(f"checkpoint {folder}: is a {name!r}, which is not served here: {REFUSED[name]}")
     if name in _PATCHED:

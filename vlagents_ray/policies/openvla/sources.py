@@ -39,7 +39,7 @@ def model_classes(checkpoint: Path, source_dir: str | None, trust_remote_code: b
             _remote(checkpoint, "config.json", "AutoModelForVision2Seq"),
             _remote(checkpoint, "preprocessor_config.json", "AutoImageProcessor"),
         )
-    return _from_source(_source(source_dir))
+    return _from_source(find_source(source_dir))
 
 
 def _remote(checkpoint: Path, file: str, auto: str) -> Any:
@@ -52,7 +52,7 @@ def _remote(checkpoint: Path, file: str, auto: str) -> Any:
     return require("transformers.dynamic_module_utils").get_class_from_dynamic_module(named, str(checkpoint))
 
 
-def _source(source_dir: str | None) -> Path:
+def find_source(source_dir: str | None) -> Path:
     """Return the folder that holds the package `prismatic`."""
     asked = [source_dir] if source_dir else [os.environ[name] for name in VARIABLES if os.environ.get(name)]
     if not asked:

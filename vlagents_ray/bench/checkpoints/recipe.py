@@ -1,0 +1,28 @@
+"""What a recipe is asked for, and what it wrote."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+SizeName = Literal["full", "small"]
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """A checkpoint to be written."""
+
+    family: str
+    folder: Path  # absolute, and there
+    size: SizeName
+    dtype: str  # of the weights
+
+
+@dataclass(frozen=True, slots=True)
+class WrittenCheckpoint:
+    """A checkpoint that was written."""
+
+    policy: str  # that serves it
+    parameters: int
+    config: dict[str, Any] = field(default_factory=dict)  # the policy's settings
