@@ -392,7 +392,9 @@ def test_the_result_says_which_versions_of_the_weights_played() -> None:
     assert (unserved.first_policy_version, unserved.policy_version, unserved.policy_fingerprint) == (None,) * 3
 
 
-@pytest.mark.parametrize(("images", "looked_at"), [(True, [True] * 6), (False, [False, False, True, False, False, False])])
+@pytest.mark.parametrize(
+    ("images", "looked_at"), [(True, [True] * 6), (False, [False, False, True, False, False, False])]
+)
 def test_an_env_is_told_whether_anybody_looks(images: bool, looked_at: list[bool]) -> None:
     class Told(Script):
         def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
