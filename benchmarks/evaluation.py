@@ -201,7 +201,9 @@ def their_runs(
 
 
 def _median(rounds: Sequence[Played]) -> Played:
-    return Played(*(None if None in values else statistics.median(values) for values in zip(*rounds, strict=True)))
+    rates, walls, *busy = zip(*rounds, strict=True)
+    known = (None if None in shares else statistics.median(shares) for shares in busy)
+    return Played(statistics.median(rates), statistics.median(walls), *known)
 
 
 def show_evaluation(found: Mapping[str, Any]) -> None:

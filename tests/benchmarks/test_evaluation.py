@@ -77,6 +77,16 @@ def test_a_rate_is_that_from_the_first_reset_to_the_last_step(tmp_path: Path) ->
     assert read_episode_times(tmp_path / "fake" / "notes")[2][0] == EpisodeTimes(106, 108, 3, 2)
 
 
+def test_ours_says_how_busy_both_sides_were(tmp_path: Path) -> None:
+    def run(folder: Path, notes: Path) -> None:
+        play_here(notes, range(FEW.episodes))
+        (folder / "results").mkdir()
+        (folder / "results" / "summary.json").write_text('{"env_busy": 0.75, "policy_busy": 0.5}')
+
+    played = play(FEW, run, tmp_path / "fake")
+    assert (played.env_busy, played.policy_busy) == (0.75, 0.5)
+
+
 @pytest.mark.parametrize(("seeds", "steps"), [(range(3), 3), (range(1, 5), 3), (range(4), 2)])
 def test_whoever_plays_something_else_is_not_compared(tmp_path: Path, seeds: range, steps: int) -> None:
     with pytest.raises(ProcessFailed, match="want each of 4 once with 3"):
