@@ -24,6 +24,7 @@ from vlagents_ray.bench.line_process import ProcessFailed
 from vlagents_ray.bench.peers import SCRIPTS
 from vlagents_ray.bench.report.section import evaluation_outcomes
 from vlagents_ray.envs import make_env
+from vlagents_ray.envs.base import known_contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Act
 
@@ -40,7 +41,7 @@ def play_here(notes: Path, seeds: range, steps: int = FEW.max_steps) -> None:
 
 def test_the_noted_tabletop_is_the_tabletop(tmp_path: Path) -> None:
     with make_env(TIMED_TABLETOP, **FEW.env(tmp_path)) as noted, make_env("tabletop", width=32, height=32) as plain:
-        assert noted.contract == plain.contract
+        assert noted.contract == plain.contract == known_contract(TIMED_TABLETOP, FEW.env(tmp_path))
         ours, theirs = noted.reset(seed=5)[0], plain.reset(seed=5)[0]
         assert np.array_equal(ours.cameras["front"], theirs.cameras["front"])
 
