@@ -47,7 +47,9 @@ class TimedTabletop(Tabletop):
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
-        return super().known_contract({"width": arguments["size"], "height": arguments["size"]})
+        """Of our arguments, or of the tabletop's, whose constructor calls this."""
+        size = {"width": arguments["size"], "height": arguments["size"]} if "size" in arguments else {}
+        return super().known_contract({**arguments, **size})
 
     def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
         self._begun, self._seed = time.time(), seed
