@@ -45,6 +45,12 @@ class TimedTabletop(Tabletop):
         self._begun = 0.0
         self._seed = 0
 
+    @classmethod
+    def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
+        """Of our arguments, or of the tabletop's, whose constructor calls this."""
+        size = {"width": arguments["size"], "height": arguments["size"]} if "size" in arguments else {}
+        return super().known_contract({**arguments, **size})
+
     def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
         self._begun, self._seed = time.time(), seed
         return super().reset(seed=seed, options=options)

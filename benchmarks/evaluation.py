@@ -9,6 +9,8 @@ each once:
   the second splits the episodes into one configuration for each worker, each with a process and a server of its own;
 - vla-eval: one model server, and as many shards as ours has workers, without Docker.
 
+Of ours, summary.json also says which share of the time the simulators and the policy were busy.
+
 The rate is that from the first reset to the last step, so that nobody's start-up or shutdown counts: that of `run-eval`
 contains a fixed sleep of 30 s. The wall time of the whole command is the second figure, with all of that.
 """
@@ -39,6 +41,7 @@ from vlagents_ray.cli.bench import DEFAULT_PEERS_PYTHON, Json, PeersPython, show
 from vlagents_ray.cli.console import errors, out, progress, save, table
 from vlagents_ray.cli.options import parse_list
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate.results.summary import FILE as SUMMARY
 from vlagents_ray.evaluate.workers.cluster import THREAD_VARIABLES
 from vlagents_ray.serve.ports import LOOPBACK, free_block
 
@@ -73,6 +76,8 @@ class Played(NamedTuple):
 
     episodes_per_minute: float  # from the first reset to the last step
     wall_s: float  # of the whole command
+    env_busy: float | None = None  # share of the workers' time, of ours alone
+    policy_busy: float | None = None  # share of the replica's time, of ours alone
 
 
 Run = Callable[[Path, Path], None]  # given its own folder and that of the notes
@@ -128,7 +133,9 @@ def play(plan: EvaluationPlan, run: Run, folder: Path) -> Played:
             f"want each of {plan.episodes} once with {plan.max_steps}; its results stand for something else"
         )
     playing_s = max(note.ended for note in episodes) - min(note.begun for note in episodes)
-    return Played(60 * plan.episodes / playing_s, wall_s)
+    summary = folder / "results" / SUMMARY
+    found = json.loads(summary.read_text()) if summary.is_file() else {}
+    return Played(60 * plan.episodes / playing_s, wall_s, found.get("env_busy"), found.get("policy_busy"))
 
 
 def ratios(ours: Sequence[Played], theirs: Sequence[Played]) -> dict[str, Any]:
@@ -194,13 +201,17 @@ def their_runs(
 
 
 def _median(rounds: Sequence[Played]) -> Played:
-    return Played(*(statistics.median(values) for values in zip(*rounds, strict=True)))
+    rates, walls, *busy = zip(*rounds, strict=True)
+    known = (None if None in shares else statistics.median(shares) for shares in busy)
+    return Played(statistics.median(rates), statistics.median(walls), *known)
 
 
 def show_evaluation(found: Mapping[str, Any]) -> None:
     """Print a row for each system, and the targets."""
     plan = found["plan"]
-    rows = table("", "episodes/min", "whole command s", "ours / theirs", "wall: theirs / ours")
+    rows = table(
+        "", "episodes/min", "whole command s", "simulators busy", "policy busy", "ours / theirs", "wall: theirs / ours"
+    )
     rows.title = (
         f"{plan['episodes']} episodes of {plan['max_steps']} steps, {plan['size']}x{plan['size']}, "
         f"{plan['workers']} workers on {found['cores']} cores, medians of {plan['rounds']} rounds"
@@ -208,7 +219,8 @@ def show_evaluation(found: Mapping[str, Any]) -> None:
     for name, row in found["medians"].items():
         ratio = found["ratios"].get(name)
         cells = [f"{ratio['median']:.2f}", f"{ratio['wall_median']:.2f}"] if ratio else ["", ""]
-        rows.add_row(name, f"{row['episodes_per_minute']:.0f}", f"{row['wall_s']:.1f}", *cells)
+        busy = ["" if row[side] is None else f"{row[side]:.0%}" for side in ("env_busy", "policy_busy")]
+        rows.add_row(name, f"{row['episodes_per_minute']:.0f}", f"{row['wall_s']:.1f}", *busy, *cells)
     out.print(rows)
     show_outcomes(evaluation_outcomes(found))
     show_skipped(found)

@@ -24,6 +24,7 @@ from vlagents_ray.bench.line_process import ProcessFailed
 from vlagents_ray.bench.peers import SCRIPTS
 from vlagents_ray.bench.report.section import evaluation_outcomes
 from vlagents_ray.envs import make_env
+from vlagents_ray.envs.base import known_contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Act
 
@@ -40,7 +41,7 @@ def play_here(notes: Path, seeds: range, steps: int = FEW.max_steps) -> None:
 
 def test_the_noted_tabletop_is_the_tabletop(tmp_path: Path) -> None:
     with make_env(TIMED_TABLETOP, **FEW.env(tmp_path)) as noted, make_env("tabletop", width=32, height=32) as plain:
-        assert noted.contract == plain.contract
+        assert noted.contract == plain.contract == known_contract(TIMED_TABLETOP, FEW.env(tmp_path))
         ours, theirs = noted.reset(seed=5)[0], plain.reset(seed=5)[0]
         assert np.array_equal(ours.cameras["front"], theirs.cameras["front"])
 
@@ -75,6 +76,16 @@ def test_a_rate_is_that_from_the_first_reset_to_the_last_step(tmp_path: Path) ->
     played = play(FEW, run, tmp_path / "fake")
     assert played.episodes_per_minute == pytest.approx(60 * 4 / 11)
     assert read_episode_times(tmp_path / "fake" / "notes")[2][0] == EpisodeTimes(106, 108, 3, 2)
+
+
+def test_ours_says_how_busy_both_sides_were(tmp_path: Path) -> None:
+    def run(folder: Path, notes: Path) -> None:
+        play_here(notes, range(FEW.episodes))
+        (folder / "results").mkdir()
+        (folder / "results" / "summary.json").write_text('{"env_busy": 0.75, "policy_busy": 0.5}')
+
+    played = play(FEW, run, tmp_path / "fake")
+    assert (played.env_busy, played.policy_busy) == (0.75, 0.5)
 
 
 @pytest.mark.parametrize(("seeds", "steps"), [(range(3), 3), (range(1, 5), 3), (range(4), 2)])

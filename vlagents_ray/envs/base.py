@@ -44,8 +44,8 @@ class Environment(ABC):
     looked_at: bool = True
     """Whether the next observation is used; if not, an env may omit its images, which saves rendering them.
 
-    The observations between the rows of a chunk are not used, unless videos are made. Nothing but the images may depend
-    on this.
+    The observations between the rows of a chunk are not used, unless videos are made, nor is that of the last step.
+    Nothing but the images may depend on this.
     """
 
     @property

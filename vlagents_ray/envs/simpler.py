@@ -162,7 +162,8 @@ class Simpler(EvalEnv):
     def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
         if self._steps is None:
             raise NotReset(f"{self._name}: step before reset; call reset(seed=...) first")
-        now = self._simulator.step(_command(one_row(act, self._contract))[np.newaxis])
+        command = _command(one_row(act, self._contract))
+        now = self._simulator.step(command[np.newaxis], look=self.looked_at)
         self._steps += 1
         return self._seen(now), now.rewards[0], False, self._steps >= self.max_steps, {"success": now.success[0]}
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar
@@ -375,6 +376,32 @@ def test_the_policys_options_reach_its_reset_and_the_result_says_what_checkpoint
     assert run_episode(Script(), Chunks(*[np.zeros(2)] * 6), KEY).checkpoint is None
 
 
+def test_the_result_says_how_long_each_side_was_busy() -> None:
+    """A server says how long a batch took, of which each answer has its part."""
+
+    class Served(Chunks):
+        def act(self, obs: Obs) -> Act:
+            act = super().act(obs)
+            act.info["timing"] = {"inference_ms": 40.0, "batch_size": 4}
+            return act
+
+    result = run_episode(Script(), Served(*[np.zeros(2)] * 6), KEY)
+    assert result.policy_seconds == pytest.approx(6 * 0.040 / 4)
+    assert result.env_seconds is not None
+    assert 0 < result.env_seconds < result.seconds
+
+
+def test_a_policy_in_this_process_is_busy_while_it_is_waited_for() -> None:
+    class Slow(Chunks):
+        def act(self, obs: Obs) -> Act:
+            time.sleep(0.005)
+            return super().act(obs)
+
+    result = run_episode(Script(), Slow(*[np.zeros(2)] * 6), KEY)
+    assert result.policy_seconds is not None
+    assert 6 * 0.005 <= result.policy_seconds < result.seconds
+
+
 def test_the_result_says_which_versions_of_the_weights_played() -> None:
     class Trained(Chunks):
         version = 4
@@ -392,7 +419,9 @@ def test_the_result_says_which_versions_of_the_weights_played() -> None:
     assert (unserved.first_policy_version, unserved.policy_version, unserved.policy_fingerprint) == (None,) * 3
 
 
-@pytest.mark.parametrize(("images", "looked_at"), [(True, [True] * 6), (False, [False, False, True] * 2)])
+@pytest.mark.parametrize(
+    ("images", "looked_at"), [(True, [True] * 6), (False, [False, False, True, False, False, False])]
+)
 def test_an_env_is_told_whether_anybody_looks(images: bool, looked_at: list[bool]) -> None:
     class Told(Script):
         def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:

@@ -27,7 +27,17 @@ from vlagents_ray.policies.experts.tabletop import TabletopExpert
 RELATIVE = Contract(action=ActionSpec(dim=2, delta=True, gripper_open=1.0), control_hz=10.0)
 ABSOLUTE = Contract(action=ActionSpec(dim=2, delta=False), control_hz=10.0)
 CHUNK = np.array([[i, -1.0] for i in range(1, 7)], np.float32)  # rows 1 to 6, the gripper closed
-TIMES = ("seconds", "reset_ms", "env_step_ms", "policy_ms", "policy_p95_ms", "timing_ms", "latency_ms")
+TIMES = (
+    "seconds",
+    "reset_ms",
+    "env_step_ms",
+    "policy_ms",
+    "policy_p95_ms",
+    "timing_ms",
+    "latency_ms",
+    "env_seconds",
+    "policy_seconds",
+)
 
 
 def played(player: ChunkExecutor, latency_s: float, rows: np.ndarray = CHUNK) -> list[float]:

@@ -32,6 +32,8 @@ TIMES: dict[str, Any] = {
     "env_step_ms": None,
     "policy_ms": None,
     "policy_p95_ms": None,
+    "env_seconds": None,
+    "policy_seconds": None,
 }
 
 

@@ -105,6 +105,27 @@ def test_the_report_shows_rates_and_what_was_not_the_policys_fault(summary: Summ
     assert "report:" not in text  # there is none
 
 
+def test_a_summary_says_how_busy_envs_and_policy_were(config: Config) -> None:
+    settings = config(envs=[LINE], episodes=2, policy="act", policy_url="http://localhost:1")
+    with Store(settings) as store:
+        store.begin_run(settings, versions())
+        for job in plan(store.cells):
+            done = EpisodeResult(job.key, "done", True, True, steps=9, seconds=8.0, env_seconds=6.0, policy_seconds=1.0)
+            store.record(done, 1)
+        store.end_run("complete")
+    summary = summarize(Results.load(settings.out))
+    assert summary.env_busy == pytest.approx(12 / 16)
+    assert summary.policy_busy == pytest.approx(2 / summary.rollout_seconds)
+    assert summary.to_json()["env_busy"] == summary.env_busy
+    of_replica = f"{summary.policy_busy:.0%}"
+    assert f"envs busy for 75% of the workers' time, the policy for {of_replica} of one replica's" in printed(summary)
+
+
+def test_results_that_do_not_say_it_show_no_busy_share(summary: Summary) -> None:
+    assert (summary.env_busy, summary.policy_busy) == (None, None)
+    assert "busy" not in printed(summary)
+
+
 def test_the_page_is_named_where_there_is_one(summary: Summary) -> None:
     page = write_report(summary.results, Path(summary.out) / "report.html")
     console = Console(file=StringIO(), width=100)

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from libero_episodes import STILL, begin, fingerprint, play, world
+from unseen_images import require_same_without_unseen_images
 
 from vlagents_ray.contract import CameraSpec
 from vlagents_ray.envs.base import known_contract
@@ -142,3 +143,10 @@ def test_a_closed_env_says_so(folder: str) -> None:
     env.close()
     with pytest.raises(EnvFailed, match="closed"):
         env.reset(seed=0)
+
+
+def test_images_that_nobody_looks_at_are_not_rendered_and_change_nothing(
+    soup: Libero, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(soup, "max_steps", 9)
+    require_same_without_unseen_images(soup)

@@ -100,7 +100,7 @@ class ManiSkillBatch(BatchEnv):
         for i, act in enumerate(acts):
             if act is not None:
                 actions[i] = one_row(act, self._contract)
-        now = self._simulator.step(actions)
+        now = self._simulator.step(actions, look=self.looked_at)
         self._steps += 1
         n = self._playing
         over = self._steps >= self.max_steps

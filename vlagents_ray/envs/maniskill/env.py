@@ -117,7 +117,7 @@ class ManiSkill(EvalEnv):
         if self._steps is None:
             raise NotReset(f"maniskill/{self._task}: step before reset; call reset(seed=...) first")
         action = one_row(act, self._contract)
-        now = self._simulator.step(action[np.newaxis])
+        now = self._simulator.step(action[np.newaxis], look=self.looked_at)
         self._steps += 1
         outcome = {"success": now.success[0]}
         return now.obs[0], now.rewards[0], False, self._steps >= self.max_steps, outcome

@@ -116,20 +116,17 @@ class Simulator:
         """
         env = self.alive()
         with self._failing("reset"):
-            mode, env._obs_mode = env._obs_mode, "none"  # nothing is rendered before all episodes have begun
-            try:
+            with self._observing("none"):  # nothing is rendered before all episodes have begun
                 for i, (seed, option) in enumerate(zip(seeds, options, strict=True)):
                     only = require("torch").tensor([i], device=env.device)
                     env.reset(seed=[seed % 2**32] * env.num_envs, options={**option, "env_idx": only})
-            finally:
-                env._obs_mode = mode
             info = env.get_info()
             return self.moment(env.get_obs(info), info)
 
-    def step(self, actions: np.ndarray) -> Moment:
-        """Execute one action in each environment, (N, D) float32."""
+    def step(self, actions: np.ndarray, *, look: bool = True) -> Moment:
+        """Execute one action in each environment, (N, D) float32; without `look` nothing is rendered."""
         env = self.alive()
-        with self._failing("step"):
+        with self._failing("step"), contextlib.nullcontext() if look else self._observing("state_dict"):
             # a copy: torch shares the memory, and warns of read-only arrays, such as those of Ray
             raw, rewards, _, _, info = env.step(actions.copy())
             return replace(self.moment(raw, info), rewards=rewards.cpu().numpy().astype(float).tolist())
@@ -137,14 +134,15 @@ class Simulator:
     def moment(self, raw: Mapping[str, Any], info: Mapping[str, Any]) -> Moment:
         """Convert ManiSkill's observation and info. The images of a camera share one array, (N, H, W, 3)."""
         env = self.alive()
-        sensors = raw["sensor_data"]
-        images = {name: np.ascontiguousarray(sensors[name]["rgb"].cpu().numpy()) for name in self.cameras}
+        rendered = raw.get("sensor_data")
+        shown = {} if rendered is None else {name: rendered[name]["rgb"] for name in self.cameras}
+        images = {name: np.ascontiguousarray(image.cpu().numpy()) for name, image in shown.items()}
         states = raw["state"].cpu().numpy() if "state" in raw else None
         seen = []
         for i, (state, gripper) in enumerate(self._robot.read(env.agent)):
             extra = {} if states is None else {"sim_state": states[i]}
             seen.append(Obs({name: rows[i] for name, rows in images.items()}, gripper, state, extra))
-        if self._record is not None:
+        if self._record is not None and rendered is not None:
             seen[0].info[HIGH_RES] = self._record.views(env)
         success = [bool(value) for value in info["success"]]
         return Moment(seen, success, [0.0] * len(seen))
@@ -199,6 +197,16 @@ class Simulator:
             raise ConfigError(f"{self.name} has no camera {unknown}: want some of {sorted(sizes)}")
         chosen = sizes if cameras is None else cameras
         return {name: CameraSpec(height=sizes[name][0], width=sizes[name][1]) for name in chosen}
+
+    @contextlib.contextmanager
+    def _observing(self, mode: str) -> Iterator[None]:
+        """Have ManiSkill observe in another mode; what tasks add to the state, they decide by the own one."""
+        env = self.alive()
+        own, env._obs_mode = env._obs_mode, mode
+        try:
+            yield
+        finally:
+            env._obs_mode = own
 
     @contextlib.contextmanager
     def _failing(self, doing: str) -> Iterator[None]:

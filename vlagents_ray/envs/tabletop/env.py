@@ -162,18 +162,25 @@ class Tabletop(EvalEnv):
         world.step(dx * STEP_LIMIT, dy * STEP_LIMIT, dz * STEP_LIMIT, (grip + 1) / 2)
         self._steps += 1
         success = goal.reached(world)
-        return self._observe(world, goal), float(success), False, self._steps >= self.max_steps, {"success": success}
+        return (
+            self._observe(world, goal, look=self.looked_at),
+            float(success),
+            False,
+            self._steps >= self.max_steps,
+            {"success": success},
+        )
 
     def close(self) -> None:
         self._world = self._goal = None
 
-    def _observe(self, world: TabletopWorld, goal: Goal) -> Obs:
+    def _observe(self, world: TabletopWorld, goal: Goal, *, look: bool = True) -> Obs:
         state = {"xyzrpy": np.array((world.x, world.y, world.z, *_POINTING_DOWN), np.float32)}
         if self._object_state:
             puck = world.puck(goal.puck)
             state["puck"] = np.array((puck.x, puck.y, puck.z), np.float32)
             state["target"] = np.array(goal.place(world), np.float32)
-        return Obs(cameras={"front": self._renderer.draw(world)}, gripper=world.opening, state=state)
+        cameras = {"front": self._renderer.draw(world)} if look else {}
+        return Obs(cameras=cameras, gripper=world.opening, state=state)
 
     def _task_in_scene(self) -> Task:
         return next(task for task in _TASKS if task == self._task)

@@ -75,7 +75,7 @@ def run_episodes(
         watch: Called before each phase that may take long.
         record: Called with every observation, the first one included.
         images: Whether `record` needs the images of every step. If not, the environments may leave out those between
-            two requests to the policy.
+            two requests to the policy, and after the last step.
         request_info: Added to the `Obs.info` of every request to the policy.
         acted: Called with every answer of the policy, before its rows are executed, and with the number of steps that
             are executed first, in real-time mode, since it came late.
@@ -122,7 +122,8 @@ def run_episodes(
             playing = _unfinished(playing)
         if playing:
             watch("env step", steps)
-            env.looked_at = images or any(len(episode.ticks) == 1 for episode in playing)
+            asks = steps + 1 < env.max_steps and any(len(episode.ticks) == 1 for episode in playing)
+            env.looked_at = images or asks
             _step(env, episodes, playing, contract, record, executed)
             steps, playing = steps + 1, _unfinished(playing)
     return [episode.outcome for episode in episodes if episode.outcome is not None]

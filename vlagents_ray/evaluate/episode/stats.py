@@ -41,6 +41,7 @@ class EpisodeStats:
     reset_ms: float | None = None
     step_ms: list[float] = field(default_factory=list)
     act_ms: list[float] = field(default_factory=list)
+    policy_seconds: float = 0.0
     latency_ms: list[float] = field(default_factory=list)
     ticks_waited: int = 0
     ticks_held: int = 0
@@ -56,7 +57,11 @@ class EpisodeStats:
     def acted(self, act: Act, seconds: float, latency_s: float | None) -> None:
         """Record an answer of the policy, its duration and, in real-time mode, the latency that it counts as."""
         self.act_ms.append(1e3 * seconds)
-        for stage, spent in act.info.get("timing", {}).items():
+        timing = act.info.get("timing", {})
+        # Of a batch, each answer has its part; a policy in this process computes for as long as it is waited for.
+        computed_ms = timing.get("inference_ms", 1e3 * seconds)
+        self.policy_seconds += computed_ms / 1e3 / max(1, timing.get("batch_size", 1))
+        for stage, spent in timing.items():
             if stage.endswith("_ms"):  # the batch size is among them
                 self.timing_ms.setdefault(stage, []).append(float(spent))
         if (version := version_of(act)) is not None:
@@ -96,9 +101,11 @@ class EpisodeStats:
             seconds=perf_counter() - self.started,
             reset_ms=self.reset_ms,
             env_step_ms=_quantile(self.step_ms, 0.5),
+            env_seconds=((self.reset_ms or 0.0) + sum(self.step_ms)) / 1e3,
             acts=len(self.act_ms),
             policy_ms=_quantile(self.act_ms, 0.5),
             policy_p95_ms=_quantile(self.act_ms, 0.95),
+            policy_seconds=self.policy_seconds,
             latency_ms=_quantile(self.latency_ms, 0.5),
             ticks_waited=self.ticks_waited,
             ticks_held=self.ticks_held,

@@ -48,6 +48,11 @@ def print_summary(console: Console, summary: Summary) -> None:
     lines = [f"{total.steps} steps in {summary.wall_seconds:.1f} s"]
     if speed is not None:
         lines[0] += f", {speed:.1f} a second once the workers had started"
+    if summary.env_busy is not None and summary.policy_busy is not None:
+        lines.append(
+            f"envs busy for {summary.env_busy:.0%} of the workers' time, "
+            f"the policy for {summary.policy_busy:.0%} of one replica's"
+        )
     if total.policy_errors:
         lines.append(f"{total.policy_errors} episodes ended by an error of the policy; they count as no success")
     if total.retries:

@@ -37,8 +37,9 @@ CREATE TABLE episodes (
     key TEXT PRIMARY KEY, cell TEXT NOT NULL REFERENCES cells, env TEXT NOT NULL, episode INTEGER NOT NULL,
     seed INTEGER NOT NULL, status TEXT NOT NULL, success_once INTEGER, success_at_end INTEGER, first_success INTEGER,
     steps INTEGER NOT NULL, episode_return REAL NOT NULL, ending TEXT NOT NULL, instruction TEXT NOT NULL,
-    error TEXT, seconds REAL NOT NULL, reset_ms REAL, env_step_ms REAL, acts INTEGER NOT NULL,
-    policy_ms REAL, policy_p95_ms REAL, latency_ms REAL, ticks_waited INTEGER NOT NULL, ticks_held INTEGER NOT NULL,
+    error TEXT, seconds REAL NOT NULL, reset_ms REAL, env_step_ms REAL, env_seconds REAL, acts INTEGER NOT NULL,
+    policy_ms REAL, policy_p95_ms REAL, policy_seconds REAL, latency_ms REAL,
+    ticks_waited INTEGER NOT NULL, ticks_held INTEGER NOT NULL,
     timing_ms TEXT NOT NULL, transport TEXT NOT NULL, checkpoint TEXT, weights TEXT,
     policy_version INTEGER, policy_fingerprint TEXT, first_policy_version INTEGER,
     actions_sha256 TEXT, videos TEXT NOT NULL, trajectory TEXT, attempts INTEGER NOT NULL,
@@ -71,6 +72,8 @@ _COLUMNS = {
         "policy_version": "INTEGER",
         "policy_fingerprint": "TEXT",
         "first_policy_version": "INTEGER",
+        "env_seconds": "REAL",
+        "policy_seconds": "REAL",
     }
 }
 

@@ -117,7 +117,7 @@ class Summary:
     @property
     def transports(self) -> list[str]:
         """The transports by which observations reached the policies."""
-        return sorted({result.transport for cell in self.results.cells for result in cell.counted})
+        return sorted({result.transport for result in self._counted})
 
     @property
     def steps_per_second(self) -> float | None:
@@ -128,6 +128,21 @@ class Summary:
     def rollout_steps_per_second(self) -> float | None:
         """Env steps of all workers together per second of `rollout_seconds`; None if no time has passed."""
         return self.total.steps / self.rollout_seconds if self.rollout_seconds else None
+
+    @property
+    def env_busy(self) -> float | None:
+        """The share of the workers' time in which they reset and stepped environments; None for older results."""
+        played = [one for one in self._counted if one.env_seconds is not None]
+        return _share([one.env_seconds for one in played], sum(one.seconds for one in played))
+
+    @property
+    def policy_busy(self) -> float | None:
+        """The share of `rollout_seconds` in which policies computed, above 1 with several replicas; None as above."""
+        return _share([one.policy_seconds for one in self._counted], self.rollout_seconds)
+
+    @property
+    def _counted(self) -> list[EpisodeResult]:
+        return [result for cell in self.results.cells for result in cell.counted]
 
     def to_json(self) -> dict[str, Any]:
         """The content of summary.json."""
@@ -148,6 +163,8 @@ class Summary:
             "rollout_seconds": self.rollout_seconds,
             "steps_per_second": self.steps_per_second,
             "rollout_steps_per_second": self.rollout_steps_per_second,
+            "env_busy": self.env_busy,
+            "policy_busy": self.policy_busy,
             "transports": self.transports,
             "policies": self.results.policies,
             "versions": last.versions,
@@ -227,6 +244,11 @@ def _mean(values: Sequence[float]) -> float | None:
 def _median(values: Sequence[float | None]) -> float | None:
     known = [value for value in values if value is not None]
     return float(np.median(known)) if known else None
+
+
+def _share(parts: Sequence[float | None], whole_s: float) -> float | None:
+    known = [part for part in parts if part is not None]
+    return sum(known) / whole_s if known and whole_s else None
 
 
 def _wall_seconds(results: Results, run: Run) -> float:
