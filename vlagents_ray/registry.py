@@ -94,6 +94,7 @@ _EXTRAS = {
 _POLICY_REQUIREMENTS = {
     "torch": ("diffusion_policy", "hf", "lerobot", "openpi", "openvla"),
     "transformers": ("hf", "lerobot", "octo", "openpi", "openvla"),
+    "tokenizers": ("hf", "lerobot", "octo", "openpi", "openvla"),
     "huggingface_hub": ("diffusion_policy", "hf", "lerobot", "octo", "openpi", "openvla"),
     "safetensors": ("hf", "lerobot", "openpi", "openvla"),
     "timm": ("hf", "openvla"),
