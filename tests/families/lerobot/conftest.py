@@ -20,7 +20,7 @@ from vlagents_ray.serve.models.agent_copies import AgentCopies
 torch.set_num_threads(1)  # the models are too small for more: threads would wait for one another
 # Only a transformers with openpi's changes has this module, and only it runs pi0 and pi0.5.
 PATCHED = importlib.util.find_spec("transformers.models.siglip.check") is not None
-collect_ignore = [] if PATCHED else ["test_pi.py"]
+collect_ignore = [] if PATCHED else ["test_pi.py", "test_pi_recipe.py"]
 
 Load = Callable[..., LeRobot]
 Made = Callable[[str], Path]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.families.lerobot.conftest import FILTERS, PATCHED
+from tests.families.lerobot.conftest import FILTERS
 from vlagents_ray.bench.checkpoints import lerobot as recipe
 from vlagents_ray.bench.checkpoints.recipe import Recipe
 from vlagents_ray.bench.checkpoints.recipes import write_checkpoint
@@ -40,7 +41,6 @@ def test_others_load_and_act(tmp_path: Path, family: str) -> None:
     [
         ("smolvla", 450),  # arXiv 2506.01844
         ("act", 52),  # LeRobot's with ResNet-18 and its own settings
-        pytest.param("pi05", 3600, marks=pytest.mark.skipif(not PATCHED, reason="transformers without openpi's")),
     ],
 )
 def test_the_full_size_is_the_published_one(tmp_path: Path, family: str, millions: float) -> None:
@@ -53,8 +53,8 @@ def test_a_pi05_of_another_size_is_refused(tmp_path: Path) -> None:
         write_checkpoint("pi05", tmp_path / "made", "small")
 
 
-@pytest.mark.skipif(PATCHED, reason="this transformers has openpi's changes")
-def test_a_pi05_needs_the_transformers_that_serves_it(tmp_path: Path) -> None:
+def test_a_pi05_needs_the_transformers_that_serves_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "transformers.models.siglip.check", None)
     with pytest.raises(ConfigError, match="openpi's changes"):
         write_checkpoint("pi05", tmp_path / "made")
     assert list(tmp_path.iterdir()) == []
