@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import os
+import queue
 import socket
 import threading
 from collections.abc import Iterator
@@ -45,6 +47,29 @@ def stream(base: SplitResult) -> Iterator[Stream]:
     stream = Stream(base, base.port, "/", 5)
     yield stream
     stream.close()
+
+
+@pytest.mark.parametrize("size", [0, 1, 125, 126, 65535, 65536, 2**20, 3 * 2**20 + 1])
+def test_a_message_arrives_whole_in_pieces_of_any_length(size: int) -> None:
+    message = os.urandom(size)
+    received: queue.SimpleQueue[str | bytes] = queue.SimpleQueue()
+
+    def receive(connection: ServerConnection) -> None:
+        for _ in range(3):
+            received.put(connection.recv())
+
+    with serve(receive, "127.0.0.1", 0, max_size=None) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        port = server.socket.getsockname()[1]
+        stream = Stream(urlsplit("http://127.0.0.1"), port, "/", 5)
+        stream.send(b"before", 30)
+        stream.send_pieces([message[: size // 3], b"", memoryview(message)[size // 3 :]], 30)
+        stream.send(b"after", 30)
+        assert [received.get(timeout=30) for _ in range(3)] == [b"before", message, b"after"]
+        stream.close()
+        server.shutdown()
+        thread.join()
 
 
 def test_a_server_that_closes_in_place_of_an_answer_is_a_connection_that_is_gone(stream: Stream) -> None:

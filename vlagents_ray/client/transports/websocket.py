@@ -33,7 +33,8 @@ from vlagents_ray.errors import (
     PolicyUnavailable,
     VLAgentsError,
 )
-from vlagents_ray.protocol.frames import decode_replies, decode_reply, encode_requests
+from vlagents_ray.protocol.arrays import Buffer
+from vlagents_ray.protocol.frames import decode_replies, decode_reply, request_parts
 from vlagents_ray.protocol.messages import (
     SERVERS_MACHINE,
     STREAM_BYTES,
@@ -52,6 +53,8 @@ _DIRECT_S = 1.0  # s for a replica's own port to answer: a firewall may drop the
 
 class _Socket(Protocol):
     def send(self, message: bytes, timeout_s: float) -> None: ...
+
+    def send_pieces(self, pieces: Sequence[Buffer], timeout_s: float) -> None: ...
 
     def recv(self, timeout_s: float) -> bytes: ...
 
@@ -85,6 +88,10 @@ class ProxiedSocket:
         limit = struct.pack("@ll", int(timeout_s), int(timeout_s % 1 * 1e6))
         self._connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
         self._connection.send(message)
+
+    def send_pieces(self, pieces: Sequence[Buffer], timeout_s: float) -> None:
+        """Send a message, given one piece after the other, within a time limit."""
+        self.send(b"".join(pieces), timeout_s)
 
     def recv(self, timeout_s: float) -> bytes:
         """Return the next message, also if it is a text."""
@@ -149,15 +156,15 @@ class WebSocketTransport:
         """Send one frame and return its replies; replies to earlier requests that timed out are discarded."""
         deadline = time.monotonic() + timeout_s
         codec = self._codec.codec_for(requests[0].obs, lambda probe: self._probe(probe, timeout_s), STREAM_BYTES)
-        frame = encode_requests(requests, codec)
-        if len(frame) > STREAM_BYTES:  # the server would only close the connection
+        pieces = request_parts(requests, codec)
+        if (size := sum(map(len, pieces))) > STREAM_BYTES:  # the server would only close the connection
             raise MessageTooLarge(
-                f"{self._url}: got {len(frame)} bytes, the limit of a WebSocket message is {STREAM_BYTES}; "
+                f"{self._url}: got {size} bytes, the limit of a WebSocket message is {STREAM_BYTES}; "
                 f"send JPEG, or use transport='http'"
             )
         connection = self._stream(timeout_s)
         try:
-            connection.send(frame, timeout_s)
+            connection.send_pieces(pieces, timeout_s)
             return _await(connection, requests, deadline)
         except (ConnectionClosed, OSError) as error:
             raise self._failure(error, timeout_s) from error
