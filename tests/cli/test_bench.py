@@ -23,6 +23,7 @@ from vlagents_ray.cli.main import app
         (["throughput", "--clients", "few"], "few"),
         (["policy", "noop", "--batch", "0"], "from 1"),
         (["policy", "noop", "--state", "joints=some"], "joints"),
+        (["policy", "noop", "--set", "colour=blue"], "colour"),
         (["policy", "nowhere.yaml"], "nowhere.yaml"),
         (["throughput", "--config", "{"], "JSON"),
         (["throughput", "--config", '{"base_ms": 1}'], "--policy"),
@@ -59,6 +60,15 @@ def test_what_is_no_user_measurement_any_more_names_the_module_to_run(words: lis
 
 def test_every_command_that_moved_is_a_module_of_benchmarks() -> None:
     assert all(importlib.util.find_spec(f"benchmarks.{module}") for module in _MOVED.values())
+
+
+def test_a_policy_is_measured_with_other_settings_than_its_files(tmp_path: Path) -> None:
+    words = ["noop", "--set", "base_ms=20", "--batch", "1", "--seconds", "0.1", "--rounds", "1"]
+    done = CliRunner().invoke(app, ["bench", "policy", *words, "--json", str(tmp_path / "found.json")])
+    assert done.exit_code == 0, done.output
+    [row] = json.loads((tmp_path / "found.json").read_text())["batches"]
+    assert row["bare"]["batch_ms"] >= 20
+    assert row["queued_share"] == pytest.approx(row["queued"]["actions_per_s"] / row["bare"]["actions_per_s"])
 
 
 def test_two_runs_stand_side_by_side(tmp_path: Path) -> None:

@@ -91,13 +91,18 @@ class _SizedRow:
     memory: list[float] = field(default_factory=list)
 
     def to_json(self) -> dict[str, Any]:
-        """Return the medians of the rounds, the 99th percentile of all their round trips, and the rounds."""
+        """Return the medians of the rounds, the 99th percentile of all their round trips, and the rounds.
+
+        `queued_share` is the median of the rounds' actions a second behind the queue, divided by those without it.
+        """
         queued = [turn.to_json() for turn in self.queued]
+        shares = [ours["actions_per_s"] / bare["actions_per_s"] for ours, bare in zip(queued, self.bare, strict=True)]
         p99 = float(np.quantile([trip for turn in self.queued for trip in turn.trips_ms], 0.99))
         return {
             "batch": self.size,
             "bare": _medians(self.bare),
             "queued": _medians(queued) | {"p99_ms": p99},
+            "queued_share": statistics.median(shares),
             "peak_mib": max(self.memory),
             "rounds": {"bare": self.bare, "queued": queued},
         }

@@ -12,7 +12,7 @@ import typer
 from rich.text import Text
 
 from vlagents_ray.cli.console import errors, out, progress, save, table
-from vlagents_ray.cli.options import parse_counts, parse_dims, parse_list, parse_policy
+from vlagents_ray.cli.options import Set, parse_counts, parse_dims, parse_list, parse_policy, parse_settings
 from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -146,6 +146,7 @@ def bench_policy(
     state: Annotated[
         list[str], typer.Option(metavar="PART=N", help="Numbers in a part for which the policy does not say.")
     ] = [],  # noqa: B006
+    settings: Set = [],  # noqa: B006
     json_file: Json = None,
 ) -> None:
     """Actions a second of one policy alone, by batch size: bare, and behind its batch queue; without Ray."""
@@ -155,9 +156,9 @@ def bench_policy(
 
     with errors():
         origin, args, batches = measured_on(), server_args(file, app), parse_counts(batch, "--batch")
-        found = measure_policy(
-            PolicyPlan(args, batches, seconds, rounds, image, parse_dims(state, "--state")), progress
-        )  # fmt: skip
+        args = args.model_copy(update={"config": args.config | parse_settings(settings, "--set")})
+        plan = PolicyPlan(args, batches, seconds, rounds, image, parse_dims(state, "--state"))
+        found = measure_policy(plan, progress)
     show_policy(found)
     save(_joined(origin, found), json_file)
 
@@ -294,8 +295,8 @@ def show_round_trips(found: Mapping[str, Any], title: str) -> None:
 def show_policy(found: Mapping[str, Any]) -> None:
     """Print a row for each batch size."""
     rows = table(
-        "batch", "bare actions/s", "ms a batch", "queued actions/s", "round trip ms", "p99 ms", "mean batch",
-        "peak MiB",
+        "batch", "bare actions/s", "ms a batch", "queued actions/s", "of bare", "round trip ms", "p99 ms",
+        "mean batch", "peak MiB",
     )  # fmt: skip
     chunk = f", {found['chunk']} rows an action" if (found["chunk"] or 1) > 1 else ""
     rows.title = f"{found['policy']} on {found['device']}{chunk}"
@@ -303,8 +304,8 @@ def show_policy(found: Mapping[str, Any]) -> None:
         bare, queued = row["bare"], row["queued"]
         rows.add_row(
             str(row["batch"]), f"{bare['actions_per_s']:.1f}", f"{bare['batch_ms']:.2f}",
-            f"{queued['actions_per_s']:.1f}", f"{queued['round_trip_ms']:.2f}", f"{queued['p99_ms']:.2f}",
-            f"{queued['mean_batch']:.2f}", f"{row['peak_mib']:.0f}",
+            f"{queued['actions_per_s']:.1f}", f"{row['queued_share']:.1%}", f"{queued['round_trip_ms']:.2f}",
+            f"{queued['p99_ms']:.2f}", f"{queued['mean_batch']:.2f}", f"{row['peak_mib']:.0f}",
         )  # fmt: skip
     out.print(rows)
 
