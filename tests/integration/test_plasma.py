@@ -25,15 +25,16 @@ from ray._private import ray_constants
 from ray._private.internal_api import memory_summary
 from ray._private.worker import global_worker
 from readme_blocks import ENV, ROOT
+from streaming_agents import ROWS
 
-from tests.integration.conftest import serving
 from vlagents_ray import ConnectionLost, Obs, PolicyUnavailable, RemoteAgent
 from vlagents_ray.client.transports.local import unix_messages
 from vlagents_ray.client.transports.local.plasma import PlasmaTransport
 from vlagents_ray.errors import DeadlineExceeded, MalformedMessage, MessageTooLarge
 from vlagents_ray.protocol.messages import PlasmaAddress, Request
 from vlagents_ray.ray_tools.reaper import MARK
-from vlagents_ray.serve.launch.server import Server
+from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.server import Server, running_server
 
 APP = "Echo"
 STORE = 100 * 10**6
@@ -44,7 +45,10 @@ LIMIT = 40 * 10**6
 def served() -> Iterator[Server]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ray_constants, "DEFAULT_OBJECT_STORE_MAX_MEMORY_BYTES", STORE)
-        with serving("served_agents:Echo", limits={"body_bytes": LIMIT, "pixels": LIMIT // 3}) as server:
+        document = deployment("served_agents:Echo", limits={"body_bytes": LIMIT, "pixels": LIMIT // 3})
+        [in_parts] = deployment("streaming_agents:InParts").applications
+        document.applications.append(in_parts.model_copy(update={"route_prefix": "/parts"}))
+        with running_server(document, num_cpus=4) as server:
             yield server
 
 
@@ -94,7 +98,7 @@ def test_a_ray_program_of_the_user_joins_the_server_and_its_actors_act_over_plas
     script.write_text(LEARNER)
     ran = of_the_user(script, served.url)
     played = "('plasma', 'of an actor', [7.0])"
-    assert ran.stdout.splitlines() == [f"('{APP}',) {played} {played}", "of the driver"], ran.stderr
+    assert ran.stdout.splitlines() == [f"{(APP, 'InParts')} {played} {played}", "of the driver"], ran.stderr
 
 
 UNCHANGED = """
@@ -156,6 +160,18 @@ def held(agent: RemoteAgent) -> tuple[int, int]:
     """Threads and descriptors of the replica."""
     info = agent.act(frame()).info
     return info["threads"], info["descriptors"]
+
+
+def test_a_chunk_comes_in_parts_of_which_each_is_read_from_its_own_frame() -> None:
+    with RemoteAgent("serve://InParts", transport="plasma") as agent:
+        image = np.full((64, 64, 3), 9, np.uint8)
+        agent.reset(Obs({"front": image}, info={"value": 0.0}), "task")
+        for value in (1.0, 2.0):
+            parts = list(agent.act_stream(Obs({"front": image}, info={"value": value})))
+            assert [part.more for part in parts] == [True] * (ROWS - 1) + [False]
+            assert [part.rows().tolist() for part in parts] == [[[value, row]] for row in range(ROWS)]
+            whole = agent.act(Obs({"front": image}, info={"value": value}))
+            assert whole.rows().tolist() == [[value, row] for row in range(ROWS)]
 
 
 def test_every_type_of_value_comes_back(agent: RemoteAgent) -> None:
@@ -329,8 +345,9 @@ def test_a_killed_replica_is_noticed_and_the_next_one_serves() -> None:
 
     wait_for(again)
     assert agent.act(frame()).info["instruction"] == "after"
-    assert len(set(folder.glob("vla*"))) == 1
-    assert not names & set(folder.glob("vla*"))
+    left = set(folder.glob("vla*"))
+    assert (len(names), len(left)) == (2, 2)  # one of each application
+    assert len(names - left) == 1  # that of the killed replica
     wait_for(lambda: channel not in memory_summary(ray.get_runtime_context().gcs_address))
     gc.enable()
     agent.close()
