@@ -7,11 +7,12 @@ from __future__ import annotations
 
 import socket
 import sys
+from dataclasses import asdict
 
 import uvicorn
 
 from vlagents_ray.policies.noop import Noop
-from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION, LocalAddress, boot_id
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
@@ -20,9 +21,9 @@ from vlagents_ray.serve.engine.engine import Engine
 def main(host: str) -> None:
     engine = Engine(Noop())
     engine.start()
-    inside = build_http_app(
-        engine, lambda: {"policy": "noop", "version": "0", "protocol": PROTOCOL_VERSION}, DEFAULT_LIMITS
-    )
+    local = asdict(LocalAddress(socket="", boot_id=boot_id()))  # nobody listens there
+    metadata = {"policy": "noop", "version": "0", "protocol": PROTOCOL_VERSION, "local": local}
+    inside = build_http_app(engine, lambda: metadata, DEFAULT_LIMITS)
     app = AccessMiddleware(inside, None, "noop")
     with socket.socket() as listening:
         listening.bind((host, 0))

@@ -8,7 +8,9 @@ import time
 import uuid
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
+from vlagents_ray.client.credentials import is_loopback
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import (
     ConfigError,
@@ -18,7 +20,7 @@ from vlagents_ray.errors import (
     UnknownApp,
     VLAgentsError,
 )
-from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Reply, Request
+from vlagents_ray.protocol.messages import PROTOCOL_VERSION, Reply, Request, boot_id
 
 if TYPE_CHECKING:
     from vlagents_ray.client.transports.base import Transport
@@ -104,6 +106,7 @@ class Connection:
         contract = metadata.get("contract")
         self.contract = None if contract is None else Contract.from_json(contract)
         self.act_parts = metadata.get("act_parts")
+        self.codec.near = _is_near(self.url, metadata)
         self.metadata = metadata
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
@@ -184,3 +187,9 @@ class Connection:
 def _changes_connection(reply: Reply) -> bool:
     """Whether the reply changes the state of the connection."""
     return reply.error is not None or reply.draining
+
+
+def _is_near(url: str, metadata: dict[str, Any]) -> bool:
+    """Whether the server is known to be on this machine: a tunnel to another one also begins at a loopback address."""
+    local = metadata.get("local")
+    return local is not None and local["boot_id"] == boot_id() != "" and is_loopback(urlsplit(url).hostname or "")

@@ -22,7 +22,7 @@ from vlagents_ray.client.transports.codec_selection import (
 )
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.errors import MessageTooLarge, TooManyRequests
-from vlagents_ray.images.codecs import JPEG, LOSSLESS, RAW
+from vlagents_ray.images.codecs import JPEG, LOSSLESS, RAW, ImageCodec
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS
 
 pytestmark = pytest.mark.alone
@@ -152,6 +152,22 @@ def test_the_choice_stands_until_images_change_much_or_the_connection_is_new() -
     assert (choice.link, choice.codec) == (None, None)
 
 
+@pytest.mark.parametrize(("part", "chosen"), [(2, RAW), (0.5, JPEG)])
+def test_within_a_machine_nothing_is_measured_and_pixels_stay_raw_unless_they_are_too_many(
+    part: float, chosen: ImageCodec
+) -> None:
+    limit = part * sum(image.nbytes for image in OBS.cameras.values())
+
+    def refuse(message: bytes) -> None:
+        if len(message) > limit:
+            raise MessageTooLarge("too large")
+
+    choice = CodecChoice("auto")
+    choice.near = True
+    assert choice.codec_for(OBS, refuse) == chosen
+    assert choice.link is None
+
+
 @pytest.fixture(scope="module")
 def near() -> Iterator[str]:
     with network_links.loopback() as url:
@@ -162,7 +178,9 @@ def near() -> Iterator[str]:
 def test_loopback_gets_raw_pixels(near: str, transport: TransportName) -> None:
     with RemoteAgent(near, transport=transport) as agent:
         assert agent.codec is None
-        assert network_links.measure_until(agent, OBS, lambda: agent.codec == RAW), agent.link
+        agent.reset(OBS, "look")
+        assert agent.codec == RAW
+        assert agent.link is None  # not measured, as it is within this machine
         agent.act(OBS)
 
 

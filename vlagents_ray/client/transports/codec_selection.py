@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -45,6 +46,9 @@ class LinkSpeed:
     def seconds(self, size: int) -> float:
         """Return the time, s, for a message of `size` bytes and a short answer."""
         return self.round_trip_s + size / self.bandwidth
+
+
+_WITHIN_A_MACHINE = LinkSpeed(0.0, math.inf)  # to copy pixels takes less time than to encode them
 
 
 def measure(send: Send, clock: Callable[[], float] = time.perf_counter) -> LinkSpeed:
@@ -134,10 +138,12 @@ def coding_cost(cameras: Sequence[np.ndarray], codec: ImageCodec) -> tuple[int, 
 class CodecChoice:
     """The codec of one session's cameras: the one that the user asks for, or the fastest over the link.
 
-    "auto" takes the fastest of JPEG, PNG and raw; "exact" the faster of PNG and raw.
+    "auto" takes the fastest of JPEG, PNG and raw; "exact" the faster of PNG and raw. Within a machine that is raw, and
+    nothing is measured.
     """
 
     def __init__(self, requested: CodecName | ImageCodec) -> None:
+        self.near = False  # whether the server is known to be on this machine
         self.link: LinkSpeed | None = None
         self.codec: ImageCodec | None = None
         self._candidates: tuple[ImageCodec, ...] = ()  # those that are likely to be short come first
@@ -158,9 +164,10 @@ class CodecChoice:
         size = sum(image.nbytes for image in obs.cameras.values())
         if size and (self.codec is None or not self._size / _RESIZED <= size <= self._size * _RESIZED):
             try:
-                self.link = self.link or measure(send)
+                if not self.near:
+                    self.link = self.link or measure(send)
                 cameras = list(obs.cameras.values())
-                self.codec = fastest(cameras, self._candidates, self.link, send, most_bytes)
+                self.codec = fastest(cameras, self._candidates, self.link or _WITHIN_A_MACHINE, send, most_bytes)
             except TooManyRequests as error:  # probes count as requests: the key's rate is too low to measure by
                 self.codec = self._candidates[0]
                 time.sleep(min(error.retry_after_s, _RATE_WAIT_S))  # the request that follows counts, too
