@@ -21,6 +21,8 @@ from vlagents_ray.interface import Act, Agent, Obs
 
 LINE = "eval_fakes:Line"
 OTHER_LINE = "eval_fakes:OtherLine"
+SPARING_LINE = "eval_fakes:SparingLine"
+DRIFTING_LINE = "eval_fakes:DriftingLine"
 CLINGING = "eval_fakes:Clinging"
 EVERY = -1  # seed
 HURRY = "VLAGENTS_RAY_TEST_HURRY"  # variable, see `Unhurried`
@@ -135,6 +137,33 @@ class Clinging(Line):
 
 class OtherLine(Line):
     """The same under another name."""
+
+
+class SparingLine(Line):
+    """Renders what is looked at alone; `rendered` is how many images all of them have made."""
+
+    rendered = 0
+
+    def _look(self) -> Obs:
+        obs = super()._look()
+        if self._steps and not self.looked_at:
+            return replace(obs, cameras={})
+        SparingLine.rendered += len(obs.cameras)
+        return obs
+
+
+class DriftingLine(SparingLine):
+    """No two of its episodes begin alike."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options)
+        self._resets = 0
+
+    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
+        obs, info = super().reset(seed=seed, options=options)
+        self._resets += 1
+        self._position += 0.01 * self._resets
+        return replace(obs, state={"position": np.array([self._position], np.float32)}), info
 
 
 class ToZero(Agent):

@@ -224,6 +224,13 @@ class _Run:
             self._failed(job, report.failure)
         elif report.result is not None:
             self._attempts.note_played()
+            if (reason := report.artifacts.not_repeatable) is not None:
+                log.warning(
+                    "%s: nothing of it is recorded, as its actions do not repeat it in the simulator: %s; its worker "
+                    "renders further episodes as they are played",
+                    job.key,
+                    reason,
+                )
             self._record(job, report.result, report.artifacts)
 
     def _note_worker(self, cell: EvalCase, worker: WorkerInfo) -> None:

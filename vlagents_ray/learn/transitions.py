@@ -10,8 +10,9 @@ import numpy as np
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts, EpisodeRecorder
 from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.episode.second_pass import SecondPass
 from vlagents_ray.evaluate.episode.stats import version_of
-from vlagents_ray.evaluate.plan.config import EvalConfig
+from vlagents_ray.evaluate.plan.config import EpisodeChoice, EvalConfig
 from vlagents_ray.interface import BEHAVIOUR, WANT, Act, Obs
 from vlagents_ray.learn.columns import EXTRA, FINAL, REPLAY, at_rows, constant, tensors, words
 from vlagents_ray.learn.row_memory import RowMemory
@@ -55,8 +56,8 @@ class TransitionRecorder(EpisodeRecorder):
         self._next_replay: dict[str, np.ndarray] = {}  # until the first row of the act is executed
 
     @property
-    def wants_images(self) -> bool:
-        return self._images
+    def wants_images(self) -> EpisodeChoice:
+        return "all" if self._images else "none"
 
     def add_observation(self, obs: Obs) -> None:
         seen: dict[str, Any] = {f"cameras.{name}": image for name, image in sorted(obs.cameras.items()) if self._images}
@@ -113,7 +114,7 @@ class TransitionRecorder(EpisodeRecorder):
             raise ConfigError(f"act.info[{BEHAVIOUR!r}][{REPLAY!r}]: got {got}, want {want} as in the first act")
         return values
 
-    def finish(self, result: EpisodeResult) -> Artifacts:
+    def finish(self, result: EpisodeResult, second_pass: SecondPass) -> Artifacts:
         """Return the transitions of a whole episode; none of one that an error of the policy ended."""
         if result.status != "done":
             return Artifacts()

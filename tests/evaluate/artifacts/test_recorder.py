@@ -20,6 +20,7 @@ from vlagents_ray.evaluate import ClockConfig, EvalConfig
 from vlagents_ray.evaluate.artifacts.recorder import Recording
 from vlagents_ray.evaluate.artifacts.trajectory import NO_VERSION, Trajectory, TrajectoryRecorder, videos_of
 from vlagents_ray.evaluate.artifacts.video import VideoRecorder
+from vlagents_ray.evaluate.episode.second_pass import PlayedEpisode
 from vlagents_ray.interface import HIGH_RES, Act, Agent, Obs
 
 Config = Callable[..., EvalConfig]
@@ -133,9 +134,11 @@ def test_nothing_is_encoded_or_collected_unless_it_is_asked_for(
 
     monkeypatch.setattr(VideoRecorder, "add", fail)
     monkeypatch.setattr(TrajectoryRecorder, "add_observation", fail)
+    monkeypatch.setattr(PlayedEpisode, "add_observation", fail)
     with Recording(config(video="none", record="none"), 10.0) as recording:
         recording.add_observation(Obs(state={"position": np.zeros(1, np.float32)}))
-        assert not recording.wants_images
+        recording.add_action(np.zeros(1, np.float32), 0.0, False)
+        assert recording.wants_images == "none"
 
 
 def test_an_observation_that_lacks_a_part_of_the_state_is_the_simulators_failure() -> None:

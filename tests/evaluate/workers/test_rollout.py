@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 import pytest
-from eval_fakes import LINE, OTHER_LINE, Line, ToZero
+from eval_fakes import DRIFTING_LINE, LINE, OTHER_LINE, SPARING_LINE, Line, SparingLine, ToZero
 from flat_config import flat_config
 
 from vlagents_ray.errors import (
@@ -151,6 +151,94 @@ def test_failed_episodes_leave_a_video(config: Config) -> None:
         assert report.result is not None
         assert bool(report.artifacts.footage.shown) != report.result.success_once
     assert {bool(report.artifacts.footage.shown) for report in reports} == {True, False}
+
+
+def seeds_by_outcome(config: Config, chunk: int) -> dict[bool, list[int]]:
+    worker = rollout_of(config, lambda: ToZero(chunk))
+    found: dict[bool, list[int]] = {True: [], False: []}
+    for seed in range(40):
+        result = played(worker, job(seed)).result
+        assert result is not None
+        found[bool(result.success_once)].append(seed)
+    return found
+
+
+def rendered(worker: Rollout, *seeds: int, env: str = SPARING_LINE) -> tuple[list[int], list[Report]]:
+    """How many images each episode took, and the reports."""
+    images, reports = [], []
+    for seed in seeds:
+        before = SparingLine.rendered
+        reports.append(played(worker, job(seed, env, env_options={"camera": [32, 32]})))
+        images.append(SparingLine.rendered - before)
+    return images, reports
+
+
+@pytest.mark.parametrize("kept", ["video", "record"])
+def test_only_failed_episodes_are_rendered_wholly_and_show_what_a_video_of_all_shows(config: Config, kept: str) -> None:
+    """Of 11 observations the policy gets 1, 4, 7 and 10; a failed episode is played again for all of them."""
+    seeds = seeds_by_outcome(config, chunk=3)
+    solved, failed = seeds[True][0], seeds[False][0]
+    few, [first, second] = rendered(rollout_of(config, lambda: ToZero(3), **{kept: "failures"}), solved, failed)
+    every, [_, shown] = rendered(rollout_of(config, lambda: ToZero(3), **{kept: "all"}), solved, failed)
+    assert few == [4, 4 + 11]
+    assert every == [11, 11]
+    assert (first.artifacts.footage.shown, first.artifacts.footage.seen, first.artifacts.trajectory) == ({}, {}, None)
+    assert second.artifacts == shown.artifacts
+    assert second.result is not None
+    assert shown.result is not None
+    assert second.result.outcome == shown.result.outcome
+
+
+def test_a_policy_that_gets_every_image_needs_no_second_pass(config: Config) -> None:
+    failed = seeds_by_outcome(config, chunk=1)[False][0]
+    images, [report] = rendered(Rollout(config(video="failures"), lambda _policy: ToZero(3)), failed)
+    assert images == [4 + 11]
+    worker = Rollout(config(video="failures"), lambda _policy: ToZero())
+    single = job(failed, SPARING_LINE, env_options={"camera": [32, 32]}, execute=1)
+    before = SparingLine.rendered
+    report = played(worker, single)
+    assert SparingLine.rendered - before == 11
+    assert list(report.artifacts.footage.shown) == ["front"]
+
+
+def test_a_worker_whose_episodes_mostly_fail_renders_them_as_it_plays(config: Config) -> None:
+    seeds = seeds_by_outcome(config, chunk=3)
+    worker = rollout_of(config, lambda: ToZero(3), video="failures")
+    images, reports = rendered(worker, *seeds[False][:2], seeds[True][0], seeds[True][1])
+    assert images == [4 + 11, 11, 11, 11]
+    assert [bool(report.artifacts.footage.shown) for report in reports] == [True, True, False, False]
+
+
+def test_an_episode_that_its_actions_do_not_repeat_has_no_video_and_says_why(config: Config) -> None:
+    failed = seeds_by_outcome(config, chunk=3)[False][0]
+    worker = rollout_of(config, lambda: ToZero(3), video="failures")
+    images, reports = rendered(worker, failed, failed, env=DRIFTING_LINE)
+    assert [one.artifacts.not_repeatable for one in reports] == ["after 0 steps, state 'position' differs", None]
+    assert [list(one.artifacts.footage.shown) for one in reports] == [[], ["front"]]
+    assert images == [4 + 1, 11]
+    assert reports[0].result is not None
+
+
+def test_episodes_side_by_side_are_rendered_again_one_by_one(config: Config) -> None:
+    class Sessions(ToZero):
+        def sessions(self, n: int) -> list[ToZero]:
+            return [ToZero(3) for _ in range(n)]
+
+        def act_batch(self, obs: Any, sessions: Any) -> Any:
+            return [session.act(one) for session, one in zip(sessions, obs, strict=True)]
+
+    seeds = seeds_by_outcome(config, chunk=3)
+    both = [seeds[True][0], seeds[False][0]]
+    options = {"env_options": {"camera": [32, 32]}, "num_envs": 2}
+    found = {
+        video: rollout_of(config, lambda: Sessions(3), video=video).run(
+            tuple(job(seed, SPARING_LINE, **options) for seed in both)
+        )
+        for video in ("failures", "all")
+    }
+    assert found["failures"][0].artifacts.footage.shown == {}
+    assert found["failures"][1].artifacts == found["all"][1].artifacts
+    assert found["failures"][1].artifacts.footage.shown
 
 
 def test_progress_tells_phase_age_and_place(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:

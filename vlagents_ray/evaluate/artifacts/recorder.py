@@ -12,6 +12,7 @@ import numpy as np
 from vlagents_ray.evaluate.artifacts.trajectory import TrajectoryRecorder, save_trajectory
 from vlagents_ray.evaluate.artifacts.video import Footage, VideoRecorder, save_videos
 from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.episode.second_pass import PlayedEpisode, SecondPass
 from vlagents_ray.evaluate.episode.stats import version_of
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import EpisodeChoice, EvalConfig
@@ -28,6 +29,7 @@ class Artifacts:
     footage: Footage = field(default_factory=Footage)
     trajectory: bytes | None = None  # a `Trajectory` as .npz
     transitions: Any = None  # a pyarrow.RecordBatch, for a learner
+    not_repeatable: str | None = None  # why images are missing that were to be rendered in a second pass
 
 
 class EpisodeRecorder:
@@ -37,9 +39,9 @@ class EpisodeRecorder:
     """Added to the `Obs.info` of every request to the policy."""
 
     @property
-    def wants_images(self) -> bool:
-        """Whether the images of every step are needed; an episode's outcome may discard them in the end."""
-        return False
+    def wants_images(self) -> EpisodeChoice:
+        """Of which episodes the images of every step are needed."""
+        return "none"
 
     def add_observation(self, obs: Obs) -> None:
         """Add an observation, beginning with that of the reset."""
@@ -50,8 +52,8 @@ class EpisodeRecorder:
     def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
         """Add an executed action, (D,), with its reward and success; its next observation was added before."""
 
-    def finish(self, result: EpisodeResult) -> Artifacts:
-        """Return what is kept of an episode with this result."""
+    def finish(self, result: EpisodeResult, second_pass: SecondPass) -> Artifacts:
+        """Return what is kept of an episode with this result; `second_pass` renders images that are missing."""
         return Artifacts()
 
     def __enter__(self) -> Self:
@@ -71,16 +73,17 @@ class Recording(EpisodeRecorder):
         self._wants_video, self._wants_trajectory = config.video, config.record
         self._video = VideoRecorder(fps, seen=config.record != "none")
         self._trajectory = TrajectoryRecorder()
+        self._played = PlayedEpisode()
 
     @property
-    def wants_images(self) -> bool:
-        return {self._wants_video, self._wants_trajectory} != {"none"}
+    def wants_images(self) -> EpisodeChoice:
+        wanted = {self._wants_video, self._wants_trajectory}
+        return "all" if "all" in wanted else "failures" if "failures" in wanted else "none"
 
     def add_observation(self, obs: Obs) -> None:
-        if self._wants_video != "none":
-            self._video.add(obs)
-        elif self._wants_trajectory != "none":
-            self._video.add(replace(obs, info={}))  # without the views for people
+        self._show(obs)
+        if self.wants_images == "failures":
+            self._played.add_observation(obs)
         if self._wants_trajectory != "none":
             self._trajectory.add_observation(obs)
 
@@ -89,18 +92,30 @@ class Recording(EpisodeRecorder):
             self._trajectory.add_version(version_of(act), ticks_waited)
 
     def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
+        if self.wants_images == "failures":
+            self._played.add_action(action, reward, success)
         if self._wants_trajectory != "none":
             self._trajectory.add_action(action, reward, success)
 
-    def finish(self, result: EpisodeResult) -> Artifacts:
+    def finish(self, result: EpisodeResult, second_pass: SecondPass) -> Artifacts:
         video, trajectory = _wanted(self._wants_video, result), _wanted(self._wants_trajectory, result)
         if not video and not trajectory:
             return Artifacts()
+        if self._played.lacks_images:
+            self._video.close()
+            if (reason := second_pass(self._played, self._show)) is not None:
+                return Artifacts(not_repeatable=reason)
         footage = self._video.finish()
         return Artifacts(
             Footage(footage.shown if video else {}, footage.seen if trajectory else {}),
             self._trajectory.finish().to_bytes() if trajectory else None,
         )
+
+    def _show(self, obs: Obs) -> None:
+        if self._wants_video != "none":
+            self._video.add(obs)
+        elif self._wants_trajectory != "none":
+            self._video.add(replace(obs, info={}))  # without the views for people
 
     def __exit__(self, *exc: object) -> None:
         self._video.close()

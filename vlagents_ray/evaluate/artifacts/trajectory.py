@@ -97,7 +97,7 @@ class TrajectoryRecorder:
             raise EnvFailed(f"env step: got the state {_shapes(state)}, want {_shapes(self._seen[0])} as after reset")
         if self._grippers and (obs.gripper is None) != (self._grippers[0] is None):
             raise EnvFailed("env step: an observation has a gripper, another of the same episode has none")
-        self._cameras = tuple(sorted(obs.cameras))
+        self._cameras = self._cameras or tuple(sorted(obs.cameras))  # those of the reset; a later one may lack them
         self._seen.append(state)
         self._grippers.append(obs.gripper)
 

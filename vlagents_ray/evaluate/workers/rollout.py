@@ -25,7 +25,7 @@ from vlagents_ray.envs.batch import BatchEnv, SequentialBatch, make_batch
 from vlagents_ray.envs.rendering.graphics import require_own
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, VLAgentsError
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts, EpisodeRecorder, RecorderFactory, Recording
-from vlagents_ray.evaluate.episode.episode import Outcome, Phase, run_episodes, transport_of
+from vlagents_ray.evaluate.episode.episode import Outcome, Phase, options_of_reset, run_episodes, transport_of
 from vlagents_ray.evaluate.episode.failures import Failure, env_side, explain, policy_side
 from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, WorkerInfo
 from vlagents_ray.evaluate.plan.cases import EvalCase
@@ -91,6 +91,8 @@ class Rollout:
         self._sessions: list[Agent] = []  # further sessions of the agent, for episodes side by side
         self._env: BatchEnv | None = None
         self._place: str | None = None  # the place of the environment
+        self._repeatable = True  # as far as is known of the environment
+        self._surplus = 0  # successes over failures in this environment
         self._thread = 0  # id of the thread that plays
         self._current_phase: tuple[Phase, float, int] = ("idle", monotonic(), 0)
 
@@ -149,17 +151,38 @@ class Rollout:
             recordings = [
                 stack.enter_context(self._recorder_factory(self._config, env.contract.control_hz)) for _ in jobs
             ]
+            outcomes = self._play(agent, env, jobs, recordings)
             return [
-                Report(result=one, artifacts=recording.finish(one))
+                Report(result=one, artifacts=self._finished(env, job, one, recording))
                 if isinstance(one, EpisodeResult)
                 else Report(failure=explain(one))
-                for one, recording in zip(self._play(agent, env, jobs, recordings), recordings, strict=True)
+                for job, one, recording in zip(jobs, outcomes, recordings, strict=True)
             ]
+
+    def _finished(self, env: BatchEnv, job: Job, result: EpisodeResult, recording: EpisodeRecorder) -> Artifacts:
+        """Return what is kept of an episode; where images are missing, it is played again."""
+        options = options_of_reset(env, job.key.episode, job.cell.suite.reset_options)
+        kept = recording.finish(
+            result, lambda played, record: played.play_again(env, job.key.seed, options, self._set_phase, record)
+        )
+        self._repeatable = self._repeatable and kept.not_repeatable is None
+        self._surplus += 1 if result.success_once else -1
+        return kept
+
+    def _renders_at_once(self, agent: Agent, env: BatchEnv, policy: PolicyConfig) -> bool:
+        """Whether each step is rendered as it is played, if images are wanted of failures alone.
+
+        The alternative is to play the failed ones again. That saves nothing if the policy gets each image, and costs
+        more than it saves if most fail; environments that one simulator runs together cannot be played again alone.
+        """
+        rows = policy.execute or (agent.contract.chunk if agent.contract is not None else None)
+        return rows == 1 or self._surplus < 0 or not self._repeatable or not isinstance(env, SequentialBatch)
 
     def _play(
         self, agent: Agent, env: BatchEnv, jobs: tuple[Job, ...], recordings: list[EpisodeRecorder]
     ) -> list[Outcome]:
         cell = jobs[0].cell
+        wanted = recordings[0].wants_images
         return run_episodes(
             env,
             agent,
@@ -171,7 +194,7 @@ class Rollout:
             policy_options=cell.policy_options,
             watch=self._set_phase,
             record=lambda i, obs: recordings[i].add_observation(obs),
-            images=recordings[0].wants_images,
+            images=wanted == "all" or (wanted == "failures" and self._renders_at_once(agent, env, cell.policy)),
             request_info=recordings[0].request_info,
             acted=lambda i, *said: recordings[i].add_act(*said),
             executed=lambda i, *done: recordings[i].add_action(*done),
@@ -225,6 +248,7 @@ class Rollout:
                 raise
             raise MissingDependency(f"env {cell.env!r} cannot run here: {reason}") from error
         self._place = cell.place
+        self._repeatable, self._surplus = True, 0
         return env
 
     def _drop_agent(self) -> None:
