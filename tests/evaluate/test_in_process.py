@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from eval_fakes import LINE, OTHER_LINE, ToZero
+from eval_fakes import DRIFTING_LINE, LINE, OTHER_LINE, ToZero
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Summary, evaluate
@@ -35,6 +35,20 @@ def test_it_is_one_worker_without_ray_whatever_the_plan_says(config: Config) -> 
     summary = evaluate(config(workers=4), agent_factory=ToZero, in_process=True)
     assert (summary.state, summary.total.episodes) == ("complete", 6)
     assert [worker.pid for worker in summary.results.workers] == [os.getpid()]
+
+
+def test_a_simulator_that_does_not_repeat_itself_leaves_one_failure_without_a_video_and_a_warning(
+    config: Config, caplog: pytest.LogCaptureFixture
+) -> None:
+    settings = config(envs=[DRIFTING_LINE], env_options={"camera": [32, 32]}, episodes=12, video="failures")
+    summary = evaluate(settings, agent_factory=lambda: ToZero(3), in_process=True)
+    failed = [one for cell in summary.results.cells for one in cell.episodes if not one.result.success_once]
+    bare = [str(one.result.key) for one in failed if not one.videos]
+    warnings = [record.getMessage() for record in caplog.records if "nothing of it is recorded" in record.getMessage()]
+    assert len(bare) == len(warnings) == 1
+    assert len(failed) > 1
+    assert warnings[0].startswith(f"{bare[0]}: ")
+    assert "state 'position' differs" in warnings[0]
 
 
 def test_it_goes_on_with_what_has_no_result(config: Config) -> None:
