@@ -5,13 +5,19 @@ from __future__ import annotations
 import asyncio
 import gc
 import multiprocessing
+import threading
 from types import TracebackType
 from typing import Any, ClassVar
 
+import numpy as np
 from shared_cpu_memory import SharedCpuMemory, files_of_torch
 
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.serve.scaling.weight_push import OwnWeights
+from vlagents_ray.serve.weights.updates import WeightUpdates
+from vlagents_ray.serve.weights.versions import ModelWeights
+from vlagents_ray.weights.trainable import portable
 
 
 def model(device: str) -> Any:
@@ -24,7 +30,7 @@ def model(device: str) -> Any:
     found.tied = found.layer.weight
     found.turned = torch.nn.Parameter(torch.randn(8, 4, device=device).T)
     found.part = torch.nn.Parameter(torch.randn(16, device=device)[3:7])
-    found.half = torch.nn.Parameter(torch.randn(5, device=device, dtype=torch.bfloat16))
+    found.rough = torch.nn.Parameter(torch.randn(5, device=device, dtype=torch.bfloat16))
     found.register_buffer("steps", torch.tensor(7, device=device))
     found.register_buffer("mean", torch.randn(3))
     found.register_buffer("empty", torch.zeros(0, device=device))
@@ -54,21 +60,17 @@ class _Replica:
     """What runs in the other process."""
 
     def __init__(self, device: str, gpu: str) -> None:
-        from vlagents_ray.serve.engine.engine import Engine
-        from vlagents_ray.serve.scaling.weight_push import OwnWeights
-
         if gpu:
             SharedCpuMemory(gpu).install()
         self.agent = Served(device)
         self.agent.initialize()
-        self.weights = Engine(self.agent).weights
-        self.own = OwnWeights("replica", self.weights)
+        self.weights = ModelWeights(self.agent, threading.Lock())
+        self.own = OwnWeights("replica", WeightUpdates(lambda: self.weights, list))
 
-    def values(self) -> dict[str, Any]:
+    def values(self) -> dict[str, np.ndarray]:
         """Act with the newest version, and return its values."""
-        own = self.weights._own()
-        own.use(own.newest)
-        return {name: value.cpu() for name, value in self.agent.parameters().items()}
+        self.weights.use(self.weights.newest)
+        return {name: portable(value) for name, value in self.agent.parameters().items()}
 
     def memory(self) -> tuple[int, set[str]]:
         """Bytes of GPU memory in use, and open files of shared memory."""
@@ -116,8 +118,8 @@ class ReplicaProcess:
     async def newest_weights(self) -> Any:
         return self.ask("newest_weights")
 
-    async def stage_weights(self, *args: Any) -> Any:
-        return self.ask("stage_weights", *args)
+    async def stage_weights(self, number: int, values: Any, options: Any) -> Any:
+        return self.ask("stage_weights", number, await values[0] if isinstance(values, list) else values, options)
 
     async def commit_weights(self, *args: Any) -> None:
         self.ask("commit_weights", *args)

@@ -36,8 +36,10 @@ class SharedCpuMemory:
     def handed_over(self, storage: Any) -> Iterator[StorageHandle]:
         manager, file, size = storage._share_filename_cpu_()  # moves the values there, so that writes are seen by all
         self.handles += 1
-        yield StorageHandle(file, size, 0, manager, 0)
-        self.handles -= 1
+        try:
+            yield StorageHandle(file, size, 0, manager, 0)
+        finally:
+            self.handles -= 1
 
     def opened(self, gpu: str, handle: StorageHandle) -> Any:
         import torch
@@ -50,4 +52,4 @@ class SharedCpuMemory:
 def files_of_torch() -> set[str]:
     """The files of shared memory that this process has mapped."""
     lines = Path("/proc/self/maps").read_text().splitlines()
-    return {line.split()[-1] for line in lines if "/torch_" in line and "/dev/shm" in line}
+    return {line.partition("/dev/shm")[2] for line in lines if "/dev/shm/torch_" in line}

@@ -73,8 +73,8 @@ class AppTarget:
     """An application of the Ray cluster that this process is in.
 
     If the learner and all replicas have their weights on the same GPU, the replicas copy them from where they are.
-    Otherwise the values are put into Ray's object store once. All replicas of this node read them there, without a copy where the
-    policy is on the CPU; Ray transfers them to other nodes once each.
+    Otherwise the values are put into Ray's object store once. All replicas of this node read them there, without a copy
+    where the policy is on the CPU; Ray transfers them to other nodes once each.
     """
 
     def __init__(self, app: str) -> None:
