@@ -66,7 +66,7 @@ def changed(learner: Any) -> dict[str, np.ndarray]:
     """Take a step, and return copies of the values after it."""
     with torch.no_grad():
         for value in learner.parameters():
-            value += 1
+            value.add_(1)
     return {name: portable(value).copy() for name, value in learner.state_dict().items()}
 
 
