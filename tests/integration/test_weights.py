@@ -36,7 +36,12 @@ def gain(value: float) -> dict[str, np.ndarray]:
 
 
 def acts(server: Server, transport: str) -> tuple[int, float]:
-    url = "serve://Trainable" if transport in ("handle", "plasma") else server.url
+    return acts_of(server, "Trainable", transport)
+
+
+def acts_of(server: Server, app: str, transport: str) -> tuple[int, float]:
+    """Version and first number of the first act of an episode."""
+    url = f"serve://{app}" if transport in ("handle", "plasma") else server.url
     with RemoteAgent(url, transport=transport, rank="simulation") as agent:
         agent.reset(Obs(), None)
         act = agent.act(Obs())

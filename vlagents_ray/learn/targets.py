@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 from collections.abc import Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import asdict
@@ -21,10 +22,13 @@ from vlagents_ray.errors import ConfigError, InvalidWeights, PolicyUnavailable, 
 from vlagents_ray.protocol.frames import read_error
 from vlagents_ray.serve.endpoints.weights import PATH
 from vlagents_ray.serve.engine.engine import Engine
-from vlagents_ray.serve.scaling.weight_push import OwnWeights, WeightPusher, WeightsReplica
+from vlagents_ray.serve.scaling.weight_push import OwnWeights, Values, WeightPusher, WeightsReplica
 from vlagents_ray.serve.weights.updates import PushOptions, PushResult
 from vlagents_ray.weights.safetensors import MESSAGE_BYTES, header_of, parts_of
+from vlagents_ray.weights.shared_values import NotShared, gpu_of, shared
 from vlagents_ray.weights.trainable import is_array, portable
+
+logger = logging.getLogger(__name__)
 
 _ANSWER_S = 10.0  # time limit for the question which versions act
 _PUSH_S = 600.0  # time limit for a push, which includes the transfer to all nodes
@@ -68,8 +72,9 @@ class EngineTarget:
 class AppTarget:
     """An application of the Ray cluster that this process is in.
 
-    The values are put into Ray's object store once. All replicas of this node read them there, without a copy where the
-    policy is on the CPU; Ray transfers them to other nodes once each.
+    If the learner and all replicas have their weights on the same GPU, the replicas copy them from where they are.
+    Otherwise the values are put into Ray's object store once. All replicas of this node read them there, without a copy
+    where the policy is on the CPU; Ray transfers them to other nodes once each.
     """
 
     def __init__(self, app: str) -> None:
@@ -84,7 +89,16 @@ class AppTarget:
         """Let the policy act with new weights, and return their version; see `Publisher.push`."""
         import ray
 
-        result: PushResult = self._call("push_weights", [ray.put(_portable(named))], options, timeout_s=_PUSH_S)
+        if gpu_of(named):
+            try:
+                with shared(named) as values:
+                    return self._push(values, options)
+            except NotShared as error:
+                logger.info("serve://%s: the weights go through Ray's object store: %s", self._app, error)
+        return self._push([ray.put(_portable(named))], options)
+
+    def _push(self, values: Values, options: PushOptions) -> int:
+        result: PushResult = self._call("push_weights", values, options, timeout_s=_PUSH_S)
         return result.version
 
     def versions(self) -> list[int]:

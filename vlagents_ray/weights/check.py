@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import InvalidWeights, UnchangedWeights
-from vlagents_ray.weights.trainable import converted, dtype_name, is_array
+from vlagents_ray.weights.trainable import converted, dtype_name, is_array, portable
 
 _SHOWN = 5  # faults in a message
 _SAMPLED = 1024  # most elements of each value that the fingerprint covers
@@ -122,7 +122,4 @@ def _size(value: Any) -> int:
 
 def _sampled_bytes(value: Any) -> bytes:
     flat = value.reshape(-1)[:: max(1, -(-_size(value) // _SAMPLED))]
-    torch = sys.modules.get("torch")
-    if torch is not None and isinstance(flat, torch.Tensor):
-        flat = flat.detach().contiguous().cpu().view(torch.uint8).numpy()
-    return np.ascontiguousarray(flat).tobytes()
+    return portable(flat).tobytes()

@@ -51,6 +51,7 @@ class NewestVersion:
 
     number: int
     model: tuple[str, str]  # equal in replicas that loaded the same checkpoint with the same settings
+    gpu: str = ""  # UUID of the GPU on which its weights are; empty if it is none, or more than one
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,7 +116,7 @@ class WeightUpdates:
         """The newest version; raises `PolicyUnavailable` while the policy loads."""
         own = self._own()
         own.settle()
-        return NewestVersion(own.newest.number, own.model)
+        return NewestVersion(own.newest.number, own.model, own.gpu)
 
     @property
     def number(self) -> int:

@@ -18,6 +18,7 @@ from vlagents_ray.errors import NotTrainable, Overloaded, UnknownSession, Weight
 from vlagents_ray.interface import POLICY, Agent
 from vlagents_ray.weights.check import fingerprint, fitted, require_fit
 from vlagents_ray.weights.safetensors import ValueSpec
+from vlagents_ray.weights.shared_values import gpu_of
 from vlagents_ray.weights.trainable import is_copied, own_copy, portable
 
 DIGITS = 16  # of a fingerprint, hexadecimal
@@ -77,12 +78,13 @@ class ModelWeights:
             values: dict[str, Any] | None = agent.parameters()
         except NotTrainable as error:
             self._refusal: NotTrainable | None = error
-            first, self._in_place = WeightsVersion(0, digest, None), False
+            first, self._in_place, self.gpu = WeightsVersion(0, digest, None), False, ""
         else:
             self._refusal = None
             # An agent of its own ways may copy as well, so that references to old values do not last.
             self._in_place = type(agent).load_parameters is not Agent.load_parameters or is_copied(values or {})
             first = WeightsVersion(0, fingerprint(values or {}), None if self._in_place else values)
+            self.gpu = gpu_of(values or {})
         self.newest = self.pinned = first
         self._staged: WeightsVersion | None = None
         self._timer: threading.Timer | None = None
