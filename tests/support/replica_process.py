@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import gc
 import multiprocessing
 import threading
 from types import TracebackType
@@ -64,6 +63,7 @@ class _Replica:
             SharedCpuMemory(gpu).install()
         self.agent = Served(device)
         self.agent.initialize()
+        self.left_open: set[str] = set()
         self.weights = ModelWeights(self.agent, threading.Lock())
         self.own = OwnWeights("replica", WeightUpdates(lambda: self.weights, list))
 
@@ -73,11 +73,10 @@ class _Replica:
         return {name: portable(value) for name, value in self.agent.parameters().items()}
 
     def memory(self) -> tuple[int, set[str]]:
-        """Bytes of GPU memory in use, and open files of shared memory."""
+        """Bytes of GPU memory in use, and the files of shared memory that were open at any answer."""
         import torch
 
-        gc.collect()
-        return torch.cuda.memory_allocated() if torch.cuda.is_available() else 0, files_of_torch()
+        return torch.cuda.memory_allocated() if torch.cuda.is_available() else 0, self.left_open
 
 
 def _serve(pipe: Any, device: str, gpu: str) -> None:
@@ -86,10 +85,12 @@ def _serve(pipe: Any, device: str, gpu: str) -> None:
         method, args = asked
         try:
             found = getattr(replica, method, None) or getattr(replica.own, method)
-            result = found(*args)
-            pipe.send(asyncio.run(result) if asyncio.iscoroutine(result) else result)
+            answer = found(*args)
+            answer = asyncio.run(answer) if asyncio.iscoroutine(answer) else answer
         except VLAgentsError as error:
-            pipe.send(error)
+            answer = error  # which holds all local variables of its frames
+        replica.left_open |= files_of_torch()
+        pipe.send(answer)
 
 
 class ReplicaProcess:

@@ -8,7 +8,6 @@ https://docs.nvidia.com/cuda/cuda-c-programming-guide/. Torch is never imported 
 from __future__ import annotations
 
 import sys
-import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -109,11 +108,8 @@ def opened(values: SharedValues) -> Iterator[Mapping[str, Any]]:
         yield named
         for device in devices:
             _MEMORY.finish(device)
-    except BaseException as error:
-        traceback.clear_frames(error.__traceback__)  # their local variables would keep the memory open
-        raise
     finally:
-        named.clear()
+        named.clear()  # an error has frames that refer to it
 
 
 class _GpuMemory:
