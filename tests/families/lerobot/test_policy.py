@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from pushed_weights import check_pushed_weights
@@ -12,7 +14,7 @@ from vlagents_ray import Obs
 from vlagents_ray.contract import CameraSpec, StateSpec
 from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.interface import DISTRIBUTION, SAMPLES, Act
-from vlagents_ray.policies.lerobot import LeRobot
+from vlagents_ray.policies.lerobot import LeRobot, policy_types
 from vlagents_ray.testing import check_agent
 
 pytestmark = FILTERS
@@ -61,6 +63,31 @@ def test_the_instruction_decides(kind: str, loaded: Load) -> None:
         session.reset(view(), task, seed=0)
         chunks.append(session.act(view()).action)
     assert not np.allclose(*chunks, atol=1e-4)
+
+
+def test_the_samples_of_an_observation_of_x_vla_are_of_one_reading_of_it(
+    loaded: Load, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy, read = loaded("xvla"), list[int]()
+    vlm = policy.model.kind.policy.model.vlm
+    look = vlm._encode_image
+
+    def counted(images: Any) -> Any:
+        read.append(len(images))  # one camera
+        return look(images)
+
+    monkeypatch.setattr(vlm, "_encode_image", counted)
+    views = [view(0, **{SAMPLES: 8}), view(1), view(2, **{SAMPLES: 3})]
+    shared = policy.act_batch(views, [begun(policy, number) for number in range(3)])
+    monkeypatch.setattr(policy_types, "shared_frames", lambda rows: (list(range(len(rows))), list(range(len(rows)))))
+    each = policy.act_batch(views, [begun(policy, number) for number in range(3)])
+    assert read == [3, 14]
+    for one, other in zip(shared, each, strict=True):
+        assert isinstance(one, Act)
+        assert isinstance(other, Act)
+        np.testing.assert_allclose(one.action, other.action, atol=ATOL)
+        if DISTRIBUTION in one.info:
+            np.testing.assert_allclose(*(act.info[DISTRIBUTION]["samples"] for act in (one, other)), atol=ATOL)
 
 
 def test_a_policy_that_reads_no_instruction_does_without(loaded: Load) -> None:

@@ -11,7 +11,8 @@ import pytest
 from tests.families.openpi.marks import MARKS
 from vlagents_ray import Obs
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera
-from vlagents_ray.interface import DELAY, LEFTOVER
+from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER, SAMPLES
+from vlagents_ray.policies.openpi import policy as openpi_policy
 from vlagents_ray.serve.mapping.presets import presets
 from vlagents_ray.testing import check_agent
 
@@ -79,6 +80,35 @@ def test_neighbours_change_nothing(kind: str, loaded: Any) -> None:
         acts = policy.act_batch([seen(kind, i) for i in range(size)], [begun(policy, kind, i) for i in range(size)])
         for one, act in zip(alone, acts, strict=False):
             np.testing.assert_allclose(act.action, one, atol=BATCHED, rtol=1e-5)
+
+
+@pytest.mark.parametrize("kind", ["pi0", "pi05"])
+def test_the_samples_of_an_observation_are_of_one_reading_of_it(
+    kind: str, loaded: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = type(loaded(kind))(loaded(kind).config.model_copy(update={"batch_sizes": [2, 8]}))
+    policy.initialize()
+    model, read = policy.model.model, []
+    encode, follow = model._encode, model._follow
+
+    def counted(state: Any, batch: Any) -> Any:
+        read.append(len(batch["state"]))
+        return encode(state, batch)
+
+    monkeypatch.setattr(model, "_encode", counted)
+    plan = begun(policy, kind, 1).act(seen(kind, 1)).action[1:]
+    # seven rows, of which the last follow a plan, and one of padding
+    views = [seen(kind, 0, **{SAMPLES: 4}), seen(kind, 1, **{SAMPLES: 1, LEFTOVER: plan, DELAY: 2})]
+    read.clear()
+    shared = policy.act_batch(views, [begun(policy, kind, i) for i in range(2)])
+    monkeypatch.setattr(openpi_policy, "shared_frames", lambda rows: (list(range(len(rows))),) * 2)
+    each = policy.act_batch(views, [begun(policy, kind, i) for i in range(2)])
+    assert read == [2, 8]
+    for one, other in zip(shared, each, strict=True):
+        np.testing.assert_allclose(one.action, other.action, atol=BATCHED, rtol=1e-5)
+        samples = [act.info[DISTRIBUTION]["samples"] for act in (one, other)]
+        np.testing.assert_allclose(*samples, atol=BATCHED, rtol=1e-5)
+    assert (encode._cache_size(), follow._cache_size()) == (2, 2)  # of the two sizes, from the start
 
 
 def test_it_keeps_what_an_agent_promises(loaded: Any, checkpoint: Any) -> None:

@@ -201,6 +201,16 @@ def test_a_deterministic_pass_encodes_every_row_also_those_of_samples() -> None:
         assert set(act.action.ravel()) == {4}
 
 
+def test_padding_has_no_observations_of_its_own() -> None:
+    policy = CountsViews.from_config({"checkpoint": "none", "batch_sizes": [4, 8]})
+    policy.initialize()
+    sessions = [copy.copy(policy) for _ in range(2)]
+    for session in sessions:
+        session.reset(at(0.0), "go")
+    acts = policy.act_batch([at(0.0, **{SAMPLES: 3}), at(1.0)], sessions)
+    assert [set(act.action.ravel()) for act in acts] == [{2}, {2}]  # of eight rows
+
+
 @pytest.mark.parametrize("sizes", [None, [1, 2]])
 def test_deterministic_wants_one_size(sizes: list[int] | None) -> None:
     with pytest.raises(ConfigError, match=r"deterministic with batch_sizes .*: want one size, such as \[8\]"):

@@ -294,11 +294,12 @@ class ModelPolicy(Agent, abc.ABC):
         most = self.config.rows
         for start in range(0, len(rows), most):
             part = rows[start : start + most]
-            if self.config.deterministic:  # each row has frames of its own, so that as many are encoded in every batch
-                part = [replace(row, frames=(*row.frames,)) for row in part]
             size = next((s for s in self.config.batch_sizes or () if s >= len(part)), len(part))
-            padding = [copy.deepcopy(part[-1]) for _ in range(size - len(part))]
-            results = self.predict([*part, *padding])
+            last = part[-1]  # whose copies see what it sees
+            filled = [*part, *(copy.deepcopy(last, {id(last.frames): last.frames}) for _ in range(size - len(part)))]
+            if self.config.deterministic:  # each row has frames of its own, so that as many are encoded in every batch
+                filled = [replace(row, frames=(*row.frames,)) for row in filled]
+            results = self.predict(filled)
             if len(results) != size:
                 raise PolicyFailed(f"predict: got {size} rows, returned {len(results)} chunks")
             found += results[: len(part)]

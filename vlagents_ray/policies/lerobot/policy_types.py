@@ -187,9 +187,20 @@ class XVla(Kind):
     def batched(self) -> bool:  # type: ignore[override]
         return bool(self.config.pad_language_to == "max_length")
 
+    def __init__(self, policy: Any, compilation: Compilation) -> None:
+        super().__init__(policy, compilation)
+        self._look = policy.model.forward_vlm
+
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
         from vlagents_ray.policies.lerobot.sampling_rng import RowDraws
 
+        firsts, owners = shared_frames(rows)
+
+        def look(*inputs: Any) -> dict[str, Any]:
+            """Run the vision-language encoder once for each observation."""
+            return {name: one[owners] for name, one in self._look(*(each[firsts] for each in inputs)).items()}
+
+        self.policy.model.forward_vlm = look
         with RowDraws([row.rng for row in rows]):
             return self.policy.predict_action_chunk(batch)
 

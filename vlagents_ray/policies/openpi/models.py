@@ -60,20 +60,55 @@ class OpenPiModel(abc.ABC):
 
 
 class JaxFlow(OpenPiModel):
-    """π0 and π0.5 in JAX, compiled once for each number of rows."""
+    """π0 and π0.5 in JAX, in two programs, each compiled once for each number of its rows.
+
+    The first computes the keys and values of images and instruction, once for each observation. The second follows the
+    flow of each row from them, with the steps of openpi's `sample_actions`.
+    """
+
+    shares = True
 
     def __init__(self, network: Any, device: Any, config: OpenPiConfig) -> None:
-        jax, nnx = require("jax"), require("flax.nnx")
+        jax, nnx, models = require("jax"), require("flax.nnx"), require("openpi.models.model")
+        jnp, attention_mask = jax.numpy, require("openpi.models.pi0").make_attn_mask
         graph, self._state = nnx.split(network)
         self._device = device
         steps, limit = config.steps or _STEPS, config.guidance
 
-        def sample(state: Any, batch: Any, noise: Any, guide: Any) -> Any:
+        def encode(state: Any, batch: Any) -> Any:
             model = nnx.merge(graph, state)
-            _steer_jax(model, noise, Guide(*guide), steps, limit)
-            return model.sample_actions(jax.random.key(0), _observation(batch), num_steps=steps, noise=noise)
+            observation = models.preprocess_observation(None, _observation(batch), train=False)
+            tokens, seen, causal = model.embed_prefix(observation)
+            mask, places = attention_mask(seen, causal), jnp.cumsum(seen, axis=1) - 1
+            _, (keys, values) = model.PaliGemma.llm([tokens, None], mask=mask, positions=places)
+            return keys.swapaxes(0, 1), values.swapaxes(0, 1), seen, observation.state  # rows before layers
 
-        self._sample = jax.jit(sample)
+        def follow(state: Any, encoded: Any, noise: Any, guide: Any) -> Any:
+            model, guide = nnx.merge(graph, state), Guide(*guide)
+            keys, values, seen, proprio = encoded
+            cache = keys.swapaxes(0, 1), values.swapaxes(0, 1)
+            observation = models.Observation(images={}, image_masks={}, state=proprio)
+
+            def step(now: Any) -> Any:
+                actions, time = now
+                tokens, mask, causal, condition = model.embed_suffix(
+                    observation, actions, jnp.broadcast_to(time, len(noise))
+                )
+                before = jnp.broadcast_to(seen[:, None], (*tokens.shape[:2], seen.shape[1]))
+                (_, hidden), _ = model.PaliGemma.llm(
+                    [None, tokens],
+                    mask=jnp.concatenate([before, attention_mask(mask, causal)], axis=-1),
+                    positions=seen.sum(-1)[:, None] + jnp.cumsum(mask, axis=-1) - 1,
+                    kv_cache=cache,
+                    adarms_cond=[None, condition],
+                )
+                velocity = model.action_out_proj(hidden[:, -noise.shape[1] :])
+                velocity = guide.steer(velocity, actions, noise, time, steps=steps, limit=limit, lower=jnp.minimum)
+                return actions - velocity / steps, time - 1 / steps
+
+            return jax.lax.while_loop(lambda now: now[1] >= 0.5 / steps, step, (noise, 1.0))[0]
+
+        self._encode, self._follow = jax.jit(encode), jax.jit(follow)
         self.noise_shape = (network.action_horizon, network.action_dim)
 
     def sample(
@@ -89,8 +124,11 @@ class JaxFlow(OpenPiModel):
         if guide is None:
             none = np.zeros((*noise.shape[:2], 1), np.float32)
             guide = Guide(np.zeros_like(noise), none, none)
-        arrays = jax.device_put((batch, noise, (guide.plan, guide.frozen, guide.weight)), self._device)
-        return np.asarray(self._sample(self._state, *arrays), np.float32)  # waits for the device
+        batch, noise, plan = jax.device_put((batch, noise, (guide.plan, guide.frozen, guide.weight)), self._device)
+        encoded = self._encode(self._state, batch)
+        if list(owners) != list(range(len(encoded[0]))):
+            encoded = jax.tree.map(lambda one: one[np.asarray(owners)], encoded)
+        return np.asarray(self._follow(self._state, encoded, noise, plan), np.float32)  # waits for the device
 
 
 class JaxTokens(OpenPiModel):
@@ -218,26 +256,6 @@ def load_torch(config: Any, folder: Path, settings: OpenPiConfig, compilation: C
 def _observation(batch: dict[str, Any]) -> Any:
     data = {**batch, "image": dict(batch["image"])}  # openpi writes into it
     return require("openpi.models.model").Observation.from_dict(data)
-
-
-def _steer_jax(model: Any, noise: Any, guide: Guide, steps: int, limit: float) -> None:
-    """Change a copy of π0 so that its velocity follows the guide.
-
-    openpi's sampling loop is a single function, but each step's actions and time pass through `embed_suffix`, and the
-    velocity through `action_out_proj`.
-    """
-    minimum = require("jax.numpy").minimum
-    embed, project = model.embed_suffix, model.action_out_proj
-    now: dict[str, Any] = {}
-
-    def embed_suffix(observation: Any, actions: Any, time: Any) -> Any:
-        now.update(actions=actions, time=time[:, None, None])
-        return embed(observation, actions, time)
-
-    def action_out_proj(hidden: Any) -> Any:
-        return guide.steer(project(hidden), now["actions"], noise, now["time"], steps=steps, limit=limit, lower=minimum)
-
-    model.embed_suffix, model.action_out_proj = embed_suffix, action_out_proj
 
 
 def _require_used(params: Any, network: Any, folder: Path, name: str) -> None:

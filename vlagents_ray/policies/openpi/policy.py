@@ -133,9 +133,14 @@ class OpenPi(ModelPolicy):
         ]
 
     def _shared(self, rows: Sequence[Row]) -> tuple[list[int], list[int]]:
-        """Return `shared_frames`, or each row by itself for a model whose rows cannot share an observation."""
+        """Return `shared_frames`, or each row by itself for a model whose rows cannot share an observation.
+
+        The observations are padded to one of `batch_sizes`, as rows are.
+        """
         each = list(range(len(rows)))
-        return shared_frames(rows) if self._loaded().model.shares else (each, each)
+        firsts, owners = shared_frames(rows) if self._loaded().model.shares else (each, each)
+        size = next((size for size in self.config.batch_sizes or () if size >= len(firsts)), len(firsts))
+        return firsts + firsts[-1:] * (size - len(firsts)), owners
 
     def _planned(self, row: Row) -> TransformedRow | Exception:
         """Return the row with its leftover actions in the model's units, or an exception for its session."""
