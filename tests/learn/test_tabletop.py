@@ -7,23 +7,20 @@ import json
 import os
 import signal
 import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from subprocess import PIPE
 from typing import Any, get_args
 
 import numpy as np
 import pytest
 from eval_fakes import wait_for
 from ray_processes import end, processes, ray_folder
+from tabletop_runs import ended, start_run, table
 
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.cli.options import read_run_file
 from vlagents_ray.envs.tabletop.env import Tabletop
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera
-from vlagents_ray.evaluate import Results
-from vlagents_ray.evaluate.results.summary import pushed_of
 from vlagents_ray.interface import BEHAVIOUR, WANT
 from vlagents_ray.learn.tabletop.colours import named_colour, puck_position
 from vlagents_ray.learn.tabletop.learner import RPDLearner, advantages, advice, inputs_of
@@ -247,7 +244,7 @@ def folder() -> Iterator[Path]:
 def undisturbed(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """The table of a run in which nothing was killed."""
     out = tmp_path_factory.mktemp("runs") / "whole"
-    with start(folder, out) as run:
+    with start_run(folder, out) as run:
         printed = ended(run, folder)
     assert "demonstrations: 8 of 8 episodes solved" in printed
     assert (out / "report.html").is_file()
@@ -262,11 +259,11 @@ def undisturbed(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[
 @pytest.mark.slow
 def test_a_killed_run_goes_on_to_the_same_table(folder: Path, undisturbed: dict[str, Any], tmp_path: Path) -> None:
     out = tmp_path / "run"
-    with start(folder, out) as run:
+    with start_run(folder, out) as run:
         wait_until_rpd_learns(run, out)
         run.kill()
     end(folder)
-    with start(folder, out, "--resume") as run:
+    with start_run(folder, out, "--resume") as run:
         assert "demonstrations:" not in ended(run, folder)
     assert table(out) == undisturbed
 
@@ -276,7 +273,7 @@ def test_a_killed_run_goes_on_to_the_same_table(folder: Path, undisturbed: dict[
 @pytest.mark.slow
 def test_killed_replicas_and_workers_change_nothing(folder: Path, undisturbed: dict[str, Any], tmp_path: Path) -> None:
     out, pushed, killed = tmp_path / "run", tmp_path / "pushed", tmp_path / "killed"
-    with start(folder, out, before=HELD.format(pushed=str(pushed), killed=str(killed))) as run:
+    with start_run(folder, out, before=HELD.format(pushed=str(pushed), killed=str(killed))) as run:
         wait_for(lambda: pushed.exists() or run.poll() is not None, timeout_s=400)
         for pid in [*processes(folder, "ray::ServeReplica:rpd"), *processes(folder, "ray::Rollout")]:
             with contextlib.suppress(ProcessLookupError):
@@ -304,33 +301,6 @@ _LearnRun._collect = held
 """
 
 
-def start(folder: Path, out: Path, *options: str, before: str = "") -> subprocess.Popen[str]:
-    """Start the command in a Ray of its own, in a process that first runs the code of `before`."""
-    code = before + "\nfrom vlagents_ray.cli import main; main()"
-    command = [sys.executable, "-c", code, "learn", "tabletop"]
-    command += [str(folder / "plan.yaml"), "--out", str(out), *options]
-    return subprocess.Popen(
-        command, env=os.environ | {"RAY_TMPDIR": str(folder)}, stdout=PIPE, stderr=subprocess.STDOUT, text=True
-    )
-
-
 def wait_until_rpd_learns(run: subprocess.Popen[str], out: Path) -> None:
     """Until the first of its iterations is over."""
     wait_for(lambda: (out / "checkpoints" / "rpd.pt").exists() or run.poll() is not None, timeout_s=400)
-
-
-def ended(run: subprocess.Popen[str], folder: Path) -> str:
-    """What the command has printed at its end, after which nothing runs."""
-    printed, _ = run.communicate(timeout=500)
-    assert run.returncode == 0, printed
-    assert not processes(folder), "left running"
-    return printed
-
-
-def table(out: Path) -> dict[str, tuple[str | None, list[tuple[int, float]]]]:
-    """The weights, and seed and return of each episode, by contender."""
-    results, found = Results.load(out), {}
-    for cell in results.cells:
-        episodes = sorted((one.result.key.seed, one.result.episode_return) for one in cell.episodes)
-        found[cell.contender] = pushed_of(cell), episodes
-    return {name: found[name] for name in results.contenders}

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from eval_fakes import wait_for
+from ray_processes import end, ray_folder
+from tabletop_runs import ended, start_run, table
 
 from vlagents_ray import Act, Obs
+from vlagents_ray.cli.options import read_run_file
 from vlagents_ray.envs.tabletop.env import Tabletop
 from vlagents_ray.interface import BEHAVIOUR, WANT
 from vlagents_ray.learn.tabletop.grpo import GRPOLearner, group_advantages
@@ -165,3 +171,28 @@ def test_without_a_group_of_both_outcomes_the_weights_stay() -> None:
     before = {name: value.clone() for name, value in learner.state().items()}
     learner.improve(columns, 5)
     assert all(value.equal(before[name]) for name, value in learner.state().items())
+
+
+@pytest.mark.server
+@pytest.mark.torch
+@pytest.mark.slow
+def test_the_example_killed_after_an_iteration_goes_on_to_the_table_of_a_whole_run(tmp_path: Path) -> None:
+    example = read_run_file(Path(__file__).parents[2] / "examples/learn/grpo.yaml", "file of settings", "`methods`")
+    small = {"iterations": 2, "episodes": 32, "evaluate_every": 1, "held_out": 8}  # with the example's clone
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    with ray_folder() as folder:
+        (folder / "plan.yaml").write_text(json.dumps(example | small))
+        with start_run(folder, whole) as run:
+            ended(run, folder)
+        with start_run(folder, killed) as run:
+            first = killed / "checkpoints" / "grpo.pt"
+            wait_for(lambda: first.exists() or run.poll() is not None, timeout_s=400)
+            run.kill()
+        end(folder)
+        with start_run(folder, killed, "--resume") as run:
+            assert "demonstrations:" not in ended(run, folder)
+    # Each iteration took its steps, pushed them, and was evaluated with other weights than the one before.
+    found = table(whole)
+    assert list(found) == ["grpo@400", "grpo@420", "grpo@440"]
+    assert len({weights for weights, _ in found.values()}) == 3
+    assert table(killed) == found
