@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from eval_fakes import wait_for
 from ray_processes import end, ray_folder
 from tabletop_runs import ended, start_run, table
 
 from vlagents_ray import Act, Obs
-from vlagents_ray.cli.options import read_run_file
 from vlagents_ray.envs.tabletop.env import Tabletop
 from vlagents_ray.interface import BEHAVIOUR, WANT
 from vlagents_ray.learn.tabletop.grpo import GRPOLearner, group_advantages
@@ -177,7 +177,7 @@ def test_without_a_group_of_both_outcomes_the_weights_stay() -> None:
 @pytest.mark.torch
 @pytest.mark.slow
 def test_the_example_killed_after_an_iteration_goes_on_to_the_table_of_a_whole_run(tmp_path: Path) -> None:
-    example = read_run_file(Path(__file__).parents[2] / "examples/learn/grpo.yaml", "file of settings", "`methods`")
+    example = yaml.safe_load((Path(__file__).parents[2] / "examples/learn/grpo.yaml").read_text())
     small = {"iterations": 2, "episodes": 32, "evaluate_every": 1, "held_out": 8}  # with the example's clone
     whole, killed = tmp_path / "whole", tmp_path / "killed"
     with ray_folder() as folder:
