@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 from shared_cpu_memory import SharedCpuMemory
-from test_weights import acts_of
 
+from tests.integration.test_weights import acts_of
 from vlagents_ray.errors import InvalidWeights
 from vlagents_ray.learn import Publisher
 from vlagents_ray.learn.targets import AppTarget
