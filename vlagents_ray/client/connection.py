@@ -106,7 +106,7 @@ class Connection:
         contract = metadata.get("contract")
         self.contract = None if contract is None else Contract.from_json(contract)
         self.act_parts = metadata.get("act_parts")
-        self.codec.near = _is_near(self.url, metadata)
+        self.codec.connected(near=_is_near(self.url, metadata))
         self.metadata = metadata
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:

@@ -153,7 +153,7 @@ def test_the_choice_stands_until_images_change_much_or_the_connection_is_new() -
 
 
 @pytest.mark.parametrize(("part", "chosen"), [(2, RAW), (0.5, JPEG)])
-def test_within_a_machine_nothing_is_measured_and_pixels_stay_raw_unless_they_are_too_many(
+def test_within_a_machine_pixels_stay_raw_without_a_measurement_unless_they_are_too_many(
     part: float, chosen: ImageCodec
 ) -> None:
     limit = part * sum(image.nbytes for image in OBS.cameras.values())
@@ -163,9 +163,9 @@ def test_within_a_machine_nothing_is_measured_and_pixels_stay_raw_unless_they_ar
             raise MessageTooLarge("too large")
 
     choice = CodecChoice("auto")
-    choice.near = True
+    choice.connected(near=True)
     assert choice.codec_for(OBS, refuse) == chosen
-    assert choice.link is None
+    assert (choice.link is None) == (chosen == RAW)
 
 
 @pytest.fixture(scope="module")

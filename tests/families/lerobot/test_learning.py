@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from normal_steps import logprob_of_steps
+from shared_readings import check_shared_readings
 
 from tests.families.lerobot import tiny
 from tests.families.lerobot.conftest import FILTERS, Load, Made, begun, view
@@ -112,13 +113,5 @@ def test_the_samples_of_an_observation_are_of_one_reading_of_it(
 
     monkeypatch.setattr(model, "embed_prefix", counted)
     views = [view(0, **{SAMPLES: 8, WANT: ALL}), view(1), view(2, **{SAMPLES: 3})]
-    shared = learnt.act_batch(views, [begun(learnt, number) for number in range(3)])
-    monkeypatch.setattr(policy_types, "shared_frames", lambda rows: (list(range(len(rows))), list(range(len(rows)))))
-    each = learnt.act_batch(views, [begun(learnt, number) for number in range(3)])
+    check_shared_readings(learnt, views, begun, policy_types, ATOL)
     assert read == [3, 14]
-    for one, other in zip(shared, each, strict=True):
-        assert isinstance(one, Act)
-        assert isinstance(other, Act)
-        np.testing.assert_allclose(one.action, other.action, atol=ATOL)
-        if DISTRIBUTION in one.info:
-            np.testing.assert_allclose(*(act.info[DISTRIBUTION]["samples"] for act in (one, other)), atol=ATOL)

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from pushed_weights import check_pushed_weights
+from shared_readings import check_shared_readings
 
 from tests.families.lerobot import tiny
 from tests.families.lerobot.conftest import FILTERS, TASKS, Load, Made, begun, view
@@ -78,16 +79,8 @@ def test_the_samples_of_an_observation_of_x_vla_are_of_one_reading_of_it(
 
     monkeypatch.setattr(vlm, "_encode_image", counted)
     views = [view(0, **{SAMPLES: 8}), view(1), view(2, **{SAMPLES: 3})]
-    shared = policy.act_batch(views, [begun(policy, number) for number in range(3)])
-    monkeypatch.setattr(policy_types, "shared_frames", lambda rows: (list(range(len(rows))), list(range(len(rows)))))
-    each = policy.act_batch(views, [begun(policy, number) for number in range(3)])
+    check_shared_readings(policy, views, begun, policy_types, ATOL)
     assert read == [3, 14]
-    for one, other in zip(shared, each, strict=True):
-        assert isinstance(one, Act)
-        assert isinstance(other, Act)
-        np.testing.assert_allclose(one.action, other.action, atol=ATOL)
-        if DISTRIBUTION in one.info:
-            np.testing.assert_allclose(*(act.info[DISTRIBUTION]["samples"] for act in (one, other)), atol=ATOL)
 
 
 def test_a_policy_that_reads_no_instruction_does_without(loaded: Load) -> None:

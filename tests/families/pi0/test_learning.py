@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from normal_steps import logprob_of_steps
+from shared_readings import check_shared_readings
 
 from tests.families.pi0 import tiny
 from tests.families.pi0.test_pi0 import BATCHED, begun, seen
@@ -144,14 +145,5 @@ def test_the_samples_of_an_observation_are_of_one_reading_of_it(learnt: Pi0, mon
 
     monkeypatch.setattr(learnt.model.network.model, "embed_prefix", counted)
     views = [seen(0, **{SAMPLES: 8, WANT: ALL}), seen(1), seen(2, **{SAMPLES: 3})]
-    shared = learnt.act_batch(views, [begun(learnt, seed) for seed in range(3)])
-    monkeypatch.setattr(pi0, "shared_frames", lambda rows: (list(range(len(rows))), list(range(len(rows)))))
-    each = learnt.act_batch(views, [begun(learnt, seed) for seed in range(3)])
+    check_shared_readings(learnt, views, begun, pi0, BATCHED)
     assert read == [3, 14]
-    for one, other in zip(shared, each, strict=True):
-        assert isinstance(one, Act)
-        assert isinstance(other, Act)
-        np.testing.assert_allclose(one.action, other.action, atol=BATCHED)
-        if DISTRIBUTION in one.info:
-            samples = [act.info[DISTRIBUTION]["samples"] for act in (one, other)]
-            np.testing.assert_allclose(*samples, atol=BATCHED)

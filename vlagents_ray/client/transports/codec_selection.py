@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -46,9 +45,6 @@ class LinkSpeed:
     def seconds(self, size: int) -> float:
         """Return the time, s, for a message of `size` bytes and a short answer."""
         return self.round_trip_s + size / self.bandwidth
-
-
-_WITHIN_A_MACHINE = LinkSpeed(0.0, math.inf)  # to copy pixels takes less time than to encode them
 
 
 def measure(send: Send, clock: Callable[[], float] = time.perf_counter) -> LinkSpeed:
@@ -108,12 +104,20 @@ def fastest(
         seconds = link.seconds(sizes[codec]) + coding_s
         taken[codec] = seconds if codec.exact else seconds / _JPEG_GAIN
     for codec in sorted(candidates, key=taken.__getitem__):
-        if sizes[codec] > most_bytes:
-            continue
-        with contextlib.suppress(MessageTooLarge):
-            send(bytes_probe(sizes[codec]))
+        if _passes(sizes[codec], send, most_bytes):
             return codec
     return candidates[0]
+
+
+def _passes(size: int, send: Send, most_bytes: float) -> bool:
+    """Whether a message of that size is accepted on the way, which is tried with one of at most `most_bytes`."""
+    if size > most_bytes:
+        return False
+    try:
+        send(bytes_probe(size))
+    except MessageTooLarge:
+        return False
+    return True
 
 
 def coding_cost(cameras: Sequence[np.ndarray], codec: ImageCodec) -> tuple[int, float]:
@@ -138,12 +142,12 @@ def coding_cost(cameras: Sequence[np.ndarray], codec: ImageCodec) -> tuple[int, 
 class CodecChoice:
     """The codec of one session's cameras: the one that the user asks for, or the fastest over the link.
 
-    "auto" takes the fastest of JPEG, PNG and raw; "exact" the faster of PNG and raw. Within a machine that is raw, and
-    nothing is measured.
+    "auto" takes the fastest of JPEG, PNG and raw; "exact" the faster of PNG and raw. Within a machine
+    it is raw without a measurement, unless a message of so many bytes is refused.
     """
 
     def __init__(self, requested: CodecName | ImageCodec) -> None:
-        self.near = False  # whether the server is known to be on this machine
+        self._near = False  # whether the server is known to be on this machine
         self.link: LinkSpeed | None = None
         self.codec: ImageCodec | None = None
         self._candidates: tuple[ImageCodec, ...] = ()  # those that are likely to be short come first
@@ -157,6 +161,10 @@ class CodecChoice:
             self.codec = ImageCodec(requested)
         self._size = 0  # bytes of the images for which the codec was chosen
 
+    def connected(self, *, near: bool) -> None:
+        """Note whether the server is known to be on this machine; called for each new connection."""
+        self._near = near
+
     def codec_for(self, obs: Obs | None, send: Send, most_bytes: float = float("inf")) -> ImageCodec:
         """Return the codec for an observation; probes are sent only if it has yet to be chosen."""
         if not self._candidates or obs is None:
@@ -164,12 +172,13 @@ class CodecChoice:
         size = sum(image.nbytes for image in obs.cameras.values())
         if size and (self.codec is None or not self._size / _RESIZED <= size <= self._size * _RESIZED):
             try:
-                if not self.near:
+                if self._near and _passes(size, send, most_bytes):
+                    self.codec = RAW
+                else:
                     self.link = self.link or measure(send)
-                cameras = list(obs.cameras.values())
-                self.codec = fastest(cameras, self._candidates, self.link or _WITHIN_A_MACHINE, send, most_bytes)
+                    self.codec = fastest(list(obs.cameras.values()), self._candidates, self.link, send, most_bytes)
             except TooManyRequests as error:  # probes count as requests: the key's rate is too low to measure by
-                self.codec = self._candidates[0]
+                self.codec = RAW if self._near else self._candidates[0]
                 time.sleep(min(error.retry_after_s, _RATE_WAIT_S))  # the request that follows counts, too
             self._size = size
         return self.codec or RAW

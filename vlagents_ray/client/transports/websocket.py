@@ -170,7 +170,7 @@ class WebSocketTransport:
             raise self._failure(error, timeout_s) from error
 
     def call_on(self, request: Request, timeout_s: float) -> Reply:
-        """See `RequestChannel`."""
+        """Wait for the next part of a reply, as `RequestChannel` says."""
         if self._socket is None:
             raise ConnectionLost(f"{self._url}: closed between two parts of a chunk; reset before the next act")
         try:
