@@ -1,4 +1,4 @@
-"""What a policy reports while it loads: the step that it is at, and what it could not compile.
+"""What a policy reports while it loads, and the batch sizes for which a compiled one is to be ready.
 
 A server opens a `loading_report` around `Agent.initialize`; without one, progress is only logged.
 """
@@ -6,12 +6,14 @@ A server opens a `loading_report` around `Agent.initialize`; without one, progre
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 
 logger = logging.getLogger(__name__)
+
+COMPILED_SIZES = (1, 2, 4, 8, 16)  # where no server says how large its batches are
 
 
 @dataclass(slots=True)
@@ -19,6 +21,7 @@ class LoadingReport:
     """The report of one policy."""
 
     on_progress: Callable[[str], None]  # called with each step, on the thread that loads
+    batch_sizes: Sequence[int]  # the server's, ascending
     uncompiled: list[str] = field(default_factory=list)  # what runs without compilation, although `compile` is set
 
 
@@ -26,14 +29,27 @@ _report: ContextVar[LoadingReport | None] = ContextVar("_report", default=None)
 
 
 @contextmanager
-def loading_report(on_progress: Callable[[str], None]) -> Iterator[LoadingReport]:
-    """Yield the report of the policy that is loaded in this context."""
-    report = LoadingReport(on_progress)
+def loading_report(
+    on_progress: Callable[[str], None], batch_sizes: Sequence[int] = COMPILED_SIZES
+) -> Iterator[LoadingReport]:
+    """Yield the report of the policy that is loaded in this context.
+
+    Args:
+        on_progress: Called with each step of a long load, on the thread that loads.
+        batch_sizes: For which a policy is compiled whose settings name none, ascending.
+    """
+    report = LoadingReport(on_progress, batch_sizes)
     token = _report.set(report)
     try:
         yield report
     finally:
         _report.reset(token)
+
+
+def served_batch_sizes() -> list[int]:
+    """Return the batch sizes of the server that loads the policy, ascending, for a policy that must fix some."""
+    report = _report.get()
+    return list(COMPILED_SIZES if report is None else report.batch_sizes)
 
 
 def report_progress(step: str) -> None:

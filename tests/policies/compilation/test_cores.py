@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import gc
 import threading
@@ -22,6 +23,7 @@ from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.base.model_inputs import state_vector
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.loading import LoadingReport, loading_report
+from vlagents_ray.serve.engine.engine import Engine
 
 pytestmark = pytest.mark.torch
 
@@ -177,9 +179,36 @@ def test_a_closed_policy_keeps_no_weights(compiler: CountingCompiler) -> None:
     assert weights() is None
 
 
-def test_usual_sizes_if_none_are_given() -> None:
-    assert ModelConfig(checkpoint="any", compile=True).batch_sizes == [1, 2, 4, 8, 16]
-    assert ModelConfig(checkpoint="any").batch_sizes is None
+def test_usual_sizes_if_neither_the_settings_nor_a_server_name_some(compiler: CountingCompiler) -> None:
+    assert made(compile="require").compilation.sizes == [1, 2, 4, 8, 16]
+    assert made().config.batch_sizes is None
+
+
+@pytest.mark.parametrize(
+    ("batch", "own", "sizes"),
+    [
+        ({"max_batch_size": 1}, None, [1]),
+        ({"max_batch_size": 6}, None, [1, 2, 4, 6]),
+        ({"max_batch_size": 8}, None, [1, 2, 4, 8]),
+        ({"max_batch_size": 5, "batch_sizes": [3, 5]}, None, [3, 5]),
+        ({"max_batch_size": 5, "batch_sizes": [3, 5]}, [1, 2], [1, 2]),
+    ],
+)
+def test_the_sizes_are_those_of_the_deployments_batches_unless_the_settings_name_others(
+    compiler: CountingCompiler, batch: dict[str, Any], own: list[int] | None, sizes: list[int]
+) -> None:
+    policy = Linear.from_config({"checkpoint": "none", "compile": "require", "batch_sizes": own})
+    with contextlib.closing(Engine(policy, **batch)) as engine:
+        engine.start()
+        assert (policy.compilation.sizes, policy.config.batch_sizes) == (sizes, sizes)
+        assert sorted(compiler.rows) == sizes
+
+
+def test_a_policy_that_is_not_compiled_keeps_any_size_in_a_server() -> None:
+    policy = Linear.from_config({"checkpoint": "none"})
+    with contextlib.closing(Engine(policy, max_batch_size=6)) as engine:
+        engine.start()
+        assert policy.config.batch_sizes is None
 
 
 @pytest.mark.parametrize("wrong", [lambda out: out + 0.01, lambda out: out * float("nan"), lambda out: out.flip(0)])

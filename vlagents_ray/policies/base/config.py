@@ -10,7 +10,6 @@ from typing_extensions import Self
 from vlagents_ray.policies.base.checkpoint import STEP
 from vlagents_ray.policies.compilation import CompileMode, Quantization
 
-COMPILED_SIZES = [1, 2, 4, 8, 16]
 DType = Literal["auto", "float32", "bfloat16", "float16"]
 NoiseLevel = Annotated[
     float,
@@ -73,7 +72,7 @@ class ModelConfig(BaseModel, extra="forbid"):
     batch_sizes: list[int] | None = Field(
         default=None,
         description="the only numbers of rows to run, ascending; each is run, or compiled, when the model is loaded, "
-        f"smaller batches are padded; unset: {COMPILED_SIZES} if `compile` is set, else any",
+        "smaller batches are padded; unset: if `compile` is set those of the deployment's `batch`, else any",
     )
 
     deterministic: bool = Field(
@@ -107,18 +106,16 @@ class ModelConfig(BaseModel, extra="forbid"):
                 )
         return self
 
-    @model_validator(mode="after")
-    def _compiled_sizes_are_few(self) -> Self:
-        if self.compile and self.batch_sizes is None:
-            self.batch_sizes = list(COMPILED_SIZES)
-        return self
-
     @field_validator("batch_sizes")
     @classmethod
     def _ascending(cls, sizes: list[int] | None) -> list[int] | None:
         if sizes is not None and (not sizes or sizes[0] < 1 or sizes != sorted(set(sizes))):
             raise ValueError(f"got {sizes}, want ascending positive numbers, such as [1, 2, 4, 8, 16]")
         return sizes
+
+    def with_sizes(self, sizes: list[int]) -> Self:
+        """Return the settings with these `batch_sizes`, unless they name others."""
+        return self if self.batch_sizes is not None else self.model_copy(update={"batch_sizes": sizes})
 
     @property
     def rows(self) -> int:

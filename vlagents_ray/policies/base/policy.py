@@ -32,7 +32,7 @@ from vlagents_ray.policies.base.model_inputs import (
 )
 from vlagents_ray.policies.compilation import Compilation, quantize, require_whole
 from vlagents_ray.policies.determinism import require_deterministic
-from vlagents_ray.policies.loading import report_progress
+from vlagents_ray.policies.loading import report_progress, served_batch_sizes
 from vlagents_ray.validation import check_action
 
 
@@ -118,6 +118,8 @@ class ModelPolicy(Agent, abc.ABC):
 
     def initialize(self) -> None:
         """Load the checkpoint; with `batch_sizes`, run each of them once, or compile the model's cores for it."""
+        if self.config.compile:
+            self.config = self.config.with_sizes(served_batch_sizes())
         self.model = self._load_with_adapters() if self.config.adapters else self.load()
         if self.config.quantization:
             quantize(self, self.config.quantization)

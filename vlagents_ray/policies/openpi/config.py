@@ -38,5 +38,6 @@ class OpenPiConfig(ModelConfig):
     noise_level: NoiseLevel = 0.0
     batch_sizes: list[int] | None = Field(
         default=None,
-        description="the only numbers of rows to run; unset: [1, 2, 4, 8, 16] for JAX or with `compile`, else any",
+        description="the only numbers of rows to run; unset: for JAX or with `compile` those of the "
+        "deployment's `batch`, else any",
     )

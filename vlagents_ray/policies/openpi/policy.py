@@ -23,6 +23,7 @@ from vlagents_ray.policies.base.model_inputs import (
 )
 from vlagents_ray.policies.base.realtime import Guide
 from vlagents_ray.policies.flow import OFFERED
+from vlagents_ray.policies.loading import served_batch_sizes
 from vlagents_ray.policies.openpi.config import OpenPiConfig
 from vlagents_ray.policies.openpi.models import OpenPiModel, load_jax, load_torch
 from vlagents_ray.policies.openpi.robots import RobotConvention, choose_robot
@@ -30,7 +31,6 @@ from vlagents_ray.policies.openpi.training import FOLDERS, SOURCE, train_config
 from vlagents_ray.policies.openpi.transforms import Transforms
 from vlagents_ray.registry import require
 
-_JAX_SIZES = [1, 2, 4, 8, 16]
 _REMOTE = "://"
 
 
@@ -99,8 +99,7 @@ class OpenPi(ModelPolicy):
         elif (folder / "params").is_dir():
             if self.config.compile:
                 raise ConfigError("compile: openpi's JAX models always are; leave it out")
-            if self.config.batch_sizes is None:
-                self.config = self.config.model_copy(update={"batch_sizes": _JAX_SIZES})
+            self.config = self.config.with_sizes(served_batch_sizes())
             model = load_jax(config, folder, self.config)
         else:
             raise ConfigError(

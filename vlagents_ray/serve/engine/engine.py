@@ -65,6 +65,7 @@ class Engine:
         finder: SessionFinder | None = None,
     ) -> None:
         """With `batch_sizes`, batches are padded to the next of these sizes; the largest is `max_batch_size`.
+        Without, a compiled policy that names no sizes is compiled for 1, 2, 4, … `max_batch_size`.
 
         `version` is the policy's version: sessions only move between replicas of equal version and settings. `check`
         raises an error if a policy with that contract cannot be served. The engine is unhealthy while a call exceeds
@@ -78,7 +79,7 @@ class Engine:
             session_limit, session_idle_s, wall_clock, self._session_ended
         )
         self.calls, self.pauses = PolicyCalls(limits, clock), PauseDetector(clock)
-        loader = Loader(self._source, version, batch_sizes, check, self.calls)
+        loader = Loader(self._source, version, batch_sizes, max_batch_size, check, self.calls)
         self.models = ModelManager(self._source, loader, self.sessions)
         self.stats, self.admission = MetricsBuffer(), Admission(in_flight_bytes)
         self._batch_sizes, self._reply_bytes = batch_sizes, reply_bytes

@@ -21,7 +21,7 @@ from vlagents_ray.policies.loading import loading_report
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.models.checkpoints import Checkpoints, resolved
-from vlagents_ray.serve.models.padding import Padding
+from vlagents_ray.serve.models.padding import Padding, powers_up_to
 from vlagents_ray.serve.queue.call_limits import LOAD, PolicyCall, PolicyCalls
 from vlagents_ray.serve.queue.checkpoint_choice import CheckpointChoice
 from vlagents_ray.serve.weights.versions import DIGITS, ModelWeights
@@ -110,6 +110,7 @@ class Loader:
         source: Checkpoints,
         version: str,
         batch_sizes: Sequence[int],
+        max_batch_size: int,
         check: Callable[[Contract | None], None],
         calls: PolicyCalls,
     ) -> None:
@@ -117,6 +118,7 @@ class Loader:
         self._source = source
         self._version = version
         self._batch_sizes = batch_sizes
+        self._compiled_sizes = batch_sizes or powers_up_to(max_batch_size)
         self._check = check
         self._calls = calls
         self.on_progress: Callable[[str], None] = lambda _: None  # called with each step of a long load
@@ -138,7 +140,7 @@ class Loader:
     def _load(self, choice: CheckpointChoice, settings: dict[str, Any], agent: Agent | None) -> LoadedModel:
         agent = agent or self._source.make(settings)
         try:
-            with used_checkpoints() as found, loading_report(self.on_progress) as report:
+            with used_checkpoints() as found, loading_report(self.on_progress, self._compiled_sizes) as report:
                 agent.initialize()
             weights = agent.weights_id or weights_of(found)
             contract = agent.contract

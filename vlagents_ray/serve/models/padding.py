@@ -22,6 +22,11 @@ class _DummySession:
     acts: int = 0
 
 
+def powers_up_to(most: int) -> list[int]:
+    """Return 1, 2, 4, … and, as the last of them, `most`."""
+    return [*(2**power for power in range((most - 1).bit_length())), most]
+
+
 class Padding:
     """Dummy sessions that pad a batch to the next of `sizes`. May only be used on the policy's thread.
 
