@@ -8,6 +8,7 @@ import gc
 import threading
 import weakref
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -228,6 +229,35 @@ def test_a_program_with_other_results_is_not_used(
 def test_the_rounding_of_a_program_is_accepted(compiler: CountingCompiler) -> None:
     compiler.change[1] = lambda out: out * 1.0001
     assert loaded(compile="require", batch_sizes=[1])[0].compilation.sizes == [1]
+
+
+class Candidates(Linear):
+    """A model that runs five rows for each of a batch, at most three at a time, as a planner tries plans."""
+
+    def load(self) -> Any:
+        model = super().load()
+        self.pass_of = partial(self._in_passes, self.compilation.core("tried", self._layer(model), rows=3))
+        return model
+
+    def _in_passes(self, core: Callable[..., Any], states: Any, noise: Any) -> Any:
+        tried = [one.repeat_interleave(5, dim=0).split(3) for one in (states, noise)]
+        return torch.cat([core(*each) for each in zip(*tried, strict=True)])[::5]
+
+
+def test_a_core_of_its_own_number_of_rows_has_one_program_for_all_batches(compiler: CountingCompiler) -> None:
+    policy = made(Candidates, compile="require", batch_sizes=[1, 2])
+    assert compiler.rows == [3]
+    for seeds in ([0], [0, 1], [0, 1, 2]):
+        for one, other in zip(acted(policy, seeds), acted(made(), seeds), strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-6)
+    assert compiler.rows == [3]
+
+
+def test_a_program_of_its_own_number_of_rows_that_is_wrong_is_not_used(compiler: CountingCompiler) -> None:
+    compiler.change[3] = lambda out: out + 0.01
+    policy, report, _ = loaded(Candidates, compile=True, batch_sizes=[1, 2])
+    assert (policy.compilation.sizes, len(report.uncompiled)) == ([], 2)
+    np.testing.assert_allclose(acted(policy, [0])[0], acted(made(), [0])[0], atol=1e-6)
 
 
 def test_what_is_required_and_wrong_is_an_error(compiler: CountingCompiler) -> None:

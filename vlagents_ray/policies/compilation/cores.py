@@ -52,17 +52,19 @@ class Compilation:
         if mode:
             keep_torch_programs()
 
-    def core(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    def core(self, name: str, function: Callable[..., Any], rows: int | None = None) -> Callable[..., Any]:
         """Return a function's compiled form, or the function itself if nothing is compiled.
 
         Args:
             name: The core's name in messages.
             function: The core. Its arguments are tensors on the model's device. It must read nothing that changes but
                 the model's weights, whose values may change.
+            rows: The most rows of a call, if that does not follow from the batch size, such as those of a planner's
+                candidates: the core then has one program, for so many rows. None: those of each batch size.
         """
         if not self.mode:
             return function
-        self.cores.append(Core(self, name, function))
+        self.cores.append(Core(self, name, function, rows))
         return self.cores[-1]
 
     def add_size(self, size: int, forward: Callable[[], object]) -> None:
@@ -99,8 +101,8 @@ class Compilation:
 class Core:
     """A core with its programs."""
 
-    def __init__(self, owner: Compilation, name: str, function: Callable[..., Any]) -> None:
-        self._owner, self._name, self._function = owner, name, function
+    def __init__(self, owner: Compilation, name: str, function: Callable[..., Any], rows: int | None) -> None:
+        self._owner, self._name, self._function, self._rows = owner, name, function, rows
         self._programs: dict[int, Callable[..., Any]] = {}
         self._shapes: dict[int, list[Any]] = {}  # of a row of each argument, for each program
 
@@ -108,17 +110,18 @@ class Core:
         """Return the core's result for a batch of any size."""
         rows, building = len(tensors[0]), self._owner.building
         tensors = tuple(map(_of_one_kind, tensors))
-        if building == rows:
+        if building is not None and rows == (self._rows or building):
             return self._compared(tensors)
-        size = next((size for size in self._owner.sizes if size >= rows and size in self._programs), None)
+        sizes = self._owner.sizes if self._rows is None else [self._rows]
+        size = next((size for size in sizes if size >= rows and size in self._programs), None)
         if size is None or building is not None or self._shapes[size] != _row_shapes(tensors):
             return self._function(*tensors)
         result = self._programs[size](*(_padded(tensor, size) for tensor in tensors))
         return tuple(one[:rows] for one in result) if isinstance(result, tuple) else result[:rows]
 
     def drop(self, size: int) -> None:
-        """Drop the program for a batch size."""
-        self._programs.pop(size, None)
+        """Drop the program for a batch size, and one for a number of rows unless another batch size proved it."""
+        self._programs.pop(size if self._rows is None or self._owner.sizes else self._rows, None)
 
     def _compared(self, tensors: Sequence[Any]) -> Any:
         """Return the eager result, once the program is made and its result is near it."""

@@ -13,8 +13,7 @@ from vlagents_ray.policies.base.config import ModelConfig
 class VJepa2AcConfig(ModelConfig):
     """Settings of V-JEPA 2-AC, beside those of all models: its checkpoint, and the search for plans."""
 
-    deterministic: Literal[False] = Field(default=False, description="not for this family, either")
-    compile: Literal[False] = Field(default=False, description="not for this family: its batches have too many sizes")
+    deterministic: Literal[False] = Field(default=False, description="not for this family")
     encoder: str | None = Field(
         default=None, description="folder or hub id of a `VJEPA2Model` instead of the encoder in the checkpoint"
     )
@@ -41,6 +40,11 @@ class VJepa2AcConfig(ModelConfig):
     maxnorm: float = Field(default=0.05, gt=0, description="largest step along each axis, m")
     close_gripper: int | None = Field(default=None, ge=0, description="step of a plan from which on the gripper closes")
     pass_size: int = Field(default=400, ge=1, description="largest number of plans in a forward pass of the predictor")
+
+    @property
+    def plans_a_pass(self) -> int:
+        """The largest number of plans in a forward pass of the predictor; compiled, every full pass has as many."""
+        return min(self.samples, self.pass_size) if self.compile else self.pass_size
 
     @model_validator(mode="after")
     def _chosen_from_more(self) -> Self:

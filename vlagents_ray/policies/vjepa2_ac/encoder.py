@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.accelerator import ensure_torchvision
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, from_pretrained, require_loaded
+from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.vjepa2_ac.config import VJepa2AcConfig
 from vlagents_ray.registry import require
 
@@ -34,17 +35,25 @@ def to_pixels(image: np.ndarray, side: int) -> np.ndarray:
 class Encoder:
     """Computes features of still images, which are repeated for the two frames of one step of the encoder."""
 
-    def __init__(self, model: Any, normalize: bool) -> None:
+    def __init__(self, model: Any, normalize: bool, compilation: Compilation) -> None:
         self._model = model
-        self._normalize = normalize
+        self._normalized = normalizer(normalize)
+        self._encode = compilation.core("encode", self._features)
 
-    def __call__(self, pixels: np.ndarray) -> Any:
-        """Compute features (B, N, F) of images (B, 3, side, side)."""
-        torch = require("torch")
-        device = self._model.device
-        clip = torch.as_tensor(pixels).to(device, self._model.dtype, non_blocking=True)[:, None].repeat(1, 2, 1, 1, 1)
-        features = self._model(pixel_values_videos=clip, skip_predictor=True).last_hidden_state.float()
-        return torch.nn.functional.layer_norm(features, features.shape[-1:]) if self._normalize else features
+    def __call__(self, pixels: Sequence[np.ndarray]) -> Any:
+        """Compute features (B, N, F) of images, each (3, side, side) float32."""
+        images = require("torch").as_tensor(np.stack(pixels))
+        return self._encode(images.to(self._model.device, self._model.dtype, non_blocking=True))
+
+    def _features(self, images: Any) -> Any:
+        clip = images[:, None].repeat(1, 2, 1, 1, 1)
+        return self._normalized(self._model(pixel_values_videos=clip, skip_predictor=True).last_hidden_state.float())
+
+
+def normalizer(normalize: bool) -> Callable[[Any], Any]:
+    """Return a function that normalises features (..., F), or else returns them as they are."""
+    layer_norm = require("torch").nn.functional.layer_norm
+    return lambda features: layer_norm(features, features.shape[-1:]) if normalize else features
 
 
 def load_encoder(config: VJepa2AcConfig, saved: Mapping[str, Any] | None) -> Any:

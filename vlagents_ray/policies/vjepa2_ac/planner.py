@@ -43,7 +43,7 @@ def plan(world: World, features: Tensor, poses: Tensor, goals: Tensor, noise: Te
     energy = torch.zeros(len(poses), 0)
     for draws in noise.unbind(1):
         tried = _bounded(draws * std[:, :, None] + mean[:, :, None], config)  # (B, H, S, 4)
-        energy = _energies(world, features, poses, goals, _actions(tried.transpose(1, 2)), config.pass_size)
+        energy = _energies(world, features, poses, goals, _actions(tried.transpose(1, 2)), config.plans_a_pass)
         best = energy.topk(config.topk, largest=False).indices  # (B, K)
         chosen = tried.gather(2, best[:, None, :, None].expand(-1, config.rollout, -1, DRAWN))
         mean = chosen.mean(2) * (1 - keep_mean) + mean * keep_mean

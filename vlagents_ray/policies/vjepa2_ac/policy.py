@@ -21,10 +21,11 @@ from vlagents_ray.policies.base.model_inputs import (
     state_specs,
     state_vector,
 )
+from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.vjepa2_ac.config import VJepa2AcConfig
-from vlagents_ray.policies.vjepa2_ac.encoder import Encoder, load_encoder, to_pixels
+from vlagents_ray.policies.vjepa2_ac.encoder import Encoder, load_encoder, normalizer, to_pixels
 from vlagents_ray.policies.vjepa2_ac.planner import DRAWN, Tensor, plan
-from vlagents_ray.policies.vjepa2_ac.predictor import load_predictor, read_checkpoint
+from vlagents_ray.policies.vjepa2_ac.predictor import load_predictor, read_checkpoint, usual_attention
 from vlagents_ray.registry import require
 
 CAMERA = "front"  # the model has one camera, without a name
@@ -43,10 +44,16 @@ class Frame:
 class WorldModel:
     """The encoder and the predictor; weights and features are float32, computations may be in another type."""
 
-    def __init__(self, encoder: Any, predictor: Any, config: VJepa2AcConfig, dtype: Any) -> None:
-        self.encode = Encoder(encoder, config.normalize)
+    def __init__(
+        self, encoder: Any, predictor: Any, config: VJepa2AcConfig, dtype: Any, compilation: Compilation
+    ) -> None:
+        self.encode = Encoder(encoder, config.normalize, compilation)
         self._predictor = predictor
-        self._normalize = config.normalize
+        self._following = [  # by the number of frames that are known
+            compilation.core(f"predict frame {frames + 1}", self._predict, config.plans_a_pass)
+            for frames in range(1, config.rollout + 1)
+        ]
+        self._normalized = normalizer(config.normalize)
         self._device, self._dtype = encoder.device.type, dtype
 
     def autocast(self) -> Any:
@@ -56,10 +63,11 @@ class WorldModel:
 
     def __call__(self, features: Tensor, actions: Tensor, poses: Tensor) -> Tensor:
         """Predict the next frame's features (see `planner.World`)."""
-        torch = require("torch")
+        return self._following[features.shape[1] - 1](features, actions, poses)
+
+    def _predict(self, features: Tensor, actions: Tensor, poses: Tensor) -> Tensor:
         tokens = features.shape[2]
-        following = self._predictor(features.flatten(1, 2), actions, poses)[:, -tokens:].float()
-        return torch.nn.functional.layer_norm(following, following.shape[-1:]) if self._normalize else following
+        return self._normalized(self._predictor(features.flatten(1, 2), actions, poses)[:, -tokens:].float())
 
 
 class VJepa2Ac(ModelPolicy):
@@ -101,7 +109,7 @@ class VJepa2Ac(ModelPolicy):
         dtype = torch_dtype(self.config.dtype, device, preferred="float32")  # upstream plans in float32
         encoder = load_encoder(self.config, saved.get("encoder"))
         predictor = load_predictor(self.config, saved["predictor"], encoder.config.hidden_size)
-        return WorldModel(encoder.to(device).eval(), predictor.to(device).eval(), self.config, dtype)
+        return WorldModel(encoder.to(device).eval(), predictor.to(device).eval(), self.config, dtype, self.compilation)
 
     def notice(self, obs: Obs) -> None:
         """Set the goal to that of an observation, if it has one; features of the same image are kept."""
@@ -135,17 +143,17 @@ class VJepa2Ac(ModelPolicy):
         config, world = self.config, self.model
         new = [row for row in rows if _GOAL_FEATURES not in row.memory]
         shape = (config.iterations, config.rollout, config.samples, DRAWN)
-        with torch.inference_mode(), world.autocast():
-            pixels = [row.frames[-1].pixels for row in rows] + [row.memory[_GOAL] for row in new]
-            features = world.encode(np.stack(pixels))
-            for row, goal in zip(new, features[len(rows) :], strict=True):
+        with torch.inference_mode(), world.autocast(), usual_attention():
+            features = world.encode([row.frames[-1].pixels for row in rows])
+            goals_of_new = world.encode([row.memory[_GOAL] for row in new]) if new else []
+            for row, goal in zip(new, goals_of_new, strict=True):
                 row.memory[_GOAL_FEATURES] = goal.clone()
             poses, noise = (
                 torch.as_tensor(np.stack(parts)).to(features.device, non_blocking=True)
                 for parts in ([row.frames[-1].pose for row in rows], [row.noise(*shape) for row in rows])
             )
             goals = torch.stack([row.memory[_GOAL_FEATURES] for row in rows])
-            plans = plan(world, features[: len(rows)], poses, goals, noise, config)
+            plans = plan(world, features, poses, goals, noise, config)
         actions, std, energy = (part.cpu().numpy() for part in (plans.actions, plans.std, plans.energy))
         predictions = []
         for i, row in enumerate(rows):

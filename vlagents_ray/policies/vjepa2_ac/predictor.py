@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -69,6 +70,20 @@ def load_predictor(config: VJepa2AcConfig, saved: Mapping[str, Any], width: int)
         ) from error
     require_loaded(model, saved)
     return model
+
+
+@contextmanager
+def usual_attention() -> Iterator[None]:
+    """Have upstream's attention use torch's choice of a kernel as it is.
+
+    Upstream sets that choice to torch's default for each layer, by a deprecated function that cannot be compiled.
+    """
+    backend = require("torch").backends.cuda
+    setter, backend.sdp_kernel = backend.sdp_kernel, nullcontext
+    try:
+        yield
+    finally:
+        backend.sdp_kernel = setter
 
 
 def _only(folder: Path) -> Path:
