@@ -12,6 +12,9 @@ import itertools
 import statistics
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from multiprocessing import get_context
 from typing import Annotated, Any, ClassVar
 
 import numpy as np
@@ -93,17 +96,17 @@ def served(policy: str, config: dict[str, Any], patience: float, **settings: Any
         yield measure
 
 
-@contextlib.contextmanager
-def torchrl_collector(layout: str, policy: str, **settings: Any) -> Iterator[Callable[[int], float]]:
-    """Yield a function that returns the steps a second of TorchRL's collector; see `collected`."""
+def torchrl_rate(layout: str, policy: str, episodes: int, **settings: Any) -> float:
+    """Return the steps a second of TorchRL's collector, in a process that is gone afterwards; see `rate` there."""
     try:
-        from benchmarks.torchrl_collector import collected
+        from benchmarks.torchrl_collector import rate
     except ModuleNotFoundError as error:
         raise typer.BadParameter(f"TorchRL is not installed ({error}): pip install torchrl") from error
     slow = policy == "slow"
     name, config = _POLICIES[policy]
-    with collected(name, config, grouped=layout == "grouped", whole_batches=slow, images=slow, **settings) as measure:
-        yield measure
+    settings |= {"grouped": layout == "grouped", "whole_batches": slow, "images": slow}
+    with ProcessPoolExecutor(1, get_context("spawn")) as process:
+        return process.submit(rate, name, config, episodes=episodes, **settings).result()
 
 
 def main(
@@ -135,8 +138,8 @@ def main(
     with contextlib.ExitStack() as stack:
         settings = {"workers": workers, "num_envs": num_envs}
         ways: dict[str, Callable[[int], float]] = {"loop": plain}
-        if torchrl:  # first, so that its processes are started before Ray
-            ways["torchrl"] = stack.enter_context(torchrl_collector(torchrl, policy, options=options, **settings))
+        if torchrl:
+            ways["torchrl"] = partial(torchrl_rate, torchrl, policy, options=options, **settings)
         measure = stack.enter_context(served(name, config, patience, images=images, env_options=options, **settings))
         for _ in range(rounds):
             rates = {way: rate(episodes) for way, rate in ways.items()}

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import itertools
 import time
-from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
@@ -82,24 +80,25 @@ def _module(name: str, config: dict[str, Any], in_keys: list[str]) -> TensorDict
     return TensorDictModule(TorchPolicy(name, config), in_keys=in_keys, out_keys=["action"])
 
 
-@contextlib.contextmanager
-def collected(
+def rate(
     policy: str,
     config: dict[str, Any],
     options: dict[str, Any],
+    episodes: int,
     *,
     workers: int,
     num_envs: int,
     grouped: bool,
     whole_batches: bool,
     images: bool,
-) -> Iterator[Callable[[int], float]]:
-    """Yield a function that returns the steps a second of so many episodes of TorchRL's collector.
+) -> float:
+    """Return the steps a second of TorchRL's collector; in a process of its own, since its threads never rest.
 
     Args:
         policy: The policy's name.
         config: Its settings.
         options: The options of the environments.
+        episodes: Episodes that are measured, a multiple of all environments.
         workers: Processes of environments.
         num_envs: Environments of each of these.
         grouped: Whether these are the processes, which its coordinator in this process steps; if not, each environment
@@ -121,23 +120,11 @@ def collected(
         transition_chunk_size="auto" if grouped else steps,
         server_config=server,
     )
-    batches = iter(collector)
-    next(batches)  # processes start
-    with contextlib.ExitStack() as paused:
-        paused.enter_context(collector.pause(None))
-
-        def measure(episodes: int) -> float:
-            paused.close()
-            for _ in range(3):  # it has collected ahead, at most two episodes of each environment
-                next(batches)
-            begun = time.perf_counter()
-            frames: int = sum(next(batches).numel() for _ in range(episodes // total))
-            rate = frames / (time.perf_counter() - begun)
-            paused.enter_context(collector.pause(None))
-            return rate
-
-        try:
-            yield measure
-        finally:
-            paused.close()
-            collector.shutdown()
+    try:
+        batches = iter(collector)
+        next(batches)  # processes start
+        begun = time.perf_counter()
+        frames: int = sum(next(batches).numel() for _ in range(episodes // total))
+        return frames / (time.perf_counter() - begun)
+    finally:
+        collector.shutdown()
