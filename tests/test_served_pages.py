@@ -71,6 +71,7 @@ def test_modules_of_ones_own_are_served_and_evaluated_from_their_folder(tmp_path
         f"serving Reach at {url}",
         "  policy: my_policies:Reach (gain=0.3)",
         f"  how to talk to it: {url}/docs",
+        f"  what it does now: {url}/live",
         f"Ray programs of yours on this machine: vlagents_ray.join('{url}')",
         "Ctrl-C stops",
     ]

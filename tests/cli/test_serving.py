@@ -86,6 +86,7 @@ def test_a_server_says_its_policy_its_page_and_where_each_kind_of_client_connect
     assert said[2:] == [
         "  policy: noop (action_dim=7)",
         "  how to talk to it: https://127.0.0.1:8000/docs",
+        "  what it does now: https://127.0.0.1:8000/live",
         "  openpi: wss://127.0.0.1:8000/, wss://127.0.0.1:8000/openpi",
         "  gr00t: tcp://0.0.0.0:5556",
         "  vlagents: rpyc://0.0.0.0:8080",

@@ -63,6 +63,9 @@ from vlagents_ray.serve.endpoints.local.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.endpoints.weights import weights_routes
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.live.endpoint import live_routes
+from vlagents_ray.serve.live.fleet import Fleet
+from vlagents_ray.serve.live.snapshot import ReplicaView
 from vlagents_ray.serve.ports import free_port, reserve
 from vlagents_ray.serve.weights.updates import PushResult
 from vlagents_ray.weights.safetensors import header_of
@@ -166,8 +169,10 @@ class KeyedReplica:
             each.open()
         self.engine.start()
         routes = dialect_routes(DialectArgs(**ALL), ReplicaContext(self.engine, lambda: METADATA, LIMITS))
-        weights = weights_routes(_Receiving(self), 30.0, open_to_network=False)
-        inside = build_http_app(self.engine, lambda: METADATA, LIMITS, dialects=routes, weights=weights)
+        view = ReplicaView(self.engine, "this", "here", lambda: METADATA | {"policy_version": None})
+        live = live_routes(Fleet(view), open_to_network=False)
+        others = [*weights_routes(_Receiving(self), 30.0, open_to_network=False), *live]
+        inside = build_http_app(self.engine, lambda: METADATA, LIMITS, dialects=routes, others=others)
         self.routes = inside.routes
         self.port = stack.enter_context(served(AccessMiddleware(inside, self.known.keys, "app")))
         check = partial(self.at_gateway.check, app="app")
@@ -507,11 +512,11 @@ class _Receiving:
         return [1]
 
 
-def _with_scope(way: Way) -> Way:
-    """The same, with keys that may push weights."""
+def _with_scope(scope: str, way: Way) -> Way:
+    """The same, with keys of this scope."""
 
     def attempt(visitor: Visitor, when: str) -> str:
-        visitor.replica.known.change(visitor.name, scopes=["weights"])
+        visitor.replica.known.change(visitor.name, scopes=[scope])
         return way(visitor, when)
 
     return attempt
@@ -524,6 +529,14 @@ def _weights(mark: str) -> bytes:
 def _read_pushed(data: bytes | str) -> str:
     answer = json.loads(data)
     return str(BY_CODE[answer["code"]].status) if "code" in answer else "done"
+
+
+def _watch(_mark: str) -> bytes:
+    return b'{"shown": []}'
+
+
+def _read_seen(data: bytes | str) -> str:
+    return "200" if isinstance(data, bytes) else str(BY_CODE[json.loads(data)["code"]].status)
 
 
 def _stream_message(mark: str) -> bytes:
@@ -563,9 +576,14 @@ WAYS: dict[str, Way] = {
     "`WS /roboarena`": over_websocket("/roboarena", _arena, _read_map),
     "`WS /vla-eval`": over_websocket("/vla-eval", _see, _read_vla_eval),
     "`GET /v1/weights`": over_http("GET", "/v1/weights"),
-    "`GET /v1/weights`, scope `weights`": _with_scope(over_http("GET", "/v1/weights")),
+    "`GET /v1/weights`, scope `weights`": _with_scope("weights", over_http("GET", "/v1/weights")),
     "`WS /v1/weights`": over_websocket("/v1/weights", _weights, _read_pushed),
-    "`WS /v1/weights`, scope `weights`": _with_scope(over_websocket("/v1/weights", _weights, _read_pushed)),
+    "`WS /v1/weights`, scope `weights`": _with_scope("weights", over_websocket("/v1/weights", _weights, _read_pushed)),
+    "`GET /live`": over_http("GET", "/live"),
+    "`GET /v1/live`": over_http("GET", "/v1/live"),
+    "`GET /v1/live`, scope `watch`": _with_scope("watch", over_http("GET", "/v1/live")),
+    "`WS /v1/live`": over_websocket("/v1/live", _watch, _read_seen),
+    "`WS /v1/live`, scope `watch`": _with_scope("watch", over_websocket("/v1/live", _watch, _read_seen)),
     "own port": over_websocket("own", _stream_message, _read_reply),
     "own port, another path": over_websocket("own/x", _stream_message, _read_reply),
     "shared memory": over_shm,

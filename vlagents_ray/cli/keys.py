@@ -36,7 +36,10 @@ def new(
     rate: Annotated[float | None, typer.Option(help="Requests a second, at each replica.")] = None,
     sessions: Annotated[int | None, typer.Option(min=1, help="Sessions held at once, at each replica.")] = None,
     rank: Annotated[str | None, typer.Option(help="'simulation': none of its requests goes before a robot's.")] = None,
-    scope: Annotated[list[str], typer.Option(help="'weights': it may also push new weights; repeatable.")] = [],  # noqa: B006
+    scope: Annotated[
+        list[str],
+        typer.Option(help="'weights': it may also push new weights; 'watch': it sees all sessions; repeatable."),
+    ] = [],  # noqa: B006
     days: Annotated[float | None, typer.Option(help="It expires after so many days.")] = None,
 ) -> None:
     """Make a key. It is shown this once; the file keeps its hash."""

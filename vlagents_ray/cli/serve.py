@@ -117,6 +117,8 @@ def connection_lines(
         yield f"  policy: {args.policy}" + (f" ({settings})" if settings else "")
         keyed = not insecure and (keys is not None or _wants_key(args))
         yield f"  how to talk to it: {_page(url) if keyed else f'{url}/docs'}"
+        if not (insecure or args.access.insecure):  # then nobody may watch
+            yield f"  what it does now: {url}/live"
         for name, one in describe(args.dialects).items():
             places = [one["address"]] if "address" in one else [_address(url, path) for path in one["paths"]]
             yield f"  {name}: {', '.join(places)}"

@@ -61,10 +61,15 @@ class ImageCodec:
         return jpeg_png.encode_png(image)
 
 
+DecodedFiles = dict[int, tuple[np.ndarray, "bytes | memoryview"]]
+"""The image and the file that it was decoded from, by the `id` of the image."""
+
+
 class PixelBudget(Protocol):
     """The limits of a message; see `vlagents_ray.protocol.budget`."""
 
     serial: bool
+    files: DecodedFiles | None  # gets the files of the images that are decoded; None if nobody needs them
 
     @property
     def pixels(self) -> int:
@@ -123,6 +128,10 @@ def decode_files(
     decode = partial(attributed, jpeg_png.decode)
 
     if budget.serial or not files:
-        return [decode(file) for file in files]
-    is_jpeg = bytes(files[0][:3]) == jpeg_png.JPEG_MAGIC  # as are the others, usually
-    return thread_map(decode, files, (_JPEG_S if is_jpeg else _PNG_S) * size)
+        images = [decode(file) for file in files]
+    else:
+        is_jpeg = bytes(files[0][:3]) == jpeg_png.JPEG_MAGIC  # as are the others, usually
+        images = thread_map(decode, files, (_JPEG_S if is_jpeg else _PNG_S) * size)
+    if budget.files is not None:
+        budget.files.update((id(image), (image, file)) for image, file in zip(images, files, strict=True))
+    return images

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from vlagents_ray.errors import MessageTooLarge
+from vlagents_ray.images.codecs import DecodedFiles
 from vlagents_ray.protocol.messages import Limits
 
 
@@ -13,11 +14,12 @@ class Budget:
     allow, and decides on which thread to decode: `vlagents_ray.serve.engine.admission.MessageAdmission`.
     """
 
-    __slots__ = ("_left", "limits", "serial")
+    __slots__ = ("_left", "files", "limits", "serial")
 
     def __init__(self, limits: Limits) -> None:
         self.limits = limits
         self.serial = False  # whether images are decoded one after the other
+        self.files: DecodedFiles | None = None  # see `PixelBudget`
         self._left = limits.decoded_bytes
 
     @property

@@ -45,6 +45,7 @@ class Session(Generic[M]):
     agent: Agent | None = None  # None until the first `reset` succeeded
     model: M | None = None  # model of which `agent` is a copy; only the model manager and its cache set it
     weights: WeightsVersion | None = None  # version of the model's weights with which it acts
+    instruction: str = ""  # of its last reset
     follows: bool = True  # whether it takes the newest version of the weights, otherwise the pinned one
     over: bool = False  # whether the session has ended, so that no table contains it
     resetting: PendingRequest | None = None  # reset that waits for its checkpoint

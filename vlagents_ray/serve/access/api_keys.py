@@ -32,6 +32,7 @@ from vlagents_ray.serve.access.key_store import Key, parse_keys, read_text
 logger = logging.getLogger(__name__)
 
 FILE_VARIABLE, TEXT_VARIABLE = "VLAGENTS_RAY_KEYS_FILE", "VLAGENTS_RAY_KEYS"
+_KEY_PROTOCOL = "vlagents.key."  # begins the subprotocol of a WebSocket that states a key
 _THROTTLED_S = (0.05, 1.0)  # minimum and maximum time for which a sender over its rate is not read
 _CHECK_S = 1.0  # minimum time between two checks of the file
 _CLOSE_S = 300.0  # time for which the keys stay valid while the file cannot be read
@@ -288,12 +289,15 @@ def load_keys(file: str | None = None, environment: Mapping[str, str] = os.envir
 def token_of(headers: Mapping[str, str]) -> str | None:
     """Return the key of a request: `Authorization: Bearer KEY`, `Authorization: Api-Key KEY` or `x-api-key: KEY`.
 
-    openpi's client sends the second form. The names in `headers` must be in lower case.
+    openpi's client sends the second form. A page in a browser, which can set no header of a WebSocket, states the key
+    among its subprotocols, as `vlagents.key.KEY`. The names in `headers` must be in lower case.
     """
     kind, _, token = headers.get("authorization", "").strip().partition(" ")
     if kind.lower() in ("bearer", "api-key") and token.strip():
         return token.strip()
-    return headers.get("x-api-key") or None
+    offered = (one.strip() for one in headers.get("sec-websocket-protocol", "").split(","))
+    stated = (one.removeprefix(_KEY_PROTOCOL) for one in offered if one.startswith(_KEY_PROTOCOL))
+    return headers.get("x-api-key") or next(stated, None)
 
 
 Identity = Caller | NoKey

@@ -1,8 +1,8 @@
 """Access control of a replica's HTTP paths and WebSockets: API keys, and time limits for slow clients.
 
 The middleware is an ASGI application around another one, so that everything behind it, the dialects included, is
-protected in the same way. Only `/healthz` requires no key; it reports only whether the policy is ready, or which
-step of loading it is at. A WebSocket is refused before it is accepted.
+protected in the same way. Two paths require no key: `/healthz` reports only whether the policy is ready, or which step
+of loading it is at, and `/live` is a page without data. A WebSocket is refused before it is accepted.
 """
 
 from __future__ import annotations
@@ -29,6 +29,8 @@ from vlagents_ray.serve.access.origin_check import require_own_page
 from vlagents_ray.serve.endpoints.http_messages import headers_of, named, problem_response
 
 logger = logging.getLogger(__name__)
+
+LIVE_PAGE = "/live"  # see `vlagents_ray.serve.live.endpoint`
 
 _TICK_S = 0.5  # period at which a WebSocket's key and time limits are checked
 _DROPPED_BYTES = 2**20  # a refused request with a longer body loses its connection
@@ -74,7 +76,7 @@ class AccessMiddleware:
         headers = headers_of(scope)
         caller: Identity = NoKey.OPEN
         try:
-            if _asks_for_health(scope):
+            if _is_public(scope):
                 pass
             elif self._keys is None:
                 require_own_page(headers, self._hosts)  # any page that the robot's user opens can reach loopback
@@ -101,10 +103,10 @@ class AccessMiddleware:
                 await self._app(scope, receive, send)
 
 
-def _asks_for_health(scope: Scope) -> bool:
+def _is_public(scope: Scope) -> bool:
     path: str = scope["path"]
-    root: str = scope.get("root_path", "")
-    return scope["type"] == "http" and scope["method"] in ("GET", "HEAD") and path in ("/healthz", f"{root}/healthz")
+    path = path.removeprefix(scope.get("root_path", ""))
+    return scope["type"] == "http" and scope["method"] in ("GET", "HEAD") and path in ("/healthz", LIVE_PAGE)
 
 
 def _has_body(scope: Scope, most: int = 0) -> bool:

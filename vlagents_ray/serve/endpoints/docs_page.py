@@ -51,6 +51,8 @@ _PATHS = f"""\
 `WS /v1/weights`, `GET /v1/weights`
     New weights from a learner, with a key of the scope `weights`; see `vlagents_ray.learn.Publisher`. The versions
     that act.
+`GET /live`
+    A page that shows what the sessions do now. With keys, it asks for one with the scope `watch`.
 `GET /v1/metadata`
     Policy, checkpoint, contract, protocol version, every way in.
 `GET /healthz`

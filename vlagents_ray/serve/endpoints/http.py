@@ -4,6 +4,7 @@
     POST /v1/probe                       answered at once, for measuring the link
     WS   /v1/stream                      sessions that end with the connection; binary frames or probes
     WS   /v1/weights                     new weights from a learner, see `vlagents_ray.serve.endpoints.weights`
+    GET  /live, /v1/live, WS /v1/live    what the sessions do, see `vlagents_ray.serve.live.endpoint`
     GET  /healthz, /v1/metadata, /docs
 
 Errors over HTTP are problem+json with a stable code; over WebSocket they are reply frames.
@@ -66,7 +67,7 @@ def build_http_app(
     limits: Limits,
     machine_metadata: Callable[[str], Awaitable[dict[str, Any]]] | None = None,
     dialects: Sequence[BaseRoute] = (),
-    weights: Sequence[BaseRoute] = (),
+    others: Sequence[BaseRoute] = (),
 ) -> Starlette:
     """Build the ASGI application of a replica.
 
@@ -79,7 +80,8 @@ def build_http_app(
         limits: Of a request.
         machine_metadata: Returns the metadata for a caller on the machine with the given boot id.
         dialects: The routes of other systems' clients, see `vlagents_ray.serve.dialects`.
-        weights: The routes of learners, see `vlagents_ray.serve.endpoints.weights`.
+        others: The routes of learners and viewers, see `vlagents_ray.serve.endpoints.weights` and
+            `vlagents_ray.serve.live`.
     """
     server = _HttpEndpoint(engine, metadata, limits, machine_metadata)
     return Starlette(
@@ -91,7 +93,7 @@ def build_http_app(
             Route("/healthz", server.health),
             Route("/docs", server.docs),
             *dialects,
-            *weights,
+            *others,
         ],
         exception_handlers={HTTPException: _http_problem},
     )

@@ -129,6 +129,7 @@ class MessageAdmission(Budget):
         *,
         robot: bool = True,
         inline: bool = True,
+        keep_files: bool = False,
     ) -> None:
         """Create the admission of one message.
 
@@ -141,8 +142,10 @@ class MessageAdmission(Budget):
             robot: Whether the message may use the bytes reserved for robots.
             inline: Whether the first decoding thread has other work waiting for it, so that large messages are decoded
                 elsewhere.
+            keep_files: Whether `files` remembers the files of the message's images.
         """
         super().__init__(limits)
+        self.files = {} if keep_files else None
         self._admission = admission
         self._admit = admit
         self._size = size  # size of the message, until it is counted

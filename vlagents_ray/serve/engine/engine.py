@@ -26,7 +26,7 @@ from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.arrival import PauseDetector
 from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
 from vlagents_ray.serve.engine.resets import Resets
-from vlagents_ray.serve.engine.responses import build_reply, public_error, timing
+from vlagents_ray.serve.engine.responses import Watcher, build_reply, public_error, timing
 from vlagents_ray.serve.engine.session_transfer import DrainList, SessionTransfer
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.models.loaded_model import LoadedModel, Loader, synchronise
@@ -68,10 +68,9 @@ class Engine:
         Without, a compiled policy that names no sizes is compiled for 1, 2, 4, … `max_batch_size`.
 
         `version` is the policy's version: sessions only move between replicas of equal version and settings. `check`
-        raises an error if a policy with that contract cannot be served. The engine is unhealthy while a call exceeds
-        its `limits`. Replies whose action and info exceed `reply_bytes` are not sent; messages in flight take at most
-        `in_flight_bytes`. A simulated engine gets simulated clocks (s, and wall clock in ns), and a `poller` that does
-        not block. `finder` looks for sessions that are at other replicas.
+        raises an error if a policy with that contract cannot be served. A call over its `limits` makes the engine
+        unhealthy. Larger replies than `reply_bytes` are not sent; messages in flight take at most `in_flight_bytes`. A
+        simulated engine gets simulated clocks (s and ns), and a `poller` that does not block. `finder` finds sessions.
         """
         self._source = agent if isinstance(agent, Checkpoints) else Checkpoints(lambda _: agent)
         self.clock, self.finder = clock, finder
@@ -104,6 +103,7 @@ class Engine:
         self.weights = WeightUpdates(lambda: self.models.own_weights, self.sessions.all)
         self.transfer = SessionTransfer(self.sessions, self.models, self.require_ready)
         self._resets = Resets(self.sessions, self.models, self.queue, finder, clock, reply_bytes)
+        self.live: Watcher | None = None  # sees all messages; None while nobody looks
         self._streams = ActStreams(self.sessions, self.queue, self.stats, clock, batch_sizes, reply_bytes)
 
     def start(self, *, threaded: bool = True) -> None:

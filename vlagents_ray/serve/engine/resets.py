@@ -97,7 +97,7 @@ class Resets:
         info = {**model.identity, **info}  # a session with an adapter states both by itself
         spent = timing(ticket.arrived, call.began, call.ended)
         require_serializable(info, self._reply_bytes)
-        session.agent = agent
+        session.agent, session.instruction = agent, request.instruction or ""
         model.padding.record_reset(request)
         request.obs, request.history = None, []
         if not session.announced and self._finder is not None:

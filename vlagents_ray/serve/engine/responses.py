@@ -6,7 +6,7 @@ import logging
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -19,6 +19,7 @@ from vlagents_ray.errors import (
     PolicyFailed,
     VLAgentsError,
 )
+from vlagents_ray.images.codecs import DecodedFiles
 from vlagents_ray.interface import Act
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Reply, Request
 from vlagents_ray.protocol.values import ValueWriter
@@ -30,6 +31,21 @@ from vlagents_ray.validation import check_action
 logger = logging.getLogger(__name__)
 
 Done = Callable[[list[Reply]], None]
+
+
+class Watcher(Protocol):
+    """Sees messages and their answers: `vlagents_ray.serve.live.tap.LiveTap`."""
+
+    def note(self, sessions: Sequence[str], items: Sequence[Request | Reply], files: DecodedFiles, done: Done) -> Done:
+        """Return `done`, or a function that calls it with the answers.
+
+        Args:
+            sessions: The session of each of `items`, as the engine names it.
+            items: The requests of a message, and the replies to unreadable ones.
+            files: The files of its images.
+            done: Sends the answers.
+        """
+        ...
 
 
 def build_reply(

@@ -59,7 +59,7 @@ class SessionTransfer:
             with model.call("adopt", threading.get_ident()):
                 arriving.agent = model.copies.load(state["agent"])
             arriving.weights = model.parameters.find(*state["parameters"])
-            arriving.follows = state["follows"]
+            arriving.follows, arriving.instruction = state["follows"], state["instruction"]
         except BaseException:
             self.discard(arriving)
             raise
@@ -96,6 +96,7 @@ class SessionTransfer:
             "settings": model.settings,
             "parameters": [weights.number, weights.fingerprint],
             "follows": session.follows,
+            "instruction": session.instruction,
         }
         ticket.answer(Reply(ticket.request.request_id, info=state))
 

@@ -14,7 +14,6 @@ from typing import Any
 
 import ray
 from ray import serve
-from ray.serve.config import HTTPOptions
 from ray.serve.exceptions import RayServeException
 from starlette.types import ASGIApp
 
@@ -40,9 +39,11 @@ from vlagents_ray.serve.endpoints.weights import weights_routes
 from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import LoadMeter, RequestTrace
+from vlagents_ray.serve.live.endpoint import live_routes
 from vlagents_ray.serve.models.checkpoints import resolved
 from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK
 from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
+from vlagents_ray.serve.replica.live import ReplicaLive
 from vlagents_ray.serve.replica.metrics import Exporter, tags_of
 from vlagents_ray.serve.replica.weights import ReplicaWeights
 from vlagents_ray.serve.scaling.autoscaling import SESSIONS, UTILISATION, WAITING
@@ -60,7 +61,7 @@ _STDERR = 2
 _GATEWAY_POLL_S = 10.0
 
 
-class PolicyReplica(ReplicaWeights, ClientApi, SiblingApi):
+class PolicyReplica(ReplicaWeights, ReplicaLive, ClientApi, SiblingApi):
     """Loads the policy in its first `reconfigure`, so that Serve reports RUNNING only when the policy can act.
 
     A policy that does not load therefore makes the start fail, with the reason in `serve status`. Until the first
@@ -76,7 +77,7 @@ class PolicyReplica(ReplicaWeights, ClientApi, SiblingApi):
         self._app = serve.get_replica_context().app_name
         self._code = code_of(names("policies").get(self._args.policy, self._args.policy))
         self._keys = self._args.access.keys()
-        require_access(_http().host or EVERYWHERE, self._keys, self._args.access.insecure)
+        require_access(http_options().host or EVERYWHERE, self._keys, self._args.access.insecure)
         if self._keys is not None:
             write_audit()
             if not self._args.access.plain_http:
@@ -100,6 +101,7 @@ class PolicyReplica(ReplicaWeights, ClientApi, SiblingApi):
         )
         self._migrator.start(self._engine)
         self._open_weights(self._engine, self._peers)
+        self._open_live(self._engine, self._peers, self.metadata)
         self._meter = LoadMeter(self._engine.queue)
         self._metrics = Exporter(self._engine, tags_of(self._args.policy), self._keys)
         self._metrics.start()
@@ -147,11 +149,12 @@ class PolicyReplica(ReplicaWeights, ClientApi, SiblingApi):
     def __serve_build_asgi_app__(self) -> ASGIApp:
         slow_s, idle_s = self._args.limits.slow_s, self._args.sessions.idle_s
         dialects = dialect_routes(self._args.dialects, ReplicaContext(self._engine, self.metadata, self._limits))
-        weights = weights_routes(self, slow_s, open_to_network=self._args.access.insecure)
-        inside = build_http_app(
-            self._engine, self.metadata, self._limits, self._metadata_for_machine, dialects, weights
-        )
-        hosts = self._args.access.hosts
+        insecure, hosts = self._args.access.insecure, self._args.access.hosts
+        others = [
+            *weights_routes(self, slow_s, open_to_network=insecure),
+            *live_routes(self._fleet, open_to_network=insecure),
+        ]
+        inside = build_http_app(self._engine, self.metadata, self._limits, self._metadata_for_machine, dialects, others)
         return AccessMiddleware(inside, self._keys, self._app, slow_s=slow_s, idle_s=idle_s, hosts=hosts)
 
     def _admit(self) -> Admit | NoKey:
@@ -321,6 +324,7 @@ class PolicyReplica(ReplicaWeights, ClientApi, SiblingApi):
                 getattr(self, task).cancel()
         if self._engine.draining:
             await self._migrator.hand_over()
+        self._view.close()
         self._rebalancer.close()
         await self._migrator.close()
         await asyncio.to_thread(self._engine.close)
@@ -330,15 +334,9 @@ class PolicyReplica(ReplicaWeights, ClientApi, SiblingApi):
                 endpoint.close()
 
 
-def _http() -> HTTPOptions:
-    """Return Serve's HTTP options: host, port and certificate."""
-    options: HTTPOptions = http_options()
-    return options
-
-
 def _plain_host() -> str:
     """Return the address for unencrypted ports: loopback if Serve's own port is encrypted."""
-    http = _http()
+    http = http_options()
     return os.environ.get(HOST) or (LOOPBACK if http.ssl_certfile else http.host or EVERYWHERE)
 
 

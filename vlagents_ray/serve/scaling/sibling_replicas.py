@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Collection, Iterator
+from functools import partial
 from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 import ray
@@ -13,6 +14,8 @@ from ray import serve
 
 from vlagents_ray.client.transports.serve_handle import call_replica
 from vlagents_ray.errors import VLAgentsError
+from vlagents_ray.serve.live.fleet import Other
+from vlagents_ray.serve.live.snapshot import Snapshot
 from vlagents_ray.serve.scaling.held_sessions import HeldSessions, Peer, PeerEnded, PeerUnreachable
 from vlagents_ray.serve.scaling.replica_selection import ReplicaLoad
 from vlagents_ray.serve.scaling.weight_push import Values, WeightsReplica
@@ -43,6 +46,10 @@ class SiblingApi(Protocol):
 
     async def peer(self, method: str, *args: Any) -> Any:
         """Call the method of that name in `PEER_METHODS`, for moving sessions, and return its result."""
+        ...
+
+    async def live(self, since: int, shown: Collection[str]) -> Snapshot:
+        """Return what happened since a snapshot, with pictures of the sessions `shown`."""
         ...
 
 
@@ -116,6 +123,10 @@ class SiblingReplicas:
         """Return all other replicas, for pushes of weights."""
         return await asyncio.to_thread(lambda: [_WeightsOf(name, actor) for name, actor in self._actors()])
 
+    async def views(self) -> dict[str, Other]:
+        """Return the readers of the snapshots of all other replicas, by name, for viewers."""
+        return await asyncio.to_thread(lambda: {name: partial(_view, actor) for name, actor in self._actors()})
+
     def loads(self) -> list[ReplicaLoad]:
         """Return the loads of the replicas that answer within 0.3 s."""
         now = time.monotonic()
@@ -149,6 +160,11 @@ class SiblingReplicas:
                     yield name, ray.get_actor(name, namespace=_NAMESPACE)
                 except ValueError:  # the replica has ended meanwhile
                     continue
+
+
+async def _view(actor: Any, since: int, shown: Collection[str]) -> Snapshot:
+    snapshot: Snapshot = await asyncio.wait_for(call_replica(actor, SiblingApi.live, since, shown), _QUICK_S)
+    return snapshot
 
 
 def _result(reference: Any, timeout_s: float = _ANSWER_S) -> Any:

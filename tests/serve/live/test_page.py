@@ -1,0 +1,151 @@
+"""The live page in a browser."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+
+import numpy as np
+import pytest
+from browser import Page, browser
+from eval_fakes import wait_for
+from in_memory_keys import ChangingKeys
+from live_server import LiveServer, live_server
+
+from vlagents_ray import Obs, RemoteAgent
+from vlagents_ray.policies.noop import Noop
+from vlagents_ray.protocol.messages import RankName
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow]
+
+CARDS = "document.querySelectorAll('article').length"
+PICTURES = "[...document.querySelectorAll('article img')].filter((one) => one.naturalWidth === 48).length"
+STATUS = "document.getElementById('connection').textContent"
+
+
+class Address:
+    """An address of the web, as `Page.open` takes files."""
+
+    def __init__(self, url: str) -> None:
+        self._url = url
+
+    def as_uri(self) -> str:
+        return self._url
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Page]:
+    with browser(tmp_path_factory.mktemp("profile")) as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[LiveServer]:
+    with live_server(Noop.from_config({"action_dim": 7, "chunk": 8})) as one:
+        yield one
+
+
+def show(page: Page, server: LiveServer, *, width: int = 1400, scheme: str = "light") -> None:
+    page.said.clear()
+    page.asked.clear()
+    page.open(Address(f"{server.url}/live"), width=width, scheme=scheme)  # type: ignore[arg-type]
+
+
+def until(page: Page, expression: str, want: object) -> None:
+    """Wait until the page says so."""
+    wait_for(lambda: page.value(expression) == want, 30)
+
+
+@contextmanager
+def acting(server: LiveServer, number: int, rank: RankName = "robot", key: str | None = None) -> Iterator[None]:
+    """So many robots or simulations that act until the end of the context."""
+    over = threading.Event()
+
+    def act(index: int) -> None:
+        image = np.full((32, 48, 3), 10 * index, np.uint8)
+        with RemoteAgent(server.url, rank=rank, api_key=key) as agent:
+            obs = Obs({"front": image}, 1.0, {"joints": np.zeros(7, np.float32)})
+            agent.reset(obs, f"push cube {index}")
+            while not over.wait(0.05):
+                obs.state["joints"] = obs.state["joints"] + np.float32(0.01)
+                agent.act(obs)
+
+    threads = [threading.Thread(target=act, args=(index,)) for index in range(number)]
+    with ExitStack() as stack:
+        for thread in threads:
+            thread.start()
+            stack.callback(thread.join)
+        stack.callback(over.set)
+        yield
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [360, 1400])
+@pytest.mark.parametrize("robots", [0, 1])
+def test_it_fits_without_errors_or_requests_outside(
+    page: Page, server: LiveServer, robots: int, width: int, scheme: str
+) -> None:
+    wait_for(lambda: len(server.engine.sessions) == 0, 30)
+    with acting(server, robots):
+        show(page, server, width=width, scheme=scheme)
+        until(page, STATUS, "Live")
+        until(page, CARDS, robots)
+        until(page, PICTURES, robots)
+        assert page.value("document.documentElement.scrollWidth") <= width
+        assert page.said == []
+        assert [url for url in page.asked if not url.startswith(("blob:", "data:"))] == [f"{server.url}/live"]
+        assert page.value("document.getElementById('nothing').hidden") == (robots > 0)
+
+
+def test_a_card_says_what_its_session_does(page: Page, server: LiveServer) -> None:
+    with acting(server, 1):
+        show(page, server)
+        until(page, PICTURES, 1)
+        until(page, "document.querySelectorAll('article polyline').length >= 15", True)  # state, gripper and plan
+        text = page.value("document.querySelector('article').innerText")
+        assert "push cube 0" in text
+        assert "robot, websocket" in text
+        assert "plan: 8 rows" in text
+        assert page.value("document.querySelectorAll('#fleet tr').length") == 1
+        until(page, "document.getElementById('percentiles').innerText.includes(' ms')", True)
+    until(page, CARDS, 0)  # it ended
+
+
+def test_sixteen_simulations_are_found_by_name(page: Page, server: LiveServer) -> None:
+    with acting(server, 16, "simulation"):
+        show(page, server)
+        until(page, CARDS, 16)
+        name = page.value("document.querySelector('article h3').textContent")
+        page.value(
+            f"(() => {{ const filter = document.getElementById('filter'); filter.value = '{name}';"
+            "filter.dispatchEvent(new Event('input')); })()"
+        )
+        assert (
+            page.value("[...document.querySelectorAll('article')].filter((one) => one.checkVisibility()).length") == 1
+        )
+        assert "simulation" in page.value("document.querySelector('article').innerText")
+
+
+def test_it_asks_for_a_key_and_watches_with_one(page: Page) -> None:
+    keys = ChangingKeys()
+    plain, watching = keys.add("plain"), keys.add("watching", scopes=["watch"])
+    with live_server(keys=keys.keys) as server, acting(server, 1, key=plain):
+        show(page, server)
+        until(page, "document.getElementById('key').hidden", want=False)
+        assert page.value("document.querySelector('main').hidden") is True
+        for key, told in ((plain, "This key may not watch here"), (watching, "Live")):
+            page.value(
+                f"(() => {{ document.getElementById('key-text').value = '{key}';"
+                "document.querySelector('#key button').click(); })()"
+            )
+            until(page, STATUS, told)
+        until(page, PICTURES, 1)
+        assert "plain/" in page.value("document.querySelector('article h3').textContent")
+
+
+def test_it_says_so_when_the_server_is_gone(page: Page) -> None:
+    with live_server() as server:
+        show(page, server)
+        until(page, STATUS, "Live")
+    until(page, f"{STATUS} !== 'Live'", want=True)

@@ -1,0 +1,85 @@
+"""A server with the live page, without Ray, and a viewer of it."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+from asgi_server import served
+
+from vlagents_ray.client.credentials import Credentials
+from vlagents_ray.client.transports.websocket import ProxiedSocket, open_websocket
+from vlagents_ray.interface import Agent
+from vlagents_ray.policies.noop import Noop
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
+from vlagents_ray.serve.access.api_keys import Keys
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.live.endpoint import live_routes
+from vlagents_ray.serve.live.fleet import Fleet, OtherReplicas
+from vlagents_ray.serve.live.snapshot import ReplicaView
+
+METADATA = {
+    "policy": "noop",
+    "checkpoint": "org/model@4f0c",
+    "policy_version": {"newest": {"version": 3, "fingerprint": "ab"}, "pinned": {"version": 0, "fingerprint": "cd"}},
+    "version": "0",
+    "protocol": PROTOCOL_VERSION,
+    "local": None,
+    "dialects": {},
+}
+
+
+@dataclass(frozen=True)
+class LiveServer:
+    engine: Engine
+    view: ReplicaView
+    fleet: Fleet
+    port: int
+
+    @property
+    def url(self) -> str:
+        return f"http://127.0.0.1:{self.port}"
+
+    def viewer(self, key: str = "") -> closing[ProxiedSocket]:
+        """A WebSocket that watches."""
+        return closing(open_websocket(f"ws://127.0.0.1:{self.port}/v1/live", Credentials(key), 10))
+
+
+@contextmanager
+def live_server(
+    agent: Agent | None = None, keys: Keys | None = None, others: OtherReplicas | None = None, *, insecure: bool = False
+) -> Iterator[LiveServer]:
+    """A replica of `agent`, by default `noop`, until the end of the context."""
+    engine = Engine(agent or Noop.from_config({}))
+    engine.start()
+    view = ReplicaView(engine, "this", "here", lambda: METADATA)
+    fleet = Fleet(view, others)
+    routes = live_routes(fleet, open_to_network=insecure)
+    inside = build_http_app(engine, lambda: METADATA, DEFAULT_LIMITS, others=routes)
+    with ExitStack() as stack:
+        stack.callback(engine.close)
+        view.open()
+        stack.callback(view.close)
+        yield LiveServer(engine, view, fleet, stack.enter_context(served(AccessMiddleware(inside, keys, "app"))))
+
+
+def ask(socket: ProxiedSocket, shown: Sequence[str] = ()) -> tuple[dict[str, Any], list[bytes]]:
+    """Ask for the next message; its document, and the files in it."""
+    socket.send(json.dumps({"shown": list(shown)}).encode(), 10)
+    return read_message(socket.recv(10))
+
+
+def read_message(data: bytes) -> tuple[dict[str, Any], list[bytes]]:
+    [length] = struct.unpack_from("<I", data)
+    document, at, files = json.loads(data[4 : 4 + length]), 4 + length, []
+    for size in document["files"]:
+        files.append(data[at : at + size])
+        at += size
+    assert at == len(data)
+    return document, files

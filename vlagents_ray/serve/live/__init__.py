@@ -1,0 +1,1 @@
+"""The live page: what the sessions of a server do now, in a browser."""

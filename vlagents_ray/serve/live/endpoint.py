@@ -1,0 +1,167 @@
+"""The live page, and the WebSocket that feeds it.
+
+    GET /live      the page: it holds no data, and needs no key
+    GET /v1/live   what the replicas do now, as JSON without pictures; keys need the scope "watch"
+    WS  /v1/live   the same with pictures, at most ten times a second
+
+The viewer asks for each message, with the sessions whose pictures it shows: {"shown": ["arm-1", …]}. So a slow viewer
+misses what is old, and delays nobody. The answer is the length of a JSON document (32 bits, little-endian), the
+document, and the files to which it refers by their index in `files`, the list of their lengths.
+
+A page in a browser cannot set a header: it states its key among the WebSocket's subprotocols, as "vlagents.key.KEY".
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import hashlib
+import json
+import logging
+import struct
+from contextlib import suppress
+from functools import cache
+from importlib.resources import files as package_files
+from typing import Any
+
+from starlette.requests import Request as HttpRequest
+from starlette.responses import HTMLResponse, JSONResponse, Response
+from starlette.routing import BaseRoute, Route, WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from vlagents_ray.errors import Forbidden, MalformedMessage, Overloaded, VLAgentsError
+from vlagents_ray.protocol.json_messages import problem
+from vlagents_ray.serve.access.api_keys import Caller, current_caller
+from vlagents_ray.serve.endpoints.access_middleware import LIVE_PAGE
+from vlagents_ray.serve.endpoints.http_messages import problem_response, request_id
+from vlagents_ray.serve.live.fleet import Fleet, Viewer
+
+logger = logging.getLogger(__name__)
+
+PATH = "/v1/live"
+_PROTOCOL = "vlagents.live"
+_SCOPE = "watch"
+_VIEWERS = 32  # most viewers at once
+_SILENT_S = 30.0  # longest time between two messages of a viewer
+_CHARACTERS = 2**16  # longest message of a viewer
+_POLICY_VIOLATION, _TRY_AGAIN_LATER = 1008, 1013  # WebSocket close codes
+
+
+def live_routes(fleet: Fleet, *, open_to_network: bool) -> list[BaseRoute]:
+    """Return the routes of the live page.
+
+    Args:
+        fleet: Gathers what the page shows.
+        open_to_network: Whether other machines reach this server without a key; nobody may then watch, as the pictures
+            of all robots would be public.
+    """
+    endpoint = _LiveEndpoint(fleet, open_to_network)
+    return [Route(LIVE_PAGE, _page), Route(PATH, endpoint.show), WebSocketRoute(PATH, endpoint.watch)]
+
+
+class _LiveEndpoint:
+    def __init__(self, fleet: Fleet, open_to_network: bool) -> None:
+        self._fleet = fleet
+        self._open_to_network = open_to_network
+        self._watching = 0
+
+    async def show(self, http: HttpRequest) -> Response:
+        try:
+            self._require_scope()
+        except VLAgentsError as error:
+            return problem_response(error, request_id(http))
+        viewer = self._fleet.add()
+        try:
+            document, _ = await viewer.next()
+            return JSONResponse(document)
+        finally:
+            self._fleet.remove(viewer)
+
+    async def watch(self, socket: WebSocket) -> None:
+        offered = socket.scope.get("subprotocols") or []
+        try:
+            self._require_scope()
+            if self._watching >= _VIEWERS:
+                raise Overloaded(f"live: {_VIEWERS} viewers watch already; close one")
+        except VLAgentsError as error:
+            if "websocket.http.response" in (socket.scope.get("extensions") or {}):
+                await socket.send_denial_response(problem_response(error, ""))
+            else:
+                await socket.close(_POLICY_VIOLATION)
+            return
+        await socket.accept(_PROTOCOL if _PROTOCOL in offered else None)
+        caller = current_caller()
+        if isinstance(caller, Caller):
+            caller.note("watches", "the sessions")
+        viewer = self._fleet.add()
+        self._watching += 1
+        try:
+            await self._feed(socket, viewer)
+        except WebSocketDisconnect:
+            return
+        except VLAgentsError as error:
+            with suppress(WebSocketDisconnect, RuntimeError):  # the viewer has gone meanwhile
+                await socket.send_text(json.dumps(problem(error)))
+                await socket.close(_POLICY_VIOLATION)
+        finally:
+            self._watching -= 1
+            self._fleet.remove(viewer)
+
+    async def _feed(self, socket: WebSocket, viewer: Viewer) -> None:
+        while True:
+            viewer.shown = frozenset(await self._asked(socket))
+            document, files = await viewer.next()
+            self._require_scope()
+            await socket.send_bytes(_message(document, files))
+
+    async def _asked(self, socket: WebSocket) -> list[str]:
+        try:
+            message = await asyncio.wait_for(socket.receive(), _SILENT_S)
+        except asyncio.TimeoutError:
+            raise MalformedMessage(f"live: asked for nothing within {_SILENT_S:g} s; watch again") from None
+        if message["type"] == "websocket.disconnect":
+            raise WebSocketDisconnect(message["code"])
+        text = message.get("text") or (message.get("bytes") or b"").decode(errors="replace")
+        try:
+            shown = json.loads(text[:_CHARACTERS])["shown"]
+            if not all(isinstance(name, str) for name in shown):
+                raise TypeError
+        except (ValueError, TypeError, KeyError, RecursionError) as error:
+            raise MalformedMessage(f'live: got {text[:80]!r}, want {{"shown": ["SESSION", ...]}}') from error
+        return list(shown)
+
+    def _require_scope(self) -> None:
+        caller = current_caller()
+        if isinstance(caller, Caller):
+            caller.admit(free=True, scope=_SCOPE)
+        elif self._open_to_network:
+            raise Forbidden(
+                f"live: a server with `--insecure` shows nothing; make a key with `vlagents-ray keys new NAME --scope "
+                f"{_SCOPE}` and serve with `--keys`, or serve on loopback without `--insecure`"
+            )
+
+
+def _message(document: dict[str, Any], files: list[bytes]) -> bytes:
+    text = json.dumps({**document, "files": [len(file) for file in files]}, allow_nan=False, separators=(",", ":"))
+    data = text.encode()
+    return b"".join([struct.pack("<I", len(data)), data, *files])
+
+
+async def _page(_: HttpRequest) -> Response:
+    html, policy = live_page()
+    return HTMLResponse(html, headers={"content-security-policy": policy, "cache-control": "no-cache"})
+
+
+@cache
+def live_page() -> tuple[str, str]:
+    """Return the page with its style and script in it, and the policy that lets a browser load nothing else."""
+    folder = package_files("vlagents_ray.serve.live") / "page"
+    style, script = (folder.joinpath(name).read_text(encoding="utf-8") for name in ("live.css", "live.js"))
+    html = folder.joinpath("live.html").read_text(encoding="utf-8")
+    html = html.replace("/* live.css */", style).replace("/* live.js */", script)
+    own = f"script-src {_digest(script)}; style-src {_digest(style)}; connect-src 'self'; img-src blob: data:"
+    return html, f"default-src 'none'; {own}; base-uri 'none'; form-action 'none'"
+
+
+def _digest(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"

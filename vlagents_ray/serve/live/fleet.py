@@ -1,0 +1,119 @@
+"""The snapshots of all replicas, gathered once for all viewers of one replica."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections.abc import Awaitable, Callable, Collection
+from typing import Any, Protocol
+
+from vlagents_ray.serve.live.snapshot import ReplicaView, Snapshot
+from vlagents_ray.serve.live.tap import RATE
+
+logger = logging.getLogger(__name__)
+
+_BEHIND = 20  # most gathered snapshots that wait for a slow viewer; it misses the oldest
+
+Other = Callable[[int, Collection[str]], Awaitable[Snapshot]]
+"""Returns another replica's snapshot: since which, and the sessions whose pictures are wanted."""
+
+
+class OtherReplicas(Protocol):
+    """The other replicas of the application."""
+
+    async def views(self) -> dict[str, Other]:
+        """Return the reader of the snapshots of each, by name."""
+        ...
+
+
+class Viewer:
+    """What one viewer is still to be sent."""
+
+    def __init__(self) -> None:
+        self.shown: frozenset[str] = frozenset()  # the sessions whose pictures it shows
+        self._waiting: asyncio.Queue[list[Snapshot]] = asyncio.Queue()
+
+    def put(self, snapshots: list[Snapshot]) -> None:
+        """Add what is to be sent, and drop the oldest of too much."""
+        if self._waiting.qsize() >= _BEHIND:
+            self._waiting.get_nowait()
+        self._waiting.put_nowait(snapshots)
+
+    async def next(self) -> tuple[dict[str, Any], list[bytes]]:
+        """Wait for snapshots; return all that wait as one document and the files that it refers to."""
+        gathered = [await self._waiting.get()]
+        while not self._waiting.empty():
+            gathered.append(self._waiting.get_nowait())
+        files: list[bytes] = []
+        replicas = [_with_files(one, files, self.shown) for snapshots in gathered for one in snapshots]
+        return {"time": time.time(), "replicas": replicas}, files
+
+
+class Fleet:
+    """Gathers while there are viewers."""
+
+    def __init__(self, own: ReplicaView, others: OtherReplicas | None = None) -> None:
+        """Gather the snapshots of `own` and of the `others`."""
+        self._own = own
+        self._others = others
+        self._viewers: set[Viewer] = set()
+        self._gathering: asyncio.Task[None] | None = None
+        self._read: dict[str, int] = {}  # number of the last snapshot, by replica; "" is the own one
+
+    def add(self) -> Viewer:
+        """Begin to gather for a new viewer."""
+        viewer = Viewer()
+        self._viewers.add(viewer)
+        if self._gathering is None:
+            self._gathering = asyncio.ensure_future(self._gather())
+        return viewer
+
+    def remove(self, viewer: Viewer) -> None:
+        """Stop to gather for a viewer."""
+        self._viewers.discard(viewer)
+        if not self._viewers and self._gathering is not None:
+            self._gathering.cancel()
+            self._gathering = None
+
+    async def _gather(self) -> None:
+        while True:
+            begun = time.monotonic()
+            try:
+                snapshots = await self._snapshots()
+            except Exception:
+                logger.exception("the live view was not read; tried again")
+            else:
+                for viewer in self._viewers:
+                    viewer.put(snapshots)
+            await asyncio.sleep(max(1 / RATE / 2, 1 / RATE - (time.monotonic() - begun)))
+
+    async def _snapshots(self) -> list[Snapshot]:
+        shown = frozenset[str]().union(*(viewer.shown for viewer in self._viewers))
+        readers: dict[str, Other] = {} if self._others is None else dict(await self._others.views())
+        readers[""] = self._read_own
+        results = await asyncio.gather(
+            *(read(self._read.get(name, 0), shown) for name, read in readers.items()), return_exceptions=True
+        )
+        found = {name: one for name, one in zip(readers, results, strict=True) if isinstance(one, Snapshot)}
+        self._read = {name: one.number for name, one in found.items()} | {
+            name: number for name, number in self._read.items() if name in readers and name not in found
+        }
+        if isinstance(error := results[-1], BaseException):
+            raise error
+        return list(found.values())
+
+    async def _read_own(self, since: int, shown: Collection[str]) -> Snapshot:
+        return await asyncio.to_thread(self._own.read, since, shown)
+
+
+def _with_files(snapshot: Snapshot, files: list[bytes], shown: Collection[str]) -> dict[str, Any]:
+    """Return the document of a snapshot, whose references lead into `files`, with pictures of `shown` alone."""
+    sessions = []
+    for session in snapshot.document["sessions"]:
+        pictures: dict[str, int] = {}
+        for camera, index in session["pictures"].items() if session["id"] in shown else ():
+            pictures[camera] = len(files)
+            files.append(snapshot.files[index])
+        sessions.append(session | {"pictures": pictures})
+    return snapshot.document | {"sessions": sessions}

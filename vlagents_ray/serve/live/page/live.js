@@ -1,0 +1,293 @@
+"use strict";
+// The live page of a server: reads messages from WS /v1/live, and shows what they say. See the endpoint for their form.
+
+const KEPT_S = 10; // times and rates are of the last seconds
+const POINTS = 120; // of a sparkline
+const LINES = 8; // most lines in one plot
+const STAGES = ["decode", "queue", "inference", "encode"];
+const COLOURS = ["--c0", "--c1", "--c2", "--c3", "--c4", "--c5"];
+const SVG = "http://www.w3.org/2000/svg";
+
+const byId = (id) => document.getElementById(id);
+const replicas = new Map(); // by name: its last document, and what was counted lately
+const cards = new Map(); // by session
+let key = sessionStorage.getItem("vlagents.key") || "";
+let wait = 500; // before the next attempt to connect, ms
+
+function element(tag, properties = {}, ...children) {
+  const made = Object.assign(document.createElement(tag), properties);
+  made.append(...children);
+  return made;
+}
+
+// ---- connection
+
+const path = () => location.pathname.replace(/\/live\/?$/, "/v1/live");
+
+function connect() {
+  const address = `${location.protocol === "https:" ? "wss" : "ws"}://${location.host}${path()}`;
+  const socket = new WebSocket(address, ["vlagents.live", ...(key ? [`vlagents.key.${key}`] : [])]);
+  let heard = false;
+  const ask = () => socket.send(JSON.stringify({ shown: visibleSessions() }));
+  socket.binaryType = "arraybuffer";
+  socket.onopen = ask;
+  socket.onmessage = (event) => {
+    if (typeof event.data === "string") return say(JSON.parse(event.data).detail, false);
+    if (!heard) say("Live", true);
+    heard = true;
+    wait = 500;
+    byId("key").hidden = true;
+    document.querySelector("main").hidden = false;
+    show(...read(event.data));
+    ask();
+  };
+  socket.onclose = (event) => {
+    if (!heard) askForKey();
+    else say(event.reason || "Disconnected; connecting again …", false);
+    setTimeout(() => { if (byId("key").hidden) connect(); }, wait);
+    wait = Math.min(wait * 2, 10000);
+  };
+}
+
+function say(text, good) {
+  byId("connection").textContent = text;
+  byId("connection").className = good ? "good" : "bad";
+}
+
+// A browser does not say why a WebSocket was refused, so the page asks the server itself.
+async function askForKey() {
+  const headers = key ? { authorization: `Bearer ${key}` } : {};
+  let status = 0;
+  try { status = (await fetch(path(), { headers })).status; } catch { /* the server is not there */ }
+  if (status === 401 || (status === 403 && key)) {
+    say(status === 401 && !key ? "A key is needed" : "This key may not watch here", false);
+    byId("key").hidden = false;
+    byId("key-text").focus();
+  } else if (status === 403) say("This server shows nothing without keys", false);
+  else say("Not reached; connecting again …", false);
+}
+
+byId("key").addEventListener("submit", (event) => {
+  event.preventDefault();
+  key = byId("key-text").value.trim();
+  sessionStorage.setItem("vlagents.key", key);
+  byId("key").hidden = true;
+  say("Connecting …", false);
+  connect();
+});
+
+function read(data) {
+  const length = new DataView(data).getUint32(0, true);
+  const said = JSON.parse(new TextDecoder().decode(new Uint8Array(data, 4, length)));
+  let at = 4 + length;
+  const files = said.files.map((size) => {
+    at += size;
+    return new Uint8Array(data, at - size, size);
+  });
+  return [said, files];
+}
+
+// ---- what is shown
+
+function show(said, files) {
+  const present = new Set();
+  for (const replica of said.replicas) {
+    count(replica, said.time);
+    for (const session of replica.sessions) {
+      present.add(session.id);
+      if (!cards.has(session.id)) cards.set(session.id, new Card(session.id));
+      cards.get(session.id).update(session, files);
+    }
+  }
+  const names = new Set(said.replicas.map((one) => one.name));
+  for (const [name, one] of replicas) if (!names.has(name) && said.time - one.time > 3) replicas.delete(name);
+  for (const [id, card] of cards) if (!present.has(id) && ++card.missed > 5) { card.remove(); cards.delete(id); }
+  showFleet(said.time);
+  showTimes();
+  byId("session-count").textContent = cards.size ? `(${cards.size})` : "";
+  byId("nothing").hidden = cards.size > 0;
+}
+
+function count(said, now) {
+  const known = replicas.get(said.name) || { events: [] };
+  known.events.push({ time: now, acts: said.acts, ms: said.ms, sizes: said.batch_sizes, errors: said.errors });
+  while (known.events.length && now - known.events[0].time > KEPT_S) known.events.shift();
+  replicas.set(said.name, Object.assign(known, { said, time: now, since: known.since || now }));
+}
+
+function showFleet(now) {
+  const policies = [...replicas.values()].map((one) => one.said);
+  if (!policies.length) return;
+  byId("policy").textContent = policies[0].policy;
+  byId("checkpoint").textContent = policies[0].checkpoint || "";
+  document.title = `${policies[0].policy}, live`;
+  const rows = [...replicas].sort().map(([name, one]) => {
+    const { said, events } = one;
+    const seconds = Math.min(KEPT_S, Math.max(1, now - one.since));
+    const sizes = events.flatMap((event) => event.sizes);
+    const mean = sizes.length ? sizes.reduce((a, b) => a + b) / sizes.length : 0;
+    const busy = said.utilisation ?? 0;
+    const meter = element("meter", { max: 1, value: busy, high: 0.9, ariaLabel: `busy ${Math.round(busy * 100)} %` });
+    return element("tr", {},
+      element("th", { scope: "row" }, `${name} on ${said.node}`, said.ready ? "" : ` (loading${said.step ? `: ${said.step}` : ""})`),
+      element("td", {}, meter, `${Math.round(busy * 100)} %`),
+      ...[(events.reduce((sum, event) => sum + event.acts, 0) / seconds).toFixed(1), mean ? mean.toFixed(1) : "–",
+        said.waiting.robot, said.waiting.simulation, `${said.sessions_held} of ${said.session_limit}`,
+        said.weights ? said.weights.newest.version : "–"].map((text) => element("td", { className: "n" }, String(text))));
+  });
+  byId("fleet").replaceChildren(...rows);
+}
+
+function showTimes() {
+  const events = [...replicas.values()].flatMap((one) => one.events);
+  const all = (name) => events.flatMap((event) => event.ms[name] || []);
+  const totals = all("total").sort((a, b) => a - b);
+  const at = (share) => totals.length ? `${totals[Math.min(totals.length - 1, Math.floor(share * totals.length))].toPrecision(3)} ms` : "–";
+  byId("percentiles").replaceChildren(...[["p50", 0.5], ["p95", 0.95], ["p99", 0.99]].map(([name, share]) =>
+    element("div", {}, element("b", {}, at(share)), `${name} on the server`)));
+  const means = STAGES.map((name) => { const values = all(name); return values.length ? values.reduce((a, b) => a + b) / values.length : 0; });
+  const bars = STAGES.map((_, i) => { const bar = element("i", { className: `k${i}` }); bar.style.flexGrow = means[i]; return bar; });
+  if (byId("stages").children.length) [...byId("stages").children].forEach((bar, i) => { bar.style.flexGrow = means[i]; });
+  else byId("stages").replaceChildren(...bars);
+  const told = STAGES.map((name, i) => `${name} ${means[i].toFixed(2)} ms`);
+  byId("stages").ariaLabel = `Mean of the last ${KEPT_S} s: ${told.join(", ")}`;
+  byId("stage-names").replaceChildren(...told.map((text, i) => element("li", {}, element("i", { className: `k${i}` }), text)));
+  const errors = {};
+  for (const event of events) for (const [code, n] of Object.entries(event.errors)) errors[code] = (errors[code] || 0) + n;
+  const listed = Object.entries(errors).map(([code, n]) => `${n} ${code}`).join(", ");
+  byId("errors").textContent = listed ? `Refused or failed in the last ${KEPT_S} s: ${listed}` : `No request was refused or failed in the last ${KEPT_S} s.`;
+}
+
+// ---- cards
+
+class Card {
+  constructor(id) {
+    this.id = id;
+    this.missed = 0;
+    this.values = { error: null, step: null, server: null, "batch of": null, "weights version": null, "last request": null };
+    this.series = new Map(); // by part of the state: its last rows
+    this.plots = new Map(); // by name
+    this.images = new Map(); // by camera
+    this.badge = element("span", { className: "badge" });
+    this.instruction = element("p", { className: "instruction" });
+    this.cameras = element("div", { className: "cameras" });
+    this.drawn = element("div", { className: "plots" });
+    this.told = element("dl");
+    const title = element("h3", { id: `session-${cards.size}-${Date.now()}` }, id);
+    this.root = element("article", {}, element("div", {}, title, this.badge), this.instruction, this.cameras, this.drawn, this.told);
+    this.root.setAttribute("aria-labelledby", title.id);
+    byId("sessions").append(this.root);
+    this.filter();
+  }
+
+  update(said, files) {
+    this.missed = 0;
+    if (said.rank) this.badge.textContent = `${said.rank === "robot" ? "robot" : "simulation"}, ${said.transport}`;
+    this.instruction.textContent = said.instruction ? `“${said.instruction}”` : "";
+    for (const [camera, index] of Object.entries(said.pictures)) this.picture(camera, files[index]);
+    for (const [part, values] of Object.entries(said.state || {})) {
+      const rows = this.series.get(part) || [];
+      rows.push(values);
+      if (rows.length > POINTS) rows.shift();
+      this.series.set(part, rows);
+      this.plot(`state: ${part}`, rows);
+    }
+    if (said.last) this.act(said.last);
+    this.root.classList.toggle("silent", said.silent_s > 5);
+    this.tell({ step: said.step, "weights version": said.version, "last request": `${said.silent_s.toFixed(1)} s ago` });
+  }
+
+  act(act) {
+    this.root.classList.toggle("failed", Boolean(act.error));
+    this.tell({ error: act.error ? `${act.error}: ${act.detail}` : null });
+    if (act.action) this.plot(act.rows > 1 ? `plan: ${act.rows} rows` : "action", this.planned(act));
+    const ms = act.ms;
+    if (ms.inference_ms !== undefined) {
+      this.tell({ server: ms.total_ms === undefined ? null : `${ms.total_ms.toFixed(1)} ms: ${STAGES.filter((name) => ms[`${name}_ms`] !== undefined).map((name) => `${name} ${ms[`${name}_ms`].toFixed(1)}`).join(", ")}`, "batch of": ms.batch_size });
+    }
+    this.tell(act.info || {});
+  }
+
+  // A chunk is drawn as it is; single actions as the last of them.
+  planned(act) {
+    if (act.rows > 1) return act.action;
+    const rows = this.series.get("\0action") || [];
+    rows.push(act.action[0]);
+    if (rows.length > POINTS) rows.shift();
+    this.series.set("\0action", rows);
+    return rows;
+  }
+
+  picture(camera, bytes) {
+    let image = this.images.get(camera);
+    if (!image) {
+      image = element("img", { alt: `camera ${camera}` });
+      this.images.set(camera, image);
+      this.cameras.append(element("figure", {}, image, element("figcaption", {}, camera)));
+    }
+    const before = image.src;
+    image.src = URL.createObjectURL(new Blob([bytes]));
+    image.decode().catch(() => {}).finally(() => { if (before) URL.revokeObjectURL(before); });
+  }
+
+  plot(name, rows) {
+    let svg = this.plots.get(name);
+    if (!svg) {
+      for (const other of this.plots.keys()) if (name.startsWith("plan") && other.startsWith("plan")) this.removePlot(other);
+      svg = document.createElementNS(SVG, "svg");
+      svg.setAttribute("viewBox", "0 0 100 100");
+      svg.setAttribute("preserveAspectRatio", "none");
+      svg.setAttribute("role", "img");
+      this.plots.set(name, svg);
+      this.drawn.append(element("div", {}, element("span", { className: "plot-name" }), svg));
+    }
+    const values = rows.flat().filter((value) => value !== null);
+    const low = Math.min(...values), high = Math.max(...values), range = high - low;
+    const lines = [];
+    for (let joint = 0; joint < Math.min(LINES, rows[0].length); joint++) {
+      const points = rows.map((row, i) => row[joint] == null ? null : `${(100 * i) / Math.max(1, rows.length - 1)},${range ? 95 - (90 * (row[joint] - low)) / range : 50}`);
+      const line = document.createElementNS(SVG, "polyline");
+      line.setAttribute("points", points.filter(Boolean).join(" "));
+      line.style.stroke = `var(${COLOURS[joint % COLOURS.length]})`;
+      lines.push(line);
+    }
+    svg.replaceChildren(...lines);
+    const number = (value) => String(Number(value.toPrecision(3)));
+    const told = `${name}, ${range ? `${number(low)} to ${number(high)}` : number(low)}`;
+    svg.previousSibling.textContent = told;
+    svg.setAttribute("aria-label", told);
+  }
+
+  removePlot(name) {
+    this.plots.get(name).parentElement.remove();
+    this.plots.delete(name);
+  }
+
+  tell(values) {
+    Object.assign(this.values, values);
+    const shown = Object.entries(this.values).filter(([, value]) => value !== null && value !== undefined);
+    const text = (value) => typeof value === "number" && !Number.isInteger(value) ? value.toPrecision(4) : String(value);
+    this.told.replaceChildren(...shown.flatMap(([name, value]) => [element("dt", {}, name), element("dd", { className: name === "error" ? "bad" : "" }, text(value))]));
+  }
+
+  filter() {
+    this.root.hidden = !this.id.toLowerCase().includes(byId("filter").value.trim().toLowerCase());
+  }
+
+  get visible() {
+    if (this.root.hidden || document.hidden) return false;
+    const box = this.root.getBoundingClientRect();
+    return box.bottom > 0 && box.top < innerHeight;
+  }
+
+  remove() {
+    this.root.remove();
+    for (const image of this.images.values()) URL.revokeObjectURL(image.src);
+  }
+}
+
+// Only pictures that can be seen are asked for.
+const visibleSessions = () => [...cards.values()].filter((card) => card.visible).map((card) => card.id);
+
+byId("filter").addEventListener("input", () => { for (const card of cards.values()) card.filter(); });
+connect();

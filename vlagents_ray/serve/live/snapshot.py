@@ -1,0 +1,198 @@
+"""What viewers see of one replica: numbers as a JSON document, and pictures as files."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.images.codecs import JPEG
+from vlagents_ray.protocol.json_messages import plain_values
+from vlagents_ray.protocol.messages import Reply
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.metrics_buffer import SAMPLE, STAGES, LoadMeter
+from vlagents_ray.serve.live.tap import RATE, Answer, LiveTap, Seen
+from vlagents_ray.serve.models.loaded_model import LoadedModel
+from vlagents_ray.serve.periodic import each_half_second
+from vlagents_ray.serve.sessions import Session
+
+_SHARE = 0.04  # of a core, for encoding pictures
+_VALUES = 64  # most numbers of one part of a state or of one row of a chunk
+_ROWS = 128  # most rows of a chunk
+_SESSIONS = 256  # most sessions of a replica that are described
+_TEXT = 200  # most characters of a text in an act's info
+_STATE_S = 0.5  # time for which slow things are not looked up again
+_SHOWN_OPS = ("act", "reset")
+_INFO = 24  # most entries of an act's info
+_REPEATED = ("timing", "policy", "behaviour", "distribution")  # entries of an act's info that are shown elsewhere
+
+
+@dataclass(slots=True)
+class Snapshot:
+    """One replica since the snapshot before."""
+
+    number: int  # of the last answer or observation in it
+    document: dict[str, Any]
+    files: list[bytes] = field(default_factory=list)  # which `document` refers to by their index
+
+
+class ReplicaView:
+    """Makes the snapshots of one replica; each viewer of another process states how far it has read."""
+
+    def __init__(self, engine: Engine, name: str, node: str, metadata: Callable[[], Mapping[str, Any]]) -> None:
+        """Create the view of the replica `name` on `node`, whose `engine` acts as `metadata` describes."""
+        self._engine = engine
+        self._about = {"name": name, "node": node}
+        self._metadata = metadata
+        self.tap = LiveTap(self._show)
+        self._meter: LoadMeter | None = None
+        self._slow: dict[str, Any] = {}
+        self._measured = float("-inf")
+        self._pictured: dict[str, int] = {}  # number of the observation whose pictures were read last, by session
+
+    def open(self) -> None:
+        """Begin to end the leases of viewers that no longer look."""
+        each_half_second.add(self.tap.expire)
+
+    def close(self) -> None:
+        """Stop that."""
+        each_half_second.remove(self.tap.expire)
+        self._engine.live = None
+
+    def read(self, since: int, shown: Collection[str]) -> Snapshot:
+        """Return what happened since the snapshot with the number `since`, with pictures of the sessions `shown`.
+
+        It may take milliseconds, so it does not belong on an event loop or the policy's thread.
+        """
+        engine, tap = self._engine, self.tap
+        tap.renew()
+        answers = tap.answers(since)
+        snapshot = Snapshot(answers[-1].number if answers else since, {})
+        last = {one.session: one for one in answers if one.op in _SHOWN_OPS}
+        held = sorted(engine.sessions.all(), key=lambda one: one.id)[:_SESSIONS]
+        sessions = {session.id: _session(session, last.get(session.id)) for session in held}
+        begun = time.thread_time()
+        longest_without = sorted(sessions, key=lambda name: self._pictured.get(name, 0))
+        for name in longest_without:
+            seen, described = tap.seen(name), sessions[name]
+            if seen is None or seen.number <= since:
+                continue
+            snapshot.number = max(snapshot.number, seen.number)
+            described["state"] = {part: _numbers(values[:_VALUES]) for part, values in seen.state.items()}
+            if name in shown and time.thread_time() - begun < _SHARE / RATE:
+                described["pictures"] = _pictures(seen, snapshot.files)
+                self._pictured[name] = seen.number
+        snapshot.document = {
+            **self._about,
+            **self._state(),
+            **_counted(answers),
+            "waiting": {rank.name.lower(): depth for rank, depth in engine.queue.depth_by_rank().items()},
+            "sessions": list(sessions.values()),
+            "sessions_held": len(engine.sessions),
+        }
+        return snapshot
+
+    def _show(self, tap: LiveTap | None) -> None:
+        self._engine.live = tap
+        self._pictured = {}
+        self._meter = None if tap is None else LoadMeter(self._engine.queue)
+
+    def _state(self) -> dict[str, Any]:
+        """Return what changes slowly, and takes long to find out."""
+        engine, now = self._engine, time.monotonic()
+        if now - self._measured > _STATE_S:
+            metadata = self._metadata()
+            self._slow = {
+                "policy": metadata["policy"],
+                "checkpoint": metadata["checkpoint"],
+                "weights": metadata["policy_version"],
+                "ready": engine.ready,
+                "step": engine.models.step,
+                "session_limit": engine.sessions.limit,
+                "utilisation": 0.0 if self._meter is None else round(self._meter.read().utilisation, 3),
+            }
+            self._measured = now
+        return self._slow
+
+
+def _session(session: Session[LoadedModel], last: Answer | None) -> dict[str, Any]:
+    """Return a session as a viewer needs it, with its last answer if there is a new one."""
+    weights = session.weights
+    described = {
+        "id": session.id,
+        "transport": session.transport,
+        "step": session.steps - session.first,
+        "instruction": session.instruction,
+        "silent_s": round(time.monotonic() - session.used, 2),
+        "version": None if weights is None else weights.number,
+        "pictures": {},
+    }
+    return described if last is None else described | {"rank": last.rank, "last": _act(last)}
+
+
+def _pictures(seen: Seen, files: list[bytes]) -> dict[str, int]:
+    """Add the pictures of an observation to `files`, encoding those that came as pixels; return their indices."""
+    for camera, image in seen.cameras.items():
+        seen.files[camera] = JPEG.file(image)
+    seen.cameras = {}
+    files += seen.files.values()
+    return dict(zip(seen.files, range(len(files) - len(seen.files), len(files)), strict=True))
+
+
+def _act(answer: Answer) -> dict[str, Any]:
+    """Return an answer as a viewer needs it."""
+    reply = answer.reply
+    found: dict[str, Any] = {"n": answer.number, "op": answer.op, "ms": _times(reply)}
+    if reply.error is not None:
+        return found | {"error": reply.error.code, "detail": str(reply.error)[:_TEXT]}
+    if reply.act is not None:
+        rows = reply.act.rows()
+        found |= {
+            "rows": len(rows),
+            "action": _numbers(rows[:_ROWS, :_VALUES]),
+            "done": reply.act.done,
+            "info": _info(reply.act.info),
+        }
+    return found
+
+
+def _times(reply: Reply) -> dict[str, float]:
+    return {name: round(value, 3) for name, value in dict(reply.timing).items()}  # still being completed, maybe
+
+
+def _info(info: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the entries of an act's info that are numbers or short texts."""
+    told: dict[str, Any] = {}
+    for name, value in info.items():
+        if name in _REPEATED or len(told) == _INFO:
+            continue
+        if isinstance(value, str):
+            told[name] = value[:_TEXT]
+        elif isinstance(value, (bool, int, float)) or np.isscalar(value):
+            told[name] = plain_values(value)
+    return told
+
+
+def _numbers(values: np.ndarray) -> list[Any]:
+    """Return the values, without those digits that nobody sees."""
+    found: list[Any] = plain_values(np.round(values.astype(float), 4))
+    return found
+
+
+def _counted(answers: list[Answer]) -> dict[str, Any]:
+    """Return the acts and errors among the answers, the sizes of the acts' batches, and times of all acts, ms."""
+    acts = [one.reply for one in answers if one.op == "act" and one.reply.error is None]
+    errors = Counter(one.reply.error.code for one in answers if one.reply.error is not None)
+    sample = acts[:: max(1, len(acts) // SAMPLE)]
+    return {
+        "acts": len(acts),
+        "errors": dict(errors),
+        "batch_sizes": [int(reply.timing.get("batch_size", 1)) for reply in sample],
+        "ms": {
+            name: [round(reply.timing.get(f"{name}_ms", 0.0), 3) for reply in sample] for name in (*STAGES, "total")
+        },
+    }

@@ -1,0 +1,142 @@
+"""What the sessions of a replica do, kept for viewers while one looks, and only then.
+
+`Engine.live` is the tap while a viewer looks, otherwise None: then a message costs one comparison. While somebody
+looks, the thread that handles a message stores references; `vlagents_ray.serve.live.snapshot` reads them on another.
+An observation is stored at most `RATE` times a second for each session, and until it is read: it may lie in memory
+that its client wants back.
+"""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from vlagents_ray.images.codecs import DecodedFiles
+from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.serve.engine.responses import Done
+
+RATE = 10.0  # observations a second and session that are kept
+LEASE_S = 2.0  # time after the last reading at which nobody looks any more
+_ANSWERS = 4096  # most answers that are kept
+_KEPT_S = 1.0  # time for which the pictures of an observation are kept if nobody reads them
+
+
+class Answer(NamedTuple):
+    """The answer to one request."""
+
+    number: int  # increases with every answer of the replica
+    session: str
+    op: str
+    rank: str
+    reply: Reply
+
+
+@dataclass(slots=True)
+class Seen:
+    """An observation as the policy got it."""
+
+    number: int
+    time: float  # s, of `time.monotonic`
+    state: dict[str, np.ndarray]  # (D,) float32, with the gripper as a part
+    cameras: dict[str, np.ndarray]  # (H, W, 3) uint8 RGB; empty once they are encoded
+    files: dict[str, bytes]  # JPEG or PNG files by camera: those that the client sent, or encoded by the reader
+
+
+class LiveTap:
+    """The latest answers and observations of a replica. Thread-safe."""
+
+    def __init__(self, show: Callable[[LiveTap | None], None], clock: Callable[[], float] = time.monotonic) -> None:
+        """Create a tap that nobody looks at; `show` makes it the one of the engine, or takes it away (None)."""
+        self._show = show
+        self._clock = clock
+        self._until = float("-inf")  # end of the lease, s
+        self._shown = False
+        self._numbers = itertools.count(1)
+        self._answers: deque[Answer] = deque(maxlen=_ANSWERS)
+        self._seen: dict[str, Seen] = {}
+
+    @property
+    def watched(self) -> bool:
+        """Whether a viewer looks."""
+        return self._clock() < self._until
+
+    def renew(self) -> None:
+        """Keep what happens for `LEASE_S` more."""
+        self._until = self._clock() + LEASE_S
+        if not self._shown:
+            self._shown = True
+            self._show(self)
+
+    def expire(self) -> None:
+        """Drop everything if nobody looks any more, and pictures that nobody reads; called every half second."""
+        if self.watched:
+            oldest = self._clock() - _KEPT_S
+            for seen in list(self._seen.values()):
+                if seen.time < oldest:
+                    seen.cameras = {}
+        elif self._shown:
+            self._shown = False
+            self._show(None)
+            self._answers.clear()
+            self._seen.clear()
+
+    def note(
+        self,
+        sessions: Sequence[str],
+        items: Sequence[Request | Reply],
+        files: DecodedFiles,
+        done: Done,
+    ) -> Done:
+        """Keep the observations of a message, and its answers once they are sent.
+
+        Args:
+            sessions: The session of each of `items`, as the engine names it.
+            items: The requests of the message, and the replies to unreadable ones.
+            files: The files of its images.
+            done: Sends the answers.
+
+        Returns:
+            `done`, which also keeps the answers.
+        """
+        kinds = []
+        for session, item in zip(sessions, items, strict=True):
+            if isinstance(item, Reply):
+                kinds.append((session, "unknown", "robot"))
+                continue
+            kinds.append((session, item.op, item.rank))
+            self._keep(session, item, files)
+
+        def answer(replies: list[Reply]) -> None:
+            done(replies)
+            for (session, op, rank), reply in zip(kinds, replies, strict=True):
+                self._answers.append(Answer(next(self._numbers), session, op, rank, reply))
+
+        return answer
+
+    def answers(self, since: int) -> list[Answer]:
+        """Return the answers with numbers above `since`, oldest first."""
+        newest_first = itertools.takewhile(lambda one: one.number > since, reversed(self._answers.copy()))
+        return list(newest_first)[::-1]
+
+    def seen(self, session: str) -> Seen | None:
+        """Return the session's latest observation that was kept; None if there is none."""
+        return self._seen.get(session)
+
+    def _keep(self, session: str, request: Request, files: DecodedFiles) -> None:
+        obs, now, before = request.obs, self._clock(), self._seen.get(session)
+        if request.op == "close":
+            self._seen.pop(session, None)
+        if obs is None or (before is not None and now - before.time < 1 / RATE):
+            return
+        state = {name: np.array(part) for name, part in obs.state.items()}
+        if obs.gripper is not None:
+            state["gripper"] = np.array([obs.gripper], np.float32)
+        sent = {name: bytes(files[id(image)][1]) for name, image in obs.cameras.items() if id(image) in files}
+        cameras = {name: image for name, image in obs.cameras.items() if name not in sent}
+        self._seen[session] = Seen(next(self._numbers), now, state, cameras, sent)

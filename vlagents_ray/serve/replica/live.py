@@ -1,0 +1,28 @@
+"""The methods of a replica for viewers of the live page, and for the other replicas that they look at."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Callable, Collection, Mapping
+from typing import Any
+
+import ray
+
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.live.fleet import Fleet
+from vlagents_ray.serve.live.snapshot import ReplicaView, Snapshot
+from vlagents_ray.serve.scaling.sibling_replicas import SiblingReplicas
+
+
+class ReplicaLive:
+    """A part of `PolicyReplica`: what it shows to viewers."""
+
+    def _open_live(self, engine: Engine, peers: SiblingReplicas, metadata: Callable[[], Mapping[str, Any]]) -> None:
+        node = ray.get_runtime_context().get_node_id()
+        self._view = ReplicaView(engine, peers.own_name.rpartition("#")[2], node[:8], metadata)
+        self._view.open()
+        self._fleet = Fleet(self._view, peers)
+
+    async def live(self, since: int, shown: Collection[str]) -> Snapshot:
+        """Return what happened here since a snapshot, with pictures of the sessions `shown`."""
+        return await asyncio.to_thread(self._view.read, since, shown)
