@@ -100,7 +100,8 @@ def test_the_metric_of_gpus_is_one_of_ray() -> None:
 
 
 def test_the_codes_that_queries_ask_for_are_those_of_errors() -> None:
-    codes = {code for expression, _ in queries() for code in re.findall(r'code!?="(\w+)"', expression)}
+    asked = [text for expression, _ in queries() for text in re.findall(r'code!?=~?"([^"]+)"', expression)]
+    codes = {code for text in asked for code in text.split("|")}
     assert codes
     assert codes <= {"ok", *BY_CODE}
 
