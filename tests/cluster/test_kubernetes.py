@@ -14,7 +14,7 @@ import kubernetes_validate
 import pytest
 import yaml
 from cluster_pages import serve_runs
-from kuberay import FOLDER, RayJob, RayService, check, documents, manifest
+from kuberay import FOLDER, PodMonitor, RayJob, RayService, check, documents, manifest
 from pydantic import ValidationError
 from readme_blocks import check_command
 from typer.testing import CliRunner
@@ -187,6 +187,16 @@ def vlagents_ray_version() -> str:
     version = re.search(r'^version = "(.*)"$', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
     assert version is not None
     return version[1]
+
+
+def test_the_monitor_finds_the_pods_of_the_server_and_the_network_lets_it_in() -> None:
+    spec = PodMonitor.model_validate(manifest("PodMonitor", "policy")).spec
+    for name in ("policy-head", "policy-cpu", "policy-gpu"):
+        assert spec.selector.match_labels.items() <= PODS[name]["metadata"]["labels"].items()
+    assert [endpoint.port for endpoint in spec.pod_metrics_endpoints] == ["metrics"]
+    network = manifest("NetworkPolicy", "policy")
+    [rule] = [one for one in network["spec"]["ingress"] if "monitoring" in str(one["from"])]
+    assert 8080 in [port["port"] for port in rule["ports"]]
 
 
 def test_the_page_names_files_that_exist_and_settings_that_are_taken() -> None:

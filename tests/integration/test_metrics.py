@@ -7,6 +7,7 @@ import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from contextlib import suppress
+from pathlib import Path
 
 import pytest
 import ray
@@ -17,6 +18,8 @@ from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.serve.launch.server import Server
 
 ACTS = 30
+DASHBOARD = Path(__file__).parents[2] / "cluster/grafana/policy_server.json"
+NOT_YET = {"vlagents_hung_calls_total", "vlagents_weight_push_ms_bucket"}  # no call hung, no weights were pushed
 STAGES = ("decode", "queue", "inference", "encode")
 
 
@@ -86,3 +89,12 @@ def test_prometheus_reads_requests_batches_and_load(server: Server) -> None:
             wait_for(complete)
     assert {name: now.get(name) for name in expected} == expected
     assert 0 <= now["vlagents_utilisation"] < 0.5
+
+
+def test_the_dashboard_asks_for_series_that_prometheus_reads(server: Server) -> None:
+    asked = set(re.findall(r"\bray_(vlagents_\w+)", DASHBOARD.read_text()))
+    assert asked > NOT_YET
+    with RemoteAgent(server.url) as agent:
+        agent.reset(Obs())
+        agent.act(Obs())
+        wait_for(lambda: asked - NOT_YET <= {name.partition(" ")[0] for name in scraped()})

@@ -2,7 +2,8 @@
 
 Core kinds, and the pods inside KubeRay's, have the schemas that the package kubernetes-validate brings. KubeRay's own
 are on no package index; what is here names the keys that our manifests use, read from the custom resource definitions
-of KubeRay 1.6.2 and 1.7.0, and knows no others: a misspelt key is an error.
+of KubeRay 1.6.2 and 1.7.0, and knows no others: a misspelt key is an error; the same holds for the kind
+of Prometheus' operator.
 """
 
 from __future__ import annotations
@@ -137,6 +138,29 @@ class RayJob(_Closed):
         return self.spec.ray_cluster_spec
 
 
+class PodSelector(_Closed):
+    match_labels: dict[str, str]
+
+
+class MetricsEndpoint(_Closed):
+    port: str
+    interval: str
+
+
+class MonitorSpec(_Closed):
+    selector: PodSelector
+    pod_metrics_endpoints: list[MetricsEndpoint]
+
+
+class PodMonitor(_Closed):
+    """Of Prometheus' operator."""
+
+    api_version: Literal["monitoring.coreos.com/v1"]
+    kind: Literal["PodMonitor"]
+    metadata: Metadata
+    spec: MonitorSpec
+
+
 def documents(file: Path) -> list[dict[str, Any]]:
     """The manifests in a file."""
     return [one for one in yaml.safe_load_all(file.read_text()) if one is not None]
@@ -151,7 +175,7 @@ def manifest(kind: str, name: str) -> dict[str, Any]:
 
 def check(document: dict[str, Any]) -> None:
     """Raises what is wrong with a manifest: of pydantic or of kubernetes-validate."""
-    ours = {"RayService": RayService, "RayJob": RayJob}
+    ours = {"RayService": RayService, "RayJob": RayJob, "PodMonitor": PodMonitor}
     if document["kind"] in ours:
         ours[document["kind"]].model_validate(document)
     else:
