@@ -205,6 +205,11 @@ NOTHING_TO_DECODE = {
     "`POST /v1/probe`",
     "own port, another path",  # is refused
     "`WS /v1/weights`",  # is refused without the scope
+    "`GET /live`",
+    "`GET /v1/live`",
+    "`GET /v1/live`, scope `watch`",
+    "`WS /v1/live`",  # is refused without the scope
+    "`WS /v1/live`, scope `watch`",  # a viewer sends only names
 }
 NO_KEY = {"vlagents' gateway, `without_key: true`", "Serve handle (`serve://`)", "plasma (`serve://`)"}
 
