@@ -205,9 +205,6 @@ NOTHING_TO_DECODE = {
     "`POST /v1/probe`",
     "own port, another path",  # is refused
     "`WS /v1/weights`",  # is refused without the scope
-    "`GET /live`",
-    "`GET /v1/live`",
-    "`GET /v1/live`, scope `watch`",
     "`WS /v1/live`",  # is refused without the scope
     "`WS /v1/live`, scope `watch`",  # a viewer sends only names
 }

@@ -95,6 +95,7 @@ def test_errors_and_sessions_that_ended_are_told(server: LiveServer) -> None:
             agent.reset(Obs(), "")
             with pytest.raises(VLAgentsError):
                 agent.act(Obs(info={"fail": True}))
+            failing = server.engine.sessions.ids()
             told: dict[str, int] = {}
             failed: list[str] = []
             while not told or not failed:
@@ -104,6 +105,7 @@ def test_errors_and_sessions_that_ended_are_told(server: LiveServer) -> None:
             assert told == {"policy_failed": 1}
             assert "secret" not in failed[0]
         wait_for(lambda: not ask(viewer)[0]["replicas"][0]["sessions"])
+        assert all(server.view.tap.seen(session) is None for session in failing)
 
 
 def test_nothing_is_kept_once_nobody_looks(server: LiveServer) -> None:

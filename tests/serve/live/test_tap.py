@@ -124,7 +124,9 @@ def test_pictures_that_nobody_reads_are_let_go(watched: Watched) -> None:
     assert gone() is None
 
 
-def test_a_closed_session_is_forgotten(watched: Watched) -> None:
-    watched.ask("a", Obs(gripper=1.0))
-    watched.ask("a", None, "close")
+def test_sessions_that_ended_are_forgotten(watched: Watched) -> None:
+    for session in "ab":
+        watched.ask(session, Obs(gripper=1.0))
+    watched.tap.forget_others(["b", "c"])
     assert watched.tap.seen("a") is None
+    assert watched.tap.seen("b") is not None

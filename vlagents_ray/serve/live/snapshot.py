@@ -73,6 +73,7 @@ class ReplicaView:
         answers = tap.answers(since)
         snapshot = Snapshot(answers[-1].number if answers else since, {})
         last = {one.session: one for one in answers if one.op in _SHOWN_OPS}
+        tap.forget_others(engine.sessions.ids())
         held = sorted(engine.sessions.all(), key=lambda one: one.id)[:_SESSIONS]
         sessions = {session.id: _session(session, last.get(session.id)) for session in held}
         begun = time.thread_time()

@@ -11,7 +11,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -128,10 +128,13 @@ class LiveTap:
         """Return the session's latest observation that was kept; None if there is none."""
         return self._seen.get(session)
 
+    def forget_others(self, sessions: Collection[str]) -> None:
+        """Drop the observations of all sessions but these, since those have ended."""
+        for session in self._seen.keys() - set(sessions):
+            self._seen.pop(session, None)
+
     def _keep(self, session: str, request: Request, files: DecodedFiles) -> None:
         obs, now, before = request.obs, self._clock(), self._seen.get(session)
-        if request.op == "close":
-            self._seen.pop(session, None)
         if obs is None or (before is not None and now - before.time < 1 / RATE):
             return
         state = {name: np.array(part) for name, part in obs.state.items()}

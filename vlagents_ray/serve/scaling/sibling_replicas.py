@@ -30,6 +30,7 @@ _NAMESPACE = "serve"
 _ANSWER_S = 3.0  # default time limit for an answer; a replica that still loads does not answer
 _TRANSFER_S = 600.0  # time limit for an answer that weights are sent with
 _QUICK_S = 0.3  # time limit for an answer while a client waits to connect
+_VIEW_S = 2.0  # time for which the replicas that were found for viewers are not looked up again
 _SILENT_S = 3.0  # time for which a replica that did not answer is not asked for its load again
 
 
@@ -113,6 +114,8 @@ class SiblingReplicas:
         context = serve.get_replica_context()
         self._prefix = f"SERVE_REPLICA::{context.app_name}#{context.deployment}#"
         self.own_name = context.replica_id.to_full_id_str()
+        self._views: dict[str, Other] = {}  # found last, for viewers, which ask often
+        self._viewed = float("-inf")
         self._silent: dict[str, float] = {}  # time until which a silent replica is not asked, by its name
 
     async def others(self) -> list[_Replica]:
@@ -125,7 +128,12 @@ class SiblingReplicas:
 
     async def views(self) -> dict[str, Other]:
         """Return the readers of the snapshots of all other replicas, by name, for viewers."""
-        return await asyncio.to_thread(lambda: {name: partial(_view, actor) for name, actor in self._actors()})
+        if time.monotonic() - self._viewed > _VIEW_S:
+            self._viewed = time.monotonic()
+            self._views = await asyncio.to_thread(
+                lambda: {name: partial(_view, actor) for name, actor in self._actors()}
+            )
+        return self._views
 
     def loads(self) -> list[ReplicaLoad]:
         """Return the loads of the replicas that answer within 0.3 s."""
