@@ -11,6 +11,7 @@ import torch
 
 from tests.families.vjepa2_ac.tiny import PATCH, SIDE, WIDTH, make_hf_encoder
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.policies.compilation.cores import Compilation
 from vlagents_ray.policies.vjepa2_ac import VJepa2AcConfig
 from vlagents_ray.policies.vjepa2_ac.encoder import Encoder, load_encoder, to_pixels
 
@@ -31,7 +32,9 @@ def pixels(count: int) -> np.ndarray:
 
 @torch.inference_mode()
 def test_an_image_gives_the_same_features_in_a_batch_of_any_size(folder: Path) -> None:
-    encode = Encoder(load_encoder(config(encoder=str(folder)), None).eval(), normalize=True)
+    encode = Encoder(
+        load_encoder(config(encoder=str(folder)), None).eval(), normalize=True, compilation=Compilation(mode=False)
+    )
     together = encode(pixels(8))
     assert together.shape == (8, (SIDE // PATCH) ** 2, WIDTH)
     for size in (1, 2, 3):
@@ -43,7 +46,9 @@ def test_an_image_gives_the_same_features_in_a_batch_of_any_size(folder: Path) -
 def test_features_are_those_of_transformers_for_an_image_shown_twice(folder: Path) -> None:
     model = load_encoder(config(encoder=str(folder)), None).eval()
     clip = torch.as_tensor(pixels(1))[:, None].expand(-1, 2, -1, -1, -1)
-    assert torch.equal(Encoder(model, normalize=False)(pixels(1)), model.get_vision_features(clip))
+    assert torch.equal(
+        Encoder(model, normalize=False, compilation=Compilation(mode=False))(pixels(1)), model.get_vision_features(clip)
+    )
 
 
 def test_an_image_is_cut_to_the_square_in_its_middle() -> None:
