@@ -138,7 +138,7 @@ def run_loop(
             with `interventions=True`.
         real_time: Run the thread with SCHED_FIFO (see `vlagents_ray.robot.pacing.undisturbed`).
         spin_s: How long before each tick the thread spins instead of sleeping, s.
-        until: Ends the loop when it returns True; called before each tick.
+        until: Ends the loop when it returns True; called before each tick, and after the last one.
 
     Returns:
         The timing of the loop, and the reasons of the ticks without an action of the policy.
@@ -201,7 +201,7 @@ def _drive(
     interrupt = getattr(agent, "interrupt", lambda: None)
     standing = True  # before the first action, and after a stop until the next one
     try:
-        while not report.done and not until():
+        while not (until() or report.done):
             if (
                 time.monotonic() - collected > _COLLECT_S
             ):  # while idle, as automatic collection is off and failed requests leave cycles

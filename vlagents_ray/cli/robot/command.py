@@ -43,14 +43,14 @@ def robot_command(
     ] = [],  # noqa: B006
 ) -> None:
     """Drive a simulated robot: by a policy, by a human, or by a policy that a human corrects; record it if asked."""
-    from vlagents_ray.cli.robot.session import Session
+    from vlagents_ray.cli.robot.run import RobotRun
 
     with errors():
         if policy is None and teleop is None:
             raise ConfigError("robot: got neither a policy nor --teleop, want one of them, or both")
         if ask_for_help is not None and teleop != "keyboard":
             raise ConfigError("--ask-for-help: got it without a way to answer, want --teleop keyboard")
-        session = Session(
+        run = RobotRun(
             env=env,
             env_options=parse_settings(env_options, "--env-set"),
             policy=policy,
@@ -65,4 +65,4 @@ def robot_command(
             ask_for_help=ask_for_help,
             samples=samples,
         )
-        session.play(range(seed, seed + episodes))
+        run.play(range(seed, seed + episodes))

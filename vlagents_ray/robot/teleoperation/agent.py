@@ -20,7 +20,7 @@ class TeleoperatedAgent(Agent):
 
     @property
     def contract(self) -> Contract | None:
-        """What the robot gives and takes."""
+        """The contract of the robot, as it was given."""
         return self._contract
 
     def act(self, obs: Obs) -> Act:

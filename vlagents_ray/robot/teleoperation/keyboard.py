@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import select
 import sys
@@ -45,9 +46,12 @@ class Keyboard:
         self._keys = dict(keys or {})
         if taken := sorted(self._keys.keys() & {*AXES, GRIPPER, TAKE}):
             raise ConfigError(f"keyboard: {taken} move the robot, so they cannot do something else")
-        self._terminal = sys.stdin.fileno() if terminal is None else terminal
-        if not os.isatty(self._terminal):
+        if terminal is None and sys.stdin is not None:
+            with contextlib.suppress(OSError):  # what stands in for standard input need not be a file
+                terminal = sys.stdin.fileno()
+        if terminal is None or not os.isatty(terminal):
             raise ConfigError("keyboard: there is no terminal to read keys from; run this in one")
+        self._terminal = terminal
         self._until = np.zeros((6, 2))  # s of `time.monotonic`: until when a key counts, for each axis and direction
         self._presses = 0
         self._taken = False

@@ -51,7 +51,7 @@ class EnvPolicy(Wrapper):
 
 
 @dataclass
-class Session:
+class RobotRun:
     """What `vlagents-ray robot` plays, and how; the fields are its options."""
 
     env: str
@@ -101,12 +101,13 @@ class Session:
         robot = EnvRobot(env, seed, endless=self.teleop is not None)
         out.print(f"seed {seed}: {env.instruction}")
 
+        def label() -> Label:
+            return self.verdict or ("success" if robot.success else "failure")
+
         def ended() -> bool:
-            if robot.ended and self.verdict is None:
-                self.verdict = "success" if robot.success else "failure"
-            if self.verdict is not None and recorder is not None and (recorder.interventions or self.over):
-                recorder.label(self.verdict)
-            return self.verdict is not None
+            if recorder is not None and (recorder.interventions or self.over):
+                recorder.label(label())
+            return robot.ended or self.verdict is not None
 
         options = {} if self.policy is None else {"seed": seed, "env": self.env}
         guard = Guard(env.contract, max_step=self.max_step) if self.policy is None else None
@@ -120,8 +121,7 @@ class Session:
             recorder=recorder,
             until=ended,
         )
-        verdict = self.verdict or "ended by the policy"
-        out.print(f"  {verdict}: {robot.steps} steps, {report.interventions} of them a human's")
+        out.print(f"  {label()}: {robot.steps} steps, {report.interventions} of them a human's")
 
     def _leader(self, contract: Contract, stack: contextlib.ExitStack) -> Leader | None:
         if self.teleop is None:
