@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from eval_fakes import wait_for
+from in_process_replicas import Replicas
 from scripted_leader import ScriptedLeader
 
 from vlagents_ray import Act, ActionSpec, Agent, ConfigError, Contract, Obs, PolicyFailed
@@ -210,16 +211,18 @@ def test_every_action_of_a_human_passes_the_guard(make: Any) -> None:
     arm, leader = make(Near(), check=check, mode="async")
     arm.tick()
     leader.held = True
-    wrong = [row(np.nan), row(3.0), row(9.0), np.zeros(3, np.float32), np.zeros((2, 2), np.float32)]
-    for action in (*wrong, row(0.05)):
-        leader.command = action
+    for wrong in (row(np.nan), row(3.0), row(9.0), np.zeros(3, np.float32), np.zeros((2, 2), np.float32)):
+        leader.command = wrong
         at = arm.pose.copy()
         act = arm.tick()
         assert act.info[INTERVENTION]
-        assert (SAFE in act.info) == (action is not leader.given[-1] or any(action is one for one in wrong))
-        assert act.action == pytest.approx(at if SAFE in act.info else action)
-    executed = [given.tolist() for given in (leader.given[1], leader.given[-1])]
-    assert all(given in seen for given in executed)
+        assert SAFE in act.info
+        assert act.action == pytest.approx(at)
+    leader.command = row(0.05)
+    act = arm.tick()
+    assert SAFE not in act.info
+    assert act.action == pytest.approx(leader.command)
+    assert all(action.tolist() in seen for action in (row(3.0), leader.command))
 
 
 def test_a_human_without_a_safe_action_that_passes_ends_the_loop(make: Any) -> None:
@@ -243,6 +246,30 @@ def test_the_policy_is_told_what_was_executed_in_its_place(make: Any) -> None:
     for _ in range(4):
         arm.tick()
     assert EXECUTED not in agent.asked[2], "it is said once"
+
+
+def test_a_served_policy_is_told_with_its_next_request(players: list[ChunkPlayer]) -> None:
+    told: list[list[float]] = []
+
+    class Told(Near):
+        shared = ("gate",)
+
+        def act(self, obs: Obs) -> Act:
+            told.extend(np.asarray(obs.info.get(EXECUTED, np.zeros((0, 2)))).tolist())
+            return super().act(obs)
+
+    served = Replicas([Told()])
+    leader = ScriptedLeader(ahead)
+    player = ChunkPlayer(served.agent(), override=leader, execute=2)
+    arm = Arm(player)
+    given = []
+    for held in (False, True, True, True, False, False):
+        leader.held = held
+        act = arm.tick()
+        given += [act.action.tolist()] if held else []
+    player.close()
+    served.close()
+    assert told == given
 
 
 def test_a_loop_of_the_users_own_says_what_it_executed(make: Any) -> None:

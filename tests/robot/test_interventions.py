@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from scripted_leader import ScriptedLeader
 
 from vlagents_ray import Act, ActionSpec, Agent, ConfigError, Contract, Obs
 from vlagents_ray.chunking.player import ChunkPlayer
-from vlagents_ray.robot import Guard, run_loop
+from vlagents_ray.robot import Guard, Watchdog, run_loop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.simulated import SimulatedRobot
 
@@ -114,6 +115,35 @@ def test_a_correction_of_a_second_is_recorded_from_its_first_tick_with_both_acti
     steps = np.abs(np.diff(np.stack([np.zeros(2), *arm.commanded]), axis=0))
     assert steps.max() <= MAX_STEP + 1e-6, "at the release, too"
     assert all(action.tolist() in guarded for action in arm.commanded)
+
+
+def test_a_silent_server_stops_no_robot_that_a_human_moves() -> None:
+    """A silent policy gives safe actions; a human's count as signs of life of whoever moves the robot."""
+    gate = threading.Event()
+
+    class Hanging(Going):
+        asked = 0
+
+        def act(self, obs: Obs) -> Act:
+            self.asked += 1
+            assert self.asked == 1 or gate.wait(30)
+            return super().act(obs)
+
+    arm, leader = Arm(), ScriptedLeader(back)
+    leader.held = True
+    watchdog = Watchdog(lambda _: arm.stop(), {"server": 0.2})
+    with ChunkPlayer(Hanging(), override=leader, mode="async") as player:
+
+        def over() -> bool:
+            if len(arm.commanded) == 30 and leader.held:
+                assert watchdog.barks == []
+                leader.held = False  # from here on, nobody moves it but the silent policy
+            return bool(watchdog.barks)
+
+        report = run_loop(arm, player, hz=HZ, until=over, watchdog=watchdog)
+        gate.set()
+    assert report.interventions == 30
+    assert report.barks[0].startswith("server: silent")
 
 
 def add(recorder: Recorder, label: Any = None) -> None:
