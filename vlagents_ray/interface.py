@@ -53,11 +53,14 @@ DEADLINE = "deadline_ms"  # in an observation: the time after which `RemoteAgent
 # arrives, so the new chunk begins with them; it should continue the later rows smoothly.
 LEFTOVER = "leftover_actions"  # (H', D) float32: the current plan from this observation's tick on
 DELAY = "delay_ticks"  # int: ticks until the answer arrives, the longest of the last ones; at most the rows of LEFTOVER
+EXECUTED = "executed_actions"  # in an observation, (N, D): others than the policy's, executed since the last request
 # In the Act of a served policy: the weights that computed it, {"version": int, "fingerprint": str}. Version 0 is the
 # checkpoint that the server loaded, later ones were pushed; the replica computes the fingerprint from what it holds.
 POLICY = "policy"
 # In the Act of a chunk player:
 SAFE = "safe"  # str: the reason why this is the safe action; absent if the action is the policy's
+INTERVENTION = "intervention"  # True: a human's action; absent if it is not
+WANTED = "policy_action"  # (D,) float32: what the policy wanted in place of the human's action; absent if unknown
 AGE = "age_ticks"  # int: ticks since the observation from which the action was computed
 SILENT = "silent_s"  # float: seconds since the oldest unanswered request, retries included; 0.0 if there is none
 

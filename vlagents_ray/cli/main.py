@@ -15,6 +15,7 @@ from vlagents_ray.cli.evaluation.results import export_command, merge_command, r
 from vlagents_ray.cli.keys import keys
 from vlagents_ray.cli.new import new
 from vlagents_ray.cli.options import parse_list, read_run_file
+from vlagents_ray.cli.robot.command import robot_command
 from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.cli.slurm import slurm
 from vlagents_ray.cli.tune.command import tune_command
@@ -58,6 +59,7 @@ app.command("export")(export_command)
 app.command("merge")(merge_command)
 app.command("replay")(replay_command)
 app.command("report")(report_command)
+app.command("robot")(robot_command)
 app.command("tune")(tune_command)
 app.add_typer(bench, name="bench")
 app.add_typer(env, name="env")

@@ -6,7 +6,7 @@ import shutil
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -25,6 +25,12 @@ MOMENTS = {  # further columns of each recorded frame
     "tick": "int64",  # of the control loop; gaps are missed or dropped frames
     "safe": "bool",  # whether the action is a safe one, not the policy's
 }
+WANTED_ACTION, INTERVENTION_COLUMN = "policy_action", "intervention"
+INTERVENTIONS = {  # further columns of a recording with interventions, beside `WANTED_ACTION`, (D,) float32
+    INTERVENTION_COLUMN: "bool",  # whether the action is a human's
+    "policy_known": "bool",  # whether it is known what the policy wanted; if not, `WANTED_ACTION` is zeros
+}
+Label = Literal["success", "failure", "discard"]
 INDEX = {  # columns that the dataset adds to each frame
     "timestamp": "float32",  # s, frame_index / fps
     "frame_index": "int64",
@@ -45,12 +51,21 @@ class Finished:
     images: dict[str, Stats]  # statistics of the videos' frames
     videos: dict[str, Path]  # MP4 files with at least N frames, of which the first N count
     about: DatasetContract  # the same for each episode of a dataset
+    label: Label | None = None
 
 
 class RobotEpisode:
     """A running episode, to which frames are added."""
 
-    def __init__(self, folder: Path, instruction: str, fps: float, features: dict[str, Any] | None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        instruction: str,
+        fps: float,
+        features: dict[str, Any] | None,
+        *,
+        interventions: bool = False,
+    ) -> None:
         """Begin an episode in a folder.
 
         Args:
@@ -58,6 +73,7 @@ class RobotEpisode:
             instruction: The task in words.
             fps: The rate of the frames, Hz.
             features: The dataset's features, which the frames must have; None in the first episode.
+            interventions: Whether the frames have the columns of interventions.
         """
         self.instruction = instruction
         self.features: dict[str, Any] = features or {}
@@ -66,9 +82,19 @@ class RobotEpisode:
         self.images: dict[str, ImageStatistics] = {}
         self._folder = folder
         self._fps = fps
+        self._interventions = interventions
         self._about = DatasetContract(Contract())
 
-    def add(self, obs: Obs, action: np.ndarray, captured_at: float, tick: int, safe: bool) -> None:
+    def add(
+        self,
+        obs: Obs,
+        action: np.ndarray,
+        captured_at: float,
+        tick: int,
+        safe: bool,
+        intervention: bool = False,
+        wanted: np.ndarray | None = None,
+    ) -> None:
         """Append a frame.
 
         Args:
@@ -77,6 +103,8 @@ class RobotEpisode:
             captured_at: The time of the observation, s since 1970.
             tick: The tick of the control loop.
             safe: Whether the action is a safe one, not the policy's.
+            intervention: Whether a human moved the robot at this tick.
+            wanted: The policy's action, (D,), where another one was executed; None if it is not known.
 
         Raises:
             InvalidObservation: Cameras or shapes differ from those of the frames before.
@@ -90,19 +118,28 @@ class RobotEpisode:
                 f"recording: got cameras {sorted(obs.cameras)}, want those of {sorted(self.videos)}"
             )
         for name, shape in ((STATE, values.shape), (ACTION, action.shape)):
-            wanted = tuple(self.features[name]["shape"]) if name in self.features else (0,)
-            if shape != wanted:
-                raise InvalidObservation(f"recording: got {name} of {shape}, want {wanted} as in the first frame")
+            first = tuple(self.features[name]["shape"]) if name in self.features else (0,)
+            if shape != first:
+                raise InvalidObservation(f"recording: got {name} of {shape}, want {first} as in the first frame")
         for name, image in obs.cameras.items():
             self.videos[keys[name]][1].add(image)
             self.images[keys[name]].add(image)
-        frame = {ACTION: np.asarray(action, np.float32), "captured_at": captured_at, "tick": tick, "safe": safe}
+        frame: dict[str, Any] = {
+            ACTION: np.asarray(action, np.float32),
+            "captured_at": captured_at,
+            "tick": tick,
+            "safe": safe,
+        }
         if len(values):
             frame[STATE] = values
+        if self._interventions:
+            policy = wanted if safe or intervention else action
+            frame[WANTED_ACTION] = np.zeros_like(frame[ACTION]) if policy is None else np.asarray(policy, np.float32)
+            frame |= {INTERVENTION_COLUMN: intervention, "policy_known": policy is not None}
         for key, value in frame.items():
             self.rows.setdefault(key, []).append(value)
 
-    def finish(self) -> Finished:
+    def finish(self, label: Label | None = None) -> Finished:
         """Complete the videos, and return the episode."""
         for _, video in self.videos.values():
             video.finish()
@@ -113,6 +150,7 @@ class RobotEpisode:
             {key: images.result() for key, images in self.images.items()},
             {key: path for key, (path, _) in self.videos.items()},
             self._about,
+            label,
         )
 
     def abandon(self) -> None:
@@ -134,6 +172,8 @@ class RobotEpisode:
         if names:
             features[STATE] = vector_feature(names)
         features[ACTION] = vector_feature([f"action_{i}" for i in range(action_dim)])
+        if self._interventions:
+            features |= {WANTED_ACTION: features[ACTION]} | number_features(INTERVENTIONS)
         features |= number_features(MOMENTS | INDEX)
         if self.features and self.features != features:
             odd = sorted(k for k in self.features.keys() | features.keys() if self.features.get(k) != features.get(k))

@@ -14,7 +14,7 @@ from typing import Any, Literal, Protocol, get_args
 import numpy as np
 
 from vlagents_ray.errors import ConfigError, InvalidAction
-from vlagents_ray.interface import CAPTURED, SAFE, SILENT, Agent, Obs
+from vlagents_ray.interface import CAPTURED, INTERVENTION, SAFE, SILENT, WANTED, Agent, Obs
 from vlagents_ray.robot.pacing import KEPT_TICKS, SPIN_S, Pacer, jitter, undisturbed
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import Guard, Watchdog
@@ -60,6 +60,7 @@ class LoopReport:
     work_p99_ms: float = 0.0
     safe: dict[str, int] = field(default_factory=dict)  # reason -> ticks with the safe action or without any
     barks: list[str] = field(default_factory=list)  # the watchdog's reasons to stop the robot
+    interventions: int = 0  # ticks at which a human moved the robot
     done: bool = False  # the policy considered its task finished
     means: list[str] = field(default_factory=list)  # the measures taken against jitter
 
@@ -133,16 +134,18 @@ def run_loop(
         restart: With "manual" motion is restarted by a call of `watchdog.restart()`, made by a person who sees the
             robot; it has no effect while the silence lasts. With "auto" the end of the silence restarts it. The default
             is "auto" for a simulated robot and "manual" for any other.
-        recorder: Records the run as one episode, also if it ends by an exception.
+        recorder: Records the run as one episode, also if it ends by an exception. A player with `override` wants one
+            with `interventions=True`.
         real_time: Run the thread with SCHED_FIFO (see `vlagents_ray.robot.pacing.undisturbed`).
         spin_s: How long before each tick the thread spins instead of sleeping, s.
-        until: Ends the loop when it returns True; called before each tick.
+        until: Ends the loop when it returns True; called before each tick, and after the last one.
 
     Returns:
         The timing of the loop, and the reasons of the ticks without an action of the policy.
 
     Raises:
-        ConfigError: `hz`, `seconds` or `restart` has a wrong value, or `guard` differs from the agent's own.
+        ConfigError: `hz`, `seconds` or `restart` has a wrong value, `guard` differs from the agent's own, or the
+            recorder has no place for interventions.
         InvalidAction: An action is a chunk, or does not pass the guard.
     """
     if restart is None:
@@ -151,6 +154,11 @@ def run_loop(
         raise ConfigError(f"restart: got {restart!r}, want one of {list(get_args(Restart))}")
     if seconds is not None and not seconds > 0:
         raise ConfigError(f"seconds: got {seconds}, want above 0, or None")
+    takeover = getattr(agent, "takeover", None)
+    if takeover is not None and takeover.leader is not None and recorder is not None and not recorder.interventions:
+        raise ConfigError(
+            "recorder: got one without interventions for a player with override=; want Recorder(…, interventions=True)"
+        )
     report = LoopReport(hz)
     barks = len(watchdog.barks) if watchdog is not None else 0
     agent.initialize()
@@ -193,7 +201,7 @@ def _drive(
     interrupt = getattr(agent, "interrupt", lambda: None)
     standing = True  # before the first action, and after a stop until the next one
     try:
-        while not report.done and not until():
+        while not (until() or report.done):
             if (
                 time.monotonic() - collected > _COLLECT_S
             ):  # while idle, as automatic collection is off and failed requests leave cycles
@@ -208,6 +216,7 @@ def _drive(
             if act.action.ndim != 1:
                 raise InvalidAction(f"action: got {act.action.shape}, want one row; wrap the agent in a ChunkPlayer")
             report.done = act.done
+            led = bool(act.info.get(INTERVENTION))
             reason = act.info.get(SAFE)
             if watchdog is not None:
                 stop = _why_stopped(watchdog)  # before this tick counts as a sign of life: it may be late
@@ -232,8 +241,10 @@ def _drive(
             standing, last = False, action
             robot.apply(action)
             work_s.append(pacer.since_tick_s())
+            report.interventions += led
             if recorder is not None:
-                recorder.add(obs, action, tick=tick, safe=reason is not None)
+                safe, wanted = reason is not None, act.info.get(WANTED)
+                recorder.add(obs, action, tick=tick, safe=safe, intervention=led, wanted=wanted)
     finally:
         report.jitter = jitter(pacer.late_s, pacer.missed, pacer.ticks)
         if work_s:
