@@ -35,6 +35,16 @@ METADATA = {
 }
 
 
+class Address:
+    """An address of the web, as `browser.Page.open` takes files."""
+
+    def __init__(self, url: str) -> None:
+        self._url = url
+
+    def as_uri(self) -> str:
+        return self._url
+
+
 @dataclass(frozen=True)
 class LiveServer:
     engine: Engine

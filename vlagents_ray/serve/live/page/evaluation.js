@@ -85,7 +85,7 @@ function intervalBar(cell) {
   svg.append(svgElement("rect", { x: 0, y: 4, width: 100, height: 2, class: "axis" }));
   if (cell) {
     svg.append(svgElement("rect", { x: 100 * cell.low, y: 2, width: Math.max(0.5, 100 * (cell.high - cell.low)), height: 6, class: "range" }));
-    svg.append(svgElement("rect", { x: Math.min(98.5, Math.max(0, 100 * cell.rate - 0.75)), y: 0, width: 1.5, height: 10, class: "rate" }));
+    svg.append(svgElement("path", { d: `M${100 * cell.rate} 0V10`, class: "rate" }));
   }
   return svg;
 }

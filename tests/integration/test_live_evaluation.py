@@ -1,0 +1,120 @@
+"""`vlagents-ray eval … --live`: the page is there while the evaluation runs, with cells and sessions, and then gone."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from eval_fakes import LINE, PYTHONPATH, wait_for
+from ray_processes import processes, ray_folder
+
+from vlagents_ray.serve.ports import free_port
+
+COMMAND = str(Path(sys.executable).parent / "vlagents-ray")
+
+
+@pytest.fixture(name="ray_home")
+def own_ray_folder() -> Iterator[Path]:
+    with ray_folder() as folder:
+        yield folder
+        assert not processes(folder), "left running"
+
+
+class LivePage:
+    """The page of a command that runs."""
+
+    def __init__(self, port: int) -> None:
+        self.url = f"http://127.0.0.1:{port}"
+
+    def document(self) -> dict[str, Any]:
+        """What it shows; {} while it is not there."""
+        with suppress(urllib.error.URLError, ConnectionError), urllib.request.urlopen(f"{self.url}/v1/live") as answer:
+            found: dict[str, Any] = json.load(answer)
+            return found
+        return {}
+
+    def evaluation(self) -> dict[str, Any]:
+        found: dict[str, Any] = self.document().get("evaluation", {})
+        return found
+
+    def text(self) -> bytes:
+        with urllib.request.urlopen(f"{self.url}/live") as answer:
+            text: bytes = answer.read()
+            return text
+
+
+@contextmanager
+def evaluating(ray_home: Path, log: Path, *words: str) -> Iterator[LivePage]:
+    """`eval` with these words and a page; it must end with status 0."""
+    page = LivePage(free_port())
+    with (
+        log.open("w") as output,
+        subprocess.Popen(
+            [COMMAND, "eval", *words, "--live-at", page.url.removeprefix("http://")],
+            env=os.environ | {"RAY_TMPDIR": str(ray_home), "PYTHONPATH": PYTHONPATH},
+            stdout=output, stderr=subprocess.STDOUT,
+        ) as command,
+    ):  # fmt: skip
+        try:
+            yield page
+            assert command.wait(timeout=120) == 0, log.read_text()
+        finally:
+            command.terminate()
+    assert f"live: {page.url}/live" in log.read_text()
+    assert page.document() == {}
+
+
+def test_it_shows_cells_sessions_and_failures_while_it_runs(ray_home: Path, tmp_path: Path) -> None:
+    gate = {"folder": str(tmp_path), "trouble": {"gate": [3]}}  # the last episode waits for the test
+    settings = [f"{name}={yaml.safe_dump(value, default_flow_style=True)}" for name, value in gate.items()]
+    words = [word for setting in settings for word in ("--env-set", setting)]
+    policy = ["--policy", "noop", "--set", "action_dim=1", "--episodes", "4", "--out", str(tmp_path / "out")]
+    with evaluating(ray_home, tmp_path / "log", LINE, *policy, *words) as page:
+        wait_for(lambda: page.evaluation().get("done") == 3)
+        document = page.document()
+        said = document["evaluation"]
+        assert (said["state"], said["planned"], said["failed"]) == ("running", 4, 3)
+        assert said["ends"] is not None
+        [cell] = said["cells"]
+        assert (cell["policy"], cell["task"], cell["rate"], cell["low"]) == ("noop", LINE, 0.0, 0.0)
+        assert [one["outcome"] for one in said["failures"]] == ["failure"] * 3
+        [replica] = document["replicas"]
+        assert replica["policy"] == "noop"
+        assert len(replica["sessions"]) == 1
+        assert b"</html>" in page.text()
+        (tmp_path / "open").touch()
+
+
+def test_a_training_gets_a_point_for_each_checkpoint(ray_home: Path, tmp_path: Path) -> None:
+    runs, file = tmp_path / "runs", tmp_path / "watched.yaml"
+    policy = {
+        "name": "mine", "source": "served_agents:Stored", "config": {"checkpoint": str(runs / "{step}" / "number")}
+    }  # fmt: skip
+    suites = [{"envs": [LINE], "episodes": 2}]
+    file.write_text(yaml.safe_dump({"policies": [policy], "suites": suites, "video": "none"}))
+
+    def write(step: int) -> None:
+        (runs / f"{step}").mkdir(parents=True)
+        (runs / f"{step}" / "number").write_text("1")
+        (runs / f"{step}" / "done").touch()
+
+    def steps() -> list[int]:
+        return [point["step"] for curve in page.evaluation().get("curves", []) for point in curve["points"]]
+
+    write(10)
+    words = ["--watch", str(runs), "--marker", "done", "--until", "20", "--out", str(tmp_path / "out")]
+    with evaluating(ray_home, tmp_path / "log", str(file), *words) as page:
+        wait_for(lambda: page.evaluation().get("state") == "waiting")
+        assert steps() == [10]
+        write(20)
+        wait_for(lambda: steps() == [10, 20])
