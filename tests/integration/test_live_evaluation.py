@@ -75,8 +75,7 @@ def evaluating(ray_home: Path, log: Path, *words: str) -> Iterator[LivePage]:
 
 
 def test_it_shows_cells_sessions_and_failures_while_it_runs(ray_home: Path, tmp_path: Path) -> None:
-    gate = {"folder": str(tmp_path), "trouble": {"gate": [3]}}  # the last episode waits for the test
-    settings = [f"{name}={yaml.safe_dump(value, default_flow_style=True)}" for name, value in gate.items()]
+    settings = [f"folder={tmp_path}", "trouble={gate: [3]}"]  # the last episode waits for the test
     words = [word for setting in settings for word in ("--env-set", setting)]
     policy = ["--policy", "noop", "--set", "action_dim=1", "--episodes", "4", "--out", str(tmp_path / "out")]
     with evaluating(ray_home, tmp_path / "log", LINE, *policy, *words) as page:
@@ -100,7 +99,9 @@ def test_a_training_gets_a_point_for_each_checkpoint(ray_home: Path, tmp_path: P
     policy = {
         "name": "mine", "source": "served_agents:Stored", "config": {"checkpoint": str(runs / "{step}" / "number")}
     }  # fmt: skip
-    suites = [{"envs": [LINE], "episodes": 2}]
+    gate = tmp_path / "gate-1"  # while it is there, the last episode does not wait for the test
+    gate.touch()
+    suites = [{"envs": [LINE], "episodes": 2, "env_options": {"folder": str(tmp_path), "trouble": {"gate": [1]}}}]
     file.write_text(yaml.safe_dump({"policies": [policy], "suites": suites, "video": "none"}))
 
     def write(step: int) -> None:
@@ -116,5 +117,7 @@ def test_a_training_gets_a_point_for_each_checkpoint(ray_home: Path, tmp_path: P
     with evaluating(ray_home, tmp_path / "log", str(file), *words) as page:
         wait_for(lambda: page.evaluation().get("state") == "waiting")
         assert steps() == [10]
+        gate.unlink()
         write(20)
         wait_for(lambda: steps() == [10, 20])
+        (tmp_path / "open").touch()
