@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
-import urllib.error
-import urllib.request
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
 from eval_fakes import LINE, PYTHONPATH, wait_for
+from live_server import LivePage
 from ray_processes import processes, ray_folder
-
-from vlagents_ray.serve.ports import free_port
 
 COMMAND = str(Path(sys.executable).parent / "vlagents-ray")
 
@@ -30,37 +25,14 @@ def own_ray_folder() -> Iterator[Path]:
         assert not processes(folder), "left running"
 
 
-class LivePage:
-    """The page of a command that runs."""
-
-    def __init__(self, port: int) -> None:
-        self.url = f"http://127.0.0.1:{port}"
-
-    def document(self) -> dict[str, Any]:
-        """What it shows; {} while it is not there."""
-        with suppress(urllib.error.URLError, ConnectionError), urllib.request.urlopen(f"{self.url}/v1/live") as answer:
-            found: dict[str, Any] = json.load(answer)
-            return found
-        return {}
-
-    def evaluation(self) -> dict[str, Any]:
-        found: dict[str, Any] = self.document().get("evaluation", {})
-        return found
-
-    def text(self) -> bytes:
-        with urllib.request.urlopen(f"{self.url}/live") as answer:
-            text: bytes = answer.read()
-            return text
-
-
 @contextmanager
 def evaluating(ray_home: Path, log: Path, *words: str) -> Iterator[LivePage]:
     """`eval` with these words and a page; it must end with status 0."""
-    page = LivePage(free_port())
+    page = LivePage()
     with (
         log.open("w") as output,
         subprocess.Popen(
-            [COMMAND, "eval", *words, "--live-at", page.url.removeprefix("http://")],
+            [COMMAND, "eval", *words, "--live-at", page.address],
             env=os.environ | {"RAY_TMPDIR": str(ray_home), "PYTHONPATH": PYTHONPATH},
             stdout=output, stderr=subprocess.STDOUT,
         ) as command,
@@ -109,15 +81,12 @@ def test_a_training_gets_a_point_for_each_checkpoint(ray_home: Path, tmp_path: P
         (runs / f"{step}" / "number").write_text("1")
         (runs / f"{step}" / "done").touch()
 
-    def steps() -> list[int]:
-        return [point["step"] for curve in page.evaluation().get("curves", []) for point in curve["points"]]
-
     write(10)
     words = ["--watch", str(runs), "--marker", "done", "--until", "20", "--out", str(tmp_path / "out")]
     with evaluating(ray_home, tmp_path / "log", str(file), *words) as page:
         wait_for(lambda: page.evaluation().get("state") == "waiting")
-        assert steps() == [10]
+        assert page.steps() == [10]
         gate.unlink()
         write(20)
-        wait_for(lambda: steps() == [10, 20])
+        wait_for(lambda: page.steps() == [10, 20])
         (tmp_path / "open").touch()
