@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vlagents_ray.cli.console import errors
-from vlagents_ray.cli.options import YAML_SUFFIXES, Address, Set, parse_list, parse_settings, parse_time, read_run_file
+from vlagents_ray.cli.options import (
+    YAML_SUFFIXES,
+    Address,
+    Live,
+    LiveAt,
+    Set,
+    parse_list,
+    parse_settings,
+    parse_time,
+    read_run_file,
+)
 from vlagents_ray.cli.ray_session import RESUME, exit_if_ray_is_lost
 from vlagents_ray.errors import ConfigError
 
@@ -95,6 +105,8 @@ def evaluate_command(
         ),
     ] = False,
     address: Address = None,
+    live: Live = False,
+    live_at: LiveAt = None,
 ) -> None:
     """Evaluate policies: episodes in parallel, success rates with confidence intervals, videos.
 
@@ -118,19 +130,25 @@ def evaluate_command(
             raise ConfigError("--end-at and --watch exclude each other: watching ends with --until, or by Ctrl-C")
         if replica_per_gpu and address is None:
             raise ConfigError("--replica-per-gpu: want --address, a cluster whose GPUs can be counted")
+        if dry_run and (live or live_at):
+            raise ConfigError("--dry-run and --live exclude each other: nothing is played that could be watched")
         if dry_run:
             from vlagents_ray.cli.evaluation.dry_run import print_plan
 
             print_plan(evaluation)
-        elif watch is not None:
+            return
+        from vlagents_ray.cli.evaluation.live import live_address
+
+        page = live_address(live, live_at)
+        if watch is not None:
             from vlagents_ray.cli.evaluation.watch import watch_training
 
-            watch_training(evaluation, watch, address, **watching)
+            watch_training(evaluation, watch, address, live=page, **watching)
         else:
             from vlagents_ray.cli.evaluation.run import run_evaluation
 
             end = None if end_at is None else parse_time(end_at, "--end-at")
-            run_evaluation(evaluation, address, end_at=end, replica_per_gpu=replica_per_gpu)
+            run_evaluation(evaluation, address, end_at=end, replica_per_gpu=replica_per_gpu, live=page)
 
 
 def config_from_options(options: Mapping[str, Any]) -> EvalConfig:

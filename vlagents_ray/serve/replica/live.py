@@ -11,6 +11,7 @@ import ray
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.live.fleet import Fleet
 from vlagents_ray.serve.live.snapshot import ReplicaView, Snapshot
+from vlagents_ray.serve.scaling.replica_views import ReplicaViews
 from vlagents_ray.serve.scaling.sibling_replicas import SiblingReplicas
 
 
@@ -21,7 +22,7 @@ class ReplicaLive:
         node = ray.get_runtime_context().get_node_id()
         self._view = ReplicaView(engine, peers.own_name.rpartition("#")[2], node[:8], metadata)
         self._view.open()
-        self._fleet = Fleet(self._view, peers)
+        self._fleet = Fleet(self._view, ReplicaViews([peers.app], but=peers.own_name))
 
     async def live(self, since: int, shown: Collection[str]) -> Snapshot:
         """Return what happened here since a snapshot, with pictures of the sessions `shown`."""

@@ -1,0 +1,82 @@
+"""`--live`: the live page of an evaluation or of a training, for as long as the command runs."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import ray
+import typer
+
+from vlagents_ray.cli.console import out
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate.report.progress import Progress
+from vlagents_ray.evaluate.report.progress_document import ProgressDocument
+from vlagents_ray.serve.access.api_keys import load_keys
+from vlagents_ray.serve.live.fleet import Fleet
+from vlagents_ray.serve.live.page_server import page_server
+from vlagents_ray.serve.ports import LOOPBACK, is_free
+from vlagents_ray.serve.scaling.replica_views import ReplicaViews
+
+_PORT = 8050  # of the page, if it is free
+_NAME = "eval"  # of the page, where keys are for some applications alone
+
+
+def live_address(live: bool, at: str | None) -> tuple[str, int] | None:
+    """Return the (host, port) that `--live` and `--live-at` state; None for no page.
+
+    Raises:
+        ConfigError: `at` is not HOST:PORT.
+    """
+    if at is None:
+        return (LOOPBACK, _PORT if is_free(LOOPBACK, _PORT) else 0) if live else None
+    try:
+        parts = urlsplit(f"//{at}")
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host = port = None
+    if host is None or port is None or parts.netloc != at:
+        raise ConfigError(f"--live-at: got {at!r}, want HOST:PORT, as in 127.0.0.1:{_PORT}")
+    return host, port
+
+
+@contextlib.contextmanager
+def live_progress(
+    results: Path,
+    urls: Collection[str | None],
+    address: tuple[str, int] | None,
+    shown: Progress,
+    *,
+    goes_on: bool = False,
+) -> Iterator[Progress]:
+    """Serve the page of an evaluation for the length of the context, which lies within that of its Ray.
+
+    Args:
+        results: The folder of results.
+        urls: The URLs of the policies. The sessions of those that are in this process's Ray cluster are shown, too.
+        address: (host, port) of the page; None serves none.
+        shown: The progress on the terminal.
+        goes_on: As for `ProgressDocument`.
+
+    Yields:
+        The progress to evaluate with.
+    """
+    if address is None:
+        yield shown
+        return
+    document = ProgressDocument(results, shown, goes_on=goes_on)
+    apps = [url.removeprefix("serve://") for url in urls if url is not None and url.startswith("serve://")]
+    others = ReplicaViews(apps) if apps and ray.is_initialized() else None
+    fleet = Fleet(None, others, document.read)
+    with page_server(fleet, address, load_keys(), name=_NAME, videos=document.video) as url:
+        out.print(f"live: {url}")
+        try:
+            yield document
+        except Exception as error:
+            if not isinstance(error, typer.Exit):
+                document.fail(str(error))
+            raise
+        finally:
+            document.close()
