@@ -31,7 +31,7 @@ def server() -> Iterator[Server]:
             yield server
 
 
-def scraped() -> dict[str, float]:
+def scraped(application: str = "noop", policy: str = "noop", deployment: str = "Policy") -> dict[str, float]:
     """Our series of the node: name and tags, sorted, to value."""
     (node,) = ray.nodes()
     url = f"http://{node['NodeManagerAddress']}:{node['MetricsExportPort']}/metrics"
