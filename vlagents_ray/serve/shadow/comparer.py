@@ -64,7 +64,7 @@ class Comparer:
             asked: The requests.
             live: The replies of the live policy.
             replies: Those of the candidate.
-            dropped: The number of observations of each episode that the candidate has not got so far.
+            dropped: The number of observations before each request, in its episode, that the candidate has not got.
 
         Returns:
             The sessions that the candidate does not know, and cannot follow before their next reset.

@@ -15,6 +15,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
+from functools import partial
 from queue import SimpleQueue
 from typing import NamedTuple
 
@@ -37,7 +38,7 @@ class Turn(NamedTuple):
     session: str  # as the engine names it
     frame: bytes  # of the request
     reply: Reply  # without the parts of the info that only the client needs
-    dropped: int  # observations of the episode that the candidate has not got so far
+    dropped: int  # observations of the episode before this one that the candidate has not got
 
 
 class _Followed:
@@ -59,6 +60,7 @@ class _Entry:
     episode: _Followed
     request: Request
     obs: Obs | None  # of the request, which loses it when the policy has acted
+    dropped: int = 0  # observations of the episode before this one
     frame: bytes = b""
     reply: Reply | None = None
 
@@ -84,7 +86,7 @@ class _Entry:
         if act is not None:
             act = Act(act.action, act.done, {name: act.info[name] for name in (POLICY,) if name in act.info})
         about = Reply(act=act, info=None if act else {}, step=reply.step, timing=dict(reply.timing))
-        return Turn(self.session, self.frame, about, self.episode.dropped)
+        return Turn(self.session, self.frame, about, self.dropped)
 
 
 Ask = Callable[[Sequence[Turn]], Collection[str]]
@@ -123,7 +125,7 @@ class ShadowSender:
         self._lock = threading.Lock()  # of the number of drops
         self._dropped = 0
         self._next_forget = clock()
-        self._inbox: SimpleQueue[_Entry | Collection[str] | Exception | None] = SimpleQueue()
+        self._inbox: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._outbox: SimpleQueue[Sequence[Turn] | None] = SimpleQueue()
         self._threads = [
             threading.Thread(target=self._work, name="shadow", daemon=True),
@@ -151,9 +153,9 @@ class ShadowSender:
         noted: list[tuple[int, _Entry]] = []
         for place, (session, item) in enumerate(zip(sessions, items, strict=True)):
             if isinstance(item, Request) and (episode := self._episode(session, item)) is not None:
-                entry = _Entry(session, episode, item, item.obs)
-                noted.append((place, entry))
-                self._inbox.put(entry)
+                noted.append((place, _Entry(session, episode, item, item.obs, episode.dropped)))
+                if item.op == "act":
+                    self._inbox.put(noted[-1][1].encode)
         if not noted:
             return done
 
@@ -163,7 +165,7 @@ class ShadowSender:
                 entry.reply = replies[place]
                 if entry.request.op == "reset" and entry.reply.error is None:
                     self._episodes[entry.session] = entry.episode
-                self._inbox.put(entry)
+                self._inbox.put(partial(self._take, entry))
 
         return answer
 
@@ -192,12 +194,9 @@ class ShadowSender:
 
     def _work(self) -> None:
         """Run the thread that encodes, and decides what is sent."""
-        while (item := self._inbox.get()) is not None:
+        while (step := self._inbox.get()) is not None:
             try:
-                if isinstance(item, _Entry):
-                    self._take(item)
-                else:
-                    self._free(item)
+                step()
                 self._forget_ended()
                 self._send()
             except Exception:
@@ -207,15 +206,14 @@ class ShadowSender:
         """Run the thread that waits for the candidate."""
         while (turns := self._outbox.get()) is not None:
             try:
-                self._inbox.put(self._ask(turns))
+                result: Collection[str] | Exception = self._ask(turns)
             except Exception as error:  # noqa: BLE001 - whatever fails at the candidate is no failure here
-                self._inbox.put(error)
+                result = error
+            self._inbox.put(partial(self._free, result))
 
     def _take(self, entry: _Entry) -> None:
-        """Encode a request that was noted; keep it for the candidate once the live policy has acted on it."""
+        """Keep a request for the candidate, unless the live policy has not acted on it."""
         episode, op = entry.episode, entry.request.op
-        if op == "act" and not entry.frame:
-            entry.encode()
         if entry.reply is None or entry.reply.error is not None:
             return
         if op == "close":
