@@ -70,6 +70,7 @@ class RobotRun:
     verdict: Label | None = field(default=None, init=False)  # of the running episode, once a human has given it
     over: bool = field(default=False, init=False)  # the human wants no further episode
     _takeover: Takeover | None = field(default=None, init=False)
+    _said: str | None = field(default=None, init=False)  # the reason of the pause that was printed
 
     def play(self, seeds: Iterable[int]) -> None:
         """Play an episode for each seed, and print what became of it.
@@ -107,6 +108,7 @@ class RobotRun:
         def ended() -> bool:
             if recorder is not None and (recorder.interventions or self.over):
                 recorder.label(label())
+            self._say_why_paused()
             return robot.ended or self.verdict is not None
 
         options = {} if self.policy is None else {"seed": seed, "env": self.env}
@@ -165,6 +167,13 @@ class RobotRun:
             self._takeover.pause()
         else:
             self._takeover.resume()
+
+    def _say_why_paused(self) -> None:
+        reason = None if self._takeover is None else self._takeover.reason
+        if reason not in (None, self._said):
+            out.bell()
+            out.print(f"  {reason}; p continues")
+        self._said = reason
 
     def _quit(self) -> None:
         self.verdict, self.over = "discard", True
