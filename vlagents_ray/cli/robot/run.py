@@ -12,6 +12,7 @@ from vlagents_ray.chunking.modes import Mode
 from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.chunking.takeover import Leader, Takeover
 from vlagents_ray.cli.console import out
+from vlagents_ray.cli.robot.terminal_view import TerminalView
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.envs.base import EvalEnv, make_env
@@ -70,6 +71,7 @@ class RobotRun:
     verdict: Label | None = field(default=None, init=False)  # of the running episode, once a human has given it
     over: bool = field(default=False, init=False)  # the human wants no further episode
     _takeover: Takeover | None = field(default=None, init=False)
+    _view: TerminalView | None = field(default=None, init=False)
     _said: str | None = field(default=None, init=False)  # the reason of the pause that was printed
 
     def play(self, seeds: Iterable[int]) -> None:
@@ -90,6 +92,8 @@ class RobotRun:
                 recorder = stack.enter_context(Recorder(self.record, hz, interventions=leader is not None))
             if self.teleop == "keyboard":
                 out.print(f"{HELP}\n{KEYS}")
+            if self.teleop is not None and out.is_terminal:
+                self._view = TerminalView(_write)
             for seed in seeds:
                 if self.over:
                     break
@@ -100,7 +104,7 @@ class RobotRun:
     def _play(self, env: EvalEnv, agent: Agent, seed: int, hz: float, recorder: Recorder | None) -> None:
         self.verdict = None
         robot = EnvRobot(env, seed, endless=self.teleop is not None)
-        out.print(f"seed {seed}: {env.instruction}")
+        self._say(f"seed {seed}: {env.instruction}")
 
         def label() -> Label:
             return self.verdict or ("success" if robot.success else "failure")
@@ -109,6 +113,8 @@ class RobotRun:
             if recorder is not None and (recorder.interventions or self.over):
                 recorder.label(label())
             self._say_why_paused()
+            if self._view is not None:
+                self._view.draw(robot.observe().cameras)
             return robot.ended or self.verdict is not None
 
         options = {} if self.policy is None else {"seed": seed, "env": self.env}
@@ -123,7 +129,7 @@ class RobotRun:
             recorder=recorder,
             until=ended,
         )
-        out.print(f"  {label()}: {robot.steps} steps, {report.interventions} of them a human's")
+        self._say(f"  {label()}: {robot.steps} steps, {report.interventions} of them a human's")
 
     def _leader(self, contract: Contract, stack: contextlib.ExitStack) -> Leader | None:
         if self.teleop is None:
@@ -172,8 +178,18 @@ class RobotRun:
         reason = None if self._takeover is None else self._takeover.reason
         if reason not in (None, self._said):
             out.bell()
-            out.print(f"  {reason}; p continues")
+            self._say(f"  {reason}; p continues")
         self._said = reason
+
+    def _say(self, text: str) -> None:
+        if self._view is not None:
+            self._view.leave()
+        out.print(text)
 
     def _quit(self) -> None:
         self.verdict, self.over = "discard", True
+
+
+def _write(text: str) -> None:
+    out.file.write(text)
+    out.file.flush()
