@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 
 from vlagents_ray.cli.main import app
 from vlagents_ray.cli.robot.terminal_view import TerminalView, blocks
+from vlagents_ray.policies.scripted import Scripted
 
 QUICK = ["--env", "tabletop/lift", "--env-set", "width=32", "--env-set", "height=32"]
 
@@ -139,6 +140,13 @@ def test_a_policy_alone_is_recorded_without_columns_that_nobody_fills(tmp_path: 
     assert run.output.count("success: ") == 2
     assert "recorded: 2 episodes" in run.output
     assert "intervention" not in frames(tmp_path, 1)
+
+
+def test_a_policy_of_this_process_is_loaded_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    loads: list[object] = []
+    monkeypatch.setattr(Scripted, "initialize", loads.append)
+    assert robot("scripted", *QUICK, "--episodes", "3", "--hz", "200").exit_code == 0
+    assert len(loads) == 1
 
 
 @pytest.mark.parametrize(

@@ -37,6 +37,13 @@ class EnvPolicy(Wrapper):
     def __init__(self, agent: Agent, env: Contract) -> None:
         super().__init__(agent)
         self._env = env
+        self._loaded = False
+
+    def initialize(self) -> None:
+        """Load the policy once, though each run of the control loop initializes its agent."""
+        if not self._loaded:
+            super().initialize()
+        self._loaded = True
 
     @property
     def contract(self) -> Contract:
@@ -154,10 +161,11 @@ class RobotRun:
         if remote and self.settings:
             raise ConfigError(f"--set: got {sorted(self.settings)}, but {self.policy} has its settings already")
         inner = RemoteAgent(self.policy) if remote else build_agent(self.policy, self.settings)
-        inner.initialize()
+        policy = EnvPolicy(inner, contract)
+        policy.initialize()
         require_match(inner.contract, contract)
         return ChunkPlayer(
-            EnvPolicy(inner, contract),
+            policy,
             mode=self.mode,
             execute=self.execute,
             check=Guard(contract, max_step=self.max_step),
