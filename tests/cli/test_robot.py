@@ -144,7 +144,7 @@ def test_a_policy_alone_is_recorded_without_columns_that_nobody_fills(tmp_path: 
 
 def test_a_policy_of_this_process_is_loaded_once(monkeypatch: pytest.MonkeyPatch) -> None:
     loads: list[object] = []
-    monkeypatch.setattr(Scripted, "initialize", loads.append)
+    monkeypatch.setattr(Scripted, "initialize", lambda self: loads.append(self))
     assert robot("scripted", *QUICK, "--episodes", "3", "--hz", "200").exit_code == 0
     assert len(loads) == 1
 
