@@ -143,8 +143,12 @@ def test_a_policy_alone_is_recorded_without_columns_that_nobody_fills(tmp_path: 
 
 
 def test_a_policy_of_this_process_is_loaded_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    loads: list[object] = []
-    monkeypatch.setattr(Scripted, "initialize", lambda self: loads.append(self))
+    loads: list[Scripted] = []
+
+    def load(self: Scripted) -> None:
+        loads.append(self)
+
+    monkeypatch.setattr(Scripted, "initialize", load)
     assert robot("scripted", *QUICK, "--episodes", "3", "--hz", "200").exit_code == 0
     assert len(loads) == 1
 
