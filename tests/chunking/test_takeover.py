@@ -355,6 +355,44 @@ def test_a_pause_holds_the_robot_until_it_is_over(make: Any) -> None:
     assert agent.at[asked] == pytest.approx(float(at[0]))
 
 
+def test_an_answer_that_comes_in_a_pause_is_a_sign_of_life_and_nothing_else(make: Any) -> None:
+    agent = Near(gated=True)
+    arm, _ = make(agent, mode="async")
+    arm.tick()
+    arm.tick()
+    wait_for(lambda: len(agent.asked) == 2)
+    arm.player.takeover.pause()
+    assert arm.tick().info["silent_s"] > 0
+    agent.gate.release()
+    arm.settle()
+    act = arm.tick()
+    assert (act.info["silent_s"], act.info[SAFE]) == (0.0, "paused by an operator")
+
+
+def test_what_a_stopped_robot_did_not_execute_is_not_said_to_be(make: Any) -> None:
+    agent = Near()
+    arm, leader = make(agent, execute=1)
+    leader.held = True
+    given = [arm.tick().action.tolist() for _ in range(3)]
+    arm.player.interrupt()
+    arm.player.interrupt()
+    leader.held = False
+    arm.tick()
+    told = [row.tolist() for info in agent.asked if EXECUTED in info for row in info[EXECUTED]]
+    assert told == given[:2]
+
+
+def test_an_episode_begins_without_what_was_executed_in_the_last_one(make: Any) -> None:
+    agent = Near()
+    arm, leader = make(agent)
+    leader.held = True
+    arm.tick()
+    leader.held = False
+    arm.player.reset(arm.seen(), "again")
+    arm.tick()
+    assert EXECUTED not in agent.asked[-1]
+
+
 def test_a_human_takes_over_from_a_pause_and_gives_back_to_the_policy(make: Any) -> None:
     arm, leader = make(Near())
     takeover = arm.player.takeover

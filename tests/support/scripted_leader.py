@@ -1,4 +1,4 @@
-"""A leader for tests, which does at each tick what the test says."""
+"""Leaders for tests, which do at each tick what the test says."""
 
 from __future__ import annotations
 
@@ -7,6 +7,16 @@ from collections.abc import Callable
 import numpy as np
 
 from vlagents_ray import Obs
+
+
+class HoldingLeader:
+    """Has a robot of two joints all the time, and holds it; made without arguments, as commands make a leader."""
+
+    def engaged(self) -> bool:
+        return True
+
+    def action(self, obs: Obs) -> np.ndarray:
+        return np.full(2, 0.25, np.float32)
 
 
 class ScriptedLeader:

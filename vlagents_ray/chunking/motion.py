@@ -30,7 +30,7 @@ class Motion:
     def __init__(self, check: Check | None, contract: Contract | None = None, safe: SafeAction | None = None) -> None:
         self._check, self._contract, self._safe = check, contract, safe
         self._last: np.ndarray | None = None  # the last commanded action
-        self._before: np.ndarray | None = None  # the one of the tick before
+        self._before: np.ndarray | None = None  # the one before it
         self._state: Literal["stopped", "moving", "held"] = "stopped"
 
     @property
@@ -38,12 +38,8 @@ class Motion:
         """Whether an action is known that keeps the robot still."""
         return self._safe is not None
 
-    def begin_tick(self) -> None:
-        """Begin a tick, at which one action is commanded."""
-        self._before = self._last
-
     def stop(self) -> None:
-        """Note that the robot was stopped, and did not execute this tick's action."""
+        """Note that the robot was stopped, and did not execute the last command."""
         self._last = self._before
         self._state = "stopped"
 
@@ -53,9 +49,9 @@ class Motion:
         Raises:
             InvalidAction: It is not close enough to the robot's position or last target, or breaks another rule.
         """
-        self._last = self._passed(action, obs)
+        action = self._passed(action, obs)
         self._state = "moving"
-        return self._last
+        return self._command(action)
 
     def hold(self, obs: Obs, reason: str) -> tuple[np.ndarray, str]:
         """Return the action that keeps the robot still, (D,) float32, and the reason with what was refused meanwhile.
@@ -67,16 +63,20 @@ class Motion:
             raise InvalidAction(f"no action for this tick: {reason}")
         last = self._standing(obs) if self._state == "stopped" else self._last
         try:
-            self._last = self._checked(self._safe(obs, last), last)
+            action = self._checked(self._safe(obs, last), last)
         except InvalidAction as refused:
             reason = f"{reason}; the safe action is refused, too: {refused}"
             if last is None or not self._safe.holds:
                 raise InvalidAction(
                     f"no action for this tick: {reason}; let the guard pass it, or give another one (safe=)"
                 ) from refused
-            self._last = self._checked(last, last)
+            action = self._checked(last, last)
         self._state = "held" if self._state == "moving" else self._state
-        return self._last.copy(), reason
+        return self._command(action).copy(), reason
+
+    def _command(self, action: np.ndarray) -> np.ndarray:
+        self._before, self._last = self._last, action
+        return action
 
     def _passed(self, action: np.ndarray, obs: Obs) -> np.ndarray:
         if self._state == "moving":

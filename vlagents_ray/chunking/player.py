@@ -116,6 +116,7 @@ class ChunkPlayer(Agent):
         self._captured = CaptureClock()
         self._delays: deque[int] = deque(maxlen=DELAYS)
         self._motion = Motion(self.check)
+        self.takeover.begin()
 
     @property
     def contract(self) -> Contract | None:
@@ -156,6 +157,7 @@ class ChunkPlayer(Agent):
         """
         self._begin_again(STOPPED)
         self._motion.stop()
+        self.takeover.note_stopped()
 
     def observe(self, obs: Obs, action: np.ndarray | None = None) -> None:
         """Show the policy an observation for which no action is needed.
@@ -174,7 +176,6 @@ class ChunkPlayer(Agent):
             self._read_part(self._answer.rest, self._tick or 0)
         self._agent.observe(obs)
         if action is not None and self._tick is not None:
-            self._motion.begin_tick()
             self.takeover.note_executed(self._motion.move(action, obs))
             self._plan.advance()
             self._tick += 1
@@ -195,7 +196,6 @@ class ChunkPlayer(Agent):
                 raise
             self._trouble = str(error)  # the human goes on, and what the policy wants is not known
         self._tick = tick + 1
-        self._motion.begin_tick()
         if not led:
             return self._chosen(obs, tick)
         act = self.takeover.act(obs, self._next(), self._motion)

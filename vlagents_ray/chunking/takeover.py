@@ -79,6 +79,7 @@ class Takeover:
         self._samples = samples
         self._executed: deque[np.ndarray] = deque(maxlen=_EXECUTED)  # in place of the policy's, since the last request
         self._pause: str | None = None  # the reason of a pause that lasts
+        self._noted = False  # an action was noted at this tick
         self._judged: Mapping[str, Any] | None = None  # the info of the last chunk whose uncertainty was looked at
         self._helped = False  # since the last certain chunk, a human has looked at the scene
 
@@ -105,12 +106,18 @@ class Takeover:
         """Let the policy continue from the next tick on, with a new answer."""
         self._pause = None
 
+    def begin(self) -> None:
+        """Begin an episode; a pause, and a human's hold of the robot, last into it. The player calls this."""
+        self._executed.clear()
+        self._judged, self._helped = None, False
+
     def update(self) -> bool:
         """Decide at the beginning of a tick who moves the robot; the player calls this.
 
         Returns:
             Whether what the policy has planned is void, since somebody else moved the robot, or nobody does now.
         """
+        self._noted = False
         before, engaged = self._state, False
         if self.leader is not None:
             try:
@@ -153,6 +160,13 @@ class Takeover:
     def note_executed(self, action: np.ndarray) -> None:
         """Note an action, (D,), that the robot executed in place of the policy's; the next request says so."""
         self._executed.append(action)
+        self._noted = True
+
+    def note_stopped(self) -> None:
+        """Note that the robot was stopped, and did not execute the action noted at this tick."""
+        if self._noted:
+            self._executed.pop()
+            self._noted = False
 
     def extras(self) -> dict[str, Any]:
         """Return what the next request says in its `Obs.info`: the samples wanted, and what was executed since."""

@@ -73,7 +73,8 @@ def _ended_by_signals() -> Iterator[None]:
 def _run(options: argparse.Namespace) -> LoopReport:
     say: Callable[[str], None] = lambda line: print(line, flush=True)  # noqa: E731, T201
     deadline_s = options.deadline_ms / 1e3 if options.deadline_ms is not None else WAIT_S * (options.mode != "async")
-    robot_class = _load(options.robot) if options.robot else None
+    robot_class = _load("--robot", options.robot) if options.robot else None
+    leader = _load("--leader", options.leader)() if options.leader else None
     with contextlib.ExitStack() as stack:
         agent = RemoteAgent(
             options.url, transport=options.transport, timeout_s=options.timeout_s
@@ -95,11 +96,14 @@ def _run(options: argparse.Namespace) -> LoopReport:
                 max_age_s=options.max_age_s,
                 safe=options.safe,
                 check=Guard(contract, max_step=options.max_step, measure=_measure(options.measure)),
+                override=leader,
             )
         )
         player.initialize()  # refuses settings that do not fit, before anything is timed or moves
         robot: Robot = SimulatedRobot(contract) if robot_class is None else robot_class()
-        recorder = stack.enter_context(Recorder(options.record, options.hz)) if options.record else None
+        recorder = None
+        if options.record:
+            recorder = stack.enter_context(Recorder(options.record, options.hz, interventions=leader is not None))
         hangs_s = max(0.2, 5 / options.hz) + deadline_s
 
         def stop(reason: str) -> None:
@@ -128,6 +132,8 @@ def _run(options: argparse.Namespace) -> LoopReport:
         say(
             f"from a tick until its action is applied: p50 {report.work_p50_ms:.2f} ms, p99 {report.work_p99_ms:.2f} ms"
         )
+        if leader is not None:
+            say(f"ticks at which a human moved the robot: {report.interventions}")
         say(f"ticks without an action of the policy: {report.safe_ticks} of {report.jitter['ticks']:.0f}")
         for reason, ticks in sorted(report.safe.items(), key=lambda one: -one[1])[:5]:
             say(f"  {ticks} x {reason}")
@@ -232,6 +238,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="MODULE:CLASS",
         help="your class of the robot, created without arguments; default: a simulated one",
     )
+    add("--leader", metavar="MODULE:CLASS", help="your class of what a human moves the robot with, see Leader")
     add("--mode", choices=("open_loop", "ensemble", "async"), default="async", help="see ChunkPlayer (%(default)s)")
     add("--execute", type=_number(int, least=1), metavar="N", help="rows of a chunk to execute before asking again")
     add("--horizon", type=_number(int, least=1), metavar="N", help="rows of a chunk that may be executed at all")
@@ -289,15 +296,15 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _load(name: str) -> Any:
+def _load(option: str, name: str) -> Any:
     module, colon, attribute = name.partition(":")
     if not colon:
-        raise ConfigError(f"--robot: got {name!r}, want module:Class")
+        raise ConfigError(f"{option}: got {name!r}, want module:Class")
     try:
         return getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
         raise ConfigError(
-            f"--robot {name}: {error}; go to the folder of its module ({os.getcwd()} is this one), add that to "
+            f"{option} {name}: {error}; go to the folder of its module ({os.getcwd()} is this one), add that to "
             f"PYTHONPATH, or install it"
         ) from error
 

@@ -46,8 +46,6 @@ def robot_command(
     from vlagents_ray.cli.robot.run import RobotRun
 
     with errors():
-        if policy is None and teleop is None:
-            raise ConfigError("robot: got neither a policy nor --teleop, want one of them, or both")
         if ask_for_help is not None and teleop != "keyboard":
             raise ConfigError("--ask-for-help: got it without a way to answer, want --teleop keyboard")
         run = RobotRun(

@@ -12,6 +12,7 @@ from vlagents_ray.chunking.modes import Mode
 from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.chunking.takeover import Leader, Takeover
 from vlagents_ray.cli.console import out
+from vlagents_ray.cli.robot.terminal_view import TerminalView
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.envs.base import EvalEnv, make_env
@@ -36,6 +37,13 @@ class EnvPolicy(Wrapper):
     def __init__(self, agent: Agent, env: Contract) -> None:
         super().__init__(agent)
         self._env = env
+        self._loaded = False
+
+    def initialize(self) -> None:
+        """Load the policy once, though each run of the control loop initializes its agent."""
+        if not self._loaded:
+            super().initialize()
+        self._loaded = True
 
     @property
     def contract(self) -> Contract:
@@ -70,6 +78,8 @@ class RobotRun:
     verdict: Label | None = field(default=None, init=False)  # of the running episode, once a human has given it
     over: bool = field(default=False, init=False)  # the human wants no further episode
     _takeover: Takeover | None = field(default=None, init=False)
+    _view: TerminalView | None = field(default=None, init=False)
+    _said: str | None = field(default=None, init=False)  # the reason of the pause that was printed
 
     def play(self, seeds: Iterable[int]) -> None:
         """Play an episode for each seed, and print what became of it.
@@ -89,6 +99,8 @@ class RobotRun:
                 recorder = stack.enter_context(Recorder(self.record, hz, interventions=leader is not None))
             if self.teleop == "keyboard":
                 out.print(f"{HELP}\n{KEYS}")
+            if self.teleop is not None and out.is_terminal:
+                self._view = TerminalView(_write)
             for seed in seeds:
                 if self.over:
                     break
@@ -99,7 +111,7 @@ class RobotRun:
     def _play(self, env: EvalEnv, agent: Agent, seed: int, hz: float, recorder: Recorder | None) -> None:
         self.verdict = None
         robot = EnvRobot(env, seed, endless=self.teleop is not None)
-        out.print(f"seed {seed}: {env.instruction}")
+        self._say(f"seed {seed}: {env.instruction}")
 
         def label() -> Label:
             return self.verdict or ("success" if robot.success else "failure")
@@ -107,6 +119,9 @@ class RobotRun:
         def ended() -> bool:
             if recorder is not None and (recorder.interventions or self.over):
                 recorder.label(label())
+            self._say_why_paused()
+            if self._view is not None:
+                self._view.draw(robot.observe().cameras)
             return robot.ended or self.verdict is not None
 
         options = {} if self.policy is None else {"seed": seed, "env": self.env}
@@ -121,7 +136,7 @@ class RobotRun:
             recorder=recorder,
             until=ended,
         )
-        out.print(f"  {label()}: {robot.steps} steps, {report.interventions} of them a human's")
+        self._say(f"  {label()}: {robot.steps} steps, {report.interventions} of them a human's")
 
     def _leader(self, contract: Contract, stack: contextlib.ExitStack) -> Leader | None:
         if self.teleop is None:
@@ -146,10 +161,11 @@ class RobotRun:
         if remote and self.settings:
             raise ConfigError(f"--set: got {sorted(self.settings)}, but {self.policy} has its settings already")
         inner = RemoteAgent(self.policy) if remote else build_agent(self.policy, self.settings)
-        inner.initialize()
+        policy = EnvPolicy(inner, contract)
+        policy.initialize()
         require_match(inner.contract, contract)
         return ChunkPlayer(
-            EnvPolicy(inner, contract),
+            policy,
             mode=self.mode,
             execute=self.execute,
             check=Guard(contract, max_step=self.max_step),
@@ -166,5 +182,22 @@ class RobotRun:
         else:
             self._takeover.resume()
 
+    def _say_why_paused(self) -> None:
+        reason = None if self._takeover is None else self._takeover.reason
+        if reason not in (None, self._said):
+            out.bell()
+            self._say(f"  {reason}; p continues")
+        self._said = reason
+
+    def _say(self, text: str) -> None:
+        if self._view is not None:
+            self._view.leave()
+        out.print(text)
+
     def _quit(self) -> None:
         self.verdict, self.over = "discard", True
+
+
+def _write(text: str) -> None:
+    out.file.write(text)
+    out.file.flush()
