@@ -16,7 +16,7 @@ from vlagents_ray.evaluate.report.progress import Progress
 from vlagents_ray.evaluate.report.progress_document import ProgressDocument
 from vlagents_ray.serve.access.api_keys import load_keys
 from vlagents_ray.serve.live.fleet import Fleet
-from vlagents_ray.serve.live.page_server import page_server
+from vlagents_ray.serve.live.page_server import page_server, require_watch_keys
 from vlagents_ray.serve.ports import LOOPBACK, is_free
 from vlagents_ray.serve.scaling.replica_views import ReplicaViews
 
@@ -28,7 +28,7 @@ def live_address(live: bool, at: str | None) -> tuple[str, int] | None:
     """Return the (host, port) that `--live` and `--live-at` state; None for no page.
 
     Raises:
-        ConfigError: `at` is not HOST:PORT.
+        ConfigError: `at` is not HOST:PORT, or other machines would reach the page without a key.
     """
     if at is None:
         return (LOOPBACK, _PORT if is_free(LOOPBACK, _PORT) else 0) if live else None
@@ -39,6 +39,7 @@ def live_address(live: bool, at: str | None) -> tuple[str, int] | None:
         host = port = None
     if host is None or port is None or parts.netloc != at:
         raise ConfigError(f"--live-at: got {at!r}, want HOST:PORT, as in 127.0.0.1:{_PORT}")
+    require_watch_keys(host, load_keys())  # before anything is served
     return host, port
 
 

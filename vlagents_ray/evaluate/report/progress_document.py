@@ -46,8 +46,6 @@ class ProgressDocument(Progress):
         self._goes_on = goes_on
         self._state = STARTING
         self._reason = ""
-        self._begun = 0.0  # s, of `time.monotonic`
-        self._left = self._played = 0  # episodes
         self._videos: list[str] = []  # paths of the videos by their number
         self._numbers: dict[str, int] = {}  # the reverse
         self._document: dict[str, Any] = {}
@@ -55,26 +53,22 @@ class ProgressDocument(Progress):
         self._read_at, self._took_s = float("-inf"), 0.0
 
     def begin(self, cells: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
-        """Begin to count."""
-        self._begun, self._left, self._played = time.monotonic(), left, 0
+        """Note that an evaluation runs."""
         self._change(RUNNING)
         self._shown.begin(cells, recorded, left)
 
     def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
-        """Count an episode."""
-        self._left -= 1
-        self._played += 1
+        """Note that there is a result."""
         self._changed = True
         self._shown.episode(cell, result)
 
     def retry(self, job: Job, failure: Failure) -> None:
-        """Note that the number of retries has changed."""
+        """Note that there was a retry."""
         self._changed = True
         self._shown.retry(job, failure)
 
     def stopped(self, cell: EvalCase, at: int, spared: int) -> None:
-        """Count the episodes that are not played."""
-        self._left -= spared
+        """Note that fewer episodes are planned."""
         self._changed = True
         self._shown.stopped(cell, at, spared)
 
@@ -130,16 +124,17 @@ class ProgressDocument(Progress):
         return Results.load(self._out) if (self._out / FILE).is_file() else None
 
     def _last_state(self) -> str:
-        results = self._results()
+        try:
+            results = self._results()
+        except ConfigError:  # the disk, it may be: the evaluation's own error says so
+            return STOPPED
         return results.runs[-1].state if results is not None and results.runs else STOPPED
 
     def _describe(self) -> dict[str, Any]:
         results = self._results()
         cells = () if results is None else results.cells
         contenders = [] if results is None else results.contenders
-        left_s = None
-        if self._state == RUNNING:
-            left_s = seconds_left(self._left, self._played, time.monotonic() - self._begun)
+        left_s = _left_s(results) if results is not None and self._state == RUNNING else None
         failed = [(cell, one) for cell in cells for one in cell.episodes if _failed(one)]
         failed.sort(key=lambda found: found[1].finished, reverse=True)
         return {
@@ -180,6 +175,14 @@ class ProgressDocument(Progress):
             self._numbers[video] = len(self._videos)
             self._videos.append(video)
         return self._numbers[video]
+
+
+def _left_s(results: Results) -> float | None:
+    """Return how long the last run takes from now on, if episodes go on to take as long as those of it so far."""
+    run = results.runs[-1]
+    played = sum(one.run == run.run for cell in results.cells for one in cell.episodes)
+    left = sum(_planned(cell) - _done(cell) for cell in results.cells)
+    return seconds_left(left, played, time.time() - run.started)
 
 
 def _failed(one: Episode) -> bool:
