@@ -224,9 +224,8 @@ def test_a_page_that_cannot_be_is_told_before_anything_starts(
 
 
 def test_a_page_has_a_port_of_its_own_if_another_has_the_usual_one() -> None:
-    assert live_address(live=False, at=None) is None
-    assert live_address(live=True, at="[::1]:9000") == ("::1", 9000)
+    assert live_address("[::1]:9000") == ("::1", 9000)
     with closing(socket.socket()) as taken:
         with contextlib.suppress(OSError):  # it may be taken already
             taken.bind(("127.0.0.1", 8050))
-        assert live_address(live=True, at=None) == ("127.0.0.1", 0)
+        assert live_address(None) == ("127.0.0.1", 0)
