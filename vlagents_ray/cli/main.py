@@ -133,7 +133,7 @@ def learn_tabletop_command(
         settings = {} if file is None else read_run_file(file, "file of settings", "`methods`")
         settings |= {name: value for name, value in given.items() if value is not None}
         plan = LearnPlan.model_validate(settings)
-        page = live_address(live, live_at)
+        page = live_address(live_at) if live or live_at else None
 
         def watched(urls: Collection[str]) -> AbstractContextManager[Progress]:
             return live_progress(plan.out, urls, page, SilentProgress(), goes_on=True)

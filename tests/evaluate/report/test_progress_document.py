@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,9 @@ from vlagents_ray.evaluate.episode.records import EpisodeResult, Status
 from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.plan.jobs import Job, plan
-from vlagents_ray.evaluate.report import progress_document
+from vlagents_ray.evaluate.report import results_document
 from vlagents_ray.evaluate.report.progress_document import ProgressDocument
+from vlagents_ray.evaluate.report.results_document import ResultsDocument
 from vlagents_ray.evaluate.results.reader import rate_of
 from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.results.summary import summarize
@@ -26,11 +26,11 @@ from vlagents_ray.evaluate.results.summary import summarize
 
 @pytest.fixture(autouse=True)
 def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(progress_document, "_EVERY_S", 0.0)
-    monkeypatch.setattr(progress_document, "_SHARE", float("inf"))
+    monkeypatch.setattr(results_document, "_EVERY_S", 0.0)
+    monkeypatch.setattr(results_document, "_SHARE", float("inf"))
 
 
-def read(document: ProgressDocument) -> dict[str, Any]:
+def read(document: ResultsDocument) -> dict[str, Any]:
     """The document, as a browser gets it."""
     found: dict[str, Any] = json.loads(json.dumps(document.read(), allow_nan=False))
     return found["evaluation"]
@@ -93,13 +93,11 @@ def test_cells_fill_with_their_intervals(document: ProgressDocument, played: Pla
 def test_the_time_left_is_that_of_the_episodes_to_come(
     document: ProgressDocument, played: Played, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    now = time.monotonic()
     for job in played.jobs[:4]:
         played.play(job, True)
-    document.stopped(played.jobs[0].cell, 4, 10)
-    monkeypatch.setattr(progress_document.time, "monotonic", lambda: now + 40)
-    monkeypatch.setattr(progress_document.time, "time", lambda: 1000.0)
-    assert read(document)["ends"] == pytest.approx(1000 + 40 / 4 * 10, rel=0.01)
+    [run] = Results.load(played.config.out).runs
+    monkeypatch.setattr(results_document.time, "time", lambda: run.started + 40)
+    assert read(document)["ends"] == pytest.approx(run.started + 40 + 40 / 4 * 20)
 
 
 def test_failures_come_newest_first_with_what_went_wrong(document: ProgressDocument, played: Played) -> None:
@@ -120,7 +118,7 @@ def test_failures_come_newest_first_with_what_went_wrong(document: ProgressDocum
 def test_old_failures_are_counted_alone(
     document: ProgressDocument, played: Played, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(progress_document, "_FAILURES", 2)
+    monkeypatch.setattr(results_document, "_FAILURES", 2)
     for job in played.jobs[:4]:
         played.play(job, False)
     said = read(document)
@@ -189,7 +187,7 @@ def test_the_results_are_read_for_a_share_of_the_time_at_most(
     document: ProgressDocument, played: Played, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = document.read()
-    monkeypatch.setattr(progress_document, "_EVERY_S", 1e9)
+    monkeypatch.setattr(results_document, "_EVERY_S", 1e9)
     played.play(played.jobs[0], True)
     assert document.read() is before
     played.end("complete")  # which nobody should miss
@@ -233,3 +231,19 @@ def test_cells_that_may_stop_early_have_a_confidence_sequence(tmp_path: Path) ->
     found = read(ProgressDocument(tmp_path))["cells"]
     assert all(cell["sequence"] and cell["stopped"] for cell in found)
     assert all(cell["done"] == cell["planned"] < 40 for cell in found)
+
+
+def test_a_folder_that_another_process_writes_says_how_its_last_run_stands(tmp_path: Path) -> None:
+    followed = ResultsDocument(tmp_path)
+    assert read(followed)["state"] == "starting"
+    (tmp_path / "results.db").touch()  # it is just being made
+    assert read(followed)["state"] == "starting"
+    (tmp_path / "results.db").unlink()
+    one = Played(tmp_path, ProgressDocument(tmp_path))
+    one.play(one.jobs[0], False)
+    said = read(followed)
+    assert (said["state"], said["done"], len(said["failures"])) == ("running", 1, 1)
+    assert said["ends"] is not None
+    one.end("interrupted")
+    one.store.close()
+    assert read(followed)["state"] == "interrupted"

@@ -137,9 +137,11 @@ def evaluate_command(
 
             print_plan(evaluation)
             return
-        from vlagents_ray.cli.evaluation.live import live_address
+        page = None
+        if live or live_at:
+            from vlagents_ray.cli.evaluation.live import live_address
 
-        page = live_address(live, live_at)
+            page = live_address(live_at)
         if watch is not None:
             from vlagents_ray.cli.evaluation.watch import watch_training
 

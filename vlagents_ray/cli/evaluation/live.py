@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -14,9 +15,10 @@ from vlagents_ray.cli.console import out
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.report.progress import Progress
 from vlagents_ray.evaluate.report.progress_document import ProgressDocument
+from vlagents_ray.evaluate.report.results_document import ResultsDocument
 from vlagents_ray.serve.access.api_keys import load_keys
 from vlagents_ray.serve.live.fleet import Fleet
-from vlagents_ray.serve.live.page_server import page_server
+from vlagents_ray.serve.live.page_server import page_server, require_watch_keys
 from vlagents_ray.serve.ports import LOOPBACK, is_free
 from vlagents_ray.serve.scaling.replica_views import ReplicaViews
 
@@ -24,14 +26,14 @@ _PORT = 8050  # of the page, if it is free
 _NAME = "eval"  # of the page, where keys are for some applications alone
 
 
-def live_address(live: bool, at: str | None) -> tuple[str, int] | None:
-    """Return the (host, port) that `--live` and `--live-at` state; None for no page.
+def live_address(at: str | None) -> tuple[str, int]:
+    """Return the (host, port) that `--live-at` states; None is `--live` alone.
 
     Raises:
-        ConfigError: `at` is not HOST:PORT.
+        ConfigError: `at` is not HOST:PORT, or other machines would reach the page without a key.
     """
     if at is None:
-        return (LOOPBACK, _PORT if is_free(LOOPBACK, _PORT) else 0) if live else None
+        return LOOPBACK, _PORT if is_free(LOOPBACK, _PORT) else 0
     try:
         parts = urlsplit(f"//{at}")
         host, port = parts.hostname, parts.port
@@ -39,6 +41,7 @@ def live_address(live: bool, at: str | None) -> tuple[str, int] | None:
         host = port = None
     if host is None or port is None or parts.netloc != at:
         raise ConfigError(f"--live-at: got {at!r}, want HOST:PORT, as in 127.0.0.1:{_PORT}")
+    require_watch_keys(host, load_keys())  # before anything is served
     return host, port
 
 
@@ -69,9 +72,7 @@ def live_progress(
     document = ProgressDocument(results, shown, goes_on=goes_on)
     apps = [url.removeprefix("serve://") for url in urls if url is not None and url.startswith("serve://")]
     others = ReplicaViews(apps) if apps and ray.is_initialized() else None
-    fleet = Fleet(None, others, document.read)
-    with page_server(fleet, address, load_keys(), name=_NAME, videos=document.video) as url:
-        out.print(f"live: {url}")
+    with _page(document, others, address):
         try:
             yield document
         except Exception as error:
@@ -80,3 +81,17 @@ def live_progress(
             raise
         finally:
             document.close()
+
+
+def follow(results: Path, address: tuple[str, int]) -> None:
+    """Serve the page of an evaluation or a training that another process writes to a folder, until Ctrl-C."""
+    with _page(ResultsDocument(results), None, address), contextlib.suppress(KeyboardInterrupt):
+        threading.Event().wait()
+
+
+@contextlib.contextmanager
+def _page(document: ResultsDocument, others: ReplicaViews | None, address: tuple[str, int]) -> Iterator[None]:
+    fleet = Fleet(None, others, document.read)
+    with page_server(fleet, address, load_keys(), name=_NAME, videos=document.video) as url:
+        out.print(f"live: {url}")
+        yield

@@ -1,37 +1,24 @@
-"""What a page in a browser shows of a running evaluation: its results so far, and the videos of its failures."""
+"""The document of a results folder while an evaluation of this process writes it."""
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate.artifacts.storage import inside, outcome
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.report.progress import Progress, SilentProgress, seconds_left
-from vlagents_ray.evaluate.results.database import FILE
-from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results, rate_of
+from vlagents_ray.evaluate.report.progress import Progress, SilentProgress
+from vlagents_ray.evaluate.report.results_document import RUNNING, STARTING, ResultsDocument
+from vlagents_ray.evaluate.results.reader import Results
 from vlagents_ray.evaluate.results.statistics import Rate
 
-STARTING, RUNNING, WAITING, STOPPED = "starting", "running", "waiting", "stopped"
-_FAILURES = 24  # most failures in the document, the newest ones
-_TEXT = 300  # most characters of an error or an instruction
-_EVERY_S = 1.0  # least time between two readings of the results
-_SHARE = 0.04  # of a core, for reading them
+WAITING, ENDED, STOPPED = "waiting", "ended", "stopped"
 
 
-class ProgressDocument(Progress):
-    """Describes an evaluation, or the evaluations of a training, while they run.
-
-    The evaluation calls it as its `Progress`; `read` and `video` may be called on any one other thread. Numbers come
-    from the folder of results, by the code that makes the report: so they include earlier runs and, in a training,
-    earlier versions. Nothing is read while nobody calls `read`.
-    """
+class ProgressDocument(ResultsDocument, Progress):
+    """Describes an evaluation that calls it as its `Progress`. The page's thread may read it meanwhile."""
 
     def __init__(self, out: Path, shown: Progress | None = None, *, goes_on: bool = False) -> None:
         """Describe the results in a folder.
@@ -41,178 +28,62 @@ class ProgressDocument(Progress):
             shown: Gets each call, too: the progress on the terminal.
             goes_on: Whether further evaluations follow each other, as those of a training's checkpoints.
         """
-        self._out = out
+        super().__init__(out)
+        self.goes_on = goes_on
         self._shown = shown or SilentProgress()
-        self._goes_on = goes_on
         self._state = STARTING
-        self._reason = ""
-        self._begun = 0.0  # s, of `time.monotonic`
-        self._left = self._played = 0  # episodes
-        self._videos: list[str] = []  # paths of the videos by their number
-        self._numbers: dict[str, int] = {}  # the reverse
-        self._document: dict[str, Any] = {}
         self._changed = True
-        self._read_at, self._took_s = float("-inf"), 0.0
 
     def begin(self, cells: Sequence[EvalCase], recorded: Mapping[str, Rate], left: int) -> None:
-        """Begin to count."""
-        self._begun, self._left, self._played = time.monotonic(), left, 0
+        """Note that an evaluation runs."""
         self._change(RUNNING)
         self._shown.begin(cells, recorded, left)
 
     def episode(self, cell: EvalCase, result: EpisodeResult) -> None:
-        """Count an episode."""
-        self._left -= 1
-        self._played += 1
+        """Note that there is a result."""
         self._changed = True
         self._shown.episode(cell, result)
 
     def retry(self, job: Job, failure: Failure) -> None:
-        """Note that the number of retries has changed."""
+        """Note that there was a retry."""
         self._changed = True
         self._shown.retry(job, failure)
 
     def stopped(self, cell: EvalCase, at: int, spared: int) -> None:
-        """Count the episodes that are not played."""
-        self._left -= spared
+        """Note that fewer episodes are planned."""
         self._changed = True
         self._shown.stopped(cell, at, spared)
 
     def end(self) -> None:
         """Note that this evaluation has ended."""
-        if self._goes_on:
+        if self.goes_on:
             self._change(WAITING)
         else:
             self.close()
         self._shown.end()
 
     def close(self) -> None:
-        """Note that no evaluation follows: the state is that of the last one."""
+        """Note that no evaluation follows: the state is that of the last run."""
         if self._state != STOPPED:
-            self._change(self._last_state())
+            self._change(ENDED)
 
     def fail(self, reason: str) -> None:
         """Note that an error ended the evaluation."""
-        self._reason = reason[:_TEXT]
+        self.reason = reason
         self._change(STOPPED)
 
-    def read(self) -> dict[str, Any]:
-        """Return {"evaluation": the document}; the same object as before if nothing in it has changed.
-
-        It may take as long as reading the folder of results, and does that for at most 4 % of the time.
-        """
-        since = time.monotonic() - self._read_at
-        final = self._changed and self._state not in (RUNNING, WAITING)
-        due = since >= max(_EVERY_S, self._took_s / _SHARE)
-        if final or (due and (self._changed or self._state == RUNNING)):
+    def is_due(self, *, rested: bool) -> bool:
+        """Return whether there is something new; how it ended is told at once."""
+        final = self._changed and self._state in (ENDED, STOPPED)
+        due = final or (rested and (self._changed or self._state == RUNNING))
+        if due:
             self._changed = False
-            begun = time.monotonic()
-            self._document = {"evaluation": self._describe()}
-            self._read_at = time.monotonic()
-            self._took_s = self._read_at - begun
-        return self._document
+        return due
 
-    def video(self, number: int) -> Path | None:
-        """Return the file of a video in the document; None if there is none, or it is a link out of the folder."""
-        if not 0 <= number < len(self._videos):
-            return None
-        try:
-            path = inside(self._out, self._videos[number])
-        except ConfigError:
-            return None
-        return path if path.is_file() else None
+    def state(self, results: Results | None) -> str:
+        """Return how the evaluation stands: once it has ended, as its last run says."""
+        return super().state(results) if self._state == ENDED else self._state
 
     def _change(self, state: str) -> None:
         self._state = state
         self._changed = True
-
-    def _results(self) -> Results | None:
-        return Results.load(self._out) if (self._out / FILE).is_file() else None
-
-    def _last_state(self) -> str:
-        results = self._results()
-        return results.runs[-1].state if results is not None and results.runs else STOPPED
-
-    def _describe(self) -> dict[str, Any]:
-        results = self._results()
-        cells = () if results is None else results.cells
-        contenders = [] if results is None else results.contenders
-        left_s = None
-        if self._state == RUNNING:
-            left_s = seconds_left(self._left, self._played, time.monotonic() - self._begun)
-        failed = [(cell, one) for cell in cells for one in cell.episodes if _failed(one)]
-        failed.sort(key=lambda found: found[1].finished, reverse=True)
-        return {
-            "name": self._out.name,
-            "state": self._state,
-            "reason": self._reason,
-            "ends": None if left_s is None else time.time() + left_s,
-            "goes_on": self._goes_on,
-            "contenders": contenders,
-            "tasks": list(dict.fromkeys(cell.task for cell in cells)),
-            "done": sum(_done(cell) for cell in cells),
-            "planned": sum(_planned(cell) for cell in cells),
-            "retries": sum(attempt.retried for cell in cells for attempt in cell.attempts),
-            "cells": [_cell(cell) for cell in cells],
-            "curves": [] if results is None else _curves(results),
-            "failed": len(failed),
-            "failures": [self._failure(cell, one) for cell, one in failed[:_FAILURES]],
-        }
-
-    def _failure(self, cell: CellResults, one: Episode) -> dict[str, Any]:
-        result = one.result
-        return {
-            "key": str(result.key),
-            "policy": cell.contender,
-            "task": cell.task,
-            "episode": result.key.episode,
-            "seed": result.key.seed,
-            "outcome": outcome(result),
-            "error": (result.error or "")[:_TEXT],
-            "instruction": result.instruction[:_TEXT],
-            "steps": result.steps,
-            "finished": one.finished,
-            "videos": [self._number(video) for video in one.videos],
-        }
-
-    def _number(self, video: str) -> int:
-        if video not in self._numbers:
-            self._numbers[video] = len(self._videos)
-            self._videos.append(video)
-        return self._numbers[video]
-
-
-def _failed(one: Episode) -> bool:
-    return not one.beyond and not one.result.success_once
-
-
-def _done(cell: CellResults) -> int:
-    """Return the number of episodes with a result, those that infrastructure lost included."""
-    return sum(not one.beyond for one in cell.episodes)
-
-
-def _planned(cell: CellResults) -> int:
-    return cell.planned if cell.stopped_at is None else _done(cell)
-
-
-def _cell(cell: CellResults) -> dict[str, Any]:
-    counts = {"policy": cell.contender, "task": cell.task, "done": _done(cell), "planned": _planned(cell)}
-    stopped = {"stopped": cell.stopped_at is not None, "sequence": cell.stop is not None}
-    return counts | stopped | _rate(rate_of([cell], "success_once"))
-
-
-def _rate(rate: Rate) -> dict[str, Any]:
-    low, high = rate.interval
-    return {"successes": rate.successes, "episodes": rate.episodes, "rate": rate.rate, "low": low, "high": high}
-
-
-def _curves(results: Results) -> list[dict[str, Any]]:
-    """Return the learning curve of each policy that has several steps or versions: its success rate at each."""
-    points: dict[str, list[dict[str, Any]]] = {}
-    for contender in results.contenders:
-        cells = results.of(contender)
-        if cells[0].step is not None:
-            whole = all(_done(cell) == _planned(cell) for cell in cells)
-            point = {"step": cells[0].step, "whole": whole} | _rate(rate_of(cells, "success_once"))
-            points.setdefault(cells[0].policy, []).append(point)
-    return [{"policy": policy, "points": found} for policy, found in points.items()]

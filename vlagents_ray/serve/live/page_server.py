@@ -21,6 +21,17 @@ from vlagents_ray.serve.live.fleet import Fleet
 
 _LAST_S = 0.5  # time for viewers to be sent how it ended
 _END_S = 1  # time limit for their connections to close, s
+_LEAVE_S = 5.0  # time limit for all of it
+
+
+def require_watch_keys(host: str, keys: Keys | None) -> None:
+    """Raise `ConfigError` if other machines would reach a page on `host` without a key."""
+    if keys is None and not is_loopback(host):
+        raise ConfigError(
+            f"live page on {host}: whoever reaches it would see all cameras. Make a key (`vlagents-ray keys new NAME "
+            f"--scope watch --file keys.json`) and set VLAGENTS_RAY_KEYS_FILE=keys.json; or stay on loopback, and look "
+            f"at it through `ssh -L`"
+        )
 
 
 @contextmanager
@@ -43,12 +54,7 @@ def page_server(
         ConfigError: Other machines would reach the page without a key, or the address is not free.
     """
     host, port = address
-    if keys is None and not is_loopback(host):
-        raise ConfigError(
-            f"live page on {host}: whoever reaches it would see all cameras. Make a key (`vlagents-ray keys new NAME "
-            f"--scope watch --file keys.json`) and set VLAGENTS_RAY_KEYS_FILE=keys.json; or stay on loopback, and look "
-            f"at it through `ssh -L`"
-        )
+    require_watch_keys(host, keys)
     try:
         listening = socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
     except OSError as error:
@@ -69,4 +75,4 @@ def page_server(
         if fleet.watched:
             time.sleep(_LAST_S)
         server.should_exit = True
-        thread.join()
+        thread.join(_LEAVE_S)  # it may wait for a Ray that is lost

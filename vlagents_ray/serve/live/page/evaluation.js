@@ -175,6 +175,12 @@ async function loadVideo(video) {
   } catch { video.replaceWith(element("p", { className: "note" }, "Its video is not there any more.")); }
 }
 
+// Another evaluation may be at this address now, with other numbers of its videos.
+function forgetFailures() {
+  for (const card of failures.values()) removeFailure(card);
+  failures.clear();
+}
+
 function removeFailure(card) {
   for (const video of card.querySelectorAll("video")) { inView.unobserve(video); URL.revokeObjectURL(video.src); }
   card.remove();

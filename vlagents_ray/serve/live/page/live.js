@@ -30,7 +30,7 @@ function connect() {
   let heard = false;
   const ask = () => socket.send(JSON.stringify({ shown: visibleSessions() }));
   socket.binaryType = "arraybuffer";
-  socket.onopen = ask;
+  socket.onopen = () => { forgetFailures(); ask(); };
   socket.onmessage = (event) => {
     if (typeof event.data === "string") return say(JSON.parse(event.data).detail, false);
     if (!heard) say("Live", true);
