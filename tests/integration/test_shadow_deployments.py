@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 from eval_fakes import wait_for
 from ray.serve.schema import ServeDeploySchema
@@ -14,6 +15,12 @@ from tests.integration.test_shadow import AGENT, frames, played, recorded
 from vlagents_ray import ConfigError, Obs, RemoteAgent
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
+
+
+def candidates() -> set[int]:
+    """The processes of candidates on this machine."""
+    found = psutil.process_iter(["pid", "cmdline"])
+    return {one.info["pid"] for one in found if "ServeReplica:Seeded:Shadow" in " ".join(one.info["cmdline"] or ())}
 
 
 def redeploy(config: ServeDeploySchema) -> None:
@@ -47,9 +54,13 @@ def test_the_candidate_changes_its_settings_and_the_live_policy_does_not_restart
         acts = [line for line in recorded(tmp_path) if line["op"] == "act" and not line["dropped"]]
         return acts[-1]["difference"]["mean"] if acts else 0.0
 
+    before = candidates()
     with running_server(config(0.5), num_cpus=4) as server, RemoteAgent(server.url) as agent:
         agent.reset(Obs({"front": np.zeros((2, 2, 3), np.uint8)}, 1.0, {"joints": np.ones(7, np.float32)}), "", seed=1)
         wait_for(lambda: difference() == pytest.approx(0.5, abs=1e-4))
         redeploy(config(2.0))
         wait_for(lambda: difference() == pytest.approx(2.0, abs=1e-4))
         assert agent.act(frames(0)[0]).action.shape == (4, 7)
+        running = candidates() - before
+        assert running
+    wait_for(lambda: not running & candidates())
