@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import ray
 from eval_fakes import wait_for
 from prometheus_series import scrape
 
@@ -128,3 +129,18 @@ def test_clients_learn_of_it_and_do_not_reach_it(server: Server) -> None:
     with urllib.request.urlopen(f"{server.url}/v1/metadata", timeout=10) as answer:
         metadata = json.load(answer)
     assert metadata["shadow"] == {"policy": AGENT, "share": 1.0}
+
+
+def test_a_candidate_that_dies_is_followed_again_and_the_live_policy_goes_on(
+    server: Server, folder: Path, alone: dict[str, tuple[bytes, list[float]]]
+) -> None:
+    [name] = [one["name"] for one in ray.util.list_named_actors(all_namespaces=True) if "#Shadow#" in one["name"]]
+    before = set(folder.glob("*.jsonl"))
+    ray.kill(ray.get_actor(name, namespace="serve"))
+    assert played(server, "shm")[0] == alone["shm"][0]
+
+    def compared() -> bool:
+        assert played(server, "websocket")[0] == alone["websocket"][0]
+        return set(folder.glob("*.jsonl")) > before
+
+    wait_for(compared)

@@ -31,3 +31,12 @@ class Seeded(Agent):
             raise RuntimeError("the file is there")
         rows = self.rng.normal(size=(4, 7)) + obs.cameras["front"].mean() + obs.state["joints"] + self.offset
         return Act(rows.astype(np.float32))
+
+
+class Unstated(Seeded):
+    """States its contract only once it has loaded: eight numbers."""
+
+    contract = None  # type: ignore[assignment]
+
+    def initialize(self) -> None:
+        self.contract = Contract(action=ActionSpec(dim=8))  # type: ignore[misc]

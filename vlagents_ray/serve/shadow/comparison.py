@@ -63,8 +63,7 @@ def require_comparable(live: Contract | None, candidate: Contract | None) -> Non
         return
     found = differences(candidate, replace(live, chunk=None))
     if found:
-        raise ConfigError(
-            "shadow: the candidate (below: the policy) does not fit what the live policy gets and returns (the env):\n"
-            + "\n".join(f"- {line}" for line in found)
-            + "\nwant a candidate for the same robot and control mode; its `wrappers` can adapt it"
+        raise ConfigError(  # on one line, since `serve status` ends with the last one
+            f"shadow: the candidate (the policy, below) does not fit what the live policy gets and returns (the env): "
+            f"{'. '.join(found)}. Serve a candidate for the same robot and control mode; its `wrappers` can adapt it"
         )
