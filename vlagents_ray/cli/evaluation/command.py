@@ -105,11 +105,11 @@ def evaluate_command(
     ] = None,
     operator: Annotated[
         str | None,
-        typer.Option(metavar="page|terminal", help="With --robot: where that person answers; default: page."),
+        typer.Option(metavar="page|terminal", help="With --robot: where that person is asked; default: page"),
     ] = None,
     unblind: Annotated[
         bool,
-        typer.Option("--unblind", help="With --robot: write the results of the trials that were judged; play none."),
+        typer.Option("--unblind", help="With --robot: write the results of the judged trials; play none."),
     ] = False,
     address: Address = None,
 ) -> None:

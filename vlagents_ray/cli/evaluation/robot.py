@@ -22,11 +22,12 @@ def run_on_robot(config: EvalConfig, address: str | None, *, operator: str, unbl
         unblinded: Play nothing, and write the results of the trials that have a verdict.
     """
     from vlagents_ray.evaluate import print_summary
-    from vlagents_ray.evaluate.robot import PageOperator, TerminalOperator, evaluate_on_robot, unblind
+    from vlagents_ray.evaluate.robot import PageOperator, TerminalOperator, evaluate_on_robot, planned_cells, unblind
 
     if unblinded:
-        print_summary(out, unblind(config))
+        print_summary(out, unblind(config.out, config.robot.key if config.robot is not None else None))
         return
+    planned_cells(config)  # what is wrong is said before anything starts
     with served(config, address) as ready, contextlib.ExitStack() as stack:
         person = TerminalOperator() if operator == "terminal" else stack.enter_context(PageOperator(out.print))
         summary = evaluate_on_robot(ready, person)

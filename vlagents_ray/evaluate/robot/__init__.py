@@ -6,7 +6,7 @@ methods.
 """
 
 from vlagents_ray.evaluate.robot.operator import Operator, Verdict, VisibleTrial
-from vlagents_ray.evaluate.robot.run import TrialsInterrupted, evaluate_on_robot, unblind
+from vlagents_ray.evaluate.robot.run import TrialsInterrupted, evaluate_on_robot, planned_cells, unblind
 from vlagents_ray.evaluate.robot.schedule import Trial, schedule
 from vlagents_ray.evaluate.robot.terminal import TerminalOperator
 from vlagents_ray.evaluate.robot.web_operator import PageOperator
@@ -20,6 +20,7 @@ __all__ = [
     "Verdict",
     "VisibleTrial",
     "evaluate_on_robot",
+    "planned_cells",
     "schedule",
     "unblind",
 ]

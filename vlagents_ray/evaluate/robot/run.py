@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +25,10 @@ from vlagents_ray.evaluate.robot.operator import Operator, Verdict, VisibleTrial
 from vlagents_ray.evaluate.robot.pictures import save_start, start_pictures
 from vlagents_ray.evaluate.robot.schedule import Trial, schedule
 from vlagents_ray.evaluate.robot.trial import PlayedTrial, WatchedRobot, play, rehearse
-from vlagents_ray.evaluate.robot.trial_log import LOG, LoggedTrial, TrialLog
+from vlagents_ray.evaluate.robot.trial_log import LoggedTrial, TrialLog, logged_plan
 from vlagents_ray.evaluate.run import conclude
 from vlagents_ray.evaluate.workers.agents import AgentFactory, agents
-from vlagents_ray.interface import Agent, Obs
+from vlagents_ray.interface import Obs
 from vlagents_ray.ray_tools.private import output_printer, set_output_printer
 from vlagents_ray.robot.loop import Robot, robot_class
 
@@ -51,7 +51,7 @@ def evaluate_on_robot(
     operator: Operator,
     *,
     robot: Robot | None = None,
-    agent_factory: Callable[[], Agent] | None = None,
+    agent_factory: AgentFactory | None = None,
 ) -> Summary:
     """Play every trial of `config` that has no result yet, and write the results to `config.out`.
 
@@ -64,7 +64,7 @@ def evaluate_on_robot(
         config: The policies, with their URLs, and the plan, with `robot`.
         operator: The person at the robot.
         robot: The robot; by default one of the class `config.robot.arm`.
-        agent_factory: Called to make an agent for a trial, in place of a connection to the policy's `url`.
+        agent_factory: Called with a policy to make its agent for a trial, in place of a connection to its `url`.
 
     Returns:
         The summary of all results in `config.out`.
@@ -76,7 +76,7 @@ def evaluate_on_robot(
         VLAgentsError: A policy cannot be reached, or fails, before the first trial.
     """
     planned = planned_cells(config)
-    factory = agents(config, agent_factory, "robot")
+    factory = agent_factory or agents(config, None, "robot")
     watched = WatchedRobot(robot or robot_class(str(config.robot and config.robot.arm))(), operator)
     with TrialLog(config, planned) as log:
         trials = schedule(planned, log.key)
@@ -88,19 +88,19 @@ def evaluate_on_robot(
     return _write_results(config, planned, log, "complete")
 
 
-def unblind(config: EvalConfig) -> Summary:
+def unblind(out: Path, key: str | None = None) -> Summary:
     """Write the results of the trials that have a verdict, before all have one; trials after it are not blind.
 
     Args:
-        config: The plan, with `robot`.
+        out: The folder of an evaluation on a robot.
+        key: The plan's key; None: the one that was drawn for the folder.
 
     Raises:
-        ConfigError: The settings contradict the log in `config.out`.
+        ConfigError: The folder has no trials, or they are of another key.
     """
+    config = logged_plan(out, key).model_copy(update={"out": out, "resume": True})
     planned = planned_cells(config)
-    if not (config.out / LOG).exists():
-        raise ConfigError(f"{config.out}: got no trials there, want the folder of an evaluation on a robot")
-    with TrialLog(config.model_copy(update={"resume": True}), planned) as log:
+    with TrialLog(config, planned) as log:
         log.note_unblinded()
     return _write_results(config, planned, log, "interrupted")
 
@@ -154,7 +154,8 @@ class _Run:
         if not left:
             return
         obs = self._robot.observe()
-        for cell in {trial.job.cell.name: trial.job.cell for trial in sorted(left, key=_in_plan)}.values():
+        policies = {trial.job.cell.contender: trial.job.cell for trial in left}
+        for _, cell in sorted(policies.items(), key=lambda one: one[0]):  # which tells nothing of the trials' order
             rehearse(cell, self._factory, obs)
         for trial in left:
             while not self._is_over(trial) and trial.number not in self._log.finished:
@@ -242,20 +243,21 @@ class _Run:
         return self._config.out / RECORDINGS / f"trial{trial.number:04d}-{attempt}"
 
     def _require_same_policy(self, trial: Trial, played: PlayedTrial) -> None:
-        """Raise `ConfigError`, which does not name it, if the policy is another than in its earlier trials."""
-        cell, result = trial.job.cell, played.result
+        """Raise `ConfigError` if the policy is another than before; it names neither the policy nor its trials."""
+        cell = trial.job.cell
+        now = {name: getattr(played.result, name) for name in ("checkpoint", "weights")}
         for number, logged in self._log.finished.items():
-            if self._trials[number - 1].job.cell.policy.name != cell.policy.name:
+            other = self._trials[number - 1].job.cell
+            if other.policy.name != cell.policy.name:
                 continue
-            differs = changed(logged.sealed["metadata"], played.metadata, swept=cell.step is not None)
-            if self._trials[number - 1].job.cell.name[0] == cell.contender:
-                earlier = logged.sealed["result"]
-                now = {"checkpoint": result.checkpoint, "weights": result.weights}
-                differs = differs or next((n for n in now if None not in (earlier[n], now[n]) != earlier[n]), None)
-            if differs is not None:
+            what = changed(logged.sealed["metadata"], played.metadata, swept=cell.step is not None)
+            if what is None and other.contender == cell.contender:
+                before = logged.sealed["result"]
+                what = next((name for name in now if now[name] and before[name] and now[name] != before[name]), None)
+            if what is not None:
                 raise ConfigError(
-                    f"trial {trial.number}: the {differs} of its policy is another than in trial {number}; serve all "
-                    f"policies as before and go on with --resume, or choose another out folder"
+                    f"the {what} of a policy has changed since its earlier trials; serve all policies as before and go "
+                    "on with --resume, or choose another out folder"
                 )
 
 
@@ -266,11 +268,6 @@ def result_of(trial: Trial, logged: LoggedTrial) -> EpisodeResult:
     if sealed["key"] != trial.job.key:
         raise ConfigError(f"trial {trial.number}: its result is of another plan; choose another out folder")
     return EpisodeResult(**sealed)
-
-
-def _in_plan(trial: Trial) -> tuple[str, ...]:
-    """Sorts the policies by name, so that the order of the rehearsals tells nothing of that of the trials."""
-    return trial.job.cell.name
 
 
 @contextlib.contextmanager

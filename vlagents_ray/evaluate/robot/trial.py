@@ -10,7 +10,16 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.chunking.player import ChunkPlayer
-from vlagents_ray.errors import CheckpointFailed, EnvFailed, PolicyFailed, PolicyUnavailable
+from vlagents_ray.errors import (
+    CheckpointFailed,
+    ConnectionLost,
+    DeadlineExceeded,
+    EnvFailed,
+    NoReplica,
+    OutcomeUnknown,
+    PolicyFailed,
+    PolicyUnavailable,
+)
 from vlagents_ray.evaluate.episode.episode import transport_of
 from vlagents_ray.evaluate.episode.failures import env_side, policy_side
 from vlagents_ray.evaluate.episode.records import EpisodeResult
@@ -27,6 +36,7 @@ from vlagents_ray.robot.safety import measured_state
 
 _WAIT_S = 1.0  # deadline of a tick in the modes that wait for an answer
 _ENDINGS = {"policy_done": "the policy considers the task finished", "truncated": "the time is over"}
+_LOST = {one.code for one in (PolicyUnavailable, NoReplica, ConnectionLost, DeadlineExceeded, OutcomeUnknown)}
 _STOPPED = "stopped by the operator"
 
 
@@ -215,8 +225,11 @@ def _deadline_s(settings: RobotConfig) -> float:
 
 
 def _require_alive(report: LoopReport) -> None:
-    """Raise for what the watchdog stopped: infrastructure failures are not the policy's."""
+    """Raise for a trial that the connection or the robot decided: infrastructure failures are not the policy's."""
     for bark in report.barks:
         if bark.startswith("server"):
             raise PolicyUnavailable(f"the policy's server was silent: {bark}")
         raise EnvFailed(f"robot: the control loop was held up: {bark}")
+    lost = sum(ticks for reason, ticks in report.safe.items() if reason.partition(":")[0] in _LOST)
+    if 2 * lost > report.jitter.get("ticks", 0):
+        raise PolicyUnavailable(f"the policy's server could not be reached in {lost} ticks: {sorted(report.safe)}")

@@ -17,6 +17,7 @@ import secrets
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from vlagents_ray.errors import ConfigError
@@ -71,7 +72,7 @@ class TrialLog:
             self._file = self._path.open("a+b")
         try:
             self._lock()
-            self._read(hmac.digest(self.key, _identity(cells), hashlib.sha256).hex())
+            self._read(config, hmac.digest(self.key, _identity(cells), hashlib.sha256).hex())
         except BaseException:
             self._file.close()
             raise
@@ -102,7 +103,7 @@ class TrialLog:
     def end(self, trial: int, attempt: int, seen: dict[str, Any], sealed: dict[str, Any]) -> LoggedTrial:
         """Record the end of an attempt."""
         ended = LoggedTrial(trial, attempt, time.time(), seen, sealed)
-        line = {"trial": trial, "attempt": attempt, "at": ended.at, **seen, "sealed": self._seal(sealed)}
+        line = {"trial": trial, "attempt": attempt, "at": ended.at, **seen, "sealed": _seal(self.key, sealed)}
         self._write(line)
         self.attempts.append(ended)
         return ended
@@ -119,7 +120,7 @@ class TrialLog:
                 f"{self._path}: another evaluation is writing there; wait for it, or choose another folder"
             ) from error
 
-    def _read(self, identity: str) -> None:
+    def _read(self, config: EvalConfig, identity: str) -> None:
         self._file.seek(0)
         data = self._file.read()
         whole = data.rfind(b"\n") + 1  # a line without its end was being written when the process was killed
@@ -127,7 +128,8 @@ class TrialLog:
         lines = [json.loads(line) for line in data[:whole].splitlines()]
         if not lines:
             self.started = time.time()
-            self._write({"plan": identity, "at": self.started})
+            plan = {"config": json.loads(config.model_dump_json(exclude_unset=True))}
+            self._write({"plan": identity, "at": self.started, "sealed": _seal(self.key, plan)})
             return
         if not hmac.compare_digest(lines[0]["plan"], identity):
             raise ConfigError(
@@ -144,7 +146,7 @@ class TrialLog:
                 continue
             begun.discard(place)
             self.attempts.append(
-                LoggedTrial(*place, line.pop("at"), sealed=self._unseal(line.pop("sealed")), seen=line)
+                LoggedTrial(*place, line.pop("at"), sealed=_unseal(self.key, line.pop("sealed")), seen=line)
             )
         for place in begun:
             self.end(*place, {"again": _KILLED, "cause": "operator"}, {})
@@ -155,20 +157,44 @@ class TrialLog:
             self._file.flush()
             os.fsync(self._file.fileno())
 
-    def _seal(self, content: dict[str, Any]) -> str:
-        text = json.dumps(content, default=str).encode()
-        text += b" " * (-len(text) % _BLOCK)
-        nonce = secrets.token_bytes(_NONCE)
-        return base64.b64encode(nonce + self._crypt(nonce, text)).decode()
 
-    def _unseal(self, text: str) -> dict[str, Any]:
-        data = base64.b64decode(text)
-        return dict(json.loads(self._crypt(data[:_NONCE], data[_NONCE:])))
+def logged_plan(out: Path, key: str | None) -> EvalConfig:
+    """Return the plan of the log in a folder, with the policies' URLs.
 
-    def _crypt(self, nonce: bytes, text: bytes) -> bytes:
-        """Encrypt or decrypt with SHAKE-256 of key and nonce as the key stream."""
-        stream = hashlib.shake_256(b"vlagents_ray trials" + self.key + nonce).digest(len(text))
-        return bytes(a ^ b for a, b in zip(text, stream, strict=True))
+    Args:
+        out: The folder.
+        key: The plan's key; None: the one that was drawn for the folder.
+
+    Raises:
+        ConfigError: The folder has no log, or it is of another key.
+    """
+    try:
+        with (out / LOG).open("rb") as file:
+            first = json.loads(file.readline())
+        secret = key.encode() if key is not None else (out / KEY).read_bytes().strip()
+        return EvalConfig.model_validate(_unseal(secret, first["sealed"])["config"])
+    except FileNotFoundError as error:
+        raise ConfigError(f"{error.filename}: is missing; want the folder of an evaluation on a robot") from error
+    except ValueError as error:
+        raise ConfigError(f"{out / LOG}: cannot be read with this key; want the `robot.key` of its plan") from error
+
+
+def _seal(key: bytes, content: dict[str, Any]) -> str:
+    text = json.dumps(content, default=str).encode()
+    text += b" " * (-len(text) % _BLOCK)
+    nonce = secrets.token_bytes(_NONCE)
+    return base64.b64encode(nonce + _crypt(key, nonce, text)).decode()
+
+
+def _unseal(key: bytes, text: str) -> dict[str, Any]:
+    data = base64.b64decode(text)
+    return dict(json.loads(_crypt(key, data[:_NONCE], data[_NONCE:])))
+
+
+def _crypt(key: bytes, nonce: bytes, text: bytes) -> bytes:
+    """Encrypt or decrypt with SHAKE-256 of key and nonce as the key stream."""
+    stream = hashlib.shake_256(b"vlagents_ray trials" + key + nonce).digest(len(text))
+    return bytes(a ^ b for a, b in zip(text, stream, strict=True))
 
 
 def _identity(cells: Sequence[EvalCase]) -> bytes:
