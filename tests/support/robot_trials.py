@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
-from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.evaluate import EvalConfig, Summary
 from vlagents_ray.evaluate.plan.config import PolicyConfig
-from vlagents_ray.evaluate.robot import TerminalOperator
+from vlagents_ray.evaluate.robot import Operator, TerminalOperator, evaluate_on_robot
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.robot.simulated import SimulatedRobot
 
@@ -96,6 +96,27 @@ class Policies:
     def __call__(self, policy: PolicyConfig) -> Agent:
         self.made.append(policy.name)
         return self.make(policy.name)
+
+
+class Evaluation:
+    """An evaluation on a thread."""
+
+    def __init__(self, config: EvalConfig, operator: Operator, arm: Arm) -> None:
+        self.summary: Summary | None = None
+        self.error: BaseException | None = None
+        self._play = lambda: evaluate_on_robot(config, operator, robot=arm, agent_factory=Policies())
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        try:
+            self.summary = self._play()
+        except BaseException as error:  # noqa: BLE001 - looked at by the test
+            self.error = error
+
+    def join(self) -> None:
+        self._thread.join(60)
+        assert not self._thread.is_alive()
 
 
 class ScriptedPerson(TerminalOperator):
