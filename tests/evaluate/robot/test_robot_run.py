@@ -24,7 +24,7 @@ from robot_trials import (
     typed,
 )
 
-from vlagents_ray.errors import ConfigError, ConnectionLost, PolicyFailed
+from vlagents_ray.errors import ConfigError, ConnectionLost, MissingState, PolicyFailed
 from vlagents_ray.evaluate import EvalConfig, Results, compare
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import cells
@@ -71,13 +71,11 @@ def test_what_tells_the_policy_is_nowhere_until_all_are_judged(
 
 
 class Talkative(Reaching):
-    """A policy whose connection logs and prints warnings with its name."""
+    """A policy whose connection logs its name."""
 
     def act(self, obs: Obs) -> Act:
-        if self.acts:  # a rehearsal tells nothing: it goes by name
-            logging.getLogger("vlagents_ray.client.recovery").warning("%s: slow, at %s", self.name, URLS[self.name])
-            logging.getLogger("ray.serve").error("replica of %s", self.name)
-        self.acts += 1
+        logging.getLogger("vlagents_ray.client.recovery").warning("%s: slow, at %s", self.name, URLS[self.name])
+        logging.getLogger("ray.serve").error("replica of %s", self.name)
         return super().act(obs)
 
 
@@ -214,7 +212,7 @@ def test_a_lost_connection_is_told_without_the_policy_and_is_no_failure_of_it(
     person = ScriptedPerson(judged("f"))
     summary = evaluate_on_robot(config, person, agent_factory=policies)
     [told] = [line for line in person.printed if "played again" in line]
-    assert told.strip() == f"played again: the connection failed ({code})"
+    assert told.strip() == f"played again: it could not be played ({code})"
     [attempt] = [attempt for cell in summary.results.cells for attempt in cell.attempts]
     assert attempt.cause == "policy"
     assert ".example" in attempt.error, "what was sealed is told at the end"
@@ -237,6 +235,14 @@ def test_a_policy_that_fails_has_failed_without_a_verdict(tmp_path: Path) -> Non
     assert any("trial 1: the policy failed, so it counts as a failure" in line for line in person.printed)
     assert not any("zebra" in line or "walrus" in line for line in person.printed)
     assert (summary.total.policy_errors, summary.total.success_once.successes) == (1, 1)
+
+
+def test_a_mistake_in_the_settings_shows_before_the_first_trial(tmp_path: Path) -> None:
+    config = plan(tmp_path / "out", robot={"measure": "elbow", "max_step": 0.1})
+    person = ScriptedPerson(judged("s"))
+    with pytest.raises(MissingState, match="elbow"):
+        evaluate_on_robot(config, person, agent_factory=Policies())
+    assert person.printed == []
 
 
 def test_the_guard_sees_each_action(tmp_path: Path) -> None:

@@ -80,7 +80,7 @@ def evaluate_on_robot(
     watched = WatchedRobot(robot or robot_class(str(config.robot and config.robot.arm))(), operator)
     with TrialLog(config, planned) as log:
         trials = schedule(planned, log.key)
-        run = _Run(config, operator, watched, factory, log, trials)
+        run = _RemainingTrials(config, operator, watched, factory, log, trials)
         try:
             run.play()
         except KeyboardInterrupt:
@@ -120,7 +120,7 @@ def planned_cells(config: EvalConfig) -> list[EvalCase]:
     return cells(config)
 
 
-class _Run:
+class _RemainingTrials:
     """The trials that are left, one after the other."""
 
     def __init__(
@@ -156,7 +156,8 @@ class _Run:
         obs = self._robot.observe()
         policies = {trial.job.cell.contender: trial.job.cell for trial in left}
         for _, cell in sorted(policies.items(), key=lambda one: one[0]):  # which tells nothing of the trials' order
-            rehearse(cell, self._factory, obs)
+            with _quiet():
+                rehearse(cell, self._factory, self._operator, obs)
         for trial in left:
             while not self._is_over(trial) and trial.number not in self._log.finished:
                 self._play(trial)
@@ -180,7 +181,7 @@ class _Run:
                 played = play(trial, self._robot, self._factory, self._operator, self._recording(trial, attempt))
         except VLAgentsError as error:
             failure = explain(error)
-            why = failure.message if failure.code == "env_failed" else f"the connection failed ({failure.code})"
+            why = failure.message if failure.code == "env_failed" else f"it could not be played ({failure.code})"
             self._log.end(
                 trial.number,
                 attempt,

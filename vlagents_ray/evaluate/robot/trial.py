@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from vlagents_ray.errors import (
     ConnectionLost,
     DeadlineExceeded,
     EnvFailed,
+    InvalidAction,
     NoReplica,
     OutcomeUnknown,
     PolicyFailed,
@@ -26,6 +28,7 @@ from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.episode.stats import EpisodeStats
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import RobotConfig
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.evaluate.robot.operator import Operator, Verdict
 from vlagents_ray.evaluate.robot.schedule import Trial
 from vlagents_ray.evaluate.workers.agents import AgentFactory
@@ -148,24 +151,7 @@ def play(
 
     with contextlib.ExitStack() as stack:
         stack.callback(setattr, robot, "stats", None)
-        agent = factory(cell.policy)
-        with contextlib.ExitStack() as unplayed:
-            unplayed.callback(agent.close)  # which is the player's later
-            agent.initialize()
-            guard = Guard(agent.contract, max_step=settings.max_step, measure=measured_state(settings.measure))
-            player = _CountingPlayer(
-                agent,
-                stats,
-                operator,
-                mode=settings.mode,
-                execute=cell.policy.execute,
-                deadline_s=deadline_s,
-                max_age_s=settings.max_age_s,
-                safe=settings.safe,
-                check=guard,
-            )
-            unplayed.pop_all()
-        stack.enter_context(player)
+        agent, player = stack.enter_context(_player(cell, factory, stats, operator))
         recorder = None if recording is None else stack.enter_context(Recorder(recording, settings.hz))
         failed, report = None, LoopReport(settings.hz)
         try:
@@ -193,23 +179,45 @@ def play(
         return PlayedTrial(replace(result, env_seconds=None), dict(getattr(agent, "metadata", {})), ending)
 
 
-def rehearse(cell: EvalCase, factory: AgentFactory, obs: Obs) -> None:
+def rehearse(cell: EvalCase, factory: AgentFactory, operator: Operator, obs: Obs) -> None:
     """Let a policy answer once, without moving the robot.
 
     A mistake in the settings shows before the first trial, and what a policy does at its first answer, such as
     compiling, takes no time of a trial, by which the policy could be told.
     """
+    task = _settings(cell).tasks[cell.env]
+    unused = EpisodeStats(EpisodeKey(cell.env, 0, 0, cell.fingerprint))
+    with _player(cell, factory, unused, operator) as (_, player):
+        player.initialize()
+        with contextlib.suppress(InvalidAction):  # which is a failure of the policy in a trial
+            player.reset(obs, task.instruction, **cell.policy_options)
+            player.act(obs)
+
+
+@contextlib.contextmanager
+def _player(
+    cell: EvalCase, factory: AgentFactory, stats: EpisodeStats, operator: Operator
+) -> Iterator[tuple[Agent, ChunkPlayer]]:
+    """Yield a policy's agent and its player with the plan's settings; both are closed at the end."""
+    settings = _settings(cell)
     agent = factory(cell.policy)
-    try:
+    with contextlib.ExitStack() as unplayed:
+        unplayed.callback(agent.close)
         agent.initialize()
-        with policy_side("reset"):
-            agent.reset(
-                obs, None if cell.robot is None else cell.robot.tasks[cell.env].instruction, **cell.policy_options
-            )
-        with policy_side("act"):
-            agent.act(obs)
-    finally:
-        agent.close()
+        player = _CountingPlayer(
+            agent,
+            stats,
+            operator,
+            mode=settings.mode,
+            execute=cell.policy.execute,
+            deadline_s=_deadline_s(settings),
+            max_age_s=settings.max_age_s,
+            safe=settings.safe,
+            check=Guard(agent.contract, max_step=settings.max_step, measure=measured_state(settings.measure)),
+        )
+        unplayed.pop_all()  # the player closes it
+    with player:
+        yield agent, player
 
 
 def _settings(cell: EvalCase) -> RobotConfig:
