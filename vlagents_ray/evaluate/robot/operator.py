@@ -94,6 +94,9 @@ class Operator(Protocol):
             trial: The trial that was played.
             ending: How it ended, in words.
 
+        Returns:
+            The verdict; one to repeat the trial has its reason in the note.
+
         Raises:
             KeyboardInterrupt: The operator has left. The trial will be played again.
         """

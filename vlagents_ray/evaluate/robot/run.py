@@ -42,9 +42,6 @@ class TrialsInterrupted(KeyboardInterrupt):
     It says nothing of the results, as the trials to come would not be blind.
     """
 
-    def __init__(self, done: int, planned: int, out: Path) -> None:
-        super().__init__(f"interrupted after {done} of {planned} trials; go on with --resume --out {out}")
-
 
 def evaluate_on_robot(
     config: EvalConfig,
@@ -84,7 +81,9 @@ def evaluate_on_robot(
         try:
             run.play()
         except KeyboardInterrupt:
-            raise TrialsInterrupted(len(log.finished), len(trials), config.out) from None
+            raise TrialsInterrupted(
+                f"interrupted after {len(log.finished)} of {len(trials)} trials; go on with --resume --out {config.out}"
+            ) from None
     return _write_results(config, planned, log, "complete")
 
 
@@ -94,6 +93,9 @@ def unblind(out: Path, key: str | None = None) -> Summary:
     Args:
         out: The folder of an evaluation on a robot.
         key: The plan's key; None: the one that was drawn for the folder.
+
+    Returns:
+        The summary of these results.
 
     Raises:
         ConfigError: The folder has no trials, or they are of another key.

@@ -51,6 +51,9 @@ def schedule(cells: Iterable[EvalCase], key: bytes) -> list[Trial]:
     Args:
         cells: The cells of the plan, all on a robot.
         key: Who has it knows which policy plays in which trial.
+
+    Returns:
+        The trials in the order in which they are played.
     """
     tasks: dict[tuple[str, str], dict[str, EvalCase]] = {}
     for cell in cells:

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Callable
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate.robot.operator import Outcome, Verdict, VisibleTrial
+from vlagents_ray.evaluate.robot.operator import Operator, Outcome, Verdict, VisibleTrial
 from vlagents_ray.evaluate.robot.pictures import save_overlay
 from vlagents_ray.interface import Obs
 from vlagents_ray.naming import distinct
@@ -15,7 +15,7 @@ from vlagents_ray.naming import distinct
 _OUTCOMES: dict[str, Outcome] = {"s": "success", "f": "failure", "p": "partial", "r": "repeat"}
 
 
-class TerminalOperator:
+class TerminalOperator(Operator):
     """An operator at a terminal. Enter stops a running trial.
 
     Args:
@@ -32,10 +32,9 @@ class TerminalOperator:
     ) -> None:
         self._ask = ask
         self._say = say
-        self.stops = _enter_pressed if stopping is None else stopping
+        self._stopping = _enter_pressed if stopping is None else stopping
 
     def prepare(self, trial: VisibleTrial, observe: Callable[[], Obs]) -> bool:
-        """Ask until the scene is ready; False if the operator ends the evaluation, or has left."""
         self._say(f"\ntrial {trial.number} of {trial.total}: {trial.task}, scene {trial.scene}")
         if trial.message:
             self._say(f"  {trial.message}")
@@ -57,8 +56,10 @@ class TerminalOperator:
     def watch(self, obs: Obs) -> None:
         """Show nothing: the operator sees the robot."""
 
+    def stops(self) -> bool:
+        return self._stopping()
+
     def judge(self, trial: VisibleTrial, ending: str) -> Verdict:
-        """Ask for the verdict until it is one."""
         self._say(f"trial {trial.number} has ended: {ending}")
         choices = "s success, f failure, p partial, r repeat" if trial.rubric else "s success, f failure, r repeat"
         while True:

@@ -20,7 +20,7 @@ from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, R
 from starlette.routing import Mount, Route
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate.robot.operator import Verdict, VisibleTrial
+from vlagents_ray.evaluate.robot.operator import Operator, Verdict, VisibleTrial
 from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import Obs
 from vlagents_ray.naming import distinct
@@ -49,7 +49,7 @@ _HEADERS = {
 }
 
 
-class PageOperator:
+class PageOperator(Operator):
     """An operator at a page in the browser. Use as a context manager: the page is served within it.
 
     The page is on the loopback interface, and its address has a random part, without which there is no answer. A
@@ -92,7 +92,6 @@ class PageOperator:
         self._thread.join()
 
     def prepare(self, trial: VisibleTrial, observe: Callable[[], Obs]) -> bool:
-        """Show the scene's start pictures over live ones until the page says that it is ready, or the end."""
         self._enter("scene", trial)
         while (answer := self._wait(_LOOK_S)) is None:
             if self._is_watched():
@@ -101,15 +100,12 @@ class PageOperator:
         return bool(answer["do"] == "ready")
 
     def watch(self, obs: Obs) -> None:
-        """Let the page show this observation's cameras."""
         self._obs = obs
 
     def stops(self) -> bool:
-        """Whether the page said so, or has gone."""
         return self._answer is not None or not self._is_watched()
 
     def judge(self, trial: VisibleTrial, ending: str) -> Verdict:
-        """Wait for the page's verdict."""
         self._enter("verdict", trial, ending)
         while (answer := self._wait(1.0)) is None:
             pass
