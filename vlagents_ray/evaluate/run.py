@@ -7,7 +7,7 @@ import logging
 from collections import Counter
 from collections.abc import Callable
 
-from vlagents_ray.errors import StorageFailed, from_code
+from vlagents_ray.errors import ConfigError, StorageFailed, from_code
 from vlagents_ray.evaluate.artifacts.provenance import (
     driver_code,
     policy_code,
@@ -100,6 +100,8 @@ def evaluate(
         EvaluationInterrupted: Ctrl-C or SIGTERM; `OutOfTime`, which is one, if `end_at` left episodes over.
         VLAgentsError: The last infrastructure error, after `config.abort_after` lost episodes in a row.
     """
+    if config.real_robot is not None:
+        raise ConfigError("robot.arm: got a real robot, want a plan in simulation; see vlagents_ray.evaluate.robot")
     factory = agents(config, agent_factory)
     tracking = TrackerFeed(config)
     require_envs(config)

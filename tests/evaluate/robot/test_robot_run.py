@@ -25,7 +25,7 @@ from robot_trials import (
 )
 
 from vlagents_ray.errors import ConfigError, ConnectionLost, MissingState, PolicyFailed
-from vlagents_ray.evaluate import EvalConfig, Results, compare
+from vlagents_ray.evaluate import EvalConfig, Results, compare, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.jobs import plan as jobs
@@ -45,8 +45,7 @@ def names_by_trial(config: EvalConfig) -> list[str]:
 def test_what_tells_the_policy_is_nowhere_until_all_are_judged(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    told = [part for name in NAMES for part in (name, name.removeprefix("policy-"), URLS[name], URLS[name][-4:])]
-    told += ["step-4711", "fingerprint-of", "digest-of"]
+    told = [*NAMES, *URLS.values(), "step-4711", "fingerprint-of", "digest-of"]  # none can be base64 by chance
     looks = 0
 
     def look() -> None:
@@ -373,3 +372,22 @@ def test_the_first_start_of_a_scene_is_what_later_trials_of_it_are_set_to(tmp_pa
     assert any(str(start) in line for line in person.printed)
     assert str(overlay) in person.printed[-6] or any(line.strip() == str(overlay) for line in person.printed)
     assert decode(start.read_bytes()).shape == decode(overlay.read_bytes()).shape == (32, 32, 3)
+
+
+def test_a_first_trial_that_is_repeated_takes_the_start_pictures_again(tmp_path: Path) -> None:
+    pictures: list[bytes] = []
+
+    def keep() -> None:
+        pictures.extend(path.read_bytes() for path in tmp_path.rglob("front.jpg"))
+
+    lines = ["", "r", "the cup stood on another mark", "", "s", "", "", "s", ""]
+    config = plan(tmp_path / "out", suite={"episodes": 1, "envs": ["drawer"]})
+    evaluate_on_robot(config, ScriptedPerson(typed(lines), keep), agent_factory=Policies())
+    assert len(pictures) == 8, "at every question but the first"
+    assert list(dict.fromkeys(pictures)) == [pictures[0], pictures[3]]
+    assert pictures[3:] == [pictures[3]] * 5, "the second policy is not asked for another start"
+
+
+def test_a_plan_on_a_robot_is_not_taken_for_a_simulation(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="want a plan in simulation"):
+        evaluate(plan(tmp_path / "out"))

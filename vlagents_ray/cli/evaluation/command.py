@@ -133,10 +133,11 @@ def evaluate_command(
             raise ConfigError("--dry-run and --watch exclude each other: nobody knows yet which steps there will be")
         if end_at is not None and watch is not None:
             raise ConfigError("--end-at and --watch exclude each other: watching ends with --until, or by Ctrl-C")
-        _require_robot(given)
+        on_robot = evaluation.real_robot is not None
+        _require_robot(given, on_robot)
         if replica_per_gpu and address is None:
             raise ConfigError("--replica-per-gpu: want --address, a cluster whose GPUs can be counted")
-        if arm is not None:
+        if on_robot:
             from vlagents_ray.cli.evaluation.robot import run_on_robot
 
             run_on_robot(evaluation, address, operator=operator or "page", unblinded=unblind)
@@ -155,9 +156,9 @@ def evaluate_command(
             run_evaluation(evaluation, address, end_at=end, replica_per_gpu=replica_per_gpu)
 
 
-def _require_robot(options: Mapping[str, Any]) -> None:
+def _require_robot(options: Mapping[str, Any], on_robot: bool) -> None:
     """Raise `ConfigError` for options that need a robot without one, or that exclude one."""
-    if options["arm"] is None:
+    if not on_robot:
         if needing := [f"--{name}" for name in ("operator", "unblind") if options[name]]:
             raise ConfigError(f"got {needing} without --robot")
         return

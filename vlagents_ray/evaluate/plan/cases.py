@@ -37,6 +37,13 @@ class EvalCase:
     robot: RobotConfig | None = None  # the real robot; None: `env` is simulated
 
     @property
+    def on_robot(self) -> tuple[RobotConfig, RobotTask]:
+        """The real robot and its task; only of a cell on one."""
+        if self.robot is None:
+            raise TypeError(f"{self.env}: this cell is simulated")
+        return self.robot, self.robot.tasks[self.env]
+
+    @property
     def contender(self) -> str:
         """The policy at its checkpoint, in a word: "pi0", or "pi0@20000" in a sweep."""
         return contender(self.policy.name, self.step)
@@ -56,7 +63,7 @@ class EvalCase:
         """All that an episode depends on, apart from its number and seed."""
         pushed = self.policy.pushed_weights
         return {
-            **({} if self.robot is None else {"robot": _on_robot(self.robot, self.robot.tasks[self.env])}),
+            **({} if self.robot is None else {"robot": _settings(*self.on_robot)}),
             **({} if pushed is None else {"pushed_weights": pushed.model_dump()}),  # older results have no such setting
             "env": self.env,
             "env_options": self.suite.env_options,
@@ -92,7 +99,7 @@ class EvalCase:
         return self.suite.episodes * len(self.suite.seeds)
 
 
-def _on_robot(robot: RobotConfig, task: RobotTask) -> dict[str, Any]:
+def _settings(robot: RobotConfig, task: RobotTask) -> dict[str, Any]:
     return robot.model_dump(exclude={"tasks", "key"}) | {"task": task.model_dump()}
 
 

@@ -26,9 +26,7 @@ def start_pictures(out: Path, place: str) -> dict[str, Path]:
 
 
 def save_start(out: Path, place: str, obs: Obs) -> None:
-    """Save the pictures of a scene, unless its first start has been saved."""
-    if start_pictures(out, place):
-        return
+    """Save the pictures of a scene at its start, in place of earlier ones."""
     for camera, name in distinct(obs.cameras).items():
         with whole(out / SCENES / place / f"{name}.jpg") as part:
             part.write_bytes(encode_jpeg(obs.cameras[camera], _QUALITY))

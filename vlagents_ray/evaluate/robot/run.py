@@ -7,7 +7,6 @@ import dataclasses
 import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.evaluate.artifacts.provenance import driver_code, save_diffs, versions
@@ -28,8 +27,8 @@ from vlagents_ray.evaluate.robot.trial import PlayedTrial, WatchedRobot, play, r
 from vlagents_ray.evaluate.robot.trial_log import LoggedTrial, TrialLog, logged_plan
 from vlagents_ray.evaluate.run import conclude
 from vlagents_ray.evaluate.workers.agents import AgentFactory, agents
-from vlagents_ray.interface import Obs
 from vlagents_ray.ray_tools.private import output_printer, set_output_printer
+from vlagents_ray.registry import require
 from vlagents_ray.robot.loop import Robot, robot_class
 
 RECORDINGS = "recordings"
@@ -68,18 +67,23 @@ def evaluate_on_robot(
 
     Raises:
         ConfigError: The settings are invalid or contradict the log in `config.out`, or a policy changed between trials.
+        MissingDependency: Trials are to be recorded, and the extra "record" is not installed.
         StorageFailed: The disk is full, or cannot be written to.
         TrialsInterrupted: The operator ended the evaluation, or Ctrl-C did.
         VLAgentsError: A policy cannot be reached, or fails, before the first trial.
     """
     planned = planned_cells(config)
+    if config.record != "none":
+        for module in ("av", "pyarrow"):
+            require(module)
     factory = agent_factory or agents(config, None, "robot")
     watched = WatchedRobot(robot or robot_class(str(config.robot and config.robot.arm))(), operator)
     with TrialLog(config, planned) as log:
         trials = schedule(planned, log.key)
         run = _RemainingTrials(config, operator, watched, factory, log, trials)
         try:
-            run.play()
+            with _quiet():
+                run.play()
         except KeyboardInterrupt:
             raise TrialsInterrupted(
                 f"interrupted after {len(log.finished)} of {len(trials)} trials; go on with --resume --out {config.out}"
@@ -158,8 +162,7 @@ class _RemainingTrials:
         obs = self._robot.observe()
         policies = {trial.job.cell.contender: trial.job.cell for trial in left}
         for _, cell in sorted(policies.items(), key=lambda one: one[0]):  # which tells nothing of the trials' order
-            with _quiet():
-                rehearse(cell, self._factory, self._operator, obs)
+            rehearse(cell, self._factory, self._operator, obs)
         for trial in left:
             while not self._is_over(trial) and trial.number not in self._log.finished:
                 self._play(trial)
@@ -167,20 +170,14 @@ class _RemainingTrials:
     def _play(self, trial: Trial) -> None:
         attempt = self._log.next_attempt(trial.number)
         view = self._visible(trial, attempt)
-        seen: list[Obs] = []
-
-        def observe() -> Obs:
-            seen[:] = [self._robot.observe()]
-            return seen[0]
-
-        if not self._operator.prepare(view, observe):
+        if not self._operator.prepare(view, self._robot.observe):
             raise KeyboardInterrupt
-        with storing(self._config.out):
-            save_start(self._config.out, trial.place, observe())
+        if all(self._trials[number - 1].place != trial.place for number in self._log.finished):
+            with storing(self._config.out):
+                save_start(self._config.out, trial.place, self._robot.observe())
         self._log.begin(trial.number, attempt)
         try:
-            with _quiet():
-                played = play(trial, self._robot, self._factory, self._operator, self._recording(trial, attempt))
+            played = play(trial, self._robot, self._factory, self._operator, self._recording(trial, attempt))
         except VLAgentsError as error:
             failure = explain(error)
             why = failure.message if failure.code == "env_failed" else f"it could not be played ({failure.code})"
@@ -225,7 +222,7 @@ class _RemainingTrials:
         return stopping is not None and all(one.at is not None for one in stopping.values())
 
     def _visible(self, trial: Trial, attempt: int) -> VisibleTrial:
-        task, again = trial.robot_task, self._log.why_again(trial.number)
+        (robot, task), again = trial.job.cell.on_robot, self._log.why_again(trial.number)
         return VisibleTrial(
             number=trial.number,
             total=len(self._trials),
@@ -234,7 +231,7 @@ class _RemainingTrials:
             attempt=attempt,
             instruction=task.instruction,
             setup=task.setup,
-            seconds=task.max_steps / trial.job.cell.robot.hz if trial.job.cell.robot else 0.0,
+            seconds=task.max_steps / robot.hz,
             rubric=task.rubric,
             start=start_pictures(self._config.out, trial.place),
             message=f"played again: {again}" if again else self._message,
@@ -300,7 +297,7 @@ def _write_results(config: EvalConfig, planned: Sequence[EvalCase], log: TrialLo
         store.begin_run(config, versions(), log.started)
         save_diffs(config.out, driver_code().values())
         for place in {cell.place: cell for cell in planned}.values():
-            store.note_env(place.place, EnvInfo(_described(place), {}))
+            store.note_env(place.place, EnvInfo({"robot": place.on_robot[0].arm}, {}))
         for logged in log.attempts:
             trial = trials[logged.trial - 1]
             job = dataclasses.replace(trial.job, attempt=logged.attempt)
@@ -317,7 +314,3 @@ def _failure(logged: LoggedTrial) -> Failure:
     if logged.seen["cause"] == "operator":
         return Failure("operator", "trial_repeated", logged.seen["again"])
     return Failure(**logged.sealed)
-
-
-def _described(cell: EvalCase) -> dict[str, Any]:
-    return {"simulator": "none", "robot": cell.robot.arm if cell.robot is not None else None}

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from vlagents_ray.evaluate.plan.cases import EvalCase
-from vlagents_ray.evaluate.plan.config import RobotTask, canonical
+from vlagents_ray.evaluate.plan.config import canonical
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey, Job
 from vlagents_ray.naming import plain
 
@@ -25,14 +25,6 @@ class Trial:
     def task(self) -> tuple[str, str]:
         """(suite, env)."""
         return self.job.cell.suite.name, self.job.cell.env
-
-    @property
-    def robot_task(self) -> RobotTask:
-        """The task in words, its step limit and its rubric."""
-        cell = self.job.cell
-        if cell.robot is None:
-            raise TypeError(f"{cell.env}: a cell of a simulation has no trials")
-        return cell.robot.tasks[cell.env]
 
     @property
     def place(self) -> str:

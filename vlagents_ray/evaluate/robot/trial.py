@@ -135,8 +135,8 @@ def play(
     Raises:
         VLAgentsError: The robot or the connection to the policy failed.
     """
-    cell, task = trial.job.cell, trial.robot_task
-    settings = _settings(cell)
+    cell = trial.job.cell
+    settings, task = cell.on_robot
     deadline_s = _deadline_s(settings)
     stats = robot.stats = EpisodeStats(trial.job.key, instruction=task.instruction)
     watchdog = Watchdog(
@@ -185,7 +185,7 @@ def rehearse(cell: EvalCase, factory: AgentFactory, operator: Operator, obs: Obs
     A mistake in the settings shows before the first trial, and what a policy does at its first answer, such as
     compiling, takes no time of a trial, by which the policy could be told.
     """
-    task = _settings(cell).tasks[cell.env]
+    _, task = cell.on_robot
     unused = EpisodeStats(EpisodeKey(cell.env, 0, 0, cell.fingerprint))
     with _player(cell, factory, unused, operator) as (_, player):
         player.initialize()
@@ -199,7 +199,7 @@ def _player(
     cell: EvalCase, factory: AgentFactory, stats: EpisodeStats, operator: Operator
 ) -> Iterator[tuple[Agent, ChunkPlayer]]:
     """Yield a policy's agent and its player with the plan's settings; both are closed at the end."""
-    settings = _settings(cell)
+    settings, _ = cell.on_robot
     agent = factory(cell.policy)
     with contextlib.ExitStack() as unplayed:
         unplayed.callback(agent.close)
@@ -218,12 +218,6 @@ def _player(
         unplayed.pop_all()  # the player closes it
     with player:
         yield agent, player
-
-
-def _settings(cell: EvalCase) -> RobotConfig:
-    if cell.robot is None:
-        raise TypeError(f"{cell.env}: a cell of a simulation is not played on a robot")
-    return cell.robot
 
 
 def _deadline_s(settings: RobotConfig) -> float:

@@ -174,6 +174,8 @@ class PageOperator(Operator):
                 return PlainTextResponse(f"want at most {_BODY} bytes", 413)
         try:
             answer = json.loads(body)
+            if not isinstance(answer["do"], str):
+                raise TypeError
             about = answer["phase"], answer["trial"], answer["attempt"]
             verdict = _verdict(answer) if answer["phase"] == "verdict" else None
         except (ValueError, TypeError, KeyError, RecursionError):
