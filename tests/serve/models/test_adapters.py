@@ -70,7 +70,7 @@ def serve(made: list[Adapted]) -> Iterator[Callable[..., Engine]]:
 
 def told(engine: Engine, session: str, **kwargs: Any) -> dict[str, Any]:
     """What a reset says."""
-    reply = begin(engine, session, **kwargs).get(timeout=10)
+    reply = begin(engine, session, **kwargs).get(timeout=120)
     if reply.error is not None:
         raise reply.error
     assert reply.info is not None
@@ -87,7 +87,7 @@ def test_sessions_of_one_base_act_in_one_batch_and_say_what_acted(
     assert told(engine, "s3", checkpoint="late") == {"checkpoint": "/runs/b", "weights": "whole:/runs/b"}
     replies: list[queue.SimpleQueue[Reply]] = [queue.SimpleQueue() for _ in range(4)]
     engine.queue.put(*(engine.ticket(f"s{i}", Request("act", Obs()), replies[i].put) for i in range(4)))
-    acts = [one.get(timeout=10).act for one in replies]
+    acts = [one.get(timeout=120).act for one in replies]
     assert [one.info[POLICY]["fingerprint"] for one in acts if one is not None][:2] == ["stack", "pour"]
     assert [agent.batches for agent in made] == [[["stack", "pour", ""]], [[""]]]
 
