@@ -21,6 +21,7 @@ MODULES = (
     "vlagents_ray.testing",
     "vlagents_ray.envs",
     "vlagents_ray.evaluate",
+    "vlagents_ray.evaluate.robot",
     "vlagents_ray.learn",
 )
 UNFINISHED: tuple[str, ...] = ()

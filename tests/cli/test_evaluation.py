@@ -198,6 +198,9 @@ def test_each_option_that_is_a_setting_is_one_of_a_single_model() -> None:
         "address",
         "live",
         "live_at",
+        "arm",
+        "operator",
+        "unblind",
     }
     assert {option for option, found in places.items() if len(found) != 1} == of_the_run_itself
     assert all(not places[option] for option in of_the_run_itself)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib
 import os
 import re
 import select
@@ -16,19 +15,16 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, get_args
-
-import numpy as np
+from typing import get_args
 
 from vlagents_ray.chunking.buffer import ENSEMBLE, MERGES
 from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.client.agent import RemoteAgent
-from vlagents_ray.errors import ConfigError, MissingState, VLAgentsError
-from vlagents_ray.interface import Obs
-from vlagents_ray.robot.loop import LoopReport, Restart, Robot, run_loop
+from vlagents_ray.errors import VLAgentsError
+from vlagents_ray.robot.loop import LoopReport, Restart, Robot, imported_class, run_loop
 from vlagents_ray.robot.pacing import empty_loop
 from vlagents_ray.robot.record import Recorder
-from vlagents_ray.robot.safety import Guard, Watchdog
+from vlagents_ray.robot.safety import Guard, Watchdog, measured_state
 from vlagents_ray.robot.simulated import SimulatedRobot
 
 MOSTLY_SAFE = 3  # exit status
@@ -73,8 +69,8 @@ def _ended_by_signals() -> Iterator[None]:
 def _run(options: argparse.Namespace) -> LoopReport:
     say: Callable[[str], None] = lambda line: print(line, flush=True)  # noqa: E731, T201
     deadline_s = options.deadline_ms / 1e3 if options.deadline_ms is not None else WAIT_S * (options.mode != "async")
-    robot_class = _load("--robot", options.robot) if options.robot else None
-    leader = _load("--leader", options.leader)() if options.leader else None
+    make_robot = imported_class("--robot", options.robot) if options.robot else None
+    leader = imported_class("--leader", options.leader)() if options.leader else None
     with contextlib.ExitStack() as stack:
         agent = RemoteAgent(
             options.url, transport=options.transport, timeout_s=options.timeout_s
@@ -95,12 +91,12 @@ def _run(options: argparse.Namespace) -> LoopReport:
                 horizon=options.horizon,
                 max_age_s=options.max_age_s,
                 safe=options.safe,
-                check=Guard(contract, max_step=options.max_step, measure=_measure(options.measure)),
+                check=Guard(contract, max_step=options.max_step, measure=measured_state(options.measure)),
                 override=leader,
             )
         )
         player.initialize()  # refuses settings that do not fit, before anything is timed or moves
-        robot: Robot = SimulatedRobot(contract) if robot_class is None else robot_class()
+        robot: Robot = SimulatedRobot(contract) if make_robot is None else make_robot()
         recorder = None
         if options.record:
             recorder = stack.enter_context(Recorder(options.record, options.hz, interventions=leader is not None))
@@ -188,15 +184,6 @@ def _line_typed(terminal: int) -> bool:
         pass
     time.sleep(_TYPED_S)  # the terminal is closed, or not this process's
     return False
-
-
-def _measure(part: str | None) -> Callable[[Obs], np.ndarray] | None:
-    def measured(obs: Obs) -> np.ndarray:
-        if part not in obs.state:
-            raise MissingState(str(part), obs.state)
-        return obs.state[part]
-
-    return None if part is None else measured
 
 
 def _number(kind: type[float] | type[int] = float, *, least: float = 0, above: bool = False) -> Callable[[str], float]:
@@ -294,19 +281,6 @@ def _parser() -> argparse.ArgumentParser:
         help="first measure an empty loop for this long (%(default)s)",
     )
     return parser
-
-
-def _load(option: str, name: str) -> Any:
-    module, colon, attribute = name.partition(":")
-    if not colon:
-        raise ConfigError(f"{option}: got {name!r}, want module:Class")
-    try:
-        return getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise ConfigError(
-            f"{option} {name}: {error}; go to the folder of its module ({os.getcwd()} is this one), add that to "
-            f"PYTHONPATH, or install it"
-        ) from error
 
 
 def _row(name: str, jitter: dict[str, float]) -> str:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import importlib
 import logging
+import os
 import time
 from collections import deque
 from collections.abc import Callable
@@ -48,6 +50,28 @@ class Robot(Protocol):
     def stop(self) -> None:
         """Bring the robot to rest from any state; may be called repeatedly, and from another thread."""
         ...
+
+
+def imported_class(option: str, name: str) -> Any:
+    """Import the class of a robot, or of what moves it.
+
+    Args:
+        option: The option that names it, for the error.
+        name: "module:Class".
+
+    Raises:
+        ConfigError: The name has another form, or there is no such class.
+    """
+    module, colon, attribute = name.partition(":")
+    if not colon:
+        raise ConfigError(f"{option}: got {name!r}, want module:Class")
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(
+            f"{option} {name}: {error}; go to the folder of its module ({os.getcwd()} is this one), add that to "
+            f"PYTHONPATH, or install it"
+        ) from error
 
 
 @dataclass(slots=True)
