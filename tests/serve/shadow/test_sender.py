@@ -24,7 +24,6 @@ from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.shadow.sender import PER_SESSION, ShadowSender, Turn, chosen
-from vlagents_ray.serve.watchers import unwatch, watch
 
 SESSIONS = [f"session-{number}" for number in range(4000)]
 
@@ -276,9 +275,9 @@ def test_the_live_actions_are_the_same_to_the_bit(kind: str) -> None:
     sender.start()
     try:
         alone = episode(engine)
-        watch(engine, sender)
+        engine.watchers.add(sender)
         beside = episode(engine)
-        unwatch(engine, sender)
+        engine.watchers.remove(sender)
     finally:
         release.set()
         sender.close()

@@ -19,7 +19,6 @@ from vlagents_ray.serve.live.tap import RATE, Answer, LiveTap, Seen
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.periodic import each_half_second
 from vlagents_ray.serve.sessions import Session
-from vlagents_ray.serve.watchers import unwatch, watch
 
 _SHARE = 0.04  # of a core, for encoding pictures
 _VALUES = 64  # most numbers of one part of a state or of one row of a chunk
@@ -62,7 +61,7 @@ class ReplicaView:
     def close(self) -> None:
         """Stop that."""
         each_half_second.remove(self.tap.expire)
-        unwatch(self._engine, self.tap)
+        self._engine.watchers.remove(self.tap)
 
     def read(self, since: int, shown: Collection[str]) -> Snapshot:
         """Return what happened since the snapshot with the number `since`, with pictures of the sessions `shown`.
@@ -100,9 +99,9 @@ class ReplicaView:
 
     def _show(self, tap: LiveTap | None) -> None:
         if tap is None:
-            unwatch(self._engine, self.tap)
+            self._engine.watchers.remove(self.tap)
         else:
-            watch(self._engine, tap)
+            self._engine.watchers.add(tap)
         self._pictured = {}
         self._meter = None if tap is None else LoadMeter(self._engine.queue)
 

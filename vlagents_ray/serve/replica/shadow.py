@@ -15,7 +15,6 @@ from vlagents_ray.serve.config.shadow import ShadowArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.replica.candidate import CandidateReplica
 from vlagents_ray.serve.shadow.sender import ShadowSender, Turn
-from vlagents_ray.serve.watchers import unwatch, watch
 
 
 class CandidateLink:
@@ -58,8 +57,8 @@ class ReplicaShadow:
                 CandidateLink(candidate), args.share, args.queue, is_open=engine.sessions.__contains__
             )
             self._shadow.start()
-            watch(engine, self._shadow)
-        self._followed = engine
+            engine.watchers.add(self._shadow)
+        self._followed = engine.watchers
 
     def _shadow_drops(self) -> int:
         """Return the number of observations since the last call that the candidate did not get."""
@@ -70,5 +69,5 @@ class ReplicaShadow:
 
     def _close_shadow(self) -> None:
         if self._shadow is not None:
-            unwatch(self._followed, self._shadow)
+            self._followed.remove(self._shadow)
             self._shadow.close()

@@ -7,13 +7,7 @@ from dataclasses import dataclass, field
 
 from vlagents_ray.images.codecs import DecodedFiles
 from vlagents_ray.protocol.messages import Reply, Request
-from vlagents_ray.serve.engine.responses import Done, Watcher
-from vlagents_ray.serve.watchers import unwatch, watch
-
-
-@dataclass
-class Engine:
-    live: Watcher | None = None
+from vlagents_ray.serve.engine.responses import Done, Watchers
 
 
 @dataclass(eq=False)
@@ -33,25 +27,25 @@ class Noting:
 
 
 def test_each_watcher_sees_messages_and_answers_until_it_ends() -> None:
-    engine, one, other = Engine(), Noting(), Noting()
+    watchers, one, other = Watchers(), Noting(), Noting()
     sent: list[Reply] = []
 
     def message() -> tuple[Request, Reply]:
         request, reply = Request("close"), Reply()
-        assert engine.live is not None
-        engine.live.note(["a"], [request], {}, sent.extend)([reply])
+        assert watchers.one is not None
+        watchers.one.note(["a"], [request], {}, sent.extend)([reply])
         return request, reply
 
-    watch(engine, one)
-    assert engine.live is one, "a message that one looks at makes no detour"
+    watchers.add(one)
+    assert watchers.one is one, "a message that one looks at makes no detour"
     first = message()
-    watch(engine, other)
+    watchers.add(other)
     second = message()
-    unwatch(engine, one)
+    watchers.remove(one)
     third = message()
-    unwatch(engine, one)
-    unwatch(engine, other)
-    assert engine.live is None
+    watchers.remove(one)
+    watchers.remove(other)
+    assert watchers.one is None
     assert one.seen == [*first, *second]
     assert other.seen == [*second, *third]
     assert sent == [first[1], second[1], third[1]]
