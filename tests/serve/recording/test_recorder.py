@@ -16,6 +16,7 @@ import pytest
 from eval_fakes import wait_for
 from recorded_sessions import HEIGHT, WIDTH, recorded, reply_of, seen
 
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Request
@@ -77,7 +78,7 @@ def test_an_observation_is_copied_before_its_answer_is_kept(tmp_path: Path) -> N
         robot.play(1)
         obs = seen(3)
         robot.act(obs)
-        wait_for(lambda: server.recorder._inbox.empty())
+        wait_for(server.recorder._inbox.empty)
         obs.cameras["front"][:] = 0  # its memory is the client's again
         obs.state["joints"][:] = 9
     assert rows(only(tmp_path))["observation.state"][1] == [3, -3, 0.5]
@@ -184,7 +185,7 @@ def test_what_does_not_fit_into_memory_is_dropped_and_counted(tmp_path: Path) ->
 
 def test_memory_of_requests_that_nobody_waits_for_is_free_again(tmp_path: Path) -> None:
     with recorded(tmp_path) as server:
-        server.recorder.note(["a"], [Request("act", seen(0))], {}, lambda replies: None)
+        server.recorder.note(["a"], [Request("act", seen(0))], {}, [].append)
         wait_for(lambda: server.recorder._held == 0)
 
 
@@ -220,6 +221,12 @@ def test_little_room_on_the_disk_ends_it_too(tmp_path: Path, monkeypatch: pytest
     with recorded(tmp_path) as server:
         server.robot().play(1)
         wait_for(lambda: server.recorder.ended is not None)
+
+
+def test_a_folder_that_cannot_be_written_to_is_told_at_the_start(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=r"record\.folder"), recorded(tmp_path / "file"):
+        pass
 
 
 def test_nobody_else_may_look(tmp_path: Path) -> None:
