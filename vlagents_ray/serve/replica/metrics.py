@@ -19,6 +19,8 @@
 | `vlagents_shadow_difference` | histogram | rows ("all", "first"); absolute difference of two actions, mean of joints |
 | `vlagents_shadow_joint_difference` | gauge | joint; mean absolute difference, of the last second with comparisons |
 | `vlagents_shadow_latency_ms` | histogram | waiting and inference of the candidate |
+| `vlagents_recorded_frames` | counter | outcome ("saved", "lost"); acts of sessions that `record` names |
+| `vlagents_recording` | gauge | 1 while sessions are recorded, 0 once that has ended or if `record` is not set |
 | `vlagents_keys_unreadable_s` | gauge | time since which the file of API keys cannot be read; 0 if it can |
 
 All series have the tags `application`, `deployment`, `replica` and `policy`. Transport is `shm`, `plasma`, `websocket`,
@@ -43,6 +45,7 @@ from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import STAGES, Collected, LoadMeter
 from vlagents_ray.serve.periodic import Periodic
+from vlagents_ray.serve.recording.recorder import SessionRecorder
 from vlagents_ray.serve.shadow.comparer import Comparer
 
 logger = logging.getLogger(__name__)
@@ -67,6 +70,7 @@ class Exporter:
         tags: dict[str, str],
         keys: Keys | None = None,
         shadow_drops: Callable[[], int] = lambda: 0,
+        recorder: SessionRecorder | None = None,
     ) -> None:
         """Create the series.
 
@@ -75,6 +79,7 @@ class Exporter:
             tags: The tags of every series: application, deployment, replica, policy.
             keys: The API keys of the server; None if it has none.
             shadow_drops: Returns the number of observations since the last call that the candidate did not get.
+            recorder: Records the sessions; None if nothing does.
         """
         make = partial(_series, tags)
         self._engine = engine
@@ -95,7 +100,10 @@ class Exporter:
         self._unreadable = make(Gauge, "keys_unreadable_s", "Time in which the key file could not be read.")
         self._dropped = make(Counter, "shadow_dropped", "Observations that the candidate did not get.")
         self._shadow_drops = shadow_drops
-        self._keys = keys
+        self._recorded = make(Counter, "recorded_frames", "Acts of recorded sessions.", "outcome")
+        self._recording = make(Gauge, "recording", "Whether sessions are recorded.")
+        self._keys, self._recorder = keys, recorder
+        self._counted = {"saved": 0, "lost": 0}  # frames that were exported
         self._meter = LoadMeter(engine.queue)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._loop, name="metrics", daemon=True)
@@ -136,6 +144,17 @@ class Exporter:
         if dropped := self._shadow_drops():
             self._dropped.inc(dropped)
         self._unreadable.set(0.0 if self._keys is None else self._keys.unreadable_s)
+        self._export_recording()
+
+    def _export_recording(self) -> None:
+        recorder = self._recorder
+        self._recording.set(float(recorder is not None and recorder.ended is None))
+        if recorder is None:
+            return
+        for outcome, frames in (("saved", recorder.saved), ("lost", recorder.lost)):
+            if new := frames - self._counted[outcome]:
+                self._recorded.inc(new, {"outcome": outcome})
+                self._counted[outcome] = frames
 
     def _export_collected(self, collected: Collected) -> None:
         for (op, transport, kind, code), sample in collected.requests.items():

@@ -42,6 +42,7 @@ from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK
 from vlagents_ray.serve.replica.engine_replica import EngineReplica
 from vlagents_ray.serve.replica.live import ReplicaLive
 from vlagents_ray.serve.replica.metrics import Exporter, tags_of
+from vlagents_ray.serve.replica.recording import open_recorder
 from vlagents_ray.serve.replica.shadow import ReplicaShadow
 from vlagents_ray.serve.replica.weights import ReplicaWeights
 from vlagents_ray.serve.scaling.autoscaling import SESSIONS, UTILISATION, WAITING
@@ -89,12 +90,14 @@ class PolicyReplica(EngineReplica, ReplicaWeights, ReplicaLive, ReplicaShadow, C
         self._open_live(self._engine, self._peers, self.metadata)
         self._open_shadow(self._engine, self._args.shadow, candidate)
         self._meter = LoadMeter(self._engine.queue)
-        self._metrics = Exporter(self._engine, tags_of(self._args.policy), self._keys, self._shadow_drops)
+        self._recorder = open_recorder(self._engine, self._args.record, self._peers.own_name, self.metadata)
+        self._metrics = Exporter(
+            self._engine, tags_of(self._args.policy), self._keys, self._shadow_drops, self._recorder
+        )
         self._metrics.start()
         self._rebalancer = Rebalancer(self._engine, self._peers, self._load_of)
-        self._local = None
-        if hasattr(os, "memfd_create"):
-            self._local = ShmServer(self._engine, self._limits, self._admit())
+        has_files = hasattr(os, "memfd_create")
+        self._local = ShmServer(self._engine, self._limits, self._admit()) if has_files else None
         self._plasma = PlasmaServer(self._engine, self._limits) if self._local is not None else None
         self._stream = self._stream_endpoint()
         for endpoint in (self._local, self._plasma, self._stream):
@@ -281,8 +284,9 @@ class PolicyReplica(EngineReplica, ReplicaWeights, ReplicaLive, ReplicaShadow, C
         self._close_shadow()
         self._rebalancer.close()
         await self._migrator.close()
-        await asyncio.to_thread(self._engine.close)
-        await asyncio.to_thread(self._metrics.close)
+        for part in (self._engine, self._recorder, self._metrics):
+            if part is not None:
+                await asyncio.to_thread(part.close)
         for endpoint in (self._local, self._plasma, self._stream):
             if endpoint is not None:
                 endpoint.close()
