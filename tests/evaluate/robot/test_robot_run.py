@@ -255,6 +255,25 @@ def test_the_guard_sees_each_action(tmp_path: Path) -> None:
     assert np.abs(arm.observe().state["joints"]).max() < 1.0
 
 
+@pytest.mark.parametrize("mode", ["async", "ensemble"])
+def test_it_plays_in_each_mode_of_the_chunk_player_and_closes_what_it_opened(tmp_path: Path, mode: str) -> None:
+    closed: list[str] = []
+
+    class Closing(Reaching):
+        def close(self) -> None:
+            closed.append(self.name)
+
+    arm, policies = Arm(), Policies(Closing)
+    robot = {"mode": mode, "tasks": tasks(max_steps=20)}
+    config = plan(tmp_path / "out", suite={"episodes": 2, "envs": ["drawer"]}, robot=robot)
+    summary = evaluate_on_robot(config, ScriptedPerson(judged("s")), robot=arm, agent_factory=policies)
+    assert sorted(closed) == sorted(policies.made)
+    results = [episode.result for cell in summary.results.cells for episode in cell.episodes]
+    assert sum(result.steps for result in results) == arm.applied > 0
+    assert all(0 < result.steps <= 20 and result.acts > 0 for result in results)
+    assert {result.policy_fingerprint for result in results} == {f"fingerprint-of-{name}" for name in NAMES}
+
+
 def test_the_arm_stays_still_while_nobody_is_there(tmp_path: Path) -> None:
     arm, applied = Arm(), []
 
