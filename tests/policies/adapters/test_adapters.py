@@ -15,6 +15,7 @@ from vlagents_ray import Obs
 from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError, NotTrainable, UnknownCheckpoint, UnknownSession
 from vlagents_ray.interface import DISTRIBUTION, POLICY, SAMPLES, Act
+from vlagents_ray.policies.adapters.peft_folder import read_adapter
 from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
 from vlagents_ray.policies.base.checkpoint import find_checkpoint
 from vlagents_ray.serve.models.agent_copies import AgentCopies
@@ -328,3 +329,35 @@ def test_an_adapter_of_another_base_is_refused(tmp_path: Path) -> None:
         json.dumps(config | {"base_model_name_or_path": str(tmp_path / "base")})
     )
     loaded(tmp_path, adapters=paths(tmp_path, "stack"))
+
+
+def test_a_file_of_the_folder_is_not_the_adapter(tmp_path: Path) -> None:
+    folder = save(tmp_path / "stack", pairs(network(tmp_path), LAYERS, 2))
+    with pytest.raises(ConfigError, match=r"adapter 'stack': .*got a file, want the folder with adapter_config.json"):
+        loaded(tmp_path, adapters={"stack": str(folder / "adapter_model.safetensors")})
+
+
+@pytest.mark.parametrize("named", ["/" + 300 * "a", "~nobody_here/base", "\0"])
+def test_a_base_that_cannot_be_looked_up_is_unknown(tmp_path: Path, named: str) -> None:
+    save(tmp_path / "stack", pairs(network(tmp_path), LAYERS, 2), base_model_name_or_path=named)
+    loaded(tmp_path, adapters=paths(tmp_path, "stack"))
+
+
+@pytest.mark.parametrize("content", ["[" * 100_000, '{"peft_type": "LORA", "base_model_name_or_path": 3}', "\0"])
+def test_a_damaged_config_is_refused(tmp_path: Path, content: str) -> None:
+    folder = save(tmp_path / "stack", pairs(network(tmp_path), LAYERS, 2))
+    (folder / "adapter_config.json").write_text(content)
+    with pytest.raises(ConfigError, match="adapter 'stack': "):
+        loaded(tmp_path, adapters=paths(tmp_path, "stack"))
+
+
+def test_values_are_scaled_before_they_are_rounded(tmp_path: Path) -> None:
+    small = network(tmp_path).half()
+    values = pairs(small, LAYERS, 2)
+    folder = save(tmp_path / "tiny", {name: value * np.float32(1e-9) for name, value in values.items()}, lora_alpha=2e9)
+    _, scaled = read_adapter(folder, small)["see"]
+    wanted = values["base_model.model.see.lora_B.weight"]
+    np.testing.assert_allclose(scaled.float().numpy(), wanted, rtol=1e-3)
+    huge = save(tmp_path / "huge", values, lora_alpha=2e6)
+    with pytest.raises(ConfigError, match=r"got NaN or infinite values as torch\.float16"):
+        read_adapter(huge, small)
