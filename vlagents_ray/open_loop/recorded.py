@@ -36,7 +36,7 @@ class Names:
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class RecordedStep:
     """A frame of an episode."""
 
     frame: int
@@ -45,7 +45,7 @@ class Step:
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class RecordedEpisode:
     """An episode of a dataset."""
 
     dataset: RecordedDataset
@@ -56,10 +56,10 @@ class Part:
 
 
 @dataclass(frozen=True, slots=True)
-class Play:
+class RecordedSession:
     """The episodes of one session in their order; of a public dataset, one episode."""
 
-    parts: tuple[Part, ...]
+    parts: tuple[RecordedEpisode, ...]
     options: Mapping[str, Any]  # of the reset
 
 
@@ -91,7 +91,7 @@ class RecordedDataset:
         [dim] = self.features[ACTION]["shape"]
         return [str(name) for name in names] if names and len(names) == dim else [f"{ACTION}_{i}" for i in range(dim)]
 
-    def plays(self, chosen: Sequence[int] | None = None) -> list[Play]:
+    def plays(self, chosen: Sequence[int] | None = None) -> list[RecordedSession]:
         """Return the sessions of the dataset, of all its episodes or of those chosen; raises `ConfigError`."""
         parts = self._parts()
         if chosen is not None:
@@ -99,19 +99,22 @@ class RecordedDataset:
                 raise ConfigError(f"{self.root}: has {len(parts)} episodes, got {missing} among those to replay")
             parts = [part for part in parts if part.index in set(chosen)]
         if not self.traced:
-            return [Play((part,), {}) for part in parts]
-        sessions: dict[int, list[tuple[Part, dict[str, list[Any]]]]] = {}
+            return [RecordedSession((part,), {}) for part in parts]
+        sessions: dict[int, list[tuple[RecordedEpisode, dict[str, list[Any]]]]] = {}
         for part in parts:
             columns = self._rows(part, [SESSION, "tick", "reset"])
             sessions.setdefault(columns[SESSION][0], []).append((part, columns))
-        return [Play(tuple(part for part, _ in found), _values(found[0][1]["reset"][0])) for found in sessions.values()]
+        return [
+            RecordedSession(tuple(part for part, _ in found), _values(found[0][1]["reset"][0]))
+            for found in sessions.values()
+        ]
 
-    def gaps(self, part: Part) -> int:
+    def gaps(self, part: RecordedEpisode) -> int:
         """Return the number of acts that are missing within an episode that was traced."""
         ticks = np.array(self._rows(part, ["tick"])["tick"]) if self.traced else np.zeros(0, np.int64)
         return int((np.diff(ticks) - 1).clip(0).sum())
 
-    def steps(self, part: Part, names: Names, policy: Contract | None) -> Iterator[Step]:
+    def steps(self, part: RecordedEpisode, names: Names, policy: Contract | None) -> Iterator[RecordedStep]:
         """Yield the frames of an episode, as a policy with that contract names its inputs."""
         pictures = [name for name, one in self.features.items() if one["dtype"] in _PICTURES]
         images = [name for name in pictures if self.features[name]["dtype"] == "image"]
@@ -133,9 +136,9 @@ class RecordedDataset:
             if traced:
                 info = {CAPTURED: rows["captured_at"][i], **_values(rows["request"][i])}
                 expected = np.array(rows[CHUNK][i], np.float32).reshape(-1, actions.shape[1])[: rows[ROWS][i]]
-            yield Step(i, Obs(shown, gripper, state, info), expected)
+            yield RecordedStep(i, Obs(shown, gripper, state, info), expected)
 
-    def _parts(self) -> list[Part]:
+    def _parts(self) -> list[RecordedEpisode]:
         if self.version.startswith("v2."):
             lines = (self.root / "meta/episodes.jsonl").read_text().splitlines()
             rows = [json.loads(line) for line in lines if line.strip()]
@@ -146,9 +149,9 @@ class RecordedDataset:
             tables = [self._pq.read_table(file, columns=kept) for file, kept in zip(files, columns, strict=True)]
             rows = [row for table in tables for row in table.to_pylist()]
         rows.sort(key=lambda row: row["episode_index"])
-        return [Part(self, row["episode_index"], row["length"], _task(row), row) for row in rows]
+        return [RecordedEpisode(self, row["episode_index"], row["length"], _task(row), row) for row in rows]
 
-    def _rows(self, part: Part, columns: Sequence[str]) -> dict[str, list[Any]]:
+    def _rows(self, part: RecordedEpisode, columns: Sequence[str]) -> dict[str, list[Any]]:
         file = self.root / self.info["data_path"].format(**self._place(part, "data"))
         filters = [("episode_index", "=", part.index)]
         rows: dict[str, list[Any]] = self._pq.read_table(file, columns=list(columns), filters=filters).to_pydict()
@@ -156,12 +159,12 @@ class RecordedDataset:
             raise ConfigError(f"{file}: has not the {part.length} frames of episode {part.index}; is it complete?")
         return rows
 
-    def _place(self, part: Part, kind: str) -> dict[str, int]:
+    def _place(self, part: RecordedEpisode, kind: str) -> dict[str, int]:
         if self.version.startswith("v2."):
             return {"episode_index": part.index, "episode_chunk": part.index // int(self.info["chunks_size"])}
         return {name: part.places[f"{kind}/{name}"] for name in ("chunk_index", "file_index")}
 
-    def _video(self, part: Part, feature: str) -> Iterator[np.ndarray]:
+    def _video(self, part: RecordedEpisode, feature: str) -> Iterator[np.ndarray]:
         """Yield the images of an episode, (H, W, 3) uint8 RGB."""
         place = self._place(part, f"videos/{feature}")
         file = self.root / self.info["video_path"].format(video_key=feature, **place)

@@ -16,7 +16,7 @@ from vlagents_ray.errors import ConfigError, PolicyFailed, VLAgentsError
 from vlagents_ray.interface import Agent
 from vlagents_ray.open_loop.candidates import Sessions
 from vlagents_ray.open_loop.comparison import ErrorTable, FrameError, worst
-from vlagents_ray.open_loop.recorded import Names, Part, Play, RecordedDataset, find_datasets
+from vlagents_ray.open_loop.recorded import Names, RecordedDataset, RecordedEpisode, RecordedSession, find_datasets
 from vlagents_ray.serve.models.checkpoints import CHOICE, STEP
 from vlagents_ray.serve.weights.updates import OPTION
 
@@ -100,9 +100,9 @@ def replay(
         ErrorTable(len(first.joints)),
     )
     result.missing = sum(part.dataset.gaps(part) for play in plays for part in play.parts)
-    run = _Run(result, plan, threading.Lock())
+    run = _Replaying(result, plan, threading.Lock())
 
-    def one(play: Play) -> None:
+    def one(play: RecordedSession) -> None:
         agent = sessions()
         try:
             run.play(play, agent)
@@ -124,12 +124,12 @@ def replay(
 
 
 @dataclass
-class _Run:
+class _Replaying:
     result: OpenLoopResult
     plan: ReplayPlan
     lock: threading.Lock
 
-    def play(self, play: Play, agent: Agent) -> None:
+    def play(self, play: RecordedSession, agent: Agent) -> None:
         begun = False
         for part in play.parts:
             for step in self._steps(part, agent):
@@ -143,11 +143,11 @@ class _Run:
                     raise PolicyFailed(f"{where}: {error}") from error
                 self._compare(part, step.frame, step.expected, got)
 
-    def _steps(self, part: Part, agent: Agent) -> Any:
+    def _steps(self, part: RecordedEpisode, agent: Agent) -> Any:
         every = 1 if part.dataset.traced else self.plan.every
         return islice(part.dataset.steps(part, self.plan.names, agent.contract), 0, None, every)
 
-    def _compare(self, part: Part, frame: int, expected: np.ndarray, got: np.ndarray) -> None:
+    def _compare(self, part: RecordedEpisode, frame: int, expected: np.ndarray, got: np.ndarray) -> None:
         if got.shape[1] != expected.shape[1]:
             raise ConfigError(
                 f"{part.dataset.root}: its actions have {expected.shape[1]} numbers, those of the policy "
@@ -165,6 +165,6 @@ class _Run:
                 self.result.drawn.append((expected[0], got[0]))
 
 
-def _options(play: Play) -> dict[str, Any]:
+def _options(play: RecordedSession) -> dict[str, Any]:
     """Return the options of the reset that are the policy's, not the choice of its weights."""
     return {name: value for name, value in play.options.items() if name not in (CHOICE, STEP, OPTION)}
