@@ -17,6 +17,7 @@ from vlagents_ray import registry
 MODULES = (
     "vlagents_ray",
     "vlagents_ray.robot",
+    "vlagents_ray.viewers",
     "vlagents_ray.testing",
     "vlagents_ray.envs",
     "vlagents_ray.evaluate",

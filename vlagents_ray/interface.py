@@ -59,6 +59,7 @@ POLICY = "policy"
 # In the Act of a chunk player:
 SAFE = "safe"  # str: the reason why this is the safe action; absent if the action is the policy's
 AGE = "age_ticks"  # int: ticks since the observation from which the action was computed
+PLANNED = "planned"  # (H, D) float32: the chunk that the action comes from; `chunk` and `row` are its number and row
 SILENT = "silent_s"  # float: seconds since the oldest unanswered request, retries included; 0.0 if there is none
 
 

@@ -210,6 +210,9 @@ class EvalConfig(_PlanModel):
     workers: PositiveInt = 1  # environments rolled out in parallel
     video: EpisodeChoice = "failures"  # of which episodes there are videos
     record: EpisodeChoice = "none"  # and of which trajectories: states, actions, rewards, and what the policy saw
+    # Viewers that show every episode: a folder for their files, or for Rerun "live" or "rerun+http://HOST:PORT/proxy".
+    rerun: str | None = None
+    foxglove: str | None = None
     resume: bool = False
     worker: WorkerConfig = WorkerConfig()
     stop: StopConfig | None = None  # early stopping; None: every episode is played
@@ -224,6 +227,13 @@ class EvalConfig(_PlanModel):
     policy_timeout_s: PositiveFloat = 60.0  # one reset or act of the policy
     connect_timeout_s: PositiveFloat = 120.0  # reaching the policy, a restart of its server included
     place_timeout_s: PositiveFloat = 120.0  # until the cluster has resources for a worker
+
+    @field_validator("foxglove")
+    @classmethod
+    def _no_server(cls, foxglove: str | None) -> str | None:
+        if foxglove is not None and (foxglove == "live" or "://" in foxglove):
+            raise ValueError(f"got {foxglove!r}, want a folder: workers cannot all listen at one address")
+        return foxglove
 
     @field_validator("policies")
     @classmethod
