@@ -30,7 +30,16 @@ class ViewerFrame:
 
     @classmethod
     def of(cls, obs: Obs, tick: int, **what: Any) -> ViewerFrame:
-        """Return a frame of an observation, whose arrays are copied, with further fields in `what`."""
+        """Make a frame of an observation.
+
+        Args:
+            obs: The observation, whose arrays are copied.
+            tick: The tick of the episode.
+            what: Further fields.
+
+        Returns:
+            The frame, with the time of `info["captured_at"]` if the observation states it, else now.
+        """
         state = {name: np.array(part) for name, part in obs.state.items()}
         if obs.gripper is not None:
             state["gripper"] = np.array([obs.gripper], np.float32)

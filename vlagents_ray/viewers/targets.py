@@ -50,6 +50,13 @@ def is_live(name: str, target: str) -> bool:
     return target == "live" or target.startswith(_SCHEMES[name])
 
 
+def require_no_server(foxglove_target: str | None) -> str | None:
+    """Return a target of Foxglove; raises `ValueError` for an address, which several processes cannot share."""
+    if foxglove_target is not None and is_live("foxglove", foxglove_target):
+        raise ValueError(f"got {foxglove_target!r}, want a folder: only one process can listen at an address")
+    return foxglove_target
+
+
 def dated_name(when: float | None = None) -> str:
     """Return a name for an episode that begins now, or at a time in s since 1970: 20270131_183000_250 (UTC)."""
     when = time.time() if when is None else when

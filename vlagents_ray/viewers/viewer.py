@@ -92,7 +92,12 @@ class EpisodeViewer:
 
     @contextlib.contextmanager
     def episode(self, name: str, instruction: str = "") -> Iterator[None]:
-        """Make the frames that are added within the context one episode, however the context ends."""
+        """Make the frames that are added within the context one episode, however the context ends.
+
+        Args:
+            name: The name of the episode, and of its file.
+            instruction: The task in words.
+        """
         self._queue.put(_Beginning(name, instruction))
         try:
             yield

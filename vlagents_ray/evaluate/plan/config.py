@@ -25,6 +25,7 @@ from typing_extensions import Self
 
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
+from vlagents_ray.viewers.targets import require_no_server
 
 EpisodeChoice = Literal["none", "failures", "all"]
 Tracker = Literal["wandb", "trackio", "tensorboard"]
@@ -231,9 +232,7 @@ class EvalConfig(_PlanModel):
     @field_validator("foxglove")
     @classmethod
     def _no_server(cls, foxglove: str | None) -> str | None:
-        if foxglove is not None and (foxglove == "live" or "://" in foxglove):
-            raise ValueError(f"got {foxglove!r}, want a folder: workers cannot all listen at one address")
-        return foxglove
+        return require_no_server(foxglove)
 
     @field_validator("policies")
     @classmethod

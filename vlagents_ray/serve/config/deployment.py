@@ -15,6 +15,7 @@ from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.serve.access.api_keys import Keys, load_keys
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.config.python_env import EnvironmentArgs
+from vlagents_ray.serve.config.viewers import ViewerArgs
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.queue.call_limits import CallLimits
 
@@ -279,6 +280,7 @@ class ServerArgs(_DeploymentModel):
     resources: ResourceArgs = ResourceArgs()
     environment: EnvironmentArgs = Field(default=EnvironmentArgs(), description="the Python that the policy runs in")
     dialects: DialectArgs = Field(default=DialectArgs(), description="other systems' clients that may connect")
+    viewers: ViewerArgs = Field(default=ViewerArgs(), description="recordings of all sessions for Rerun and Foxglove")
 
     @field_validator("answer_while_loading")
     @classmethod

@@ -8,8 +8,10 @@ from typing import Any
 
 import ray
 
+from vlagents_ray.serve.config.viewers import ViewerArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.live.fleet import Fleet
+from vlagents_ray.serve.live.recordings import SessionRecordings
 from vlagents_ray.serve.live.snapshot import ReplicaView, Snapshot
 from vlagents_ray.serve.scaling.sibling_replicas import SiblingReplicas
 
@@ -17,11 +19,19 @@ from vlagents_ray.serve.scaling.sibling_replicas import SiblingReplicas
 class ReplicaLive:
     """A part of `PolicyReplica`: what it shows to viewers."""
 
-    def _open_live(self, engine: Engine, peers: SiblingReplicas, metadata: Callable[[], Mapping[str, Any]]) -> None:
+    def _open_live(
+        self, engine: Engine, peers: SiblingReplicas, metadata: Callable[[], Mapping[str, Any]], viewers: ViewerArgs
+    ) -> None:
         node = ray.get_runtime_context().get_node_id()
         self._view = ReplicaView(engine, peers.own_name.rpartition("#")[2], node[:8], metadata)
         self._view.open()
         self._fleet = Fleet(self._view, peers)
+        self._recordings = SessionRecordings(engine, self._view.tap, viewers.targets())
+        self._recordings.open()
+
+    def _close_live(self) -> None:
+        self._recordings.close()
+        self._view.close()
 
     async def live(self, since: int, shown: Collection[str]) -> Snapshot:
         """Return what happened here since a snapshot, with pictures of the sessions `shown`."""
