@@ -27,7 +27,7 @@ _PERIOD_S = 0.05
 _SHARE = 0.1  # of a core, at most
 _NICE = 5  # the thread runs after the policy's
 _CLOSING_S = 5.0
-_NAME = 40  # most characters of a session's id in the name of a file
+_NAME = 8  # characters of a session's id in the name of a file: whoever lists the folder does not learn it
 
 
 @dataclass(slots=True)
@@ -109,7 +109,7 @@ class SessionRecordings:
                 episode.writers.remove(writer)
 
     def _begun(self, name: str, instruction: str | None) -> list[EpisodeWriter]:
-        file = f"{dated_name()}_{plain(name)[-_NAME:]}"
+        file = f"{dated_name()}_{plain(name)[:_NAME]}"
         try:
             return [one.begin(file, instruction or "") for one in self._formats]
         except Exception as error:  # noqa: BLE001 - likewise
