@@ -22,7 +22,7 @@ FRAMES = 100  # in the queue: 2 s at 50 Hz, 180 MB with two cameras of 640x480
 _NICE = 5  # the writing thread runs after the loop's
 
 
-class EpisodeWriter(Protocol):
+class ViewerEpisode(Protocol):
     """Writes one episode."""
 
     def write(self, frame: ViewerFrame) -> None:
@@ -41,7 +41,7 @@ class EpisodeFormat(Protocol):
     target: str  # the folder or the address
     closing_s: float | None  # how long the end waits for what is left to be written; None: until it is
 
-    def begin(self, name: str, instruction: str) -> EpisodeWriter:
+    def begin(self, name: str, instruction: str) -> ViewerEpisode:
         """Begin an episode; `name` is also that of its file."""
         ...
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import fields
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -110,6 +111,27 @@ class StreamArgs(_DeploymentModel):
         if self.ports is not None and not 1 <= self.ports[0] <= self.ports[1] <= 65_535:
             raise ValueError(f"ports: got {list(self.ports)}, want the first and the last one, such as [9000, 9015]")
         return self
+
+
+class RecordArgs(_DeploymentModel):
+    """The recording of sessions as LeRobotDatasets, see `vlagents_ray.serve.recording`."""
+
+    folder: str = Field(
+        description="folder of the datasets, on each replica's own node or shared; each replica writes its own below it"
+    )
+    share: float = Field(default=1.0, gt=0, le=1, description="share of the episodes, drawn at each reset")
+    pictures: Literal["exact", "small"] = Field(
+        default="exact",
+        description="exact: each pixel as the policy got it, in lossless H.264; small: as videos for training, some "
+        "twenty times smaller, on which the same policy acts a little differently",
+    )
+    fps: float = Field(default=10.0, gt=0, description="rate of the frames, one for each act, that the videos assume")
+    most_gb: float = Field(default=50.0, gt=0, description="size of the folder at which the recording ends, GB")
+
+    @field_validator("folder")
+    @classmethod
+    def _absolute(cls, folder: str) -> str:
+        return os.path.abspath(os.path.expanduser(folder))
 
 
 class LimitArgs(_DeploymentModel):
@@ -278,6 +300,7 @@ class ServerArgs(_DeploymentModel):
     access: AccessArgs = AccessArgs()
     stream: StreamArgs = StreamArgs()
     resources: ResourceArgs = ResourceArgs()
+    record: RecordArgs | None = Field(default=None, description="keeps requests and answers; unset: nothing is kept")
     environment: EnvironmentArgs = Field(default=EnvironmentArgs(), description="the Python that the policy runs in")
     dialects: DialectArgs = Field(default=DialectArgs(), description="other systems' clients that may connect")
     viewers: ViewerArgs = Field(default=ViewerArgs(), description="recordings of all sessions for Rerun and Foxglove")

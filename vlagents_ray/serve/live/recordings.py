@@ -18,7 +18,7 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.live.tap import Answer, LiveTap, Seen
 from vlagents_ray.viewers.frame import ViewerFrame
 from vlagents_ray.viewers.targets import dated_name, open_target
-from vlagents_ray.viewers.viewer import EpisodeFormat, EpisodeWriter
+from vlagents_ray.viewers.viewer import EpisodeFormat, ViewerEpisode
 
 logger = logging.getLogger(__name__)
 
@@ -32,7 +32,7 @@ _NAME = 8  # characters of a session's id in the name of a file: whoever lists t
 
 @dataclass(slots=True)
 class _SessionEpisode:
-    writers: list[EpisodeWriter]
+    writers: list[ViewerEpisode]
     seen: int  # number of the last observation that was shown
     acts: int = 0
 
@@ -108,7 +108,7 @@ class SessionRecordings:
                 logger.warning("session %s: the rest of its episode is not recorded: %s", name, error)
                 episode.writers.remove(writer)
 
-    def _begun(self, name: str, instruction: str | None) -> list[EpisodeWriter]:
+    def _begun(self, name: str, instruction: str | None) -> list[ViewerEpisode]:
         file = f"{dated_name()}_{plain(name)[:_NAME]}"
         try:
             return [one.begin(file, instruction or "") for one in self._formats]

@@ -60,7 +60,7 @@ class ReplicaView:
     def close(self) -> None:
         """Stop that."""
         each_half_second.remove(self.tap.expire)
-        self._engine.live = None
+        self._engine.watchers.remove(self.tap)
 
     def read(self, since: int, shown: Collection[str]) -> Snapshot:
         """Return what happened since the snapshot with the number `since`, with pictures of the sessions `shown`.
@@ -97,7 +97,10 @@ class ReplicaView:
         return snapshot
 
     def _show(self, tap: LiveTap | None) -> None:
-        self._engine.live = tap
+        if tap is None:
+            self._engine.watchers.remove(self.tap)
+        else:
+            self._engine.watchers.add(tap)
         self._pictured = {}
         self._meter = None if tap is None else LoadMeter(self._engine.queue)
 

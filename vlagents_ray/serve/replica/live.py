@@ -13,6 +13,7 @@ from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.live.fleet import Fleet
 from vlagents_ray.serve.live.recordings import SessionRecordings
 from vlagents_ray.serve.live.snapshot import ReplicaView, Snapshot
+from vlagents_ray.serve.live.spans import open_spans
 from vlagents_ray.serve.scaling.sibling_replicas import SiblingReplicas
 
 
@@ -23,14 +24,18 @@ class ReplicaLive:
         self, engine: Engine, peers: SiblingReplicas, metadata: Callable[[], Mapping[str, Any]], viewers: ViewerArgs
     ) -> None:
         node = ray.get_runtime_context().get_node_id()
-        self._view = ReplicaView(engine, peers.own_name.rpartition("#")[2], node[:8], metadata)
+        name = peers.own_name.rpartition("#")[2]
+        self._view = ReplicaView(engine, name, node[:8], metadata)
         self._view.open()
         self._fleet = Fleet(self._view, peers)
         self._recordings = SessionRecordings(engine, self._view.tap, viewers.targets())
         self._recordings.open()
+        self._spans = open_spans(engine, name)
 
     def _close_live(self) -> None:
         self._recordings.close()
+        if self._spans is not None:
+            self._spans.close()
         self._view.close()
 
     async def live(self, since: int, shown: Collection[str]) -> Snapshot:

@@ -14,6 +14,8 @@
 | `vlagents_weight_push_ms` | histogram | from new weights at the replica that received them until all act with them |
 | `vlagents_uncompiled` | gauge | batch sizes that run without compilation, although the policy's `compile` is set |
 | `vlagents_hung_calls` | counter | op; calls of the policy that took longer than `limits` allow |
+| `vlagents_recorded_frames` | counter | outcome ("saved", "lost"); acts of sessions that `record` names |
+| `vlagents_recording` | gauge | 1 while sessions are recorded, 0 once that has ended or if `record` is not set |
 | `vlagents_keys_unreadable_s` | gauge | time since which the file of API keys cannot be read; 0 if it can |
 
 All series have the tags `application`, `deployment`, `replica` and `policy`. Transport is `shm`, `plasma`, `websocket`,
@@ -35,6 +37,7 @@ from ray.util.metrics import Counter, Gauge, Histogram
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import STAGES, Collected, LoadMeter
+from vlagents_ray.serve.recording.recorder import SessionRecorder
 
 logger = logging.getLogger(__name__)
 
@@ -51,13 +54,20 @@ T = TypeVar("T")
 class Exporter:
     """Exports an engine's stats to Ray once a second, on a separate thread, until `close`."""
 
-    def __init__(self, engine: Engine, tags: dict[str, str], keys: Keys | None = None) -> None:
+    def __init__(
+        self,
+        engine: Engine,
+        tags: dict[str, str],
+        keys: Keys | None = None,
+        recorder: SessionRecorder | None = None,
+    ) -> None:
         """Create the series.
 
         Args:
             engine: The engine whose stats are exported.
             tags: The tags of every series: application, deployment, replica, policy.
             keys: The API keys of the server; None if it has none.
+            recorder: Records the sessions; None if nothing does.
         """
         common = tuple(tags)
 
@@ -81,7 +91,10 @@ class Exporter:
         self._hung = make(Counter, "hung_calls", "Calls of the policy over their time limit.", "op")
         self._uncompiled = make(Gauge, "uncompiled", "Batch sizes that run without the compilation that is set.")
         self._unreadable = make(Gauge, "keys_unreadable_s", "Time in which the key file could not be read.")
-        self._keys = keys
+        self._recorded = make(Counter, "recorded_frames", "Acts of recorded sessions.", "outcome")
+        self._recording = make(Gauge, "recording", "Whether sessions are recorded.")
+        self._keys, self._recorder = keys, recorder
+        self._counted = {"saved": 0, "lost": 0}  # frames that were exported
         self._meter = LoadMeter(engine.queue)
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._loop, name="metrics", daemon=True)
@@ -120,6 +133,17 @@ class Exporter:
         self._version.set(self._engine.weights.number)
         self._uncompiled.set(len(self._engine.models.uncompiled))
         self._unreadable.set(0.0 if self._keys is None else self._keys.unreadable_s)
+        self._export_recording()
+
+    def _export_recording(self) -> None:
+        recorder = self._recorder
+        self._recording.set(float(recorder is not None and recorder.ended is None))
+        if recorder is None:
+            return
+        for outcome, frames in (("saved", recorder.saved), ("lost", recorder.lost)):
+            if new := frames - self._counted[outcome]:
+                self._recorded.inc(new, {"outcome": outcome})
+                self._counted[outcome] = frames
 
     def _export_collected(self, collected: Collected) -> None:
         for (op, transport, kind, code), sample in collected.requests.items():

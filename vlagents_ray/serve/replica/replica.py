@@ -45,6 +45,7 @@ from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK
 from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
 from vlagents_ray.serve.replica.live import ReplicaLive
 from vlagents_ray.serve.replica.metrics import Exporter, tags_of
+from vlagents_ray.serve.replica.recording import open_recorder
 from vlagents_ray.serve.replica.weights import ReplicaWeights
 from vlagents_ray.serve.scaling.autoscaling import SESSIONS, UTILISATION, WAITING
 from vlagents_ray.serve.scaling.held_sessions import PEER_METHODS
@@ -103,12 +104,12 @@ class PolicyReplica(ReplicaWeights, ReplicaLive, ClientApi, SiblingApi):
         self._open_weights(self._engine, self._peers)
         self._open_live(self._engine, self._peers, self.metadata, self._args.viewers)
         self._meter = LoadMeter(self._engine.queue)
-        self._metrics = Exporter(self._engine, tags_of(self._args.policy), self._keys)
+        self._recorder = open_recorder(self._engine, self._args.record, self._peers.own_name, self.metadata)
+        self._metrics = Exporter(self._engine, tags_of(self._args.policy), self._keys, self._recorder)
         self._metrics.start()
         self._rebalancer = Rebalancer(self._engine, self._peers, self._load_of)
-        self._local = None
-        if hasattr(os, "memfd_create"):
-            self._local = ShmServer(self._engine, self._limits, self._admit())
+        has_files = hasattr(os, "memfd_create")
+        self._local = ShmServer(self._engine, self._limits, self._admit()) if has_files else None
         self._plasma = PlasmaServer(self._engine, self._limits) if self._local is not None else None
         self._stream = self._stream_endpoint()
         for endpoint in (self._local, self._plasma, self._stream):
@@ -327,8 +328,9 @@ class PolicyReplica(ReplicaWeights, ReplicaLive, ClientApi, SiblingApi):
         await asyncio.to_thread(self._close_live)
         self._rebalancer.close()
         await self._migrator.close()
-        await asyncio.to_thread(self._engine.close)
-        await asyncio.to_thread(self._metrics.close)
+        for part in (self._engine, self._recorder, self._metrics):
+            if part is not None:
+                await asyncio.to_thread(part.close)
         for endpoint in (self._local, self._plasma, self._stream):
             if endpoint is not None:
                 endpoint.close()
