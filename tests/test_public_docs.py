@@ -18,6 +18,7 @@ MODULES = (
     "vlagents_ray",
     "vlagents_ray.robot",
     "vlagents_ray.robot.teleoperation",
+    "vlagents_ray.viewers",
     "vlagents_ray.testing",
     "vlagents_ray.envs",
     "vlagents_ray.evaluate",

@@ -62,6 +62,7 @@ SAFE = "safe"  # str: the reason why this is the safe action; absent if the acti
 INTERVENTION = "intervention"  # True: a human's action; absent if it is not
 WANTED = "policy_action"  # (D,) float32: what the policy wanted in place of the human's action; absent if unknown
 AGE = "age_ticks"  # int: ticks since the observation from which the action was computed
+PLANNED = "planned"  # (H, D) float32: the chunk that the action comes from; `chunk` and `row` are its number and row
 SILENT = "silent_s"  # float: seconds since the oldest unanswered request, retries included; 0.0 if there is none
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 from vlagents_ray.client.connection import Connection
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.session import ClientSession, EpisodeState, call_with_recovery
+from vlagents_ray.client.tracing import traced
 from vlagents_ray.client.transports.base import no_parts
 from vlagents_ray.client.transports.codec_selection import CodecChoice, CodecName, LinkSpeed
 from vlagents_ray.client.transports.select import TransportName, select_transport
@@ -34,6 +35,7 @@ from vlagents_ray.protocol.messages import (
     Reply,
     Request,
 )
+from vlagents_ray.tracing import tracer
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -103,6 +105,8 @@ class RemoteAgent(Agent):
         self._rank: RankName = rank
         self._resume = resume
         self._session = ClientSession(connection, rank)
+        if (trace := tracer()) is not None:
+            self._call = traced(trace, connection, self._call)  # type: ignore[method-assign,assignment]
 
     def sessions(self, n: int) -> list[Self]:
         """Open `n` more sessions on this agent's connection, for `reset_batch` and `act_batch`; close each of them."""

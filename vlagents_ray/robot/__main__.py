@@ -26,6 +26,7 @@ from vlagents_ray.robot.pacing import empty_loop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import Guard, Watchdog, measured_state
 from vlagents_ray.robot.simulated import SimulatedRobot
+from vlagents_ray.viewers.targets import open_viewers
 
 MOSTLY_SAFE = 3  # exit status
 WAIT_S = 1.0  # deadline of a tick in the modes that wait for an answer; half of the default of --silent-s
@@ -100,6 +101,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
         recorder = None
         if options.record:
             recorder = stack.enter_context(Recorder(options.record, options.hz, interventions=leader is not None))
+        viewers = [stack.enter_context(viewer) for viewer in open_viewers(options.rerun, options.foxglove)]
         hangs_s = max(0.2, 5 / options.hz) + deadline_s
 
         def stop(reason: str) -> None:
@@ -120,6 +122,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
             watchdog=watchdog,
             restart=options.restart,
             recorder=recorder,
+            viewers=viewers,
             real_time=options.real_time,
         )
         if options.baseline <= 0:
@@ -140,6 +143,8 @@ def _run(options: argparse.Namespace) -> LoopReport:
         say(f"against jitter: {', '.join(report.means)}")
     if recorder is not None:  # closed, so everything is written
         say(f"recorded: {recorder.episodes} episodes in {options.record}, {recorder.dropped} frames dropped")
+    for viewer in viewers:
+        say(viewer.report())
     return report
 
 
@@ -272,6 +277,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--transport", choices=("auto", "shm", "websocket", "http"), default="auto", help="(%(default)s)")
     add("--record", metavar="DIR", help="record a LeRobotDataset v3.0 there; needs the extra 'record'")
+    add("--rerun", metavar="DIR", help="write a .rrd file there for Rerun, or 'live': show the run in a running viewer")
+    add(
+        "--foxglove", metavar="DIR", help="write an .mcap file there for Foxglove, or 'live': let it connect to the run"
+    )
     add("--real-time", action="store_true", help="ask for SCHED_FIFO in place of a nice value")
     add(
         "--baseline",

@@ -9,7 +9,7 @@ import logging
 import os
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol, get_args
 
@@ -20,6 +20,8 @@ from vlagents_ray.interface import CAPTURED, INTERVENTION, SAFE, SILENT, WANTED,
 from vlagents_ray.robot.pacing import KEPT_TICKS, SPIN_S, Pacer, jitter, undisturbed
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import Guard, Watchdog
+from vlagents_ray.viewers.loop_view import LoopView
+from vlagents_ray.viewers.viewer import EpisodeViewer
 
 Restart = Literal["manual", "auto"]
 logger = logging.getLogger(__name__)
@@ -130,6 +132,7 @@ def run_loop(
     watchdog: Watchdog | None = None,
     restart: Restart | None = None,
     recorder: Recorder | None = None,
+    viewers: Sequence[EpisodeViewer] = (),
     real_time: bool = False,
     spin_s: float = SPIN_S,
     until: Callable[[], bool] = lambda: False,
@@ -160,6 +163,7 @@ def run_loop(
             is "auto" for a simulated robot and "manual" for any other.
         recorder: Records the run as one episode, also if it ends by an exception. A player with `override` wants one
             with `interventions=True`.
+        viewers: Show the run as one episode (see `vlagents_ray.viewers`).
         real_time: Run the thread with SCHED_FIFO (see `vlagents_ray.robot.pacing.undisturbed`).
         spin_s: How long before each tick the thread spins instead of sleeping, s.
         until: Ends the loop when it returns True; called before each tick, and after the last one.
@@ -192,10 +196,12 @@ def run_loop(
             agent.reset(_observed(robot), instruction, **(reset_options or {}))
             if recorder is not None:
                 stack.enter_context(recorder.episode(instruction or ""))
+            shown = LoopView(viewers)
+            stack.enter_context(shown.episode(instruction or ""))
             report.means = stack.enter_context(undisturbed(real_time=real_time))
             if watchdog is not None:
                 stack.enter_context(watchdog)
-            _drive(robot, agent, guard, watchdog, restart, recorder, report, Pacer(hz, spin_s), seconds, until)
+            _drive(robot, agent, guard, watchdog, restart, recorder, shown, report, Pacer(hz, spin_s), seconds, until)
         finally:
             robot.stop()  # before the watchdog and the recorder end
     if watchdog is not None:
@@ -212,6 +218,7 @@ def _drive(
     watchdog: Watchdog | None,
     restart: Restart,
     recorder: Recorder | None,
+    shown: LoopView,
     report: LoopReport,
     pacer: Pacer,
     seconds: float | None,
@@ -269,6 +276,7 @@ def _drive(
             if recorder is not None:
                 safe, wanted = reason is not None, act.info.get(WANTED)
                 recorder.add(obs, action, tick=tick, safe=safe, intervention=led, wanted=wanted)
+            shown.add(obs, act, action, tick, work_s[-1])
     finally:
         report.jitter = jitter(pacer.late_s, pacer.missed, pacer.ticks)
         if work_s:

@@ -62,6 +62,15 @@ def evaluate_command(
     record: Annotated[
         str | None, typer.Option(help="Trajectories, to export and to replay: none (default), failures or all.")
     ] = None,
+    rerun: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DIR", help="Write a .rrd file of each episode for Rerun, or 'live': show them in its viewer."
+        ),
+    ] = None,
+    foxglove: Annotated[
+        str | None, typer.Option(metavar="DIR", help="Write an .mcap file of each episode for Foxglove.")
+    ] = None,
     track: Annotated[str, typer.Option(help="wandb, trackio, tensorboard, with commas between them.")] = "",
     resume: Annotated[bool, typer.Option(help="Go on with the results in --out.")] = False,
     execute: Annotated[int | None, typer.Option(min=1, help="Rows executed of each chunk; default: all.")] = None,
@@ -128,7 +137,7 @@ def evaluate_command(
     """Evaluate policies: episodes in parallel, success rates with confidence intervals, videos.
 
     A file holds policies, their checkpoints, suites of environments, seeds; --out, --workers, --video, --record,
-    --track, --retries and --resume win over it.
+    --rerun, --foxglove, --track, --retries and --resume win over it.
 
     Exit status: 0 when every episode has its result, 75 when --end-at left some over (--resume goes on), 130 after
     Ctrl-C or SIGTERM (likewise), 2 for wrong settings, 1 for what else failed, and when infrastructure lost an episode

@@ -18,6 +18,7 @@ from vlagents_ray.serve.access.api_keys import Keys, load_keys
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.config.python_env import EnvironmentArgs
 from vlagents_ray.serve.config.shadow import ShadowArgs
+from vlagents_ray.serve.config.viewers import ViewerArgs
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.queue.call_limits import CallLimits
 from vlagents_ray.settings import wrong_settings
@@ -308,6 +309,7 @@ class ServerArgs(_DeploymentModel):
     shadow: ShadowArgs | None = Field(
         default=None, description="a candidate that acts on live observations; its actions are never executed"
     )
+    viewers: ViewerArgs = Field(default=ViewerArgs(), description="recordings of all sessions for Rerun and Foxglove")
 
     @field_validator("answer_while_loading")
     @classmethod

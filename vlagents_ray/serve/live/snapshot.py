@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.images.codecs import JPEG
 from vlagents_ray.protocol.json_messages import plain_values
 from vlagents_ray.protocol.messages import Reply
 from vlagents_ray.serve.engine.engine import Engine
@@ -139,12 +138,10 @@ def _session(session: Session[LoadedModel], last: Answer | None) -> dict[str, An
 
 
 def _pictures(seen: Seen, files: list[bytes]) -> dict[str, int]:
-    """Add the pictures of an observation to `files`, encoding those that came as pixels; return their indices."""
-    for camera, image in seen.cameras.items():
-        seen.files[camera] = JPEG.file(image)
-    seen.cameras = {}
-    files += seen.files.values()
-    return dict(zip(seen.files, range(len(files) - len(seen.files), len(files)), strict=True))
+    """Add the pictures of an observation to `files`; return their indices."""
+    pictures = seen.pictures()
+    files += pictures.values()
+    return dict(zip(pictures, range(len(files) - len(pictures), len(files)), strict=True))
 
 
 def _act(answer: Answer) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vlagents_ray.images.codecs import DecodedFiles
+from vlagents_ray.images.codecs import JPEG, DecodedFiles
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.responses import Done
 
@@ -46,6 +46,13 @@ class Seen:
     state: dict[str, np.ndarray]  # (D,) float32, with the gripper as a part
     cameras: dict[str, np.ndarray]  # (H, W, 3) uint8 RGB; empty once they are encoded
     files: dict[str, bytes]  # JPEG or PNG files by camera: those that the client sent, or encoded by the reader
+
+    def pictures(self) -> dict[str, bytes]:
+        """Return a file for each camera, encoding those that came as pixels."""
+        for camera, image in self.cameras.items():
+            self.files[camera] = JPEG.file(image)
+        self.cameras = {}
+        return self.files
 
 
 class LiveTap:

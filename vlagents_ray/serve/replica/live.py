@@ -8,9 +8,12 @@ from typing import Any
 
 import ray
 
+from vlagents_ray.serve.config.viewers import ViewerArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.live.fleet import Fleet
+from vlagents_ray.serve.live.recordings import SessionRecordings
 from vlagents_ray.serve.live.snapshot import ReplicaView, Snapshot
+from vlagents_ray.serve.live.spans import open_spans
 from vlagents_ray.serve.scaling.replica_views import ReplicaViews
 from vlagents_ray.serve.scaling.sibling_replicas import SiblingReplicas
 
@@ -18,11 +21,23 @@ from vlagents_ray.serve.scaling.sibling_replicas import SiblingReplicas
 class ReplicaLive:
     """A part of `PolicyReplica`: what it shows to viewers."""
 
-    def _open_live(self, engine: Engine, peers: SiblingReplicas, metadata: Callable[[], Mapping[str, Any]]) -> None:
+    def _open_live(
+        self, engine: Engine, peers: SiblingReplicas, metadata: Callable[[], Mapping[str, Any]], viewers: ViewerArgs
+    ) -> None:
         node = ray.get_runtime_context().get_node_id()
-        self._view = ReplicaView(engine, peers.own_name.rpartition("#")[2], node[:8], metadata)
+        name = peers.own_name.rpartition("#")[2]
+        self._view = ReplicaView(engine, name, node[:8], metadata)
         self._view.open()
         self._fleet = Fleet(self._view, ReplicaViews([peers.app], but=peers.own_name))
+        self._recordings = SessionRecordings(engine, self._view.tap, viewers.targets())
+        self._recordings.open()
+        self._spans = open_spans(engine, name)
+
+    def _close_live(self) -> None:
+        self._recordings.close()
+        if self._spans is not None:
+            self._spans.close()
+        self._view.close()
 
     async def live(self, since: int, shown: Collection[str]) -> Snapshot:
         """Return what happened here since a snapshot, with pictures of the sessions `shown`."""
