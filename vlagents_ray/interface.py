@@ -48,14 +48,12 @@ WANT = "want"  # in an observation: names of what the Act is to say beside the a
 BEHAVIOUR = "behaviour"  # in the Act: {name: number, or one for each row or token}, e.g. the action's "logprob", nats
 CAPTURED = "captured_at"  # in an observation: the time at which its first sensor was read, s since 1970 (`time.time`)
 DEADLINE = "deadline_ms"  # in an observation: the time after which `RemoteAgent` gives the request up, ms
-# Real-time chunking (Black, Galliker & Levine 2025, https://arxiv.org/abs/2506.07339), in an observation: the actions
-# that the robot executes during inference. The first DELAY rows of LEFTOVER will have been executed when the answer
-# arrives, so the new chunk begins with them; it should continue the later rows smoothly.
+# Real-time chunking (Black, Galliker & Levine 2025, https://arxiv.org/abs/2506.07339), in an observation: when the answer
+# arrives, the robot has executed DELAY rows of LEFTOVER. The new chunk begins with them, and continues the later ones.
 LEFTOVER = "leftover_actions"  # (H', D) float32: the current plan from this observation's tick on
 DELAY = "delay_ticks"  # int: ticks until the answer arrives, the longest of the last ones; at most the rows of LEFTOVER
 EXECUTED = "executed_actions"  # in an observation, (N, D): others than the policy's, executed since the last request
-# In the Act of a served policy: the weights that computed it, {"version": int, "fingerprint": str}. Version 0 is the
-# checkpoint that the server loaded, later ones were pushed; the replica computes the fingerprint from what it holds.
+# In the Act of a served policy: its weights, {"version": int, "fingerprint": str}. Version 0 is the loaded checkpoint.
 POLICY = "policy"
 # In the Act of a chunk player:
 SAFE = "safe"  # str: the reason why this is the safe action; absent if the action is the policy's
