@@ -56,9 +56,12 @@ DELAY = "delay_ticks"  # int: ticks until the answer arrives, the longest of the
 # In the Act of a served policy: the weights that computed it, {"version": int, "fingerprint": str}. Version 0 is the
 # checkpoint that the server loaded, later ones were pushed; the replica computes the fingerprint from what it holds.
 POLICY = "policy"
+# In the requests of a chunk player: what was executed since the one before, see `vlagents_ray.chunking.execution`.
+PLAYED = "played"
 # In the Act of a chunk player:
 SAFE = "safe"  # str: the reason why this is the safe action; absent if the action is the policy's
 AGE = "age_ticks"  # int: ticks since the observation from which the action was computed
+AGE_MS = "age_ms"  # float: the same in ms, from its capture until the player returned the action
 SILENT = "silent_s"  # float: seconds since the oldest unanswered request, retries included; 0.0 if there is none
 
 

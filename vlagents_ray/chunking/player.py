@@ -15,10 +15,11 @@ from vlagents_ray.chunking.answer import LastAnswer
 from vlagents_ray.chunking.background import AsyncCaller, parts_of
 from vlagents_ray.chunking.buffer import DELAYS, ENSEMBLE, ENSEMBLE_M, ChunkBuffer, Merge, Step
 from vlagents_ray.chunking.capture_clock import CaptureClock, stamped
+from vlagents_ray.chunking.execution import Execution
 from vlagents_ray.chunking.fallback import LATE, OLD, STALE, STOPPED, WAITING, Safe, SafeAction
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidAction, InvalidInput, NotReset, VLAgentsError
-from vlagents_ray.interface import DEADLINE, SAFE, SILENT, Act, Agent, Obs, copied
+from vlagents_ray.interface import DEADLINE, PLAYED, SAFE, SILENT, Act, Agent, Obs, copied
 from vlagents_ray.validation import check_action
 
 Mode = Literal["open_loop", "ensemble", "async"]
@@ -114,7 +115,7 @@ class ChunkPlayer(Agent):
     def _begin(self) -> None:
         self._plan.drop()
         self._tick: int | None = None  # tick of the next `act`; None outside an episode
-        self._answer = LastAnswer()
+        self._answer, self._execution = LastAnswer(), Execution()
         self._waiting_since: float | None = None
         self._trouble = WAITING
         self._captured = CaptureClock()
@@ -164,6 +165,7 @@ class ChunkPlayer(Agent):
         self._plan.drop()
         self._answer.drop()
         self._trouble = STOPPED
+        self._execution.interrupt(STOPPED)
         self._last = self._before
         self._motion = "stopped"
 
@@ -190,7 +192,7 @@ class ChunkPlayer(Agent):
         else:
             self._ask_in_time(self._asker, obs, tick, begun + self._deadline_s)
         self._tick = tick + 1
-        return self._chosen(obs, tick)
+        return self._execution.note(self._chosen(obs, tick), self._plan.executed)
 
     def close(self) -> None:
         """Close the policy, at once or as soon as the request in progress is over."""
@@ -231,10 +233,8 @@ class ChunkPlayer(Agent):
         if self._is_old(self._captured(obs)):
             return False
         step = self._next()
-        if step is None:
-            return True
-        if step.chunk.done:
-            return False
+        if step is None or step.chunk.done:
+            return step is None
         if self._mode == "open_loop":
             return self._execute is not None and step.row >= self._execute
         last = step.chunk.end == self._plan.executed + 1  # also true for each answer of a single action
@@ -268,7 +268,7 @@ class ChunkPlayer(Agent):
             return
         if isinstance(answer, InvalidInput) or not isinstance(answer, VLAgentsError):
             raise answer
-        self._trouble = f"{answer.code}: {answer}"
+        self._trouble = self._execution.failed(answer)
 
     def _take(self, act: Act, now: int) -> None:
         answer = self._answer
@@ -288,7 +288,7 @@ class ChunkPlayer(Agent):
         self._trouble = WAITING if added or act.more else LATE
 
     def _extras(self) -> dict[str, Any]:
-        extras: dict[str, Any] = {}
+        extras: dict[str, Any] = {PLAYED: self._execution.report(self._plan.executed, self._agent)}
         if self._timeout_s is not None:
             extras[DEADLINE] = self._timeout_s * 1e3
         if self._real_time:

@@ -134,6 +134,11 @@ class RemoteAgent(Agent):
         return self._connection.codec.link
 
     @property
+    def reconnects(self) -> int:
+        """How often it has connected again, because the connection broke or the server asked for it."""
+        return self._connection.reconnects
+
+    @property
     def metadata(self) -> dict[str, Any]:
         """The server's metadata: policy, checkpoint, contract, protocol version."""
         self._connection.open()

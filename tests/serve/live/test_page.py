@@ -14,6 +14,7 @@ from in_memory_keys import ChangingKeys
 from live_server import LiveServer, live_server
 
 from vlagents_ray import Obs, RemoteAgent
+from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import RankName
 
@@ -110,6 +111,35 @@ def test_a_card_says_what_its_session_does(page: Page, server: LiveServer) -> No
         assert page.value("document.querySelectorAll('#fleet tr').length") == 1
         until(page, "document.getElementById('percentiles').innerText.includes(' ms')", True)
     until(page, CARDS, 0)  # it ended
+
+
+def test_a_card_compares_what_was_planned_with_what_was_executed(page: Page, server: LiveServer) -> None:
+    over = threading.Event()
+
+    def play() -> None:
+        with RemoteAgent(server.url) as agent:
+            player = ChunkPlayer(agent, mode="async", deadline_s=0.01, safe="hold")
+            obs = Obs(state={"joints": np.zeros(7, np.float32)})
+            player.reset(obs, "play")
+            while not over.wait(0.02):
+                player.act(obs)
+            player.close()
+
+    robot = threading.Thread(target=play)
+    robot.start()
+    try:
+        show(page, server)
+        until(page, "document.querySelectorAll('.compared polyline').length", 2)
+        page.value(
+            "(() => { const joint = document.querySelector('.compared select'); joint.value = '6';"
+            "joint.dispatchEvent(new Event('change')); })()"
+        )
+        assert page.value("document.querySelector('.compared svg').ariaLabel").startswith("Joint 7, ")
+        until(page, "document.querySelector('article').innerText.includes('age when executed')", want=True)
+        assert page.said == []
+    finally:
+        over.set()
+        robot.join()
 
 
 def test_sixteen_simulations_are_found_by_name(page: Page, server: LiveServer) -> None:

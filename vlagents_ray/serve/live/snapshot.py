@@ -15,14 +15,12 @@ from vlagents_ray.protocol.json_messages import plain_values
 from vlagents_ray.protocol.messages import Reply
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import SAMPLE, STAGES, LoadMeter
-from vlagents_ray.serve.live.tap import RATE, Answer, LiveTap, Seen
+from vlagents_ray.serve.live.tap import RATE, ROWS, VALUES, Answer, LiveTap, Played, Seen
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.periodic import each_half_second
 from vlagents_ray.serve.sessions import Session
 
 _SHARE = 0.04  # of a core, for encoding pictures
-_VALUES = 64  # most numbers of one part of a state or of one row of a chunk
-_ROWS = 128  # most rows of a chunk
 _SESSIONS = 256  # most sessions of a replica that are described
 _TEXT = 200  # most characters of a text in an act's info
 _STATE_S = 0.5  # time for which slow things are not looked up again
@@ -73,9 +71,13 @@ class ReplicaView:
         answers = tap.answers(since)
         snapshot = Snapshot(answers[-1].number if answers else since, {})
         last = {one.session: one for one in answers if one.op in _SHOWN_OPS}
+        played: dict[str, list[Played]] = {}
+        for one in answers:
+            if one.played is not None:
+                played.setdefault(one.session, []).append(one.played)
         tap.forget_others(engine.sessions.ids())
         held = sorted(engine.sessions.all(), key=lambda one: one.id)[:_SESSIONS]
-        sessions = {session.id: _session(session, last.get(session.id)) for session in held}
+        sessions = {session.id: _session(session, last.get(session.id), played.get(session.id, [])) for session in held}
         begun = time.thread_time()
         longest_without = sorted(sessions, key=lambda name: self._pictured.get(name, 0))
         for name in longest_without:
@@ -83,7 +85,7 @@ class ReplicaView:
             if seen is None or seen.number <= since:
                 continue
             snapshot.number = max(snapshot.number, seen.number)
-            described["state"] = {part: _numbers(values[:_VALUES]) for part, values in seen.state.items()}
+            described["state"] = {part: _numbers(values[:VALUES]) for part, values in seen.state.items()}
             if name in shown and time.thread_time() - begun < _SHARE / RATE:
                 described["pictures"] = _pictures(seen, snapshot.files)
                 self._pictured[name] = seen.number
@@ -120,8 +122,8 @@ class ReplicaView:
         return self._slow
 
 
-def _session(session: Session[LoadedModel], last: Answer | None) -> dict[str, Any]:
-    """Return a session as a viewer needs it, with its last answer if there is a new one."""
+def _session(session: Session[LoadedModel], last: Answer | None, played: list[Played]) -> dict[str, Any]:
+    """Return a session as a viewer needs it, with its last answer and what it executed, if there is something new."""
     weights = session.weights
     described = {
         "id": session.id,
@@ -132,6 +134,11 @@ def _session(session: Session[LoadedModel], last: Answer | None) -> dict[str, An
         "version": None if weights is None else weights.number,
         "pictures": {},
     }
+    if played:
+        said: dict[str, Any] = plain_values(played[-1].said)
+        steps = [step for one in played for step in one.steps.tolist()]
+        rows = [row for one in played for row in _numbers(one.rows)]
+        described["played"] = said | {"steps": steps[-ROWS:], "rows": rows[-ROWS:]}
     return described if last is None else described | {"rank": last.rank, "last": _act(last)}
 
 
@@ -154,10 +161,12 @@ def _act(answer: Answer) -> dict[str, Any]:
         rows = reply.act.rows()
         found |= {
             "rows": len(rows),
-            "action": _numbers(rows[:_ROWS, :_VALUES]),
+            "action": _numbers(rows[:ROWS, :VALUES]),
             "done": reply.act.done,
             "info": _info(reply.act.info),
         }
+        if answer.played is not None:
+            found["at"] = answer.played.said.get("step")
     return found
 
 

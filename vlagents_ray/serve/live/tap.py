@@ -13,18 +13,45 @@ import time
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from vlagents_ray.images.codecs import DecodedFiles
+from vlagents_ray.interface import PLAYED
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.responses import Done
 
 RATE = 10.0  # observations a second and session that are kept
 LEASE_S = 2.0  # time after the last reading at which nobody looks any more
 _ANSWERS = 4096  # most answers that are kept
+VALUES = 64  # most numbers of one part of a state, or of one action
+ROWS = 128  # most actions of a chunk, or executed before a request
+_SAID = ("step", "age_ms", "safe", "safe_ticks", "safe_spells", "late", "reconnects")
 _KEPT_S = 1.0  # time for which the pictures of an observation are kept if nobody reads them
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """What a client states of the actions that it executed: `vlagents_ray.chunking.execution`."""
+
+    steps: np.ndarray  # (n,) int64, the steps of the rows
+    rows: np.ndarray  # (n, D) float32
+    said: dict[str, Any]  # `step`, `age_ms`, `safe`, … as far as they are numbers and texts
+
+    @classmethod
+    def of(cls, request: Request) -> Played | None:
+        """Return a copy of what a request states; None if that is nothing, or has another form."""
+        stated = None if request.obs is None else request.obs.info.get(PLAYED)
+        if not isinstance(stated, dict):
+            return None
+        steps, rows = stated.get("steps"), stated.get("rows")
+        if not isinstance(steps, np.ndarray) or not isinstance(rows, np.ndarray) or rows.ndim != 2:
+            return None
+        if steps.shape != rows.shape[:1] or steps.dtype.kind not in "iu" or rows.dtype.kind != "f":
+            return None
+        said = {name: stated[name] for name in _SAID if isinstance(stated.get(name), (int, float, str))}
+        return cls(np.array(steps[:ROWS]), np.array(rows[:ROWS, :VALUES]), said)
 
 
 class Answer(NamedTuple):
@@ -35,6 +62,7 @@ class Answer(NamedTuple):
     op: str
     rank: str
     reply: Reply
+    played: Played | None = None  # what the client executed before this request
 
 
 @dataclass(slots=True)
@@ -104,18 +132,18 @@ class LiveTap:
         Returns:
             `done`, which also keeps the answers.
         """
-        kinds = []
+        kinds: list[tuple[str, str, str, Played | None]] = []
         for session, item in zip(sessions, items, strict=True):
             if isinstance(item, Reply):
-                kinds.append((session, "unknown", "robot"))
+                kinds.append((session, "unknown", "robot", None))
                 continue
-            kinds.append((session, item.op, item.rank))
+            kinds.append((session, item.op, item.rank, Played.of(item)))
             self._keep(session, item, files)
 
         def answer(replies: list[Reply]) -> None:
             done(replies)
-            for (session, op, rank), reply in zip(kinds, replies, strict=True):
-                self._answers.append(Answer(next(self._numbers), session, op, rank, reply))
+            for (session, op, rank, played), reply in zip(kinds, replies, strict=True):
+                self._answers.append(Answer(next(self._numbers), session, op, rank, reply, played))
 
         return answer
 

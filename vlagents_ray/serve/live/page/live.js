@@ -4,6 +4,7 @@
 const KEPT_S = 10; // times and rates are of the last seconds
 const POINTS = 120; // of a sparkline
 const LINES = 8; // most lines in one plot
+const EXECUTED = 300; // actions that a card keeps
 const STAGES = ["decode", "queue", "inference", "encode"];
 const COLOURS = ["--c0", "--c1", "--c2", "--c3", "--c4", "--c5"];
 const SVG = "http://www.w3.org/2000/svg";
@@ -160,6 +161,24 @@ function showTimes() {
 
 // ---- cards
 
+const number = (value) => String(Number(value.toPrecision(3)));
+
+function svgElement() {
+  const svg = document.createElementNS(SVG, "svg");
+  svg.setAttribute("viewBox", "0 0 100 100");
+  svg.setAttribute("preserveAspectRatio", "none");
+  svg.setAttribute("role", "img");
+  return svg;
+}
+
+function polyline(points, colour, kind = "") {
+  const line = document.createElementNS(SVG, "polyline");
+  line.setAttribute("points", points.join(" "));
+  line.setAttribute("class", kind);
+  line.style.stroke = `var(${colour})`;
+  return line;
+}
+
 class Card {
   constructor(id) {
     this.id = id;
@@ -173,8 +192,13 @@ class Card {
     this.cameras = element("div", { className: "cameras" });
     this.drawn = element("div", { className: "plots" });
     this.told = element("dl");
+    this.plan = null; // the chunk planned last: the step of its first row, and its rows
+    this.executed = new Map(); // action by step
+    this.joint = element("select", { onchange: () => this.compare() });
+    this.compared = element("figure", { className: "compared", hidden: true }, svgElement(),
+      element("figcaption", {}, element("label", {}, "Planned and executed, joint ", this.joint), element("span")));
     const title = element("h3", { id: `session-${cards.size}-${Date.now()}` }, id);
-    this.root = element("article", {}, element("div", {}, title, this.badge), this.instruction, this.cameras, this.drawn, this.told);
+    this.root = element("article", {}, element("div", {}, title, this.badge), this.instruction, this.cameras, this.drawn, this.compared, this.told);
     this.root.setAttribute("aria-labelledby", title.id);
     byId("sessions").append(this.root);
     this.filter();
@@ -193,6 +217,7 @@ class Card {
       this.plot(`state: ${part}`, rows);
     }
     if (said.last) this.act(said.last);
+    if (said.played) this.played(said.played);
     this.root.classList.toggle("silent", said.silent_s > 5);
     this.tell({ step: said.step, "weights version": said.version, "last request": `${said.silent_s.toFixed(1)} s ago` });
   }
@@ -200,12 +225,47 @@ class Card {
   act(act) {
     this.root.classList.toggle("failed", Boolean(act.error));
     this.tell({ error: act.error ? `${act.error}: ${act.detail}` : null });
+    if (act.action && act.at != null) this.plan = { at: act.at, rows: act.action };
     if (act.action) this.plot(act.rows > 1 ? `plan: ${act.rows} rows` : "action", this.planned(act));
     const ms = act.ms;
     if (ms.inference_ms !== undefined) {
       this.tell({ server: ms.total_ms === undefined ? null : `${ms.total_ms.toFixed(1)} ms: ${STAGES.filter((name) => ms[`${name}_ms`] !== undefined).map((name) => `${name} ${ms[`${name}_ms`].toFixed(1)}`).join(", ")}`, "batch of": ms.batch_size });
     }
     this.tell(act.info || {});
+  }
+
+  // What the robot executed, as its chunk player states it with each request.
+  played(said) {
+    if (said.step < this.step) this.executed.clear(); // another episode
+    this.step = said.step;
+    said.steps.forEach((step, i) => { this.executed.delete(step); this.executed.set(step, said.rows[i]); });
+    while (this.executed.size > EXECUTED) this.executed.delete(this.executed.keys().next().value);
+    const spells = said.safe_spells ? `${said.safe_ticks} ticks in ${said.safe_spells} ${said.safe_spells === 1 ? "spell" : "spells"}` : "none";
+    this.tell({ "age when executed": said.age_ms == null ? null : `${said.age_ms.toFixed(0)} ms`, "safe action now": said.safe || null,
+      "safe actions": spells, "answers too late": said.late, reconnects: said.reconnects });
+    this.compare();
+  }
+
+  // One joint of the chunk planned last (dashed) over the actions that were executed (solid), by step.
+  compare() {
+    const { plan, executed } = this;
+    if (!plan || !executed.size) return;
+    this.compared.hidden = false;
+    const joints = plan.rows[0].length;
+    if (this.joint.length !== joints) this.joint.replaceChildren(...plan.rows[0].map((_, i) => element("option", { value: i }, `${i + 1} of ${joints}`)));
+    const joint = Number(this.joint.value), first = plan.at - plan.rows.length;
+    const lines = [
+      [...executed].filter(([step]) => step >= first).sort((a, b) => a[0] - b[0]).map(([step, row]) => [step, row[joint]]),
+      plan.rows.map((row, i) => [plan.at + i, row[joint]]),
+    ].map((line) => line.filter(([, value]) => value != null));
+    const values = lines.flat().map(([, value]) => value), steps = lines.flat().map(([step]) => step);
+    if (!values.length) return;
+    const low = Math.min(...values), range = Math.max(...values) - low || 1, from = Math.min(...steps), length = Math.max(1, Math.max(...steps) - from);
+    const [svg, caption] = this.compared.children;
+    svg.replaceChildren(...lines.map((line, i) => polyline(line.map(([step, value]) => `${(100 * (step - from)) / length},${95 - (90 * (value - low)) / range}`), COLOURS[i], i ? "planned" : "executed")));
+    const told = `${number(low)} to ${number(Math.max(...values))}; dashed: planned, solid: executed, up to step ${this.step}`;
+    caption.lastChild.textContent = told;
+    svg.setAttribute("aria-label", `Joint ${joint + 1}, ${told}`);
   }
 
   // A chunk is drawn as it is; single actions as the last of them.
@@ -234,10 +294,7 @@ class Card {
     let svg = this.plots.get(name);
     if (!svg) {
       for (const other of this.plots.keys()) if (name.startsWith("plan") && other.startsWith("plan")) this.removePlot(other);
-      svg = document.createElementNS(SVG, "svg");
-      svg.setAttribute("viewBox", "0 0 100 100");
-      svg.setAttribute("preserveAspectRatio", "none");
-      svg.setAttribute("role", "img");
+      svg = svgElement();
       this.plots.set(name, svg);
       this.drawn.append(element("div", {}, element("span", { className: "plot-name" }), svg));
     }
@@ -246,13 +303,9 @@ class Card {
     const lines = [];
     for (let joint = 0; joint < Math.min(LINES, rows[0].length); joint++) {
       const points = rows.map((row, i) => row[joint] == null ? null : `${(100 * i) / Math.max(1, rows.length - 1)},${range ? 95 - (90 * (row[joint] - low)) / range : 50}`);
-      const line = document.createElementNS(SVG, "polyline");
-      line.setAttribute("points", points.filter(Boolean).join(" "));
-      line.style.stroke = `var(${COLOURS[joint % COLOURS.length]})`;
-      lines.push(line);
+      lines.push(polyline(points.filter(Boolean), COLOURS[joint % COLOURS.length]));
     }
     svg.replaceChildren(...lines);
-    const number = (value) => String(Number(value.toPrecision(3)));
     const told = `${name}, ${range ? `${number(low)} to ${number(high)}` : number(low)}`;
     svg.previousSibling.textContent = told;
     svg.setAttribute("aria-label", told);
