@@ -23,6 +23,7 @@ import numpy as np
 from vlagents_ray.chunking.buffer import ENSEMBLE, MERGES
 from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.client.agent import RemoteAgent
+from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.errors import ConfigError, MissingState, VLAgentsError
 from vlagents_ray.interface import Obs
 from vlagents_ray.robot.loop import LoopReport, Restart, Robot, run_loop
@@ -75,9 +76,10 @@ def _run(options: argparse.Namespace) -> LoopReport:
     deadline_s = options.deadline_ms / 1e3 if options.deadline_ms is not None else WAIT_S * (options.mode != "async")
     robot_class = _load(options.robot) if options.robot else None
     with contextlib.ExitStack() as stack:
-        agent = RemoteAgent(
-            options.url, transport=options.transport, timeout_s=options.timeout_s
-        )  # the player closes it
+        commands = CommandInbox() if options.operate else None
+        agent = RemoteAgent(  # the player closes it
+            options.url, transport=options.transport, timeout_s=options.timeout_s, commands=commands
+        )
         agent.initialize()
         contract = agent.contract
         stated = contract is not None and contract.action.relative is not None
@@ -111,17 +113,26 @@ def _run(options: argparse.Namespace) -> LoopReport:
         if options.baseline > 0:
             say(_line(_HEADER))
             say(_row("empty loop", empty_loop(options.hz, options.baseline, real_time=options.real_time)))
-        report = run_loop(
-            robot,
-            player,
-            hz=options.hz,
-            seconds=options.seconds,
-            instruction=options.instruction,
-            watchdog=watchdog,
-            restart=options.restart,
-            recorder=recorder,
-            real_time=options.real_time,
-        )
+        instruction: str | None = options.instruction
+        while True:
+            report = run_loop(
+                robot,
+                player,
+                hz=options.hz,
+                seconds=options.seconds,
+                instruction=instruction,
+                watchdog=watchdog,
+                restart=options.restart,
+                recorder=recorder,
+                real_time=options.real_time,
+                commands=commands,
+            )
+            if report.outcome:
+                say(f"marked as a {report.outcome} on the live page")
+            if report.next_instruction is None:
+                break
+            instruction = report.next_instruction
+            say(f"the live page asks for another episode: {instruction!r}")
         if options.baseline <= 0:
             say(_line(_HEADER))
         say(_row(f"{options.mode}, {agent.transport}", report.jitter))
@@ -278,6 +289,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--transport", choices=("auto", "shm", "websocket", "http"), default="auto", help="(%(default)s)")
     add("--record", metavar="DIR", help="record a LeRobotDataset v3.0 there; needs the extra 'record'")
+    add("--operate", action="store_true", help="obey the buttons of the server's live page: pause, stop, ...")
     add("--real-time", action="store_true", help="ask for SCHED_FIFO in place of a nice value")
     add(
         "--baseline",

@@ -15,8 +15,13 @@ from live_server import LiveServer, live_server
 
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.client.commands import CommandInbox
+from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import RankName
+from vlagents_ray.robot.loop import LoopReport, run_loop
+from vlagents_ray.robot.simulated import SimulatedRobot
+from vlagents_ray.serve.access import api_keys
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -129,7 +134,7 @@ def test_a_card_compares_what_was_planned_with_what_was_executed(page: Page, ser
     robot.start()
     try:
         show(page, server)
-        until(page, "document.querySelectorAll('.compared polyline').length", 2)
+        until(page, "document.querySelectorAll('.compared polyline').length > 2", want=True)
         page.value(
             "(() => { const joint = document.querySelector('.compared select'); joint.value = '6';"
             "joint.dispatchEvent(new Event('change')); })()"
@@ -172,6 +177,72 @@ def test_it_asks_for_a_key_and_watches_with_one(page: Page) -> None:
             until(page, STATUS, told)
         until(page, PICTURES, 1)
         assert "plain/" in page.value("document.querySelector('article h3').textContent")
+
+
+PRESS = "(text) => [...document.querySelectorAll('article button')].find((one) => one.textContent === text).click()"
+
+
+@contextmanager
+def operated(server: LiveServer, key: str | None = None) -> Iterator[list[LoopReport]]:
+    """A simulated robot that obeys the page."""
+    commands, over, reports = CommandInbox(), threading.Event(), []
+    with RemoteAgent(server.url, api_key=key, commands=commands) as agent:
+        robot, player = SimulatedRobot(Contract(action=ActionSpec(7))), ChunkPlayer(agent, mode="async", safe="hold")
+        thread = threading.Thread(
+            target=lambda: reports.append(
+                run_loop(robot, player, hz=50, instruction="wipe the table", commands=commands, until=over.is_set)
+            )
+        )
+        thread.start()
+        try:
+            yield reports
+        finally:
+            over.set()
+            thread.join()
+            player.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [360, 1400])
+def test_buttons_act_on_a_session(page: Page, server: LiveServer, width: int, scheme: str) -> None:
+    outcome = "document.querySelector('article .operate [role=status]')?.textContent"
+    with operated(server) as reports:
+        show(page, server, width=width, scheme=scheme)
+        until(page, "document.querySelectorAll('.compared polyline').length > 2", want=True)
+        page.value(f"({PRESS})('Pause')")
+        until(page, outcome, "pause: done")
+        until(page, "document.querySelector('article').innerText.includes('stopped')", want=True)
+        assert page.value("document.documentElement.scrollWidth") <= width
+        page.value(f"({PRESS})('Resume')")
+        until(page, outcome, "resume: done")
+        page.value(f"({PRESS})('Follow versions')")  # a robot is pinned unless it is told otherwise
+        until(page, outcome, "follow: done")
+        until(page, "[...document.querySelectorAll('article button')].some((one) => one.value === 'pin')", want=True)
+        page.value("document.querySelector('article input').value = 'fold the cloth'")
+        page.value(f"({PRESS})('Change')")
+        wait_for(lambda: reports, 30)
+        assert reports[0].next_instruction == "fold the cloth"
+        assert page.said == []
+        outside = [url for url in page.asked if not url.startswith(("blob:", "data:", server.url))]
+        assert outside == []
+
+
+def test_a_key_without_the_scope_sees_no_buttons(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(api_keys, "_CHECK_S", 0.0)
+    keys = ChangingKeys()
+    for name, scopes, buttons in (("watching", ["watch"], 0), ("lab", ["watch", "operate"], 7)):
+        key = keys.add(name, scopes=scopes)
+        with live_server(Noop.from_config({"action_dim": 7}), keys=keys.keys) as server, operated(server, key):
+            show(page, server)
+            until(page, "document.getElementById('key').hidden", want=False)
+            page.value(
+                f"(() => {{ document.getElementById('key-text').value = '{key}';"
+                "document.querySelector('#key button').click(); })()"
+            )
+            until(page, STATUS, "Live")
+            until(page, CARDS, 1)
+            shown = "[...document.querySelectorAll('article button')].filter((one) => one.checkVisibility()).length"
+            until(page, shown, buttons)
 
 
 def test_it_says_so_when_the_server_is_gone(page: Page) -> None:

@@ -15,6 +15,7 @@ from vlagents_ray.protocol.json_messages import plain_values
 from vlagents_ray.protocol.messages import Reply
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import SAMPLE, STAGES, LoadMeter
+from vlagents_ray.serve.live.commands import CommandBoard
 from vlagents_ray.serve.live.tap import RATE, ROWS, VALUES, Answer, LiveTap, Played, Seen
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.periodic import each_half_second
@@ -46,7 +47,8 @@ class ReplicaView:
         self._engine = engine
         self._about = {"name": name, "node": node}
         self._metadata = metadata
-        self.tap = LiveTap(self._show)
+        self.commands = CommandBoard(engine.sessions, self._see_all)
+        self.tap = LiveTap(self._show, commands=self.commands)
         self._meter: LoadMeter | None = None
         self._slow: dict[str, Any] = {}
         self._measured = float("-inf")
@@ -76,12 +78,14 @@ class ReplicaView:
             if one.played is not None:
                 played.setdefault(one.session, []).append(one.played)
         tap.forget_others(engine.sessions.ids())
+        self.commands.forget_others(engine.sessions.ids())
         held = sorted(engine.sessions.all(), key=lambda one: one.id)[:_SESSIONS]
         sessions = {session.id: _session(session, last.get(session.id), played.get(session.id, [])) for session in held}
         begun = time.thread_time()
         longest_without = sorted(sessions, key=lambda name: self._pictured.get(name, 0))
         for name in longest_without:
             seen, described = tap.seen(name), sessions[name]
+            described["commands"] = self.commands.of(name)
             if seen is None or seen.number <= since:
                 continue
             snapshot.number = max(snapshot.number, seen.number)
@@ -98,6 +102,9 @@ class ReplicaView:
             "sessions_held": len(engine.sessions),
         }
         return snapshot
+
+    def _see_all(self, seconds: float) -> None:
+        self.tap.renew(seconds)
 
     def _show(self, tap: LiveTap | None) -> None:
         self._engine.live = tap
@@ -132,6 +139,7 @@ def _session(session: Session[LoadedModel], last: Answer | None, played: list[Pl
         "instruction": session.instruction,
         "silent_s": round(time.monotonic() - session.used, 2),
         "version": None if weights is None else weights.number,
+        "follows": session.follows,
         "pictures": {},
     }
     if played:

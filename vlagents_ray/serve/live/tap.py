@@ -21,6 +21,7 @@ from vlagents_ray.images.codecs import DecodedFiles
 from vlagents_ray.interface import PLAYED
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.responses import Done
+from vlagents_ray.serve.live.commands import CommandBoard
 
 RATE = 10.0  # observations a second and session that are kept
 LEASE_S = 2.0  # time after the last reading at which nobody looks any more
@@ -79,9 +80,21 @@ class Seen:
 class LiveTap:
     """The latest answers and observations of a replica. Thread-safe."""
 
-    def __init__(self, show: Callable[[LiveTap | None], None], clock: Callable[[], float] = time.monotonic) -> None:
-        """Create a tap that nobody looks at; `show` makes it the one of the engine, or takes it away (None)."""
+    def __init__(
+        self,
+        show: Callable[[LiveTap | None], None],
+        clock: Callable[[], float] = time.monotonic,
+        commands: CommandBoard | None = None,
+    ) -> None:
+        """Create a tap that nobody looks at.
+
+        Args:
+            show: Makes the tap the one of the engine, or takes it away (None).
+            clock: The time, s.
+            commands: What is to be said to the sessions in their answers.
+        """
         self._show = show
+        self._commands = commands
         self._clock = clock
         self._until = float("-inf")  # end of the lease, s
         self._shown = False
@@ -94,9 +107,9 @@ class LiveTap:
         """Whether a viewer looks."""
         return self._clock() < self._until
 
-    def renew(self) -> None:
-        """Keep what happens for `LEASE_S` more."""
-        self._until = self._clock() + LEASE_S
+    def renew(self, lease_s: float = LEASE_S) -> None:
+        """Keep what happens for `lease_s` more."""
+        self._until = max(self._until, self._clock() + lease_s)
         if not self._shown:
             self._shown = True
             self._show(self)
@@ -139,8 +152,13 @@ class LiveTap:
                 continue
             kinds.append((session, item.op, item.rank, Played.of(item)))
             self._keep(session, item, files)
+            if self._commands is not None:
+                self._commands.note(session, item)
 
         def answer(replies: list[Reply]) -> None:
+            if self._commands is not None:
+                for session, reply in zip(sessions, replies, strict=True):
+                    self._commands.send(session, reply)
             done(replies)
             for (session, op, rank, played), reply in zip(kinds, replies, strict=True):
                 self._answers.append(Answer(next(self._numbers), session, op, rank, reply, played))

@@ -8,6 +8,8 @@ from typing import Any
 
 import ray
 
+from vlagents_ray.errors import UnknownSession
+from vlagents_ray.serve.access.audit import write_audit
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.live.fleet import Fleet
 from vlagents_ray.serve.live.snapshot import ReplicaView, Snapshot
@@ -18,6 +20,7 @@ class ReplicaLive:
     """A part of `PolicyReplica`: what it shows to viewers."""
 
     def _open_live(self, engine: Engine, peers: SiblingReplicas, metadata: Callable[[], Mapping[str, Any]]) -> None:
+        write_audit()  # of the buttons that are pressed, also without keys
         node = ray.get_runtime_context().get_node_id()
         self._view = ReplicaView(engine, peers.own_name.rpartition("#")[2], node[:8], metadata)
         self._view.open()
@@ -26,3 +29,10 @@ class ReplicaLive:
     async def live(self, since: int, shown: Collection[str]) -> Snapshot:
         """Return what happened here since a snapshot, with pictures of the sessions `shown`."""
         return await asyncio.to_thread(self._view.read, since, shown)
+
+    async def press(self, session: str, do: str, text: str, by: str) -> dict[str, Any] | None:
+        """Give a command to a session, for another replica; None if the session is not here."""
+        try:
+            return self._view.commands.press(session, do, text, by)
+        except UnknownSession:
+            return None

@@ -53,6 +53,10 @@ class SiblingApi(Protocol):
         """Return what happened since a snapshot, with pictures of the sessions `shown`."""
         ...
 
+    async def press(self, session: str, do: str, text: str, by: str) -> dict[str, Any] | None:
+        """Give a command to a session from the live page; None if the session is not here."""
+        ...
+
 
 class _Replica(Peer):
     def __init__(self, name: str, actor: Any) -> None:
@@ -135,6 +139,23 @@ class SiblingReplicas:
             )
         return self._views
 
+    async def press(self, session: str, do: str, text: str, by: str) -> dict[str, Any] | None:
+        """Give a command to a session of another replica; None if none has the session."""
+        actors = await asyncio.to_thread(lambda: [actor for _, actor in self._actors()])
+        asked = [_press(actor, session, do, text, by) for actor in actors]
+        for answer in asyncio.as_completed(asked):
+            try:
+                pressed = await answer
+            except (ray.exceptions.RayError, TimeoutError, asyncio.TimeoutError) as error:
+                cause = getattr(error, "cause", None)  # what the replica itself raised
+                if isinstance(cause, VLAgentsError):
+                    raise cause from error
+                logger.info("another replica does not answer: %s", error)
+                continue
+            if pressed is not None:
+                return pressed
+        return None
+
     def loads(self) -> list[ReplicaLoad]:
         """Return the loads of the replicas that answer within 0.3 s."""
         now = time.monotonic()
@@ -173,6 +194,12 @@ class SiblingReplicas:
 async def _view(actor: Any, since: int, shown: Collection[str]) -> Snapshot:
     snapshot: Snapshot = await asyncio.wait_for(call_replica(actor, SiblingApi.live, since, shown), _QUICK_S)
     return snapshot
+
+
+async def _press(actor: Any, session: str, do: str, text: str, by: str) -> dict[str, Any] | None:
+    call = call_replica(actor, SiblingApi.press, session, do, text, by)
+    pressed: dict[str, Any] | None = await asyncio.wait_for(call, _ANSWER_S)
+    return pressed
 
 
 def _result(reference: Any, timeout_s: float = _ANSWER_S) -> Any:

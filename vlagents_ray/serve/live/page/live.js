@@ -5,6 +5,7 @@ const KEPT_S = 10; // times and rates are of the last seconds
 const POINTS = 120; // of a sparkline
 const LINES = 8; // most lines in one plot
 const EXECUTED = 300; // actions that a card keeps
+const PLANS = 12; // chunks that a card keeps
 const STAGES = ["decode", "queue", "inference", "encode"];
 const COLOURS = ["--c0", "--c1", "--c2", "--c3", "--c4", "--c5"];
 const SVG = "http://www.w3.org/2000/svg";
@@ -13,6 +14,7 @@ const byId = (id) => document.getElementById(id);
 const replicas = new Map(); // by name: its last document, and what was counted lately
 const cards = new Map(); // by session
 let key = sessionStorage.getItem("vlagents.key") || "";
+let mayOperate = false; // whether this key may press buttons
 let wait = 500; // before the next attempt to connect, ms
 
 function element(tag, properties = {}, ...children) {
@@ -91,6 +93,7 @@ function read(data) {
 // ---- what is shown
 
 function show(said, files) {
+  mayOperate = said.may_operate;
   const present = new Set();
   for (const replica of said.replicas) {
     count(replica, said.time);
@@ -161,6 +164,15 @@ function showTimes() {
 
 // ---- cards
 
+const pressed = (said) => `${said.do}${said.by ? `, pressed by ${said.by}` : ""}`;
+const OUTCOMES = { // what became of a command
+  waiting: (said) => `${pressed(said)}: waits for the robot's next request`,
+  sent: (said) => `${pressed(said)}: sent, not answered yet`,
+  done: (said) => `${pressed(said)}: done`,
+  refused: (said) => `${pressed(said)}: refused by the robot: ${said.why}`,
+  ignored: (said) => `${pressed(said)}: ignored; the robot obeys no commands`,
+  "too late": (said) => `${pressed(said)}: not sent, as the robot made no request for 5 s`,
+};
 const number = (value) => String(Number(value.toPrecision(3)));
 
 function svgElement() {
@@ -192,13 +204,15 @@ class Card {
     this.cameras = element("div", { className: "cameras" });
     this.drawn = element("div", { className: "plots" });
     this.told = element("dl");
-    this.plan = null; // the chunk planned last: the step of its first row, and its rows
+    this.plans = []; // the last chunks: the step of their first row, and their rows
     this.executed = new Map(); // action by step
     this.joint = element("select", { onchange: () => this.compare() });
     this.compared = element("figure", { className: "compared", hidden: true }, svgElement(),
       element("figcaption", {}, element("label", {}, "Planned and executed, joint ", this.joint), element("span")));
     const title = element("h3", { id: `session-${cards.size}-${Date.now()}` }, id);
-    this.root = element("article", {}, element("div", {}, title, this.badge), this.instruction, this.cameras, this.drawn, this.compared, this.told);
+    this.outcome = element("p", { className: "note", role: "status" });
+    this.operated = this.buttons();
+    this.root = element("article", {}, element("div", {}, title, this.badge), this.instruction, this.cameras, this.drawn, this.compared, this.told, this.operated);
     this.root.setAttribute("aria-labelledby", title.id);
     byId("sessions").append(this.root);
     this.filter();
@@ -216,6 +230,10 @@ class Card {
       this.series.set(part, rows);
       this.plot(`state: ${part}`, rows);
     }
+    this.operated.hidden = !mayOperate;
+    this.follows.textContent = said.follows ? "Pin version" : "Follow versions";
+    this.follows.value = said.follows ? "pin" : "follow";
+    this.commands(said.commands);
     if (said.last) this.act(said.last);
     if (said.played) this.played(said.played);
     this.root.classList.toggle("silent", said.silent_s > 5);
@@ -225,7 +243,7 @@ class Card {
   act(act) {
     this.root.classList.toggle("failed", Boolean(act.error));
     this.tell({ error: act.error ? `${act.error}: ${act.detail}` : null });
-    if (act.action && act.at != null) this.plan = { at: act.at, rows: act.action };
+    if (act.action && act.at != null) this.plans = [...this.plans, { at: act.at, rows: act.action }].slice(-PLANS);
     if (act.action) this.plot(act.rows > 1 ? `plan: ${act.rows} rows` : "action", this.planned(act));
     const ms = act.ms;
     if (ms.inference_ms !== undefined) {
@@ -234,9 +252,53 @@ class Card {
     this.tell(act.info || {});
   }
 
+  // ---- for those who may operate the session
+
+  buttons() {
+    const button = (text, command, className = "") => element("button", { type: "button", className, value: command,
+      ariaLabel: `${text}: ${this.id}`, onclick: (event) => this.press(event.currentTarget.value) }, text);
+    const text = element("input", { name: "text", maxLength: 1000, required: true, placeholder: "another instruction", ariaLabel: `Instruction for ${this.id}` });
+    const instruct = element("form", { className: "row", onsubmit: (event) => {
+      event.preventDefault();
+      this.press("instruct", text.value.trim());
+      text.value = "";
+    } }, text, element("button", { className: "quiet" }, "Change"));
+    this.follows = button("Pin version", "pin", "quiet");
+    return element("div", { className: "operate", hidden: true },
+      element("div", { className: "row" }, button("Stop", "stop", "stop"), button("Pause", "pause"), button("Resume", "resume")),
+      element("div", { className: "row" }, button("Success", "success", "quiet"), button("Failure", "failure", "quiet"), this.follows),
+      instruct, this.outcome);
+  }
+
+  async press(command, text = "") {
+    this.say(`${command}: on its way`);
+    const headers = { "content-type": "application/json", ...(key ? { authorization: `Bearer ${key}` } : {}) };
+    try {
+      const answer = await fetch(`${path()}/command`, { method: "POST", headers, body: JSON.stringify({ session: this.id, do: command, text }) });
+      const said = await answer.json();
+      this.say(answer.ok ? OUTCOMES[said.state](said) : `${command}: ${said.detail}`, !answer.ok);
+    } catch (error) {
+      this.say(`${command}: the server was not reached`, true);
+    }
+  }
+
+  say(text, failed = false) {
+    if (this.outcome.textContent === text) return; // a screen reader would say it again
+    this.outcome.textContent = text;
+    this.outcome.classList.toggle("bad", failed);
+  }
+
+  commands(said) {
+    const last = said[said.length - 1];
+    const state = last && `${last.id} ${last.state}`;
+    if (!last || state === this.last) return;
+    this.last = state;
+    this.say(OUTCOMES[last.state](last), ["refused", "ignored", "too late"].includes(last.state));
+  }
+
   // What the robot executed, as its chunk player states it with each request.
   played(said) {
-    if (said.step < this.step) this.executed.clear(); // another episode
+    if (said.step < this.step) { this.executed.clear(); this.plans = []; } // another player
     this.step = said.step;
     said.steps.forEach((step, i) => { this.executed.delete(step); this.executed.set(step, said.rows[i]); });
     while (this.executed.size > EXECUTED) this.executed.delete(this.executed.keys().next().value);
@@ -246,23 +308,24 @@ class Card {
     this.compare();
   }
 
-  // One joint of the chunk planned last (dashed) over the actions that were executed (solid), by step.
+  // One joint of the last chunks (dashed) and of the actions that were executed (solid), by step.
   compare() {
-    const { plan, executed } = this;
-    if (!plan || !executed.size) return;
+    const { plans, executed } = this;
+    if (!plans.length || !executed.size) return;
+    const plan = plans[plans.length - 1];
     this.compared.hidden = false;
     const joints = plan.rows[0].length;
     if (this.joint.length !== joints) this.joint.replaceChildren(...plan.rows[0].map((_, i) => element("option", { value: i }, `${i + 1} of ${joints}`)));
-    const joint = Number(this.joint.value), first = plan.at - plan.rows.length;
+    const joint = Number(this.joint.value), first = plan.at - 2 * plan.rows.length;
     const lines = [
-      [...executed].filter(([step]) => step >= first).sort((a, b) => a[0] - b[0]).map(([step, row]) => [step, row[joint]]),
-      plan.rows.map((row, i) => [plan.at + i, row[joint]]),
-    ].map((line) => line.filter(([, value]) => value != null));
+      ...plans.map((one) => one.rows.map((row, i) => [one.at + i, row[joint]])),
+      [...executed].sort((a, b) => a[0] - b[0]).map(([step, row]) => [step, row[joint]]),
+    ].map((line) => line.filter(([step, value]) => step >= first && value != null));
     const values = lines.flat().map(([, value]) => value), steps = lines.flat().map(([step]) => step);
     if (!values.length) return;
     const low = Math.min(...values), range = Math.max(...values) - low || 1, from = Math.min(...steps), length = Math.max(1, Math.max(...steps) - from);
     const [svg, caption] = this.compared.children;
-    svg.replaceChildren(...lines.map((line, i) => polyline(line.map(([step, value]) => `${(100 * (step - from)) / length},${95 - (90 * (value - low)) / range}`), COLOURS[i], i ? "planned" : "executed")));
+    svg.replaceChildren(...lines.map((line, i) => polyline(line.map(([step, value]) => `${(100 * (step - from)) / length},${95 - (90 * (value - low)) / range}`), COLOURS[i < plans.length ? 1 : 0], i < plans.length ? "planned" : "executed")));
     const told = `${number(low)} to ${number(Math.max(...values))}; dashed: planned, solid: executed, up to step ${this.step}`;
     caption.lastChild.textContent = told;
     svg.setAttribute("aria-label", `Joint ${joint + 1}, ${told}`);
