@@ -56,11 +56,6 @@ DELAY = "delay_ticks"  # int: ticks until the answer arrives, the longest of the
 # In the Act of a served policy: the weights that computed it, {"version": int, "fingerprint": str}. Version 0 is the
 # checkpoint that the server loaded, later ones were pushed; the replica computes the fingerprint from what it holds.
 POLICY = "policy"
-# In the requests of a chunk player: what was executed since the one before, see `vlagents_ray.chunking.execution`.
-PLAYED = "played"
-# From the live page to a robot, and back: in an Act, {"id", "do", "text", "by"}: str; in a request, by id, why the
-# command was refused, "" if it was obeyed. See `vlagents_ray.client.commands`.
-COMMAND, COMMANDED = "command", "commanded"
 # In the Act of a chunk player:
 SAFE = "safe"  # str: the reason why this is the safe action; absent if the action is the policy's
 AGE = "age_ticks"  # int: ticks since the observation from which the action was computed

@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from vlagents_ray.chunking.execution import PLAYED
 from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.errors import DeadlineExceeded
-from vlagents_ray.interface import PLAYED, SAFE, Act, Agent, Obs
+from vlagents_ray.interface import SAFE, Act, Agent, Obs
 
 OBS = Obs(state={"joints": np.zeros(2, np.float32)})
 

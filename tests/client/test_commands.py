@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vlagents_ray.client.commands import CommandInbox
+from vlagents_ray.client.commands import COMMAND, COMMANDED, CommandInbox
 from vlagents_ray.errors import ConfigError, PolicyFailed
-from vlagents_ray.interface import COMMAND, COMMANDED, Act, Obs
+from vlagents_ray.interface import Act, Obs
 
 
 class Robot:

@@ -1,4 +1,4 @@
-"""What a chunk player executed, stated in its requests (`PLAYED`) for those who watch the server."""
+"""What a chunk player executed, stated in its requests for those who watch the server."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 from vlagents_ray.errors import DeadlineExceeded, VLAgentsError
 from vlagents_ray.interface import AGE_MS, SAFE, Act, Agent
 
+PLAYED = "played"  # the entry of `Obs.info`
 _ROWS = 64  # most actions between two requests that are stated; older ones are left out
 
 

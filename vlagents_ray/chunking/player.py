@@ -15,11 +15,11 @@ from vlagents_ray.chunking.answer import LastAnswer
 from vlagents_ray.chunking.background import AsyncCaller, parts_of
 from vlagents_ray.chunking.buffer import DELAYS, ENSEMBLE, ENSEMBLE_M, ChunkBuffer, Merge, Step
 from vlagents_ray.chunking.capture_clock import CaptureClock, stamped
-from vlagents_ray.chunking.execution import Execution
+from vlagents_ray.chunking.execution import PLAYED, Execution
 from vlagents_ray.chunking.fallback import LATE, OLD, STALE, STOPPED, WAITING, Safe, SafeAction
 from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError, InvalidAction, InvalidInput, NotReset, VLAgentsError
-from vlagents_ray.interface import DEADLINE, PLAYED, SAFE, SILENT, Act, Agent, Obs, copied
+from vlagents_ray.interface import DEADLINE, SAFE, SILENT, Act, Agent, Obs, copied
 from vlagents_ray.validation import check_action
 
 Mode = Literal["open_loop", "ensemble", "async"]

@@ -8,8 +8,10 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 from vlagents_ray.errors import ConfigError, InvalidInput, VLAgentsError
-from vlagents_ray.interface import COMMAND, COMMANDED, Act, Obs
+from vlagents_ray.interface import Act, Obs
 
+COMMAND = "command"  # the entry of `Act.info` with a command: {"id", "do", "text", "by"}, str each
+COMMANDED = "commanded"  # the entry of `Obs.info` with the answers: by id, why it was refused, "" if it was obeyed
 COMMANDS = ("pause", "resume", "stop", "success", "failure", "instruct")
 _REFUSAL = 200  # most characters of a refusal
 

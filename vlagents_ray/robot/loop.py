@@ -16,7 +16,7 @@ import numpy as np
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.errors import ConfigError, InvalidAction
 from vlagents_ray.interface import CAPTURED, SAFE, SILENT, Agent, Obs
-from vlagents_ray.robot.operated import OperatedLoop
+from vlagents_ray.robot.operation.operated_loop import OperatedLoop
 from vlagents_ray.robot.pacing import KEPT_TICKS, SPIN_S, Pacer, jitter, undisturbed
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import Guard, Watchdog

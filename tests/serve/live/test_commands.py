@@ -20,9 +20,9 @@ from manual_clock import Clock
 
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.chunking.player import ChunkPlayer
-from vlagents_ray.client.commands import CommandInbox
+from vlagents_ray.client.commands import COMMAND, COMMANDED, CommandInbox
 from vlagents_ray.errors import InvalidInput, Overloaded, UnknownSession
-from vlagents_ray.interface import COMMAND, COMMANDED, Act
+from vlagents_ray.interface import Act
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.robot.loop import LoopReport, run_loop

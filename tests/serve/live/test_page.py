@@ -162,23 +162,6 @@ def test_sixteen_simulations_are_found_by_name(page: Page, server: LiveServer) -
         assert "simulation" in page.value("document.querySelector('article').innerText")
 
 
-def test_it_asks_for_a_key_and_watches_with_one(page: Page) -> None:
-    keys = ChangingKeys()
-    plain, watching = keys.add("plain"), keys.add("watching", scopes=["watch"])
-    with live_server(keys=keys.keys) as server, acting(server, 1, key=plain):
-        show(page, server)
-        until(page, "document.getElementById('key').hidden", want=False)
-        assert page.value("document.querySelector('main').hidden") is True
-        for key, told in ((plain, "This key may not watch here"), (watching, "Live")):
-            page.value(
-                f"(() => {{ document.getElementById('key-text').value = '{key}';"
-                "document.querySelector('#key button').click(); })()"
-            )
-            until(page, STATUS, told)
-        until(page, PICTURES, 1)
-        assert "plain/" in page.value("document.querySelector('article h3').textContent")
-
-
 PRESS = "(text) => [...document.querySelectorAll('article button')].find((one) => one.textContent === text).click()"
 
 
@@ -225,6 +208,23 @@ def test_buttons_act_on_a_session(page: Page, server: LiveServer, width: int, sc
         assert page.said == []
         outside = [url for url in page.asked if not url.startswith(("blob:", "data:", server.url))]
         assert outside == []
+
+
+def test_it_asks_for_a_key_and_watches_with_one(page: Page) -> None:
+    keys = ChangingKeys()
+    plain, watching = keys.add("plain"), keys.add("watching", scopes=["watch"])
+    with live_server(keys=keys.keys) as server, acting(server, 1, key=plain):
+        show(page, server)
+        until(page, "document.getElementById('key').hidden", want=False)
+        assert page.value("document.querySelector('main').hidden") is True
+        for key, told in ((plain, "This key may not watch here"), (watching, "Live")):
+            page.value(
+                f"(() => {{ document.getElementById('key-text').value = '{key}';"
+                "document.querySelector('#key button').click(); })()"
+            )
+            until(page, STATUS, told)
+        until(page, PICTURES, 1)
+        assert "plain/" in page.value("document.querySelector('article h3').textContent")
 
 
 def test_a_key_without_the_scope_sees_no_buttons(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,8 +9,9 @@ import pytest
 from live_server import ask, live_server
 
 from vlagents_ray import Obs, RemoteAgent
+from vlagents_ray.chunking.execution import PLAYED
 from vlagents_ray.chunking.player import ChunkPlayer
-from vlagents_ray.interface import PLAYED, Act, Agent
+from vlagents_ray.interface import Act, Agent
 from vlagents_ray.protocol.messages import Request
 from vlagents_ray.serve.live.tap import ROWS, VALUES, Played
 

@@ -15,9 +15,8 @@ from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import Any, Literal
 
-from vlagents_ray.client.commands import COMMANDS
+from vlagents_ray.client.commands import COMMAND, COMMANDED, COMMANDS
 from vlagents_ray.errors import InvalidInput, Overloaded, UnknownSession
-from vlagents_ray.interface import COMMAND, COMMANDED
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.sessions import SessionTable

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from vlagents_ray.chunking.execution import PLAYED
 from vlagents_ray.images.codecs import DecodedFiles
-from vlagents_ray.interface import PLAYED
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.responses import Done
 from vlagents_ray.serve.live.commands import CommandBoard

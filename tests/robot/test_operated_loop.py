@@ -7,11 +7,11 @@ import time
 import numpy as np
 import pytest
 
-from vlagents_ray.client.commands import CommandInbox
+from vlagents_ray.client.commands import COMMAND, CommandInbox
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.interface import COMMAND, Act, Agent, Obs
+from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.robot.loop import LoopReport, run_loop
-from vlagents_ray.robot.operated import OperatedLoop
+from vlagents_ray.robot.operation.operated_loop import OperatedLoop
 from vlagents_ray.robot.safety import Watchdog
 
 
