@@ -85,6 +85,11 @@ class CommandInbox:
         else:
             self._answers[command.id] = f"{command.do}: not allowed here"
 
+    @property
+    def waiting(self) -> list[Command]:
+        """The commands that have come and were not obeyed yet, oldest first."""
+        return list(self._waiting)
+
     def obey(self, operated: Operated) -> list[Command]:
         """Let `operated` do what has come since the last call; return those commands that it did."""
         done = []
