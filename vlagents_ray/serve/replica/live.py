@@ -9,6 +9,7 @@ from typing import Any
 import ray
 
 from vlagents_ray.errors import UnknownSession
+from vlagents_ray.ray_tools.private import compress_no_websockets
 from vlagents_ray.serve.access.audit import write_audit
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.live.fleet import Fleet
@@ -20,6 +21,7 @@ class ReplicaLive:
     """A part of `PolicyReplica`: what it shows to viewers."""
 
     def _open_live(self, engine: Engine, peers: SiblingReplicas, metadata: Callable[[], Mapping[str, Any]]) -> None:
+        compress_no_websockets()
         write_audit()  # of the buttons that are pressed, also without keys
         node = ray.get_runtime_context().get_node_id()
         self._view = ReplicaView(engine, peers.own_name.rpartition("#")[2], node[:8], metadata)
