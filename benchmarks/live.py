@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 import inspect
 import json
+import re
 import statistics
 import sys
 import textwrap
@@ -30,6 +31,7 @@ from vlagents_ray.cli.bench import Json
 from vlagents_ray.cli.console import errors, out, progress, save, table
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.transports.select import TransportName
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.serve.engine import dispatch
 from vlagents_ray.serve.launch.deployment_file import deployment
@@ -48,17 +50,18 @@ class Untapped(Noop):
     def initialize(self) -> None:
         """Replace the methods of this process."""
         super().initialize()
-        _without(dispatch.Dispatcher.send, "        if (live :=", "        if admission is not None and")
-        _without(dispatch.Dispatcher.admission, "        keep =", "        if caller is None", "        keep = False\n")
+        looked_for = r"    if \(\w+ := self\._engine\.[\w.]+\) is not None:\n(        .*\n)+"
+        _without(dispatch.Dispatcher.send, looked_for, "")
+        _without(dispatch.Dispatcher.admission, r"keep = self\._engine\..*", "keep = False")
 
 
-def _without(method: Callable[..., Any], first: str, after: str, instead: str = "") -> None:
-    """Compile a method of the dispatcher again without its lines from `first` to before `after`."""
-    source = textwrap.indent(textwrap.dedent(inspect.getsource(method)), "    ")
-    begin = source.index(first)
-    source = source[:begin] + instead + source[source.index(after, begin) :]
+def _without(method: Callable[..., Any], lines: str, instead: str) -> None:
+    """Compile a method of the dispatcher again with something else in place of the only lines that match."""
+    source, found_lines = re.subn(lines, instead, textwrap.dedent(inspect.getsource(method)))
+    if found_lines != 1:
+        raise ConfigError(f"{method.__name__}: got {found_lines} places with the lines for the tap, want 1; look there")
     found: dict[str, Any] = {}
-    exec(textwrap.dedent(source), vars(dispatch), found)  # noqa: S102 - the package's own source
+    exec(source, vars(dispatch), found)  # noqa: S102 - the package's own source
     setattr(dispatch.Dispatcher, method.__name__, found[method.__name__])
 
 

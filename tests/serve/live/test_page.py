@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,6 +24,7 @@ from vlagents_ray.protocol.messages import RankName
 from vlagents_ray.robot.loop import LoopReport, run_loop
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.serve.access import api_keys
+from vlagents_ray.serve.config.live import LiveArgs
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -225,6 +228,18 @@ def test_it_asks_for_a_key_and_watches_with_one(page: Page) -> None:
             until(page, STATUS, told)
         until(page, PICTURES, 1)
         assert "plain/" in page.value("document.querySelector('article h3').textContent")
+
+
+def test_a_session_is_saved(page: Page, tmp_path: Path) -> None:
+    outcome = "document.querySelector('article .operate [role=status]')?.textContent"
+    policy = Noop.from_config({"action_dim": 7, "chunk": 8})
+    with live_server(policy, settings=LiveArgs(folder=str(tmp_path))) as server, operated(server):
+        show(page, server)
+        until(page, "[...document.querySelectorAll('article img')].length", 2)
+        page.value(f"({PRESS})('Save last 30 s')")
+        until(page, f"({outcome} || '').startsWith('save: done, in {tmp_path}')", want=True)
+    [info] = tmp_path.rglob("info.json")
+    assert json.loads(info.read_text())["total_episodes"] == 1
 
 
 def test_a_key_without_the_scope_sees_no_buttons(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:

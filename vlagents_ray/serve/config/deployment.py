@@ -14,6 +14,7 @@ from vlagents_ray.policies.adapters import ADAPTER
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.serve.access.api_keys import Keys, load_keys
 from vlagents_ray.serve.config.dialects import DialectArgs
+from vlagents_ray.serve.config.live import LiveArgs
 from vlagents_ray.serve.config.python_env import EnvironmentArgs
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.queue.call_limits import CallLimits
@@ -276,6 +277,9 @@ class ServerArgs(_DeploymentModel):
     limits: LimitArgs = LimitArgs()
     access: AccessArgs = AccessArgs()
     stream: StreamArgs = StreamArgs()
+    live: LiveArgs | None = Field(
+        default=None, description="keeps the last seconds of each session, for the live page; unset: nothing is kept"
+    )
     resources: ResourceArgs = ResourceArgs()
     environment: EnvironmentArgs = Field(default=EnvironmentArgs(), description="the Python that the policy runs in")
     dialects: DialectArgs = Field(default=DialectArgs(), description="other systems' clients that may connect")

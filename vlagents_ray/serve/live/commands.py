@@ -8,6 +8,7 @@ became of it. What concerns the weights is done here.
 from __future__ import annotations
 
 import itertools
+import logging
 import threading
 import time
 import uuid
@@ -16,13 +17,17 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from vlagents_ray.client.commands import COMMAND, COMMANDED, COMMANDS
-from vlagents_ray.errors import InvalidInput, Overloaded, UnknownSession
+from vlagents_ray.errors import InvalidInput, Overloaded, UnknownSession, VLAgentsError
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.sessions import SessionTable
 
+logger = logging.getLogger(__name__)
+
 HERE = {"follow": True, "pin": False}
 """The commands that the server itself obeys: whether a session's later episodes take the newest weights."""
+SAVE = "save"
+"""The command that saves the session's last seconds, which the server does as well."""
 
 TRACKED_S = 15.0  # time for which the answer to a command is looked out for
 _WAITS_S = 5.0  # time within which a command has to reach the robot
@@ -31,7 +36,7 @@ _UNANSWERED = 3  # requests without an answer to a command, after which it count
 _TEXT = 1000  # most characters of an instruction
 _REFUSAL = 200
 
-State = Literal["waiting", "sent", "done", "refused", "ignored", "too late"]
+State = Literal["waiting", "sent", "saving", "done", "refused", "ignored", "too late"]
 
 
 @dataclass(slots=True)
@@ -44,7 +49,7 @@ class Press:
     by: str  # name of the key; empty without keys
     pressed: float  # s, of the board's clock
     state: State = "waiting"
-    why: str = ""  # it was refused
+    why: str = ""  # it was refused; or the folder into which the session was saved
     requests: int = 0  # of the session since it was sent
 
     def describe(self) -> dict[str, Any]:
@@ -60,8 +65,17 @@ class CommandBoard:
         sessions: SessionTable[LoadedModel],
         watch: Callable[[float], None],
         clock: Callable[[], float] = time.monotonic,
+        save: Callable[[str], str] = lambda _: "",
     ) -> None:
-        """Create a board without commands; `watch` has it see all messages for so many seconds more."""
+        """Create a board without commands.
+
+        Args:
+            sessions: The sessions of the replica.
+            watch: Has the board see all messages for so many seconds more.
+            clock: The time, s.
+            save: Saves the last seconds of a session, and returns where to; it may take long, and raise errors.
+        """
+        self._save = save
         self._sessions = sessions
         self._watch = watch
         self._clock = clock
@@ -75,7 +89,7 @@ class CommandBoard:
 
         Args:
             session_id: Id of the session in the engine.
-            do: One of `COMMANDS` or `HERE`.
+            do: One of `COMMANDS` or `HERE`, or `SAVE`.
             text: The new instruction, for "instruct".
             by: Name of the key whose holder commands.
 
@@ -84,8 +98,8 @@ class CommandBoard:
             InvalidInput: There is no such command, or it lacks its text.
             Overloaded: Too many commands wait for the session's next request.
         """
-        if do not in COMMANDS and do not in HERE:
-            raise InvalidInput(f"do: got {do[:40]!r}, want one of {[*COMMANDS, *HERE]}")
+        if do not in (*COMMANDS, *HERE, SAVE):
+            raise InvalidInput(f"do: got {do[:40]!r}, want one of {[*COMMANDS, *HERE, SAVE]}")
         if (do == "instruct") != bool(text) or len(text) > _TEXT:
             raise InvalidInput(f"text: got {len(text)} characters, want 1 to {_TEXT} with 'instruct', else none")
         session = next((one for one in self._sessions.all() if one.id == session_id), None)  # `get` would mark it used
@@ -97,7 +111,7 @@ class CommandBoard:
             held = self._presses.setdefault(session_id, [])
             self._expire(held)
             if len(held) == _SHOWN:
-                over = next((one for one in held if one.state != "waiting"), None)
+                over = next((one for one in held if one.state not in ("waiting", "saving")), None)
                 if over is None:
                     raise Overloaded(f"session {session_id!r}: {_SHOWN} commands wait already for its robot's request")
                 held.remove(over)
@@ -105,6 +119,9 @@ class CommandBoard:
         if do in HERE:
             session.told_to_follow = session.follows = HERE[do]
             pressed.state = "done"
+        elif do == SAVE:
+            pressed.state = "saving"
+            threading.Thread(target=self._save_now, args=(session_id, pressed), daemon=True).start()
         else:
             self._watch(TRACKED_S)
         return pressed.describe()
@@ -151,6 +168,14 @@ class CommandBoard:
         with self._lock:
             for session in self._presses.keys() - set(sessions):
                 del self._presses[session]
+
+    def _save_now(self, session_id: str, pressed: Press) -> None:
+        try:
+            pressed.why, pressed.state = self._save(session_id), "done"
+        except Exception as error:
+            if not isinstance(error, VLAgentsError):
+                logger.exception("session %s was not saved", session_id)
+            pressed.why, pressed.state = str(error)[:_REFUSAL], "refused"
 
     def _expire(self, held: Collection[Press]) -> None:
         """Give up what has waited for too long; the caller holds the lock."""

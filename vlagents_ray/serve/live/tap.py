@@ -9,6 +9,7 @@ that its client wants back.
 from __future__ import annotations
 
 import itertools
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
@@ -18,17 +19,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vlagents_ray.chunking.execution import PLAYED
-from vlagents_ray.images.codecs import DecodedFiles
+from vlagents_ray.images.codecs import JPEG, DecodedFiles
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.responses import Done
 from vlagents_ray.serve.live.commands import CommandBoard
 
+ENCODING_SHARE = 0.04  # of a core, for encoding pictures
 RATE = 10.0  # observations a second and session that are kept
 LEASE_S = 2.0  # time after the last reading at which nobody looks any more
 _ANSWERS = 4096  # most answers that are kept
 VALUES = 64  # most numbers of one part of a state, or of one action
 ROWS = 128  # most actions of a chunk, or executed before a request
 _SAID = ("step", "age_ms", "safe", "safe_ticks", "safe_spells", "late", "reconnects")
+_ENCODING = threading.Lock()
 _KEPT_S = 1.0  # time for which the pictures of an observation are kept if nobody reads them
 
 
@@ -75,6 +78,15 @@ class Seen:
     state: dict[str, np.ndarray]  # (D,) float32, with the gripper as a part
     cameras: dict[str, np.ndarray]  # (H, W, 3) uint8 RGB; empty once they are encoded
     files: dict[str, bytes]  # JPEG or PNG files by camera: those that the client sent, or encoded by the reader
+    reply: Reply | None = None  # its answer, once that was sent
+
+    def pictures(self) -> dict[str, bytes]:
+        """Return the files of all cameras; those that came as pixels are encoded now, which may take milliseconds."""
+        with _ENCODING:  # several may read
+            for camera, image in self.cameras.items():
+                self.files[camera] = JPEG.file(image)
+            self.cameras = {}
+            return dict(self.files)
 
 
 class LiveTap:
@@ -145,13 +157,12 @@ class LiveTap:
         Returns:
             `done`, which also keeps the answers.
         """
-        kinds: list[tuple[str, str, str, Played | None]] = []
+        kinds: list[tuple[str, str, str, Played | None, Seen | None]] = []
         for session, item in zip(sessions, items, strict=True):
             if isinstance(item, Reply):
-                kinds.append((session, "unknown", "robot", None))
+                kinds.append((session, "unknown", "robot", None, None))
                 continue
-            kinds.append((session, item.op, item.rank, Played.of(item)))
-            self._keep(session, item, files)
+            kinds.append((session, item.op, item.rank, Played.of(item), self._keep(session, item, files)))
             if self._commands is not None:
                 self._commands.note(session, item)
 
@@ -160,7 +171,9 @@ class LiveTap:
                 for session, reply in zip(sessions, replies, strict=True):
                     self._commands.send(session, reply)
             done(replies)
-            for (session, op, rank, played), reply in zip(kinds, replies, strict=True):
+            for (session, op, rank, played, seen), reply in zip(kinds, replies, strict=True):
+                if seen is not None:
+                    seen.reply = reply
                 self._answers.append(Answer(next(self._numbers), session, op, rank, reply, played))
 
         return answer
@@ -179,13 +192,15 @@ class LiveTap:
         for session in self._seen.keys() - set(sessions):
             self._seen.pop(session, None)
 
-    def _keep(self, session: str, request: Request, files: DecodedFiles) -> None:
+    def _keep(self, session: str, request: Request, files: DecodedFiles) -> Seen | None:
+        """Keep a request's observation, unless one was kept just before."""
         obs, now, before = request.obs, self._clock(), self._seen.get(session)
         if obs is None or (before is not None and now - before.time < 1 / RATE):
-            return
+            return None
         state = {name: np.array(part) for name, part in obs.state.items()}
         if obs.gripper is not None:
             state["gripper"] = np.array([obs.gripper], np.float32)
         sent = {name: bytes(files[id(image)][1]) for name, image in obs.cameras.items() if id(image) in files}
         cameras = {name: image for name, image in obs.cameras.items() if name not in sent}
-        self._seen[session] = Seen(next(self._numbers), now, state, cameras, sent)
+        seen = self._seen[session] = Seen(next(self._numbers), now, state, cameras, sent)
+        return seen

@@ -11,6 +11,7 @@ import ray
 from vlagents_ray.errors import UnknownSession
 from vlagents_ray.ray_tools.private import compress_no_websockets
 from vlagents_ray.serve.access.audit import write_audit
+from vlagents_ray.serve.config.live import LiveArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.live.fleet import Fleet
 from vlagents_ray.serve.live.snapshot import ReplicaView, Snapshot
@@ -20,11 +21,17 @@ from vlagents_ray.serve.scaling.sibling_replicas import SiblingReplicas
 class ReplicaLive:
     """A part of `PolicyReplica`: what it shows to viewers."""
 
-    def _open_live(self, engine: Engine, peers: SiblingReplicas, metadata: Callable[[], Mapping[str, Any]]) -> None:
+    def _open_live(
+        self,
+        engine: Engine,
+        peers: SiblingReplicas,
+        metadata: Callable[[], Mapping[str, Any]],
+        settings: LiveArgs | None,
+    ) -> None:
         compress_no_websockets()
         write_audit()  # of the buttons that are pressed, also without keys
         node = ray.get_runtime_context().get_node_id()
-        self._view = ReplicaView(engine, peers.own_name.rpartition("#")[2], node[:8], metadata)
+        self._view = ReplicaView(engine, peers.own_name.rpartition("#")[2], node[:8], metadata, settings)
         self._view.open()
         self._fleet = Fleet(self._view, peers)
 

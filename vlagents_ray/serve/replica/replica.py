@@ -101,7 +101,7 @@ class PolicyReplica(ReplicaWeights, ReplicaLive, ClientApi, SiblingApi):
         )
         self._migrator.start(self._engine)
         self._open_weights(self._engine, self._peers)
-        self._open_live(self._engine, self._peers, self.metadata)
+        self._open_live(self._engine, self._peers, self.metadata, self._args.live)
         self._meter = LoadMeter(self._engine.queue)
         self._metrics = Exporter(self._engine, tags_of(self._args.policy), self._keys)
         self._metrics.start()

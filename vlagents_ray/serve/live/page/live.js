@@ -100,7 +100,7 @@ function show(said, files) {
     for (const session of replica.sessions) {
       present.add(session.id);
       if (!cards.has(session.id)) cards.set(session.id, new Card(session.id));
-      cards.get(session.id).update(session, files);
+      cards.get(session.id).update(session, files, replica.ring_s);
     }
   }
   const names = new Set(said.replicas.map((one) => one.name));
@@ -168,8 +168,9 @@ const pressed = (said) => `${said.do}${said.by ? `, pressed by ${said.by}` : ""}
 const OUTCOMES = { // what became of a command
   waiting: (said) => `${pressed(said)}: waits for the robot's next request`,
   sent: (said) => `${pressed(said)}: sent, not answered yet`,
-  done: (said) => `${pressed(said)}: done`,
-  refused: (said) => `${pressed(said)}: refused by the robot: ${said.why}`,
+  saving: (said) => `${pressed(said)}: being written`,
+  done: (said) => `${pressed(said)}: done${said.why ? `, in ${said.why}` : ""}`,
+  refused: (said) => `${pressed(said)}: refused: ${said.why}`,
   ignored: (said) => `${pressed(said)}: ignored; the robot obeys no commands`,
   "too late": (said) => `${pressed(said)}: not sent, as the robot made no request for 5 s`,
 };
@@ -218,7 +219,7 @@ class Card {
     this.filter();
   }
 
-  update(said, files) {
+  update(said, files, ring) {
     this.missed = 0;
     if (said.rank) this.badge.textContent = `${said.rank === "robot" ? "robot" : "simulation"}, ${said.transport}`;
     this.instruction.textContent = said.instruction ? `“${said.instruction}”` : "";
@@ -232,6 +233,8 @@ class Card {
     }
     this.operated.hidden = !mayOperate;
     this.follows.textContent = said.follows ? "Pin version" : "Follow versions";
+    this.save.hidden = !ring;
+    this.save.textContent = `Save last ${ring} s`;
     this.follows.value = said.follows ? "pin" : "follow";
     this.commands(said.commands);
     if (said.last) this.act(said.last);
@@ -264,9 +267,10 @@ class Card {
       text.value = "";
     } }, text, element("button", { className: "quiet" }, "Change"));
     this.follows = button("Pin version", "pin", "quiet");
+    this.save = button("Save", "save", "quiet");
     return element("div", { className: "operate", hidden: true },
       element("div", { className: "row" }, button("Stop", "stop", "stop"), button("Pause", "pause"), button("Resume", "resume")),
-      element("div", { className: "row" }, button("Success", "success", "quiet"), button("Failure", "failure", "quiet"), this.follows),
+      element("div", { className: "row" }, button("Success", "success", "quiet"), button("Failure", "failure", "quiet"), this.follows, this.save),
       instruct, this.outcome);
   }
 
