@@ -19,6 +19,7 @@ from vlagents_ray.interface import Agent
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
 from vlagents_ray.serve.access.api_keys import Keys
+from vlagents_ray.serve.config.live import LiveArgs
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
@@ -94,12 +95,17 @@ class LiveServer:
 
 @contextmanager
 def live_server(
-    agent: Agent | None = None, keys: Keys | None = None, others: OtherReplicas | None = None, *, insecure: bool = False
+    agent: Agent | None = None,
+    keys: Keys | None = None,
+    others: OtherReplicas | None = None,
+    *,
+    insecure: bool = False,
+    settings: LiveArgs | None = None,
 ) -> Iterator[LiveServer]:
     """A replica of `agent`, by default `noop`, until the end of the context."""
     engine = Engine(agent or Noop.from_config({}))
     engine.start()
-    view = ReplicaView(engine, "this", "here", lambda: METADATA)
+    view = ReplicaView(engine, "this", "here", lambda: METADATA, settings)
     fleet = Fleet(view, others)
     routes = live_routes(fleet, open_to_network=insecure)
     inside = build_http_app(engine, lambda: METADATA, DEFAULT_LIMITS, others=routes)

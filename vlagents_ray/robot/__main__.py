@@ -15,11 +15,13 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import get_args
 
 from vlagents_ray.chunking.buffer import ENSEMBLE, MERGES
 from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.client.agent import RemoteAgent
+from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.robot.loop import LoopReport, Restart, Robot, imported_class, run_loop
 from vlagents_ray.robot.pacing import empty_loop
@@ -73,9 +75,10 @@ def _run(options: argparse.Namespace) -> LoopReport:
     make_robot = imported_class("--robot", options.robot) if options.robot else None
     leader = imported_class("--leader", options.leader)() if options.leader else None
     with contextlib.ExitStack() as stack:
-        agent = RemoteAgent(
-            options.url, transport=options.transport, timeout_s=options.timeout_s
-        )  # the player closes it
+        commands = CommandInbox() if options.operate else None
+        agent = RemoteAgent(  # the player closes it
+            options.url, transport=options.transport, timeout_s=options.timeout_s, commands=commands
+        )
         agent.initialize()
         contract = agent.contract
         stated = contract is not None and contract.action.relative is not None
@@ -113,18 +116,20 @@ def _run(options: argparse.Namespace) -> LoopReport:
         if options.baseline > 0:
             say(_line(_HEADER))
             say(_row("empty loop", empty_loop(options.hz, options.baseline, real_time=options.real_time)))
-        report = run_loop(
+        play = partial(
+            run_loop,
             robot,
             player,
             hz=options.hz,
             seconds=options.seconds,
-            instruction=options.instruction,
             watchdog=watchdog,
             restart=options.restart,
             recorder=recorder,
             viewers=viewers,
             real_time=options.real_time,
+            commands=commands,
         )
+        report = _played(play, options.instruction, say)
         if options.baseline <= 0:
             say(_line(_HEADER))
         say(_row(f"{options.mode}, {agent.transport}", report.jitter))
@@ -146,6 +151,18 @@ def _run(options: argparse.Namespace) -> LoopReport:
     for viewer in viewers:
         say(viewer.report())
     return report
+
+
+def _played(play: Callable[..., LoopReport], instruction: str | None, say: Callable[[str], None]) -> LoopReport:
+    """Play an episode, and a further one whenever the live page asks for one; return the last report."""
+    while True:
+        report = play(instruction=instruction)
+        if report.outcome:
+            say(f"marked as a {report.outcome} on the live page")
+        if report.next_instruction is None:
+            return report
+        instruction = report.next_instruction
+        say(f"the live page asks for another episode: {instruction!r}")
 
 
 @contextlib.contextmanager
@@ -281,6 +298,7 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--foxglove", metavar="DIR", help="write an .mcap file there for Foxglove, or 'live': let it connect to the run"
     )
+    add("--operate", action="store_true", help="obey the buttons of the server's live page: pause, stop, ...")
     add("--real-time", action="store_true", help="ask for SCHED_FIFO in place of a nice value")
     add(
         "--baseline",

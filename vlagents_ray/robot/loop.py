@@ -15,8 +15,10 @@ from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 
+from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.errors import ConfigError, InvalidAction
 from vlagents_ray.interface import CAPTURED, INTERVENTION, SAFE, SILENT, WANTED, Agent, Obs
+from vlagents_ray.robot.operation.operated_loop import OperatedLoop
 from vlagents_ray.robot.pacing import KEPT_TICKS, SPIN_S, Pacer, jitter, undisturbed
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import Guard, Watchdog
@@ -89,6 +91,8 @@ class LoopReport:
     interventions: int = 0  # ticks at which a human moved the robot
     done: bool = False  # the policy considered its task finished
     means: list[str] = field(default_factory=list)  # the measures taken against jitter
+    outcome: str = ""  # "success" or "failure", if it was marked on the live page
+    next_instruction: str | None = None  # the live page asked for another episode with this instruction
 
     @property
     def safe_ticks(self) -> int:
@@ -136,6 +140,7 @@ def run_loop(
     real_time: bool = False,
     spin_s: float = SPIN_S,
     until: Callable[[], bool] = lambda: False,
+    commands: CommandInbox | None = None,
 ) -> LoopReport:
     """Reset an agent and let it drive a robot at a fixed rate, until it is done or the time is over.
 
@@ -167,6 +172,7 @@ def run_loop(
         real_time: Run the thread with SCHED_FIFO (see `vlagents_ray.robot.pacing.undisturbed`).
         spin_s: How long before each tick the thread spins instead of sleeping, s.
         until: Ends the loop when it returns True; called before each tick, and after the last one.
+        commands: What the live page has the loop do, from `RemoteAgent(url, commands=...)`; see `OperatedLoop`.
 
     Returns:
         The timing of the loop, and the reasons of the ticks without an action of the policy.
@@ -201,7 +207,9 @@ def run_loop(
             report.means = stack.enter_context(undisturbed(real_time=real_time))
             if watchdog is not None:
                 stack.enter_context(watchdog)
-            _drive(robot, agent, guard, watchdog, restart, recorder, shown, report, Pacer(hz, spin_s), seconds, until)
+            operated = OperatedLoop(commands, watchdog, manual=restart == "manual")
+            pacer = Pacer(hz, spin_s)
+            _drive(robot, agent, guard, watchdog, recorder, shown, report, pacer, seconds, until, operated)
         finally:
             robot.stop()  # before the watchdog and the recorder end
     if watchdog is not None:
@@ -216,13 +224,13 @@ def _drive(
     agent: Agent,
     guard: Guard,
     watchdog: Watchdog | None,
-    restart: Restart,
     recorder: Recorder | None,
     shown: LoopView,
     report: LoopReport,
     pacer: Pacer,
     seconds: float | None,
     until: Callable[[], bool],
+    operated: OperatedLoop,
 ) -> None:
     work_s: deque[float] = deque(maxlen=KEPT_TICKS)
     collected = time.monotonic()
@@ -249,19 +257,20 @@ def _drive(
             report.done = act.done
             led = bool(act.info.get(INTERVENTION))
             reason = act.info.get(SAFE)
+            stop = operated.holds()  # before this tick counts as a sign of life: it may be late
+            if operated.over:
+                break
             if watchdog is not None:
-                stop = _why_stopped(watchdog)  # before this tick counts as a sign of life: it may be late
                 watchdog.heard("loop")
                 watchdog.heard("server", act.info.get(SILENT, 0.0))
-                if stop is not None:
-                    if not standing:
-                        robot.stop()  # again, as the watchdog may have stopped it just before the last action
-                    standing = True
-                    interrupt()
-                    report.count(stop)
-                    if restart == "auto":
-                        watchdog.restart()
-                    continue
+            if stop is not None:
+                if not standing:
+                    robot.stop()  # again, as the watchdog may have stopped it just before the last action
+                standing = True
+                interrupt()
+                report.count(stop)
+                operated.stood()
+                continue
             if reason is not None:
                 report.count(reason)
                 if standing:  # a robot at rest gets no command
@@ -278,18 +287,11 @@ def _drive(
                 recorder.add(obs, action, tick=tick, safe=safe, intervention=led, wanted=wanted)
             shown.add(obs, act, action, tick, work_s[-1])
     finally:
+        report.outcome, report.next_instruction = operated.outcome, operated.next_instruction
         report.jitter = jitter(pacer.late_s, pacer.missed, pacer.ticks)
         if work_s:
             report.work_p50_ms = float(np.median(work_s)) * 1e3
             report.work_p99_ms = float(np.quantile(work_s, 0.99)) * 1e3
-
-
-def _why_stopped(watchdog: Watchdog) -> str | None:
-    if not watchdog.stopped:
-        return None
-    silent = watchdog.silent
-    cause = f"no signal from the {' and the '.join(silent)}" if silent else "waiting for a restart (Watchdog.restart)"
-    return f"stopped by the watchdog: {cause}"
 
 
 def _guard(agent: Agent, given: Guard | None) -> Guard:

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from live_server import METADATA
 
+from vlagents_ray.errors import UnknownSession
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.live import fleet
@@ -27,6 +28,9 @@ class Others:
 
     async def views(self) -> dict[str, Other]:
         return {name: partial(self._read, name) for name in self.names}
+
+    async def press(self, session: str, do: str, text: str, by: str) -> dict[str, Any] | None:
+        return {"do": do, "by": by} if session == "of b" else None
 
     async def _read(self, name: str, since: int, shown: Collection[str]) -> Snapshot:
         self.asked.append((name, since, shown))
@@ -60,6 +64,15 @@ def test_pictures_go_to_those_who_show_them(own: ReplicaView) -> None:
     assert [one["sessions"][0]["pictures"] for one in second["replicas"][:2]] == [{"front": 0}, {"front": 1}]
     assert their_files == [b"b", b"c"]
     assert others.asked[0][2] == {"of b", "of c"}
+
+
+def test_a_command_reaches_the_replica_that_has_the_session(own: ReplicaView) -> None:
+    gathered = Fleet(own, Others("b"))
+    assert asyncio.run(gathered.press("of b", "stop", "", "lab")) == {"do": "stop", "by": "lab"}
+    with pytest.raises(UnknownSession):
+        asyncio.run(gathered.press("of c", "stop", "", "lab"))
+    with pytest.raises(UnknownSession):
+        asyncio.run(Fleet(own).press("of b", "stop", "", "lab"))
 
 
 def test_a_replica_that_does_not_answer_is_left_out_and_asked_again_from_where_it_was(own: ReplicaView) -> None:

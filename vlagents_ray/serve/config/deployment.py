@@ -16,6 +16,7 @@ from vlagents_ray.policies.adapters import ADAPTER
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.serve.access.api_keys import Keys, load_keys
 from vlagents_ray.serve.config.dialects import DialectArgs
+from vlagents_ray.serve.config.live import LiveArgs
 from vlagents_ray.serve.config.python_env import EnvironmentArgs
 from vlagents_ray.serve.config.shadow import ShadowArgs
 from vlagents_ray.serve.config.viewers import ViewerArgs
@@ -302,6 +303,9 @@ class ServerArgs(_DeploymentModel):
     limits: LimitArgs = LimitArgs()
     access: AccessArgs = AccessArgs()
     stream: StreamArgs = StreamArgs()
+    live: LiveArgs | None = Field(
+        default=None, description="keeps the last seconds of each session, for the live page; unset: nothing is kept"
+    )
     resources: ResourceArgs = ResourceArgs()
     record: RecordArgs | None = Field(default=None, description="keeps requests and answers; unset: nothing is kept")
     environment: EnvironmentArgs = Field(default=EnvironmentArgs(), description="the Python that the policy runs in")

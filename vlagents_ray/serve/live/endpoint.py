@@ -3,6 +3,7 @@
     GET /live      the page: it holds no data, and needs no key
     GET /v1/live   what the replicas do now, as JSON without pictures; keys need the scope "watch"
     WS  /v1/live   the same with pictures, at most ten times a second
+    POST /v1/live/command   {"session": …, "do": "pause"}: see `CommandBoard.press`; keys need the scope "operate"
     GET /v1/live/videos/7   a video to which the document refers by its number, where an evaluation is watched
 
 The viewer asks for each message, with the sessions whose pictures it shows: {"shown": ["arm-1", …]}. So a slow viewer
@@ -27,14 +28,16 @@ from importlib.resources import files as package_files
 from pathlib import Path
 from typing import Any
 
+from starlette.requests import ClientDisconnect
 from starlette.requests import Request as HttpRequest
 from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from vlagents_ray.errors import Forbidden, MalformedMessage, Overloaded, VLAgentsError
+from vlagents_ray.errors import Forbidden, MalformedMessage, MessageTooLarge, Overloaded, VLAgentsError
 from vlagents_ray.protocol.json_messages import problem
 from vlagents_ray.serve.access.api_keys import Caller, current_caller
+from vlagents_ray.serve.access.audit import log_pressed
 from vlagents_ray.serve.endpoints.access_middleware import LIVE_PAGE
 from vlagents_ray.serve.endpoints.http_messages import problem_response, request_id
 from vlagents_ray.serve.live.fleet import Fleet, Viewer
@@ -43,7 +46,9 @@ logger = logging.getLogger(__name__)
 
 PATH = "/v1/live"
 _PROTOCOL = "vlagents.live"
-_SCOPE = "watch"
+_COMMAND = f"{PATH}/command"
+_WATCH, _OPERATE = "watch", "operate"  # scopes of keys
+_COMMAND_BYTES = 2**14  # longest command
 _VIEWERS = 32  # most viewers at once
 _SILENT_S = 30.0  # longest time between two messages of a viewer
 _SCRIPTS = ("evaluation.js", "live.js")
@@ -68,6 +73,7 @@ def live_routes(fleet: Fleet, *, open_to_network: bool, videos: VideoFiles | Non
         Route(LIVE_PAGE, _page),
         Route(PATH, endpoint.show),
         WebSocketRoute(PATH, endpoint.watch),
+        Route(_COMMAND, endpoint.press, methods=["POST"]),
     ]
     return routes if videos is None else [*routes, Route(f"{PATH}/videos/{{number:int}}", endpoint.video)]
 
@@ -81,7 +87,7 @@ class _LiveEndpoint:
 
     async def show(self, http: HttpRequest) -> Response:
         try:
-            self._require_scope()
+            self._require_scope(_WATCH)
         except VLAgentsError as error:
             return problem_response(error, request_id(http))
         viewer = self._fleet.add()
@@ -93,16 +99,30 @@ class _LiveEndpoint:
 
     async def video(self, http: HttpRequest) -> Response:
         try:
-            self._require_scope()
+            self._require_scope(_WATCH)
         except VLAgentsError as error:
             return problem_response(error, request_id(http))
         path = None if self._videos is None else self._videos(http.path_params["number"])
         return Response(status_code=404) if path is None else FileResponse(path, media_type="video/mp4")
 
+    async def press(self, http: HttpRequest) -> Response:
+        try:
+            self._require_scope(_OPERATE)
+            session, do, text = _command(await _body(http))
+            caller = current_caller()
+            by = caller.name if isinstance(caller, Caller) else ""
+            pressed = await self._fleet.press(session, do, text, by)
+        except ClientDisconnect:
+            return Response(status_code=499)
+        except VLAgentsError as error:
+            return problem_response(error, request_id(http))
+        log_pressed(by, f"{do!r} {text!r} for session {session!r}" if text else f"{do!r} for session {session!r}")
+        return JSONResponse(pressed)
+
     async def watch(self, socket: WebSocket) -> None:
         offered = socket.scope.get("subprotocols") or []
         try:
-            self._require_scope()
+            self._require_scope(_WATCH)
             if self._watching >= _VIEWERS:
                 raise Overloaded(f"live: {_VIEWERS} viewers watch already; close one")
         except VLAgentsError as error:
@@ -133,8 +153,8 @@ class _LiveEndpoint:
         while True:
             viewer.shown = frozenset(await self._asked(socket))
             document, files = await viewer.next()
-            self._require_scope()
-            await socket.send_bytes(_message(document, files))
+            self._require_scope(_WATCH)
+            await socket.send_bytes(_message({**document, "may_operate": self._may(_OPERATE)}, files))
 
     async def _asked(self, socket: WebSocket) -> list[str]:
         try:
@@ -152,15 +172,44 @@ class _LiveEndpoint:
             raise MalformedMessage(f'live: got {text[:80]!r}, want {{"shown": ["SESSION", ...]}}') from error
         return list(shown)
 
-    def _require_scope(self) -> None:
+    def _may(self, scope: str) -> bool:
+        caller = current_caller()
+        return caller.refusal(scope) is None if isinstance(caller, Caller) else not self._open_to_network
+
+    def _require_scope(self, scope: str) -> None:
         caller = current_caller()
         if isinstance(caller, Caller):
-            caller.admit(free=True, scope=_SCOPE)
+            caller.admit(free=True, scope=scope)
         elif self._open_to_network:
             raise Forbidden(
                 f"live: a server with `--insecure` shows nothing; make a key with `vlagents-ray keys new NAME --scope "
-                f"{_SCOPE}` and serve with `--keys`, or serve on loopback without `--insecure`"
+                f"{scope}` and serve with `--keys`, or serve on loopback without `--insecure`"
             )
+
+
+async def _body(http: HttpRequest) -> bytes:
+    """Return the body of a command; of a longer one no more is read."""
+    kind = http.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if kind != "application/json":  # which no other site's page can send unasked
+        raise MalformedMessage(f"content-type: got {kind or 'none'!r}, want application/json")
+    parts = b""
+    async for part in http.stream():
+        parts += part
+        if len(parts) > _COMMAND_BYTES:
+            raise MessageTooLarge(f"live: a command of more than {_COMMAND_BYTES} bytes")
+    return parts
+
+
+def _command(body: bytes) -> tuple[str, str, str]:
+    """Return session, command and text in a body."""
+    try:
+        stated = json.loads(body)
+        found = stated["session"], stated["do"], stated.get("text", "")
+        if not all(isinstance(one, str) for one in found):
+            raise TypeError
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise MalformedMessage(f'live: got {body[:80]!r}, want {{"session": ..., "do": ..., "text": ...}}') from error
+    return found
 
 
 def _message(document: dict[str, Any], files: list[bytes]) -> bytes:

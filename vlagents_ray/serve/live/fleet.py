@@ -6,9 +6,11 @@ import asyncio
 import logging
 import time
 from collections.abc import Awaitable, Callable, Collection
+from contextlib import suppress
 from functools import partial
 from typing import Any, Protocol
 
+from vlagents_ray.errors import UnknownSession
 from vlagents_ray.serve.live.snapshot import ReplicaView, Snapshot
 from vlagents_ray.serve.live.tap import RATE
 
@@ -29,6 +31,10 @@ class OtherReplicas(Protocol):
 
     async def views(self) -> dict[str, Other]:
         """Return the reader of the snapshots of each, by name."""
+        ...
+
+    async def press(self, session: str, do: str, text: str, by: str) -> dict[str, Any] | None:
+        """Give a command to a session of one of them, see `CommandBoard.press`; None if none has the session."""
         ...
 
 
@@ -95,6 +101,16 @@ class Fleet:
         if not self._viewers and self._gathering is not None:
             self._gathering.cancel()
             self._gathering = None
+
+    async def press(self, session: str, do: str, text: str, by: str) -> dict[str, Any]:
+        """Give a command to a session of any replica, see `CommandBoard.press`, and return it."""
+        if self._own is not None:
+            with suppress(UnknownSession):
+                return self._own.commands.press(session, do, text, by)
+        pressed = None if self._others is None else await self._others.press(session, do, text, by)
+        if pressed is None:
+            raise UnknownSession(f"session {session!r}: no replica has it; it has ended")
+        return pressed
 
     async def _gather(self) -> None:
         while True:

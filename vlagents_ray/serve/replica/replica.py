@@ -87,7 +87,7 @@ class PolicyReplica(EngineReplica, ReplicaWeights, ReplicaLive, ReplicaShadow, C
         self._open_engine(self._args, partial(require_fit, self._args.dialects), self._migrator)
         self._migrator.start(self._engine)
         self._open_weights(self._engine, self._peers)
-        self._open_live(self._engine, self._peers, self.metadata, self._args.viewers)
+        self._open_live(self._engine, self._peers, self.metadata, self._args.live, self._args.viewers)
         self._open_shadow(self._engine, self._args.shadow, candidate)
         self._meter = LoadMeter(self._engine.queue)
         self._recorder = open_recorder(self._engine, self._args.record, self._peers.own_name, self.metadata)

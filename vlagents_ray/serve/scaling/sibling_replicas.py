@@ -50,6 +50,10 @@ class SiblingApi(Protocol):
         """Return what happened since a snapshot, with pictures of the sessions `shown`."""
         ...
 
+    async def press(self, session: str, do: str, text: str, by: str) -> dict[str, Any] | None:
+        """Give a command to a session from the live page; None if the session is not here."""
+        ...
+
 
 class _Replica(Peer):
     def __init__(self, name: str, actor: Any) -> None:
