@@ -88,7 +88,7 @@ class RemoteAgent(Agent):
             rank: The class of the requests: a "robot" goes before a "simulation".
             resume: False raises the loss of a session as `ConnectionLost`; the episode then needs a new `reset`.
             api_key: The API key, for a server that requires one; by default the value of `VLAGENTS_RAY_API_KEY`.
-            ca: With `https://`, `wss://`: PEM file of the authorities for the server's certificate; default: the system's.
+            ca: With `https://`, `wss://`: PEM file of the server's authorities; by default the system's.
             certificate: The PEM files of this client's certificate and its key, for a server that requires one.
             commands: Gets the commands from the live page to this agent's session; by default they are ignored.
 
