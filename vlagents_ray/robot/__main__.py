@@ -21,7 +21,7 @@ from vlagents_ray.chunking.buffer import ENSEMBLE, MERGES
 from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.robot.loop import LoopReport, Restart, Robot, robot_class, run_loop
+from vlagents_ray.robot.loop import LoopReport, Restart, Robot, import_class, run_loop
 from vlagents_ray.robot.pacing import empty_loop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import Guard, Watchdog, measured_state
@@ -69,7 +69,7 @@ def _ended_by_signals() -> Iterator[None]:
 def _run(options: argparse.Namespace) -> LoopReport:
     say: Callable[[str], None] = lambda line: print(line, flush=True)  # noqa: E731, T201
     deadline_s = options.deadline_ms / 1e3 if options.deadline_ms is not None else WAIT_S * (options.mode != "async")
-    make_robot = robot_class(options.robot) if options.robot else None
+    robot_class = import_class("--robot", options.robot) if options.robot else None
     with contextlib.ExitStack() as stack:
         agent = RemoteAgent(
             options.url, transport=options.transport, timeout_s=options.timeout_s
@@ -94,7 +94,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
             )
         )
         player.initialize()  # refuses settings that do not fit, before anything is timed or moves
-        robot: Robot = SimulatedRobot(contract) if make_robot is None else make_robot()
+        robot: Robot = SimulatedRobot(contract) if robot_class is None else robot_class()
         recorder = stack.enter_context(Recorder(options.record, options.hz)) if options.record else None
         hangs_s = max(0.2, 5 / options.hz) + deadline_s
 

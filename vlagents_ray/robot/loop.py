@@ -52,26 +52,26 @@ class Robot(Protocol):
         ...
 
 
-def robot_class(name: str) -> type[Robot]:
-    """Import the class of a robot.
+def import_class(option: str, name: str) -> Any:
+    """Import the class that an option of a command names.
 
     Args:
-        name: "module:Class", as `--robot` takes it.
+        option: The option, for the error message: "--robot".
+        name: "module:Class".
 
     Raises:
         ConfigError: The name has another form, or there is no such class.
     """
     module, colon, attribute = name.partition(":")
     if not colon:
-        raise ConfigError(f"--robot: got {name!r}, want module:Class")
+        raise ConfigError(f"{option}: got {name!r}, want module:Class")
     try:
-        found: type[Robot] = getattr(importlib.import_module(module), attribute)
+        return getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError) as error:
         raise ConfigError(
-            f"--robot {name}: {error}; go to the folder of its module ({os.getcwd()} is this one), add that to "
+            f"{option} {name}: {error}; go to the folder of its module ({os.getcwd()} is this one), add that to "
             f"PYTHONPATH, or install it"
         ) from error
-    return found
 
 
 @dataclass(slots=True)
