@@ -77,7 +77,9 @@ def evaluate_on_robot(
         for module in ("av", "pyarrow"):
             require(module)
     factory = agent_factory or agents(config, None, "robot")
-    watched = WatchedRobot(robot or import_class("--robot", str(config.robot and config.robot.arm))(), operator)
+    if robot is None:
+        robot = import_class("--robot", str(planned[0].on_robot[0].arm))()
+    watched = WatchedRobot(robot, operator)
     with TrialLog(config, planned) as log:
         trials = schedule(planned, log.key)
         run = _RemainingTrials(config, operator, watched, factory, log, trials)
