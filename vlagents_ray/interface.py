@@ -49,7 +49,7 @@ BEHAVIOUR = "behaviour"  # in the Act: {name: number, or one for each row or tok
 CAPTURED = "captured_at"  # in an observation: the time at which its first sensor was read, s since 1970 (`time.time`)
 DEADLINE = "deadline_ms"  # in an observation: the time after which `RemoteAgent` gives the request up, ms
 # Real-time chunking (Black, Galliker & Levine 2025, https://arxiv.org/abs/2506.07339), in an observation: when the
-# answer arrives, DELAY rows of LEFTOVER have been executed. The new chunk begins with them and continues the later ones.
+# answer arrives, DELAY rows of LEFTOVER have been executed; the new chunk begins with them, and continues the rest.
 LEFTOVER = "leftover_actions"  # (H', D) float32: the current plan from this observation's tick on
 DELAY = "delay_ticks"  # int: ticks until the answer arrives, the longest of the last ones; at most the rows of LEFTOVER
 EXECUTED = "executed_actions"  # in an observation, (N, D): others than the policy's, executed since the last request

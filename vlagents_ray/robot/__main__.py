@@ -23,7 +23,7 @@ from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.robot.loop import LoopReport, Restart, Robot, imported_class, run_loop
+from vlagents_ray.robot.loop import LoopReport, Restart, Robot, import_class, run_loop
 from vlagents_ray.robot.pacing import empty_loop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import Guard, Watchdog, measured_state
@@ -72,8 +72,8 @@ def _ended_by_signals() -> Iterator[None]:
 def _run(options: argparse.Namespace) -> LoopReport:
     say: Callable[[str], None] = lambda line: print(line, flush=True)  # noqa: E731, T201
     deadline_s = options.deadline_ms / 1e3 if options.deadline_ms is not None else WAIT_S * (options.mode != "async")
-    make_robot = imported_class("--robot", options.robot) if options.robot else None
-    leader = imported_class("--leader", options.leader)() if options.leader else None
+    make_robot = import_class("--robot", options.robot) if options.robot else None
+    leader = import_class("--leader", options.leader)() if options.leader else None
     with contextlib.ExitStack() as stack:
         commands = CommandInbox() if options.operate else None
         agent = RemoteAgent(  # the player closes it

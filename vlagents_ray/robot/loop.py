@@ -56,11 +56,11 @@ class Robot(Protocol):
         ...
 
 
-def imported_class(option: str, name: str) -> Any:
-    """Import the class of a robot, or of what moves it.
+def import_class(option: str, name: str) -> Any:
+    """Import the class that an option of a command names.
 
     Args:
-        option: The option that names it, for the error.
+        option: The option, for the error message: "--robot".
         name: "module:Class".
 
     Raises:

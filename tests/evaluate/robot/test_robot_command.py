@@ -14,14 +14,15 @@ from pathlib import Path
 import pytest
 import yaml
 from eval_fakes import PYTHONPATH
-from robot_trials import tasks
+from robot_trials import Policies, ScriptedPerson, tasks, typed
+from robot_trials import plan as robot_plan
 from typer.testing import CliRunner
 
 from vlagents_ray.cli.main import app
 from vlagents_ray.evaluate import Results
 from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.config import EvalConfig
-from vlagents_ray.evaluate.robot import schedule
+from vlagents_ray.evaluate.robot import TrialsInterrupted, evaluate_on_robot, schedule
 
 NAMES = ("policy-zebra", "policy-walrus")
 _ASKS = re.compile(r"(Enter when the scene is ready.*?|verdict \(.*?\)|note): $", re.DOTALL)
@@ -112,6 +113,18 @@ def test_it_serves_both_is_killed_goes_on_and_then_tells(tmp_path: Path) -> None
     assert [outcomes[key] for key in order] == [True, True, False, False]
     assert [attempt.cause for cell in results.cells for attempt in cell.attempts] == ["operator"]
     assert {one.result.transport for cell in results.cells for one in cell.episodes} == {"shm"}
+
+
+def test_what_was_judged_can_be_told_before_the_end(tmp_path: Path) -> None:
+    config = robot_plan(tmp_path / "out", robot={"key": "the key of the plan"})
+    with pytest.raises(TrialsInterrupted):
+        evaluate_on_robot(config, ScriptedPerson(typed(["", "s", ""])), agent_factory=Policies())
+    write_plan(tmp_path / "plan.yaml")
+    command = ["eval", str(tmp_path / "plan.yaml"), "--out", str(tmp_path / "out")]
+    answer = CliRunner().invoke(app, [*command, "--robot", "robot_trials:Arm", "--unblind"])
+    assert answer.exit_code == 0
+    assert all(name in answer.stdout for name in NAMES)
+    assert "1/4" in answer.stdout
 
 
 @pytest.mark.parametrize(

@@ -29,7 +29,7 @@ from vlagents_ray.evaluate.run import conclude
 from vlagents_ray.evaluate.workers.agents import AgentFactory, agents
 from vlagents_ray.ray_tools.private import output_printer, set_output_printer
 from vlagents_ray.registry import require
-from vlagents_ray.robot.loop import Robot, imported_class
+from vlagents_ray.robot.loop import Robot, import_class
 
 RECORDINGS = "recordings"
 _LOGGERS = ("vlagents_ray", "ray", "ray.serve", "websockets", "asyncio")  # their messages may name a policy
@@ -77,7 +77,9 @@ def evaluate_on_robot(
         for module in ("av", "pyarrow"):
             require(module)
     factory = agent_factory or agents(config, None, "robot")
-    watched = WatchedRobot(robot or imported_class("--robot", str(config.robot and config.robot.arm))(), operator)
+    if robot is None:
+        robot = import_class("--robot", str(planned[0].on_robot[0].arm))()
+    watched = WatchedRobot(robot, operator)
     with TrialLog(config, planned) as log:
         trials = schedule(planned, log.key)
         run = _RemainingTrials(config, operator, watched, factory, log, trials)
