@@ -94,7 +94,7 @@ def test_a_human_corrects_a_policy(tmp_path: Path) -> None:
         wait("seed")
         press("q")
 
-    words = ["scripted", *QUICK, "--teleop", "keyboard", "--record", str(tmp_path), "--hz", "20"]
+    words = ["scripted", *QUICK, "--teleop", "keyboard", "--record", str(tmp_path), "--hz", "5"]
     said = at_terminal(words, keys)
     assert "success" in said, "the policy solves it after the correction"
     seen = frames(tmp_path, 0)
