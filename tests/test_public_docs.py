@@ -17,6 +17,8 @@ from vlagents_ray import registry
 MODULES = (
     "vlagents_ray",
     "vlagents_ray.robot",
+    "vlagents_ray.robot.teleoperation",
+    "vlagents_ray.viewers",
     "vlagents_ray.testing",
     "vlagents_ray.envs",
     "vlagents_ray.evaluate",

@@ -16,6 +16,7 @@ from vlagents_ray.evaluate.artifacts.provenance import (
 )
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts, save
 from vlagents_ray.evaluate.artifacts.storage import storing
+from vlagents_ray.evaluate.artifacts.viewing import save_views
 from vlagents_ray.evaluate.deadline import Deadline
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult, WorkerInfo
@@ -262,6 +263,7 @@ class _Run:
     def _record(self, job: Job, result: EpisodeResult, kept: Artifacts) -> None:
         # Files first: a crash in between repeats the episode, and they are overwritten.
         videos, trajectory = save(self._config.out, job.cell, result, kept)
+        save_views(self._config, job.cell, result, kept.views)
         self._store.record(result, job.attempt, videos, trajectory)
         self._progress.episode(job.cell, result)
         self._left[job.key.settings] -= 1

@@ -206,6 +206,13 @@ class Watchdog:
         """Whether the robot was stopped and motion has not been restarted since."""
         return self._stopped
 
+    def trip(self, reason: str) -> None:
+        """Stop the robot now, on the caller's thread; motion is restarted as after a silence."""
+        with self._changed:
+            self._stopped = True
+        self.barks.append(reason)
+        self._stop(reason)
+
     def restart(self) -> bool:
         """Allow motion again after a stop; may be called from any thread and from a signal handler.
 

@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vlagents_ray.cli.console import errors
-from vlagents_ray.cli.options import YAML_SUFFIXES, Address, Set, parse_list, parse_settings, parse_time, read_run_file
+from vlagents_ray.cli.options import (
+    YAML_SUFFIXES,
+    Address,
+    Live,
+    LiveAt,
+    Set,
+    parse_list,
+    parse_settings,
+    parse_time,
+    read_run_file,
+)
 from vlagents_ray.cli.ray_session import RESUME, exit_if_ray_is_lost
 from vlagents_ray.errors import ConfigError
 
@@ -51,6 +61,15 @@ def evaluate_command(
     video: Annotated[str | None, typer.Option(help="none, failures (default) or all.")] = None,
     record: Annotated[
         str | None, typer.Option(help="Trajectories, to export and to replay: none (default), failures or all.")
+    ] = None,
+    rerun: Annotated[
+        str | None,
+        typer.Option(
+            metavar="DIR", help="Write a .rrd file of each episode for Rerun, or 'live': show them in its viewer."
+        ),
+    ] = None,
+    foxglove: Annotated[
+        str | None, typer.Option(metavar="DIR", help="Write an .mcap file of each episode for Foxglove.")
     ] = None,
     track: Annotated[str, typer.Option(help="wandb, trackio, tensorboard, with commas between them.")] = "",
     resume: Annotated[bool, typer.Option(help="Go on with the results in --out.")] = False,
@@ -112,11 +131,13 @@ def evaluate_command(
         typer.Option("--unblind", help="With --robot: write the results of the judged trials; play none."),
     ] = False,
     address: Address = None,
+    live: Live = False,
+    live_at: LiveAt = None,
 ) -> None:
     """Evaluate policies: episodes in parallel, success rates with confidence intervals, videos.
 
     A file holds policies, their checkpoints, suites of environments, seeds; --out, --workers, --video, --record,
-    --track, --retries and --resume win over it.
+    --rerun, --foxglove, --track, --retries and --resume win over it.
 
     Exit status: 0 when every episode has its result, 75 when --end-at left some over (--resume goes on), 130 after
     Ctrl-C or SIGTERM (likewise), 2 for wrong settings, 1 for what else failed, and when infrastructure lost an episode
@@ -137,23 +158,32 @@ def evaluate_command(
         _require_robot(given, on_robot)
         if replica_per_gpu and address is None:
             raise ConfigError("--replica-per-gpu: want --address, a cluster whose GPUs can be counted")
+        if dry_run and (live or live_at):
+            raise ConfigError("--dry-run and --live exclude each other: nothing is played that could be watched")
         if on_robot:
             from vlagents_ray.cli.evaluation.robot import run_on_robot
 
             run_on_robot(evaluation, address, operator=operator or "page", unblinded=unblind)
-        elif dry_run:
+            return
+        if dry_run:
             from vlagents_ray.cli.evaluation.dry_run import print_plan
 
             print_plan(evaluation)
-        elif watch is not None:
+            return
+        page = None
+        if live or live_at:
+            from vlagents_ray.cli.evaluation.live import live_address
+
+            page = live_address(live_at)
+        if watch is not None:
             from vlagents_ray.cli.evaluation.watch import watch_training
 
-            watch_training(evaluation, watch, address, **watching)
+            watch_training(evaluation, watch, address, live=page, **watching)
         else:
             from vlagents_ray.cli.evaluation.run import run_evaluation
 
             end = None if end_at is None else parse_time(end_at, "--end-at")
-            run_evaluation(evaluation, address, end_at=end, replica_per_gpu=replica_per_gpu)
+            run_evaluation(evaluation, address, end_at=end, replica_per_gpu=replica_per_gpu, live=page)
 
 
 def _require_robot(options: Mapping[str, Any], on_robot: bool) -> None:
@@ -162,7 +192,7 @@ def _require_robot(options: Mapping[str, Any], on_robot: bool) -> None:
         if needing := [f"--{name}" for name in ("operator", "unblind") if options[name]]:
             raise ConfigError(f"got {needing} without --robot")
         return
-    names = ("watch", "dry_run", "end_at", "track")
+    names = ("watch", "dry_run", "end_at", "track", "live", "live_at")
     if excluded := [f"--{name.replace('_', '-')}" for name in names if options[name]]:
         raise ConfigError(f"--robot and {excluded} exclude each other")
     if options["operator"] not in (None, "page", "terminal"):
