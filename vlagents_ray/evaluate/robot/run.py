@@ -8,7 +8,7 @@ import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from vlagents_ray.errors import ConfigError, VLAgentsError
+from vlagents_ray.errors import ConfigError, VLAgentsError, from_code
 from vlagents_ray.evaluate.artifacts.provenance import driver_code, save_diffs, versions
 from vlagents_ray.evaluate.artifacts.storage import storing
 from vlagents_ray.evaluate.episode.failures import Failure, explain
@@ -164,7 +164,10 @@ class _RemainingTrials:
         obs = self._robot.observe()
         policies = {trial.job.cell.contender: trial.job.cell for trial in left}
         for _, cell in sorted(policies.items(), key=lambda one: one[0]):  # which tells nothing of the trials' order
-            rehearse(cell, self._factory, self._operator, obs)
+            try:
+                rehearse(cell, self._factory, self._operator, obs)
+            except VLAgentsError as error:
+                raise from_code(error.code, f"policy {cell.contender!r}: {error}") from error
         for trial in left:
             while not self._is_over(trial) and trial.number not in self._log.finished:
                 self._play(trial)
