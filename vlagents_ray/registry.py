@@ -89,6 +89,8 @@ _EXTRAS = {
     "wandb": "wandb",
     "trackio": "trackio",
     "tensorboard": "tensorboard",
+    "rerun": "rerun",
+    "foxglove": "foxglove",
 }
 
 # import name -> the files in requirements/ that install it, for an environment that runs a policy

@@ -14,6 +14,7 @@ from vlagents_ray.chunking.answer import LastAnswer
 from vlagents_ray.chunking.background import AsyncCaller, parts_of
 from vlagents_ray.chunking.buffer import DELAYS, ENSEMBLE, ENSEMBLE_M, ChunkBuffer, Merge, Step
 from vlagents_ray.chunking.capture_clock import CaptureClock, stamped
+from vlagents_ray.chunking.execution import PLAYED, Execution
 from vlagents_ray.chunking.fallback import LATE, OLD, STALE, STOPPED, WAITING, Safe, SafeAction
 from vlagents_ray.chunking.modes import Mode, require_settings
 from vlagents_ray.chunking.motion import Check, Motion
@@ -110,7 +111,7 @@ class ChunkPlayer(Agent):
     def _begin(self) -> None:
         self._plan.drop()
         self._tick: int | None = None  # tick of the next `act`; None outside an episode
-        self._answer = LastAnswer()
+        self._answer, self._execution = LastAnswer(), Execution()
         self._waiting_since: float | None = None
         self._trouble = WAITING
         self._captured = CaptureClock()
@@ -156,6 +157,7 @@ class ChunkPlayer(Agent):
         at which the watchdog has the robot stopped; call it in your own loop when you stop or take over the robot.
         """
         self._begin_again(STOPPED)
+        self._execution.interrupt(STOPPED)
         self._motion.stop()
         self.takeover.note_stopped()
 
@@ -197,11 +199,11 @@ class ChunkPlayer(Agent):
             self._trouble = str(error)  # the human goes on, and what the policy wants is not known
         self._tick = tick + 1
         if not led:
-            return self._chosen(obs, tick)
+            return self._execution.note(self._chosen(obs, tick), self._plan.executed)
         act = self.takeover.act(obs, self._next(), self._motion)
         if SAFE not in act.info:  # the human's action is executed in place of a row
             self._plan.advance()
-        return act
+        return self._execution.note(act, self._plan.executed)
 
     def close(self) -> None:
         """Close the policy, at once or as soon as the request in progress is over."""
@@ -255,10 +257,8 @@ class ChunkPlayer(Agent):
         if self.takeover.state == "paused" or self._is_old(self._captured(obs)):
             return False
         step = self._next()
-        if step is None:
-            return True
-        if step.chunk.done:
-            return False
+        if step is None or step.chunk.done:
+            return step is None
         if self._mode == "open_loop":
             return self._execute is not None and step.row >= self._execute
         last = step.chunk.end == self._plan.executed + 1  # also true for each answer of a single action
@@ -292,7 +292,7 @@ class ChunkPlayer(Agent):
             return
         if isinstance(answer, InvalidInput) or not isinstance(answer, VLAgentsError):
             raise answer
-        self._trouble = f"{answer.code}: {answer}"
+        self._trouble = self._execution.failed(answer)
 
     def _take(self, act: Act, now: int) -> None:
         answer = self._answer
@@ -312,7 +312,7 @@ class ChunkPlayer(Agent):
         self._trouble = WAITING if added or act.more else LATE
 
     def _extras(self) -> dict[str, Any]:
-        extras = self.takeover.extras()
+        extras = self.takeover.extras() | {PLAYED: self._execution.report(self._plan.executed, self._agent)}
         if self._timeout_s is not None:
             extras[DEADLINE] = self._timeout_s * 1e3
         if self._real_time and self.takeover.state != "human":  # who executes other actions than those of the plan
