@@ -136,7 +136,9 @@ class RobotRun:
             recorder=recorder,
             until=ended,
         )
-        self._say(f"  {label()}: {robot.steps} steps, {report.interventions} of them a human's")
+        self._say(
+            f"  {label()}: {robot.steps} steps, {report.interventions} of them a human's; {report.paused} ticks paused"
+        )
 
     def _leader(self, contract: Contract, stack: contextlib.ExitStack) -> Leader | None:
         if self.teleop is None:
