@@ -216,7 +216,7 @@ for episode in range(3):
         for i in range(6):
             recorder.add(Obs({{"front": np.zeros((48, 48, 3), np.uint8)}}), np.zeros(2, np.float32), tick=i)
         while episode == 2:  # killed in the third
-            if list(pathlib.Path({str(tmp_path)!r}).glob("unfinished/*.mp4")) and recorder.episodes == 2:
+            if list(pathlib.Path({str(tmp_path)!r}).glob("unfinished/*/*.mp4")) and recorder.episodes == 2:
                 print("recording", flush=True)
                 time.sleep(60)
             time.sleep(0.01)

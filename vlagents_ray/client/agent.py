@@ -14,6 +14,7 @@ from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.client.connection import Connection
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.session import ClientSession, EpisodeState, call_with_recovery
+from vlagents_ray.client.tracing import traced
 from vlagents_ray.client.transports.base import no_parts
 from vlagents_ray.client.transports.codec_selection import CodecChoice, CodecName, LinkSpeed
 from vlagents_ray.client.transports.select import TransportName, select_transport
@@ -35,6 +36,7 @@ from vlagents_ray.protocol.messages import (
     Reply,
     Request,
 )
+from vlagents_ray.tracing import tracer
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -86,8 +88,7 @@ class RemoteAgent(Agent):
             rank: The class of the requests: a "robot" goes before a "simulation".
             resume: False raises the loss of a session as `ConnectionLost`; the episode then needs a new `reset`.
             api_key: The API key, for a server that requires one; by default the value of `VLAGENTS_RAY_API_KEY`.
-            ca: With `https://` and `wss://`, a PEM file of the authorities that may have signed the server's
-                certificate; by default the system's.
+            ca: With `https://`, `wss://`: PEM file of the server's authorities; by default the system's.
             certificate: The PEM files of this client's certificate and its key, for a server that requires one.
             commands: Gets the commands from the live page to this agent's session; by default they are ignored.
 
@@ -111,6 +112,8 @@ class RemoteAgent(Agent):
         self._rank: RankName = rank
         self._resume = resume
         self._session = ClientSession(connection, rank)
+        if (trace := tracer()) is not None:
+            self._call = traced(trace, connection, self._call)  # type: ignore[method-assign,assignment]
 
     def sessions(self, n: int) -> list[Self]:
         """Open `n` more sessions on this agent's connection, for `reset_batch` and `act_batch`; close each of them."""

@@ -18,7 +18,13 @@ class Mp4:
     """The running video of one camera; encoding a frame of 224x224 takes about 0.3 ms."""
 
     def __init__(
-        self, target: io.BytesIO | Path, shape: tuple[int, ...], fps: float, *, key_frames: int | None = None
+        self,
+        target: io.BytesIO | Path,
+        shape: tuple[int, ...],
+        fps: float,
+        *,
+        key_frames: int | None = None,
+        lossless: bool = False,
     ) -> None:
         """Open a video.
 
@@ -27,20 +33,21 @@ class Mp4:
             shape: The shape of its images, (H, W, 3).
             fps: The rate of the frames, Hz.
             key_frames: The number of frames from one key frame to the next; None is x264's default.
+            lossless: Whether each pixel is kept, in RGB: some ten times larger, and not for browsers.
         """
         self._av: Any = require("av")
         self._shape = shape
         height, width = shape[:2]
         self._pad = (height % 2, width % 2)  # yuv420p halves both dimensions
         self._container = self._av.open(target if isinstance(target, io.BytesIO) else str(target), "w", format="mp4")
-        options = {"preset": "ultrafast", "crf": "23", "threads": "1"}
+        options = {"preset": "ultrafast", "threads": "1", **({"qp": "0"} if lossless else {"crf": "23"})}
         if key_frames is not None:
             options["g"] = str(key_frames)
         self._stream = self._container.add_stream(
-            "libx264", rate=Fraction(fps).limit_denominator(1000), options=options
+            "libx264rgb" if lossless else "libx264", rate=Fraction(fps).limit_denominator(1000), options=options
         )
         self._stream.height, self._stream.width = self.size
-        self._stream.pix_fmt = "yuv420p"
+        self._stream.pix_fmt = "rgb24" if lossless else "yuv420p"
 
     @property
     def size(self) -> tuple[int, int]:

@@ -6,6 +6,8 @@ i]` a JPEG or PNG file, `["bin", i]` bytes; `["float", "nan"]`, "inf" and "-inf"
 
 from __future__ import annotations
 
+import base64
+import json
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -178,3 +180,21 @@ def require_plain(value: Any, depth: int) -> None:
             require_plain(item, depth - 1)
     elif value is not None and not isinstance(value, (bool, int, float, str, bytes, np.ndarray, np.generic)):
         raise MalformedMessage(f"message: got a {type(value).__name__}, want plain values and arrays")
+
+
+def to_text(value: Any) -> str:
+    """Return a supported value as JSON, with its arrays and bytes in base64; raises `InvalidInput` as `ValueWriter`."""
+    writer = ValueWriter()
+    plain = writer.value(value)
+    blobs = [base64.b64encode(blob).decode() for blob in writer.blobs]
+    return json.dumps({"value": plain, "blobs": blobs} if blobs else {"value": plain}, separators=(",", ":"))
+
+
+def from_text(text: str, budget: Budget) -> Any:
+    """Return the value of which `to_text` made the text; raises `MalformedMessage` if there is none."""
+    try:
+        document = json.loads(text)
+        blobs = [base64.b64decode(blob) for blob in document.get("blobs", ())]
+        return ValueReader(blobs, budget).value(document["value"])
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise MalformedMessage(f"value: {type(error).__name__}: {error}") from error

@@ -11,30 +11,55 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from vlagents_ray.contract import ActionSpec
 from vlagents_ray.dataset_contract import INFO, STATISTICS
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import require
-from vlagents_ray.robot.episode import ACTION, Finished, RobotEpisode
+from vlagents_ray.robot.episode import ACTION, INTERVENTION_COLUMN, Finished, RobotEpisode
 from vlagents_ray.robot.statistics import Stats, joined, of_values
 
 VERSION = "v3.0"
 FILE = "chunk-{chunk_index:03d}/file-{file_index:03d}"
 DATA, VIDEO, EPISODES = f"data/{FILE}.parquet", f"videos/{{video_key}}/{FILE}.mp4", f"meta/episodes/{FILE}.parquet"
 FILES_IN_CHUNK = 1000
-UNFINISHED = "unfinished"  # folder of the running episode
+UNFINISHED = "unfinished"  # folder of the running episodes
 
 
 class Dataset:
-    """A dataset to which episodes are added; opening an existing one continues it."""
+    """A dataset to which episodes are added; opening an existing one continues it, with the columns that it has."""
 
-    def __init__(self, root: Path, fps: float, robot_type: str | None = None) -> None:
+    def __init__(
+        self,
+        root: Path,
+        fps: float,
+        robot_type: str | None = None,
+        *,
+        interventions: bool = False,
+        lossless: bool = False,
+    ) -> None:
+        """Open or begin a dataset.
+
+        Args:
+            root: Its folder.
+            fps: The rate of its frames, Hz.
+            robot_type: The robot's name, if it has one.
+            interventions: Whether its frames have the columns of interventions.
+            lossless: Whether the videos of new episodes keep each pixel, see `Mp4`.
+
+        Raises:
+            ConfigError: The folder has other files, or a dataset of another rate or version.
+            MissingDependency: The extra "record" is not installed.
+        """
         self.root = root
+        self.interventions = interventions
+        self._lossless = lossless
         self._pq: Any = require("pyarrow.parquet")
         self._pa: Any = require("pyarrow")
         require("av")
@@ -67,12 +92,23 @@ class Dataset:
         """The number of episodes."""
         return int(self.info["total_episodes"])
 
-    def begin(self, instruction: str) -> RobotEpisode:
-        """Begin an episode, to which frames are added; it is then passed to `save`, or abandoned."""
-        folder = self.root / UNFINISHED
-        shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
-        return RobotEpisode(folder, instruction, self.info["fps"], self.info["features"] or None)
+    def begin(self, instruction: str, meaning: ActionSpec | None = None) -> RobotEpisode:
+        """Begin an episode, to which frames are added; it is then passed to `save`, or abandoned.
+
+        Several episodes may run at once. `meaning` is that of the actions' numbers, if it is known.
+        """
+        unfinished = self.root / UNFINISHED
+        unfinished.mkdir(parents=True, exist_ok=True)
+        folder = Path(tempfile.mkdtemp(dir=unfinished))
+        return RobotEpisode(
+            folder,
+            instruction,
+            self.info["fps"],
+            self.info["features"] or None,
+            interventions=self.interventions,
+            lossless=self._lossless,
+            meaning=meaning,
+        )
 
     def save(self, episode: Finished) -> None:
         """Add an episode to the dataset."""
@@ -89,9 +125,12 @@ class Dataset:
             "index": first + index,
             "task_index": np.full(frames, self.tasks.index(episode.instruction)),
         }
-        stats = {key: of_values(values.reshape(frames, -1)) for key, values in rows.items()}
+        numbers = {key: values for key, values in rows.items() if values.dtype != object}
+        stats = {key: of_values(values.reshape(frames, -1)) for key, values in numbers.items()}
         stats |= episode.images
         about: dict[str, Any] = {"episode_index": number, "tasks": [episode.instruction], "length": frames}
+        if self.interventions:
+            about["label"] = episode.label or "none"
         about |= {f"data/{name}": value for name, value in place.items()}
         about |= {"dataset_from_index": first, "dataset_to_index": first + frames}
         for key in episode.videos:
@@ -113,13 +152,21 @@ class Dataset:
         self._json(plain | episode.about.to_statistics(first + frames), "meta/stats.json")
         self._json(info, "meta/info.json")
         self.info, self._stats = info, stats
+        if episode.folder is not None:
+            shutil.rmtree(episode.folder, ignore_errors=True)
 
     def _open(self, fps: float) -> None:
         info = json.loads((self.root / "meta/info.json").read_text())
         for key, mine in (("codebase_version", VERSION), ("fps", fps), ("data_path", DATA), ("video_path", VIDEO)):
             if info.get(key) != mine:
                 raise ConfigError(f"{self.root}: has {key} {info.get(key)!r}, want {mine!r}; record into a new folder")
-        self.info = info
+        has = INTERVENTION_COLUMN in info["features"]
+        if self.interventions and not has:
+            raise ConfigError(
+                f"{self.root}: was recorded without interventions, so its frames lack the column "
+                f"{INTERVENTION_COLUMN!r}; record into a new folder"
+            )
+        self.info, self.interventions = info, has
         stats = json.loads((self.root / "meta/stats.json").read_text())
         stats.pop(STATISTICS, None)
         self._stats = {key: {name: np.array(value) for name, value in one.items()} for key, one in stats.items()}
@@ -181,7 +228,7 @@ class Dataset:
         return folder / name.replace("/", "_")
 
 
-_ARROW = {"float64": "float64", "float32": "float32", "int64": "int64", "bool": "bool_"}
+_ARROW = {"float64": "float64", "float32": "float32", "int64": "int64", "bool": "bool_", "string": "string"}
 
 
 def _move(part: Path, path: Path) -> None:

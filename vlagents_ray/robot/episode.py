@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, Literal
 
 import numpy as np
 
@@ -25,6 +26,12 @@ MOMENTS = {  # further columns of each recorded frame
     "tick": "int64",  # of the control loop; gaps are missed or dropped frames
     "safe": "bool",  # whether the action is a safe one, not the policy's
 }
+WANTED_ACTION, INTERVENTION_COLUMN = "policy_action", "intervention"
+INTERVENTIONS = {  # further columns of a recording with interventions, beside `WANTED_ACTION`, (D,) float32
+    INTERVENTION_COLUMN: "bool",  # whether the action is a human's
+    "policy_known": "bool",  # whether it is known what the policy wanted; if not, `WANTED_ACTION` is zeros
+}
+Label = Literal["success", "failure", "discard"]
 INDEX = {  # columns that the dataset adds to each frame
     "timestamp": "float32",  # s, frame_index / fps
     "frame_index": "int64",
@@ -32,6 +39,7 @@ INDEX = {  # columns that the dataset adds to each frame
     "index": "int64",
     "task_index": "int64",
 }
+_DTYPES = {bool: "bool", int: "int64", float: "float64", str: "string"}
 _KEY_FRAMES = 2  # frames between key frames, as LeRobot has for quick access to any frame
 
 
@@ -41,16 +49,28 @@ class Finished:
 
     instruction: str
     features: dict[str, Any]  # as in `meta/info.json`
-    rows: dict[str, np.ndarray]  # (N, D) float32, or (N,) of the feature's dtype
+    rows: dict[str, np.ndarray]  # (N, D) float32, or (N,) of the feature's dtype; of texts, (N,) objects
     images: dict[str, Stats]  # statistics of the videos' frames
     videos: dict[str, Path]  # MP4 files with at least N frames, of which the first N count
     about: DatasetContract  # the same for each episode of a dataset
+    label: Label | None = None
+    folder: Path | None = None  # of the running episode, which is removed with what is left in it
 
 
 class RobotEpisode:
     """A running episode, to which frames are added."""
 
-    def __init__(self, folder: Path, instruction: str, fps: float, features: dict[str, Any] | None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        instruction: str,
+        fps: float,
+        features: dict[str, Any] | None,
+        *,
+        interventions: bool = False,
+        lossless: bool = False,
+        meaning: ActionSpec | None = None,
+    ) -> None:
         """Begin an episode in a folder.
 
         Args:
@@ -58,6 +78,9 @@ class RobotEpisode:
             instruction: The task in words.
             fps: The rate of the frames, Hz.
             features: The dataset's features, which the frames must have; None in the first episode.
+            interventions: Whether the frames have the columns of interventions.
+            lossless: Whether its videos keep each pixel, see `Mp4`.
+            meaning: The meaning of its actions' numbers, if that is known.
         """
         self.instruction = instruction
         self.features: dict[str, Any] = features or {}
@@ -66,9 +89,22 @@ class RobotEpisode:
         self.images: dict[str, ImageStatistics] = {}
         self._folder = folder
         self._fps = fps
+        self._interventions = interventions
+        self._lossless = lossless
+        self._meaning = meaning or ActionSpec()
         self._about = DatasetContract(Contract())
 
-    def add(self, obs: Obs, action: np.ndarray, captured_at: float, tick: int, safe: bool) -> None:
+    def add(
+        self,
+        obs: Obs,
+        action: np.ndarray,
+        captured_at: float,
+        tick: int,
+        safe: bool,
+        intervention: bool = False,
+        wanted: np.ndarray | None = None,
+        more: Mapping[str, Any] = MappingProxyType({}),
+    ) -> None:
         """Append a frame.
 
         Args:
@@ -77,42 +113,57 @@ class RobotEpisode:
             captured_at: The time of the observation, s since 1970.
             tick: The tick of the control loop.
             safe: Whether the action is a safe one, not the policy's.
+            intervention: Whether a human moved the robot at this tick.
+            wanted: The policy's action, (D,), where another one was executed; None if it is not known.
+            more: Further columns by name, the same in each frame: a bool, int, float, text, or (D,) float32.
 
         Raises:
             InvalidObservation: Cameras or shapes differ from those of the frames before.
         """
         values, names = state_vector(obs.state, None if obs.gripper is None else np.array(obs.gripper))
         if not self.rows:
-            self._first(obs, names, len(action))
+            self._first(obs, names, len(action), more)
         keys = camera_keys(obs.cameras)
         if set(keys.values()) != self.videos.keys():
             raise InvalidObservation(
                 f"recording: got cameras {sorted(obs.cameras)}, want those of {sorted(self.videos)}"
             )
         for name, shape in ((STATE, values.shape), (ACTION, action.shape)):
-            wanted = tuple(self.features[name]["shape"]) if name in self.features else (0,)
-            if shape != wanted:
-                raise InvalidObservation(f"recording: got {name} of {shape}, want {wanted} as in the first frame")
+            first = tuple(self.features[name]["shape"]) if name in self.features else (0,)
+            if shape != first:
+                raise InvalidObservation(f"recording: got {name} of {shape}, want {first} as in the first frame")
         for name, image in obs.cameras.items():
             self.videos[keys[name]][1].add(image)
             self.images[keys[name]].add(image)
-        frame = {ACTION: np.asarray(action, np.float32), "captured_at": captured_at, "tick": tick, "safe": safe}
+        frame: dict[str, Any] = {
+            ACTION: np.asarray(action, np.float32),
+            "captured_at": captured_at,
+            "tick": tick,
+            "safe": safe,
+            **more,
+        }
         if len(values):
             frame[STATE] = values
+        if self._interventions:
+            policy = wanted if safe or intervention else action
+            frame[WANTED_ACTION] = np.zeros_like(frame[ACTION]) if policy is None else np.asarray(policy, np.float32)
+            frame |= {INTERVENTION_COLUMN: intervention, "policy_known": policy is not None}
         for key, value in frame.items():
             self.rows.setdefault(key, []).append(value)
 
-    def finish(self) -> Finished:
+    def finish(self, label: Label | None = None) -> Finished:
         """Complete the videos, and return the episode."""
         for _, video in self.videos.values():
             video.finish()
         return Finished(
             self.instruction,
             self.features,
-            {key: np.stack(values) for key, values in self.rows.items()},
+            {key: _column(values) for key, values in self.rows.items()},
             {key: images.result() for key, images in self.images.items()},
             {key: path for key, (path, _) in self.videos.items()},
             self._about,
+            label,
+            self._folder,
         )
 
     def abandon(self) -> None:
@@ -121,20 +172,23 @@ class RobotEpisode:
             video.abandon()
         shutil.rmtree(self._folder, ignore_errors=True)
 
-    def _first(self, obs: Obs, names: list[str], action_dim: int) -> None:
+    def _first(self, obs: Obs, names: list[str], action_dim: int, more: Mapping[str, Any]) -> None:
         features: dict[str, Any] = {}
         keys = camera_keys(obs.cameras)
         for name, image in sorted(obs.cameras.items()):
             key = keys[name]
             path = self._folder / f"{key}.mp4"
-            video = Mp4(path, image.shape, self._fps, key_frames=_KEY_FRAMES)
+            video = Mp4(path, image.shape, self._fps, key_frames=_KEY_FRAMES, lossless=self._lossless)
             self.videos[key], self.images[key] = (path, video), ImageStatistics()
             height, width = video.size
-            features[key] = video_feature(height, width, self._fps)
+            features[key] = video_feature(height, width, self._fps, "gbrp" if self._lossless else "yuv420p")
         if names:
             features[STATE] = vector_feature(names)
         features[ACTION] = vector_feature([f"action_{i}" for i in range(action_dim)])
+        if self._interventions:
+            features |= {WANTED_ACTION: features[ACTION]} | number_features(INTERVENTIONS)
         features |= number_features(MOMENTS | INDEX)
+        features |= {name: _feature(value) for name, value in more.items()}
         if self.features and self.features != features:
             odd = sorted(k for k in self.features.keys() | features.keys() if self.features.get(k) != features.get(k))
             raise InvalidObservation(f"recording: {odd} differ from the dataset's; record into a new folder")
@@ -146,7 +200,7 @@ class RobotEpisode:
                 cameras={name: CameraSpec(*image.shape[:2]) for name, image in obs.cameras.items()},
                 state={part: StateSpec(len(obs.state[part])) for part in own},
                 gripper=obs.gripper is not None,
-                action=ActionSpec(dim=action_dim),
+                action=replace(self._meaning, dim=action_dim),
                 control_hz=self._fps,
             ),
             tuple(parts),
@@ -172,12 +226,23 @@ def without_slash(name: str) -> str:
     return name.replace("/", "_")
 
 
-def video_feature(height: int, width: int, fps: float) -> dict[str, Any]:
-    """Describe the feature of a camera whose videos have this size, in pixels, and rate, in Hz."""
+def video_feature(height: int, width: int, fps: float, pixels: str = "yuv420p") -> dict[str, Any]:
+    """Describe the feature of a camera whose videos have this size, in pixels, rate, in Hz, and pixel format."""
     size = {"video.height": height, "video.width": width, "video.fps": fps, "video.channels": 3}
-    kind = {"video.codec": "h264", "video.pix_fmt": "yuv420p", "video.is_depth_map": False, "has_audio": False}
+    kind = {"video.codec": "h264", "video.pix_fmt": pixels, "video.is_depth_map": False, "has_audio": False}
     names = ["height", "width", "channels"]
     return {"dtype": "video", "shape": [height, width, 3], "names": names, "info": size | kind}
+
+
+def _feature(value: Any) -> dict[str, Any]:
+    """Describe the feature of which this is a frame's value."""
+    if isinstance(value, np.ndarray):
+        return {"dtype": "float32", "shape": [len(value)], "names": None}
+    return {"dtype": _DTYPES[type(value)], "shape": [1], "names": None}
+
+
+def _column(values: list[Any]) -> np.ndarray:
+    return np.array(values, object) if isinstance(values[0], str) else np.stack(values)
 
 
 def vector_feature(names: list[str]) -> dict[str, Any]:

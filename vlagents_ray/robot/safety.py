@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, Contract
-from vlagents_ray.errors import ConfigError, InvalidAction
+from vlagents_ray.errors import ConfigError, InvalidAction, MissingState
 from vlagents_ray.interface import Obs
 
 
@@ -117,6 +117,21 @@ class Guard:
                     f"action[{i}]: got {action[i]:g} after {last[i]:g}, a larger step than max_step allows"
                 )
         return action
+
+
+def measured_state(part: str | None) -> Callable[[Obs], np.ndarray] | None:
+    """Return a `measure` of a `Guard`: a part of the state.
+
+    Args:
+        part: The name of the part, such as "joints"; None measures nothing.
+    """
+
+    def measured(obs: Obs) -> np.ndarray:
+        if part not in obs.state:
+            raise MissingState(str(part), obs.state)
+        return obs.state[part]
+
+    return None if part is None else measured
 
 
 def _bounds(

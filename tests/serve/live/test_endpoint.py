@@ -111,8 +111,8 @@ def test_errors_and_sessions_that_ended_are_told(server: LiveServer) -> None:
 def test_nothing_is_kept_once_nobody_looks(server: LiveServer) -> None:
     with server.viewer() as viewer:
         ask(viewer)
-        assert server.engine.live is server.view.tap
-    wait_for(lambda: server.engine.live is None)
+        assert server.engine.watchers.one is server.view.tap
+    wait_for(lambda: server.engine.watchers.one is None)
 
 
 def test_the_document_is_there_without_a_websocket(server: LiveServer) -> None:

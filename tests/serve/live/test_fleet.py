@@ -143,3 +143,22 @@ def test_an_error_of_a_reading_does_not_end_the_next(own: ReplicaView, monkeypat
         return document
 
     assert asyncio.run(watch())["replicas"][0]["name"] == "own"
+
+
+def test_what_is_beside_the_replicas_is_sent_when_it_has_changed() -> None:
+    said: list[dict[str, Any]] = [{"evaluation": {"done": 1}}]
+
+    async def watch() -> list[dict[str, Any]]:
+        gathered = Fleet(None, beside=lambda: said[-1])
+        viewer = gathered.add()
+        found = [(await viewer.next())[0] for _ in range(2)]
+        said.append({"evaluation": {"done": 2}})
+        while "evaluation" not in (last := (await viewer.next())[0]):
+            pass
+        gathered.remove(viewer)
+        return [*found, last]
+
+    first, second, last = asyncio.run(watch())
+    assert (first["evaluation"], last["evaluation"]) == ({"done": 1}, {"done": 2})
+    assert "evaluation" not in second
+    assert first["replicas"] == []

@@ -13,7 +13,7 @@ import pytest
 from browser import Page, browser
 from eval_fakes import wait_for
 from in_memory_keys import ChangingKeys
-from live_server import LiveServer, live_server
+from live_server import Address, LiveServer, live_server
 
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.chunking.player import ChunkPlayer
@@ -31,16 +31,6 @@ pytestmark = [pytest.mark.browser, pytest.mark.slow]
 CARDS = "document.querySelectorAll('article').length"
 PICTURES = "[...document.querySelectorAll('article img')].filter((one) => one.naturalWidth === 48).length"
 STATUS = "document.getElementById('connection').textContent"
-
-
-class Address:
-    """An address of the web, as `Page.open` takes files."""
-
-    def __init__(self, url: str) -> None:
-        self._url = url
-
-    def as_uri(self) -> str:
-        return self._url
 
 
 @pytest.fixture(scope="module")

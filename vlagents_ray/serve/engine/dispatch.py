@@ -74,7 +74,7 @@ class Dispatcher:
     def admission(self, limits: Limits, size: int = 0, rank: str = "robot") -> MessageAdmission:
         """Return the admission of a message of `size` bytes; its first request counts unless the sender's `counted`."""
         robot, caller, counted = rank != "simulation", self._caller, self._counted
-        keep = self._engine.live is not None
+        keep = self._engine.watchers.one is not None
         if caller is None:
             return MessageAdmission(self._engine.admission, limits, None, size, robot=robot, keep_files=keep)
 
@@ -111,9 +111,9 @@ class Dispatcher:
             part: Receives the replies before the last to a lone act that asks for its chunk in parts; None if the
                 endpoint sends only whole chunks.
         """
-        if (live := self._engine.live) is not None:
+        if (watcher := self._engine.watchers.one) is not None:
             sessions = ["" if isinstance(item, Reply) else self._session(item) for item in items]
-            done = live.note(sessions, items, (admission and admission.files) or {}, done)
+            done = watcher.note(sessions, items, (admission and admission.files) or {}, done)
         if admission is not None and admission.holds:
             done = partial(_release, admission, done)
         collector = ReplyCollector(items, done, self._asks_to_reconnect, self._engine.withdraw)

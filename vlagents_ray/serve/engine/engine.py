@@ -26,7 +26,7 @@ from vlagents_ray.serve.engine.admission import Admission
 from vlagents_ray.serve.engine.arrival import PauseDetector
 from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
 from vlagents_ray.serve.engine.resets import Resets
-from vlagents_ray.serve.engine.responses import Watcher, build_reply, public_error, timing
+from vlagents_ray.serve.engine.responses import Watchers, build_reply, public_error, timing
 from vlagents_ray.serve.engine.session_transfer import DrainList, SessionTransfer
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.models.loaded_model import LoadedModel, Loader, synchronise
@@ -103,7 +103,7 @@ class Engine:
         self.weights = WeightUpdates(lambda: self.models.own_weights, self.sessions.all)
         self.transfer = SessionTransfer(self.sessions, self.models, self.require_ready)
         self._resets = Resets(self.sessions, self.models, self.queue, finder, clock, reply_bytes)
-        self.live: Watcher | None = None  # sees all messages; None while nobody looks
+        self.watchers = Watchers()
         self._streams = ActStreams(self.sessions, self.queue, self.stats, clock, batch_sizes, reply_bytes)
 
     def start(self, *, threaded: bool = True) -> None:

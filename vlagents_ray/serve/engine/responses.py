@@ -48,6 +48,35 @@ class Watcher(Protocol):
         ...
 
 
+class Watchers:
+    """The watchers of an engine, which are themselves one. Thread-safe."""
+
+    def __init__(self) -> None:
+        self.one: Watcher | None = None  # sees all messages; None while nobody watches, which costs one comparison
+        self._all: tuple[Watcher, ...] = ()
+        self._lock = threading.Lock()
+
+    def add(self, watcher: Watcher) -> None:
+        """Let it see the messages from now on."""
+        with self._lock:
+            self._set((*self._all, watcher))
+
+    def remove(self, watcher: Watcher) -> None:
+        """Let it see no further messages; does nothing if it was not added."""
+        with self._lock:
+            self._set(tuple(one for one in self._all if one is not watcher))
+
+    def note(self, sessions: Sequence[str], items: Sequence[Request | Reply], files: DecodedFiles, done: Done) -> Done:
+        """See `Watcher`."""
+        for watcher in self._all:
+            done = watcher.note(sessions, items, files, done)
+        return done
+
+    def _set(self, watchers: tuple[Watcher, ...]) -> None:
+        self._all = watchers
+        self.one = watchers[0] if len(watchers) == 1 else self if watchers else None
+
+
 def build_reply(
     ticket: PendingRequest,
     session: Session[LoadedModel],

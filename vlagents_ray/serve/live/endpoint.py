@@ -4,6 +4,7 @@
     GET /v1/live   what the replicas do now, as JSON without pictures; keys need the scope "watch"
     WS  /v1/live   the same with pictures, at most ten times a second
     POST /v1/live/command   {"session": …, "do": "pause"}: see `CommandBoard.press`; keys need the scope "operate"
+    GET /v1/live/videos/7   a video to which the document refers by its number, where an evaluation is watched
 
 The viewer asks for each message, with the sessions whose pictures it shows: {"shown": ["arm-1", …]}. So a slow viewer
 misses what is old, and delays nobody. The answer is the length of a JSON document (32 bits, little-endian), the
@@ -20,14 +21,16 @@ import hashlib
 import json
 import logging
 import struct
+from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from importlib.resources import files as package_files
+from pathlib import Path
 from typing import Any
 
 from starlette.requests import ClientDisconnect
 from starlette.requests import Request as HttpRequest
-from starlette.responses import HTMLResponse, JSONResponse, Response
+from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
@@ -48,31 +51,38 @@ _WATCH, _OPERATE = "watch", "operate"  # scopes of keys
 _COMMAND_BYTES = 2**14  # longest command
 _VIEWERS = 32  # most viewers at once
 _SILENT_S = 30.0  # longest time between two messages of a viewer
+_SCRIPTS = ("evaluation.js", "live.js")
 _CHARACTERS = 2**16  # longest message of a viewer
 _POLICY_VIOLATION, _TRY_AGAIN_LATER = 1008, 1013  # WebSocket close codes
 
+VideoFiles = Callable[[int], Path | None]
+"""Returns the file of the video with a number; None if there is none."""
 
-def live_routes(fleet: Fleet, *, open_to_network: bool) -> list[BaseRoute]:
+
+def live_routes(fleet: Fleet, *, open_to_network: bool, videos: VideoFiles | None = None) -> list[BaseRoute]:
     """Return the routes of the live page.
 
     Args:
         fleet: Gathers what the page shows.
         open_to_network: Whether other machines reach this server without a key; nobody may then watch, as the pictures
             of all robots would be public.
+        videos: Finds the videos to which the document refers, if it does.
     """
-    endpoint = _LiveEndpoint(fleet, open_to_network)
-    return [
+    endpoint = _LiveEndpoint(fleet, open_to_network, videos)
+    routes: list[BaseRoute] = [
         Route(LIVE_PAGE, _page),
         Route(PATH, endpoint.show),
         WebSocketRoute(PATH, endpoint.watch),
         Route(_COMMAND, endpoint.press, methods=["POST"]),
     ]
+    return routes if videos is None else [*routes, Route(f"{PATH}/videos/{{number:int}}", endpoint.video)]
 
 
 class _LiveEndpoint:
-    def __init__(self, fleet: Fleet, open_to_network: bool) -> None:
+    def __init__(self, fleet: Fleet, open_to_network: bool, videos: VideoFiles | None) -> None:
         self._fleet = fleet
         self._open_to_network = open_to_network
+        self._videos = videos
         self._watching = 0
 
     async def show(self, http: HttpRequest) -> Response:
@@ -86,6 +96,14 @@ class _LiveEndpoint:
             return JSONResponse(document)
         finally:
             self._fleet.remove(viewer)
+
+    async def video(self, http: HttpRequest) -> Response:
+        try:
+            self._require_scope(_WATCH)
+        except VLAgentsError as error:
+            return problem_response(error, request_id(http))
+        path = None if self._videos is None else self._videos(http.path_params["number"])
+        return Response(status_code=404) if path is None else FileResponse(path, media_type="video/mp4")
 
     async def press(self, http: HttpRequest) -> Response:
         try:
@@ -209,11 +227,14 @@ async def _page(_: HttpRequest) -> Response:
 def live_page() -> tuple[str, str]:
     """Return the page with its style and script in it, and the policy that lets a browser load nothing else."""
     folder = package_files("vlagents_ray.serve.live") / "page"
-    style, script = (folder.joinpath(name).read_text(encoding="utf-8") for name in ("live.css", "live.js"))
+    parts = {name: folder.joinpath(name).read_text(encoding="utf-8") for name in ("live.css", *_SCRIPTS)}
     html = folder.joinpath("live.html").read_text(encoding="utf-8")
-    html = html.replace("/* live.css */", style).replace("/* live.js */", script)
-    own = f"script-src {_digest(script)}; style-src {_digest(style)}; connect-src 'self'; img-src blob: data:"
-    return html, f"default-src 'none'; {own}; base-uri 'none'; form-action 'none'"
+    for name, part in parts.items():
+        html = html.replace(f"/* {name} */", part)
+    scripts = " ".join(_digest(parts[name]) for name in _SCRIPTS)
+    own = f"script-src {scripts}; style-src {_digest(parts['live.css'])}; connect-src 'self'"
+    media = "img-src blob: data:; media-src blob:"
+    return html, f"default-src 'none'; {own}; {media}; base-uri 'none'; form-action 'none'"
 
 
 def _digest(text: str) -> str:

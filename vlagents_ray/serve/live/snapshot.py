@@ -77,7 +77,7 @@ class ReplicaView:
         if self.ring is not None:
             self.ring.close()
         each_half_second.remove(self.tap.expire)
-        self._engine.live = None
+        self._engine.watchers.remove(self.tap)
 
     def read(self, since: int, shown: Collection[str]) -> Snapshot:
         """Return what happened since the snapshot with the number `since`, with pictures of the sessions `shown`.
@@ -128,7 +128,10 @@ class ReplicaView:
         self.tap.renew(seconds)
 
     def _show(self, tap: LiveTap | None) -> None:
-        self._engine.live = tap
+        if tap is None:
+            self._engine.watchers.remove(self.tap)
+        else:
+            self._engine.watchers.add(tap)
         self._pictured = {}
         self._meter = None if tap is None else LoadMeter(self._engine.queue)
 

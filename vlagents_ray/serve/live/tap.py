@@ -1,9 +1,9 @@
 """What the sessions of a replica do, kept for viewers while one looks, and only then.
 
-`Engine.live` is the tap while a viewer looks, otherwise None: then a message costs one comparison. While somebody
-looks, the thread that handles a message stores references; `vlagents_ray.serve.live.snapshot` reads them on another.
-An observation is stored at most `RATE` times a second for each session, and until it is read: it may lie in memory
-that its client wants back.
+The tap is one of `Engine.watchers` while a viewer looks; otherwise a message costs one comparison. While somebody
+looks, the thread that handles a message stores references; `vlagents_ray.serve.live.snapshot` reads them on another. An
+observation is stored at most `RATE` times a second for each session, and until it is read: it may lie in memory that
+its client wants back.
 """
 
 from __future__ import annotations

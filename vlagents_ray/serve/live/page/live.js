@@ -33,7 +33,7 @@ function connect() {
   let heard = false;
   const ask = () => socket.send(JSON.stringify({ shown: visibleSessions() }));
   socket.binaryType = "arraybuffer";
-  socket.onopen = ask;
+  socket.onopen = () => { forgetFailures(); ask(); };
   socket.onmessage = (event) => {
     if (typeof event.data === "string") return say(JSON.parse(event.data).detail, false);
     if (!heard) say("Live", true);
@@ -46,6 +46,7 @@ function connect() {
   };
   socket.onclose = (event) => {
     if (!heard) askForKey();
+    else if (evaluation && !UNDER_WAY.includes(evaluation.state)) say("Ended", false);
     else say(event.reason || "Disconnected; connecting again …", false);
     setTimeout(() => { if (byId("key").hidden) connect(); }, wait);
     wait = Math.min(wait * 2, 10000);
@@ -106,6 +107,8 @@ function show(said, files) {
   const names = new Set(said.replicas.map((one) => one.name));
   for (const [name, one] of replicas) if (!names.has(name) && said.time - one.time > 3) replicas.delete(name);
   for (const [id, card] of cards) if (!present.has(id) && ++card.missed > 5) { card.remove(); cards.delete(id); }
+  if (said.evaluation) showEvaluation(said.evaluation, said.time);
+  for (const section of document.querySelectorAll(".of-server")) section.hidden = evaluation !== null && !replicas.size;
   showFleet(said.time);
   showTimes();
   byId("session-count").textContent = cards.size ? `(${cards.size})` : "";
@@ -122,9 +125,12 @@ function count(said, now) {
 function showFleet(now) {
   const policies = [...replicas.values()].map((one) => one.said);
   if (!policies.length) return;
-  byId("policy").textContent = policies[0].policy;
-  byId("checkpoint").textContent = policies[0].checkpoint || "";
-  document.title = `${policies[0].policy}, live`;
+  if (!evaluation) {
+    byId("policy").textContent = policies[0].policy;
+    byId("checkpoint").textContent = policies[0].checkpoint || "";
+    document.title = `${policies[0].policy}, live`;
+  }
+  const several = new Set(policies.map((one) => one.policy)).size > 1;
   const rows = [...replicas].sort().map(([name, one]) => {
     const { said, events } = one;
     const seconds = Math.min(KEPT_S, Math.max(1, now - one.since));
@@ -133,7 +139,7 @@ function showFleet(now) {
     const busy = said.utilisation ?? 0;
     const meter = element("meter", { max: 1, value: busy, high: 0.9, ariaLabel: `busy ${Math.round(busy * 100)} %` });
     return element("tr", {},
-      element("th", { scope: "row" }, `${name} on ${said.node}`, said.ready ? "" : ` (loading${said.step ? `: ${said.step}` : ""})`),
+      element("th", { scope: "row" }, `${several ? `${said.policy}: ` : ""}${name} on ${said.node}`, said.ready ? "" : ` (loading${said.step ? `: ${said.step}` : ""})`),
       element("td", {}, meter, `${Math.round(busy * 100)} %`),
       ...[(events.reduce((sum, event) => sum + event.acts, 0) / seconds).toFixed(1), mean ? mean.toFixed(1) : "–",
         said.waiting.robot, said.waiting.simulation, `${said.sessions_held} of ${said.session_limit}`,
