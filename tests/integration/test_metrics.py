@@ -31,14 +31,25 @@ def server() -> Iterator[Server]:
             yield server
 
 
-def scraped() -> dict[str, float]:
-    """Our series of the node: name and tags, sorted, to value."""
+def exposed() -> str:
+    """What the node's metrics port says."""
     (node,) = ray.nodes()
     url = f"http://{node['NodeManagerAddress']}:{node['MetricsExportPort']}/metrics"
     with urllib.request.urlopen(url, timeout=10) as answer:
-        text = answer.read().decode()
+        text: str = answer.read().decode()
+    return text
+
+
+def scraped_of(series: str, tag: str) -> dict[str, float]:
+    """The values of a series by one of its tags."""
+    found = re.findall(rf'^ray_{series}\{{.*\b{tag}="([^"]*)".*\}} (\S+)$', exposed(), re.MULTILINE)
+    return {value: float(number) for value, number in found}
+
+
+def scraped() -> dict[str, float]:
+    """Our series of the node: name and tags, sorted, to value."""
     found = {}
-    for name, tags, value in re.findall(r"^ray_(vlagents_\w+)\{(.*)\} (\S+)$", text, re.MULTILINE):
+    for name, tags, value in re.findall(r"^ray_(vlagents_\w+)\{(.*)\} (\S+)$", exposed(), re.MULTILINE):
         assert 'application="noop"' in tags
         assert 'deployment="Policy"' in tags
         assert 'policy="noop"' in tags

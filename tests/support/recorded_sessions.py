@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
@@ -43,7 +44,10 @@ class Brightness(Agent):
             raise RuntimeError("as it was asked to")
         seen = np.array([obs.cameras["front"].astype(np.float64).mean(), obs.state["joints"][0]])
         noise = self._rng.normal(size=(obs.info.get("rows", self.rows), 2))
-        return Act((self.gain * seen + noise + obs.info.get("offset", 0)).astype(np.float32), info={"subtask": "reach"})
+        return Act(
+            (self.gain * seen + noise + obs.info.get("offset", 0)).astype(np.float32),
+            info={"subtask": "reach", "pid": os.getpid()},
+        )
 
 
 @dataclass(frozen=True)
