@@ -76,6 +76,7 @@ _EXTRAS = {
     "gymnasium": "sim",
     "av": "record",
     "pyarrow": "record",
+    "pyspacemouse": "spacemouse",
     "mani_skill": "maniskill",
     "sapien": "maniskill",
     "transforms3d": "maniskill",
@@ -88,6 +89,8 @@ _EXTRAS = {
     "wandb": "wandb",
     "trackio": "trackio",
     "tensorboard": "tensorboard",
+    "rerun": "rerun",
+    "foxglove": "foxglove",
 }
 
 # import name -> the files in requirements/ that install it, for an environment that runs a policy

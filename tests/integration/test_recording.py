@@ -13,11 +13,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from eval_fakes import wait_for
+from prometheus_series import scrape
 from recorded_sessions import seen
 from typer.testing import CliRunner
 
 from tests.integration.conftest import serving
-from tests.integration.test_metrics import scraped_of
 from vlagents_ray import RemoteAgent
 from vlagents_ray.cli.main import app
 from vlagents_ray.client.transports.select import TransportName
@@ -45,6 +45,10 @@ def saved(folder: Path) -> int:
     return sum(json.loads(path.read_text())["total_episodes"] for path in folder.glob("*/meta/info.json"))
 
 
+def series(key: str) -> list[float]:
+    return [one.value for one in scrape() if one.key("outcome") == key]
+
+
 def play(agent: RemoteAgent, seed: int) -> tuple[int, list[np.ndarray]]:
     agent.reset(seen(0), "stack", seed=seed)
     acts = [agent.act(seen(i)) for i in range(ACTS)]
@@ -69,8 +73,8 @@ def test_sessions_of_every_transport_are_recorded_and_replayed_without_error(
     assert done.exit_code == 0, done.output
     result = json.loads((tmp_path / "out/open_loop.json").read_text())
     assert (result["max"], result["frames"]) == (0.0, ACTS * len(WAYS))
-    wait_for(lambda: scraped_of("vlagents_recorded_frames_total", "outcome").get("saved") == ACTS * len(WAYS))
-    assert scraped_of("vlagents_recording", "deployment") == {"Policy": 1}
+    wait_for(lambda: series("vlagents_recorded_frames_total outcome=saved") == [ACTS * len(WAYS)])
+    assert series("vlagents_recording") == [1]
 
 
 def test_a_killed_replica_loses_its_running_episodes_and_no_others(server: Server, folder: Path) -> None:

@@ -17,6 +17,7 @@ from vlagents_ray.cli.options import Address, Set, parse_settings
 from vlagents_ray.cli.ray_session import RESTART, exit_if_ray_is_lost, quiet_ray
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK
+from vlagents_ray.viewers.targets import is_live
 
 if TYPE_CHECKING:
     from ray.serve.schema import ServeDeploySchema
@@ -38,6 +39,13 @@ def serve_command(
     ] = [],  # noqa: B006
     vlagents_port: Annotated[
         int | None, typer.Option(min=1, max=65535, help="Let clients of the package vlagents in at this port, too.")
+    ] = None,
+    rerun: Annotated[
+        str | None,
+        typer.Option(metavar="DIR", help="Write a .rrd file of each session's episodes for Rerun; see `viewers` too."),
+    ] = None,
+    foxglove: Annotated[
+        str | None, typer.Option(metavar="DIR", help="Write an .mcap file of each session's episodes for Foxglove.")
     ] = None,
     address: Address = None,
     keys: Annotated[
@@ -61,7 +69,7 @@ def serve_command(
     from vlagents_ray.serve.launch.server import running_server
 
     with errors():
-        config = read_deployment(source, _server_args(settings, serve_set))
+        config = read_deployment(source, _server_args(settings, serve_set, rerun=rerun, foxglove=foxglove))
         if vlagents_port is not None:
             config = with_dialect(config, "vlagents", {"port": vlagents_port})
         if address is None:
@@ -154,8 +162,12 @@ def _tls(certificate: Path | None, key: Path | None, client_ca: Path | None) -> 
     return Tls(certificate, key, client_ca)
 
 
-def _server_args(settings: list[str], serve_set: list[str]) -> dict[str, Any]:
+def _server_args(settings: list[str], serve_set: list[str], **viewers: str | None) -> dict[str, Any]:
     args = parse_settings(serve_set, "--serve-set")
+    for name, target in viewers.items():
+        if target is not None:
+            where = target if is_live(name, target) else str(Path(target).resolve())
+            args["viewers"] = {**args.get("viewers", {}), name: where}
     if "config" in args:
         raise ConfigError("--serve-set config: the policy's own settings go into --set")
     config = parse_settings(settings, "--set")

@@ -7,7 +7,7 @@ import logging
 from collections import Counter
 from collections.abc import Callable
 
-from vlagents_ray.errors import StorageFailed, from_code
+from vlagents_ray.errors import ConfigError, StorageFailed, from_code
 from vlagents_ray.evaluate.artifacts.provenance import (
     driver_code,
     policy_code,
@@ -16,6 +16,7 @@ from vlagents_ray.evaluate.artifacts.provenance import (
 )
 from vlagents_ray.evaluate.artifacts.recorder import Artifacts, save
 from vlagents_ray.evaluate.artifacts.storage import storing
+from vlagents_ray.evaluate.artifacts.viewing import save_views
 from vlagents_ray.evaluate.deadline import Deadline
 from vlagents_ray.evaluate.episode.failures import Failure
 from vlagents_ray.evaluate.episode.records import EpisodeResult, WorkerInfo
@@ -100,6 +101,8 @@ def evaluate(
         EvaluationInterrupted: Ctrl-C or SIGTERM; `OutOfTime`, which is one, if `end_at` left episodes over.
         VLAgentsError: The last infrastructure error, after `config.abort_after` lost episodes in a row.
     """
+    if config.real_robot is not None:
+        raise ConfigError("robot.arm: got a real robot, want a plan in simulation; see vlagents_ray.evaluate.robot")
     factory = agents(config, agent_factory)
     tracking = TrackerFeed(config)
     require_envs(config)
@@ -113,7 +116,7 @@ def evaluate(
                 state, summary = run.play(factory)
         except BaseException:
             with contextlib.suppress(StorageFailed):  # of the same disk, it may be: what went wrong first is told
-                _conclude(config, store, "stopped")
+                conclude(config, store, "stopped")
             raise
     for stopped in (EvaluationInterrupted, OutOfTime):
         if state == stopped.why:
@@ -121,8 +124,8 @@ def evaluate(
     return summary
 
 
-def _conclude(config: EvalConfig, store: Store, state: str) -> Summary:
-    """Note how the run ended, and write what it came to."""
+def conclude(config: EvalConfig, store: Store, state: str) -> Summary:
+    """Note how the run ended, and write its summary and its report."""
     with storing(config.out):
         store.end_run(state)
         summary = summarize(Results.load(config.out))
@@ -138,7 +141,8 @@ def check(config: EvalConfig) -> None:
         ConfigError: An env is not registered or not installed, or the settings contradict the results in `config.out`.
     """
     require_envs(config)
-    Store(config).close()
+    if config.real_robot is None:  # a robot's results are written when all trials are judged
+        Store(config).close()
 
 
 class _Run:
@@ -184,7 +188,7 @@ class _Run:
         answers nobody, and Slurm kills the job a few seconds later.
         """
         if not len(self._queue):
-            return "complete", _conclude(self._config, self._store, "complete")
+            return "complete", conclude(self._config, self._store, "complete")
         with contextlib.nullcontext() if self._in_process else ray_cluster(self._config), stop_signals() as stop:
             self._progress.begin(self._store.cells, self._recorded, len(self._queue))
             try:
@@ -196,7 +200,7 @@ class _Run:
                         pool.close()
                     if stop.is_set():
                         state = EvaluationInterrupted.why
-                    return state, _conclude(self._config, self._store, state)
+                    return state, conclude(self._config, self._store, state)
             finally:
                 self._progress.end()
 
@@ -259,6 +263,7 @@ class _Run:
     def _record(self, job: Job, result: EpisodeResult, kept: Artifacts) -> None:
         # Files first: a crash in between repeats the episode, and they are overwritten.
         videos, trajectory = save(self._config.out, job.cell, result, kept)
+        save_views(self._config, job.cell, result, kept.views)
         self._store.record(result, job.attempt, videos, trajectory)
         self._progress.episode(job.cell, result)
         self._left[job.key.settings] -= 1

@@ -10,7 +10,7 @@ import typer
 
 from vlagents_ray.cli.console import errors, fresh, out
 from vlagents_ray.cli.evaluation.open_loop import is_dataset, replay_dataset
-from vlagents_ray.cli.options import Address, parse_list
+from vlagents_ray.cli.options import Address, Live, LiveAt, parse_list
 from vlagents_ray.errors import ConfigError
 
 
@@ -30,13 +30,25 @@ def report_command(
     videos: Annotated[
         Videos, typer.Option(help="In the page as far as they fit, beside it, or stills alone.")
     ] = Videos.LINK,
+    live: Live = False,
+    live_at: LiveAt = None,
 ) -> None:
-    """Write a page of what came out: success with intervals, comparisons, latency, failures, and all that made it."""
+    """Write a page of what came out: success with intervals, comparisons, latency, failures, and all that made it.
+
+    With --live it writes none: it shows the results in OUT as another process adds to them, until Ctrl-C.
+    """
     from vlagents_ray.evaluate import Results
     from vlagents_ray.evaluate.report.html import FILE, write_report
     from vlagents_ray.evaluate.results.combine import combined
 
     with errors():
+        if live or live_at:
+            from vlagents_ray.cli.evaluation.live import follow, live_address
+
+            if len(folders) != 1 or html is not None:
+                raise ConfigError("--live shows one folder, and writes no file: want one OUT, and no --html")
+            follow(folders[0], live_address(live_at))
+            return
         results = combined([Results.load(folder) for folder in folders])
         path = html or (folders[0] / FILE if len(folders) == 1 else Path(FILE))
         written = write_report(results, path, videos=videos.value)

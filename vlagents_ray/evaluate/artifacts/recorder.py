@@ -11,11 +11,13 @@ import numpy as np
 
 from vlagents_ray.evaluate.artifacts.trajectory import TrajectoryRecorder, save_trajectory
 from vlagents_ray.evaluate.artifacts.video import Footage, VideoRecorder, save_videos
+from vlagents_ray.evaluate.artifacts.viewing import EpisodeViews
 from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.episode.second_pass import PlayedEpisode, SecondPass
 from vlagents_ray.evaluate.episode.stats import version_of
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.config import EpisodeChoice, EvalConfig
+from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.interface import Act, Obs
 
 if TYPE_CHECKING:
@@ -29,6 +31,7 @@ class Artifacts:
     footage: Footage = field(default_factory=Footage)
     trajectory: bytes | None = None  # a `Trajectory` as .npz
     transitions: Any = None  # a pyarrow.RecordBatch, for a learner
+    views: dict[str, bytes] = field(default_factory=dict)  # the viewers' files, by the name of the viewer
     not_repeatable: str | None = None  # why images are missing that were to be rendered in a second pass
 
 
@@ -42,6 +45,9 @@ class EpisodeRecorder:
     def wants_images(self) -> EpisodeChoice:
         """Of which episodes the images of every step are needed."""
         return "none"
+
+    def begin(self, job: Job) -> None:
+        """Begin the episode of a job; called before anything is added."""
 
     def add_observation(self, obs: Obs) -> None:
         """Add an observation, beginning with that of the reset."""
@@ -74,24 +80,32 @@ class Recording(EpisodeRecorder):
         self._video = VideoRecorder(fps, seen=config.record != "none")
         self._trajectory = TrajectoryRecorder()
         self._played = PlayedEpisode()
+        self._views = EpisodeViews(config, fps)
+        self._is_viewed = bool(config.rerun or config.foxglove)
 
     @property
     def wants_images(self) -> EpisodeChoice:
         wanted = {self._wants_video, self._wants_trajectory}
-        return "all" if "all" in wanted else "failures" if "failures" in wanted else "none"
+        return "all" if "all" in wanted or self._is_viewed else "failures" if "failures" in wanted else "none"
+
+    def begin(self, job: Job) -> None:
+        self._views.begin(job)
 
     def add_observation(self, obs: Obs) -> None:
         self._show(obs)
+        self._views.add_observation(obs)
         if self.wants_images == "failures":
             self._played.add_observation(obs)
         if self._wants_trajectory != "none":
             self._trajectory.add_observation(obs)
 
     def add_act(self, act: Act, ticks_waited: int = 0) -> None:
+        self._views.add_act(act)
         if self._wants_trajectory != "none":
             self._trajectory.add_version(version_of(act), ticks_waited)
 
     def add_action(self, action: np.ndarray, reward: float, success: bool) -> None:
+        self._views.add_action(action, reward, success)
         if self.wants_images == "failures":
             self._played.add_action(action, reward, success)
         if self._wants_trajectory != "none":
@@ -99,8 +113,9 @@ class Recording(EpisodeRecorder):
 
     def finish(self, result: EpisodeResult, second_pass: SecondPass) -> Artifacts:
         video, trajectory = _wanted(self._wants_video, result), _wanted(self._wants_trajectory, result)
+        views = self._views.finish()
         if not video and not trajectory:
-            return Artifacts()
+            return Artifacts(views=views)
         if self._played.lacks_images:
             self._video.close()
             if (reason := second_pass(self._played, self._show)) is not None:
@@ -109,6 +124,7 @@ class Recording(EpisodeRecorder):
         return Artifacts(
             Footage(footage.shown if video else {}, footage.seen if trajectory else {}),
             self._trajectory.finish().to_bytes() if trajectory else None,
+            views=views,
         )
 
     def _show(self, obs: Obs) -> None:
@@ -119,6 +135,7 @@ class Recording(EpisodeRecorder):
 
     def __exit__(self, *exc: object) -> None:
         self._video.close()
+        self._views.close()
 
 
 def save(out: Path, cell: EvalCase, result: EpisodeResult, kept: Artifacts) -> tuple[list[str], str | None]:

@@ -151,6 +151,8 @@ class Rollout:
             recordings = [
                 stack.enter_context(self._recorder_factory(self._config, env.contract.control_hz)) for _ in jobs
             ]
+            for job, recording in zip(jobs, recordings, strict=True):
+                recording.begin(job)
             outcomes = self._play(agent, env, jobs, recordings)
             return [
                 Report(result=one, artifacts=self._finished(env, job, one, recording))

@@ -1,0 +1,131 @@
+"""The files of viewers open with their own readers, and hold what was sent."""
+
+from __future__ import annotations
+
+import socket
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from viewer_files import read_mcap, read_rrd
+
+from vlagents_ray import ConfigError
+from vlagents_ray.errors import MissingDependency
+from vlagents_ray.images.jpeg_png import decode, encode_jpeg
+from vlagents_ray.viewers import ViewerFrame, open_viewers
+
+TICKS = 6
+JPEG = encode_jpeg(np.full((8, 8, 3), 200, np.uint8))
+
+
+def frame(tick: int) -> ViewerFrame:
+    return ViewerFrame(
+        tick,
+        1e9 + tick / 50,
+        cameras={"left/wrist": np.full((16, 24, 3), 40 * tick, np.uint8)},
+        files={"front": JPEG},
+        state={"joints": np.array([tick, -tick], np.float32), "gripper": np.array([0.5], np.float32)},
+        executed=np.array([tick, 1, 2], np.float32),
+        planned=np.array([tick, 1, 3], np.float32),
+        chunk=np.arange(12, dtype=np.float32).reshape(4, 3) + tick if tick % 4 == 0 else None,
+        numbers={"round_trip_ms": 3.5, "safe": 0.0},
+        note="deadline_exceeded" if tick == 2 else "",
+    )
+
+
+def write(**targets: str) -> None:
+    for viewer in open_viewers(**targets):
+        with viewer, viewer.episode("ep0", "stack the cups"):
+            for tick in range(TICKS):
+                viewer.add(frame(tick))
+        assert (viewer.episodes, viewer.dropped, viewer.error) == (1, 0, None)
+
+
+@pytest.mark.library("rerun")
+def test_a_recording_of_rerun_holds_what_was_sent(tmp_path: Path) -> None:
+    write(rerun_target=str(tmp_path / "seen"))
+    found = read_rrd(tmp_path / "seen/ep0.rrd")
+    ticks = range(TICKS)
+    assert found["instruction"] == {None: "stack the cups"}
+    assert found["state/joints"] == {tick: [tick, -tick] for tick in ticks}
+    assert found["state/gripper"] == {tick: [0.5] for tick in ticks}
+    assert found["action/executed"] == {tick: [tick, 1, 2] for tick in ticks}
+    assert found["action/planned"] == {tick: [tick, 1, 3] for tick in ticks}
+    assert found["action/chunk"] == {tick: frame(tick).chunk.tolist() for tick in (0, 4)}
+    assert found["timing/round_trip_ms"] == {tick: [3.5] for tick in ticks}
+    assert found["log"] == {2: "deadline_exceeded"}
+    assert found["cameras/front"] == dict.fromkeys(ticks, JPEG)  # as it was, not encoded again
+    pictures = found[r"cameras/left\/wrist"]
+    assert {tick: decode(data).shape for tick, data in pictures.items()} == dict.fromkeys(ticks, (16, 24, 3))
+    assert [round(float(decode(pictures[tick]).mean()), -1) for tick in ticks] == [40 * tick for tick in ticks]
+
+
+@pytest.mark.library("foxglove")
+@pytest.mark.library("mcap")
+def test_an_mcap_file_holds_what_was_sent(tmp_path: Path) -> None:
+    write(foxglove_target=str(tmp_path / "seen"))
+    found = read_mcap(tmp_path / "seen/ep0.mcap")
+    ticks = range(TICKS)
+    assert found["/state"] == [{"tick": tick, "joints": [tick, -tick], "gripper": [0.5]} for tick in ticks]
+    assert found["/action"] == [{"tick": tick, "executed": [tick, 1, 2], "planned": [tick, 1, 3]} for tick in ticks]
+    assert found["/chunk"] == [{"tick": tick, "rows": frame(tick).chunk.tolist()} for tick in (0, 4)]
+    assert found["/timing"] == [{"tick": tick, "round_trip_ms": 3.5, "safe": 0} for tick in ticks]
+    assert [b"deadline_exceeded" in message["raw"] for message in found["/log"]] == [True]
+    assert [JPEG in message["raw"] for message in found["/cameras/front"]] == [True] * TICKS
+    assert len(found["/cameras/left/wrist"]) == TICKS
+
+
+@pytest.mark.library("foxglove")
+@pytest.mark.library("mcap")
+def test_an_mcap_file_has_the_schemas_and_times_that_foxglove_reads(tmp_path: Path) -> None:
+    from mcap.reader import make_reader
+
+    write(foxglove_target=str(tmp_path))
+    with (tmp_path / "ep0.mcap").open("rb") as file:
+        reader = make_reader(file)
+        summary = reader.get_summary()
+        assert summary is not None
+        [said] = reader.iter_metadata()
+        assert said.metadata == {"name": "ep0", "instruction": "stack the cups"}
+        names = {channel.topic: summary.schemas[channel.schema_id].name for channel in summary.channels.values()}
+        at = [message.log_time for _, _, message in reader.iter_messages("/state")]
+    assert (names["/cameras/front"], names["/log"]) == ("foxglove.CompressedImage", "foxglove.Log")
+    assert at == [round((1e9 + tick / 50) * 1e9) for tick in range(TICKS)]
+
+
+@pytest.mark.library("foxglove")
+def test_foxglove_may_connect_to_what_runs() -> None:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    [viewer] = open_viewers(None, f"ws://127.0.0.1:{port}")
+    with viewer, viewer.episode("ep0"):
+        socket.create_connection(("127.0.0.1", port), 30).close()
+        with pytest.raises(ConfigError, match=f"cannot listen at ws://127.0.0.1:{port}"):
+            open_viewers(None, f"ws://127.0.0.1:{port}")
+        viewer.add(frame(0))
+    assert (viewer.episodes, viewer.error) == (1, None)
+
+
+@pytest.mark.library("rerun")
+def test_a_live_viewer_of_rerun_has_to_run() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))  # and does not listen
+        with pytest.raises(ConfigError, match=r"no viewer listens at rerun\+http.*start it with `rerun`"):
+            open_viewers(f"rerun+http://127.0.0.1:{taken.getsockname()[1]}/proxy")
+
+
+@pytest.mark.parametrize(("viewer", "target"), [("rerun", "ws://127.0.0.1:1"), ("foxglove", "rerun+http://host/proxy")])
+def test_the_address_of_something_else_is_refused(viewer: str, target: str) -> None:
+    with pytest.raises(ConfigError, match=f"{viewer}: got '{target.replace('+', '.')}', want a folder, 'live', or"):
+        open_viewers(**{f"{viewer}_target": target})
+
+
+@pytest.mark.parametrize("name", ["rerun", "foxglove"])
+def test_a_viewer_that_is_not_installed_names_its_extra(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(MissingDependency, match=rf"pip install 'vlagents-ray\[{name}\]'"):
+        open_viewers(**{f"{name}_target": str(tmp_path)})

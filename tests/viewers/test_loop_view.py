@@ -1,0 +1,106 @@
+"""A run of the control loop in viewers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from viewer_files import read_mcap, read_rrd
+
+from vlagents_ray import Act, ActionSpec, Agent, Contract, Obs
+from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.robot import run_loop
+from vlagents_ray.robot.simulated import SimulatedRobot
+from vlagents_ray.viewers import EpisodeViewer, ViewerFrame, open_viewers
+
+HZ, ROWS, TICKS = 100.0, 4, 10
+
+
+class Counting(Agent):
+    """Chunks whose rows are numbered through."""
+
+    contract = Contract(action=ActionSpec(dim=2, delta=False), chunk=ROWS)
+    asked = 0
+
+    def act(self, obs: Obs) -> Act:
+        first = ROWS * self.asked
+        self.asked += 1
+        rows = np.stack([np.arange(first, first + ROWS), np.zeros(ROWS)], axis=1)
+        return Act(rows.astype(np.float32), info={"timing": {"round_trip_ms": 2.5}})
+
+
+class Kept:
+    """A target that keeps its frames."""
+
+    name, target, closing_s = "kept", "here", None
+
+    def __init__(self) -> None:
+        self.frames: list[ViewerFrame] = []
+
+    def begin(self, name: str, instruction: str) -> Kept:
+        return self
+
+    def write(self, frame: ViewerFrame) -> None:
+        self.frames.append(frame)
+
+    def close(self) -> None:
+        pass
+
+
+def run(viewers: list[EpisodeViewer]) -> None:
+    agent = Counting()
+    player = ChunkPlayer(agent, mode="open_loop")
+    run_loop(SimulatedRobot(agent.contract), player, hz=HZ, seconds=TICKS / HZ, instruction="count", viewers=viewers)
+
+
+def test_each_tick_is_shown_with_what_was_planned_and_executed() -> None:
+    target = Kept()
+    with EpisodeViewer(target) as viewer:
+        run([viewer])
+    frames = target.frames
+    assert len(frames) > 2 * ROWS  # a busy machine may miss a tick
+    executed = [float(frame.executed[0]) for frame in frames]
+    assert executed == list(range(len(frames)))
+    assert [float(frame.planned[0]) for frame in frames] == executed
+    begins = [i for i, frame in enumerate(frames) if frame.chunk is not None]
+    assert begins == list(range(0, len(frames), ROWS))
+    assert [frames[i].chunk[:, 0].tolist() for i in begins] == [[i, i + 1, i + 2, i + 3] for i in begins]
+    assert {frame.numbers["round_trip_ms"] for frame in frames} == {2.5}
+    assert {frame.numbers["safe"] for frame in frames} == {0.0}
+    assert all(frame.numbers["work_ms"] > 0 for frame in frames)
+    ticks = [frame.tick for frame in frames]
+    assert ticks == sorted(set(ticks))
+
+
+def test_an_action_without_a_plan_is_shown_too() -> None:
+    target = Kept()
+    with EpisodeViewer(target) as viewer:
+        one = Contract(action=ActionSpec(dim=2, delta=False))
+
+        class Single(Agent):
+            contract = one
+
+            def act(self, obs: Obs) -> Act:
+                return Act(np.zeros(2, np.float32))
+
+        run_loop(SimulatedRobot(one), Single(), hz=HZ, seconds=TICKS / HZ, viewers=[viewer])
+    assert {frame.planned is None for frame in target.frames} == {True}
+    assert {tuple(frame.executed) for frame in target.frames} == {(0.0, 0.0)}
+
+
+@pytest.mark.library("rerun")
+@pytest.mark.library("foxglove")
+@pytest.mark.library("mcap")
+def test_both_viewers_get_the_run(tmp_path: Path) -> None:
+    viewers = open_viewers(str(tmp_path), str(tmp_path))
+    run(viewers)
+    for viewer in viewers:
+        viewer.close()
+    [rrd], [mcap] = tmp_path.glob("*.rrd"), tmp_path.glob("*.mcap")
+    shown = read_rrd(rrd)
+    assert shown["instruction"] == {None: "count"}
+    executed = [values[0] for _, values in sorted(shown["action/executed"].items())]
+    assert executed == list(range(len(executed)))
+    assert [message["executed"][0] for message in read_mcap(mcap)["/action"]] == executed
+    assert rrd.stem == mcap.stem

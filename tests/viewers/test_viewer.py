@@ -1,0 +1,123 @@
+"""A viewer never delays what it shows, whatever becomes of its disk, or of the other side."""
+
+from __future__ import annotations
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from vlagents_ray import Obs
+from vlagents_ray.viewers import EpisodeViewer, ViewerFrame
+
+FRAMES = 8
+
+
+class Slow:
+    """A target that writes nothing until `go` is set."""
+
+    name, target, closing_s = "slow", "nowhere", None
+
+    def __init__(self, *, broken_at: int | None = None, going: bool = True, closing_s: float | None = None) -> None:
+        self.go = threading.Event()
+        self.taken = threading.Event()  # a frame is being written
+        self.broken_at = broken_at
+        self.closing_s = closing_s
+        self.episodes: list[tuple[str, str]] = []
+        self.written: list[int] = []
+        self.closed: list[str] = []
+        if going:
+            self.go.set()
+
+    def begin(self, name: str, instruction: str) -> Slow:
+        self.episodes.append((name, instruction))
+        return self
+
+    def write(self, frame: ViewerFrame) -> None:
+        self.taken.set()
+        assert self.go.wait(60)
+        if frame.tick == self.broken_at:
+            raise OSError("no space left")
+        self.written.append(frame.tick)
+
+    def close(self) -> None:
+        self.closed.append("episode" if len(self.closed) < len(self.episodes) else "target")
+
+
+def test_frames_beyond_the_queue_are_dropped_and_counted_and_none_waits() -> None:
+    target = Slow(going=False)
+    with EpisodeViewer(target, frames=FRAMES) as viewer:
+        with viewer.episode("one"):
+            viewer.add(ViewerFrame(0, 0.0))
+            assert target.taken.wait(60)
+            for tick in range(1, 1000):  # the writer stands still: had `add` waited, the test would hang
+                viewer.add(ViewerFrame(tick, 0.0))
+            assert not viewer.has_room
+            target.go.set()
+        assert viewer.dropped == 1000 - FRAMES
+    assert target.written == list(range(FRAMES))
+
+
+def test_every_frame_of_an_episode_is_written_in_order_before_it_is_closed() -> None:
+    target = Slow()
+    with EpisodeViewer(target, frames=1000) as viewer:
+        for name in ("one", "two"):
+            with viewer.episode(name, "stack"):
+                for tick in range(50):
+                    viewer.add(ViewerFrame(tick, 0.0))
+    assert target.episodes == [("one", "stack"), ("two", "stack")]
+    assert target.written == [*range(50), *range(50)]
+    assert target.closed == ["episode", "episode", "target"]
+    assert (viewer.episodes, viewer.dropped, viewer.error) == (2, 0, None)
+
+
+def test_an_error_ends_what_is_shown_of_an_episode_and_the_next_one_is_shown(caplog: pytest.LogCaptureFixture) -> None:
+    target = Slow(broken_at=3)
+    with EpisodeViewer(target, frames=1000) as viewer:
+        with viewer.episode("one"):
+            for tick in range(6):
+                viewer.add(ViewerFrame(tick, 0.0))
+        with viewer.episode("two"):
+            viewer.add(ViewerFrame(7, 0.0))
+    assert target.written == [0, 1, 2, 7]
+    assert (viewer.episodes, str(viewer.error)) == (1, "no space left")
+    assert "episode one is not shown: no space left" in caplog.text
+    assert "stopped by OSError: no space left" in viewer.report()
+    assert viewer.has_room
+
+
+def test_an_episode_that_cannot_be_closed_does_not_take_the_next_one_with_it() -> None:
+    class Unclosable(Slow):
+        def close(self) -> None:
+            super().close()
+            if len(self.closed) == 1:
+                raise OSError("no space left")
+
+    target = Unclosable()
+    with EpisodeViewer(target) as viewer:
+        for name in ("one", "two"):
+            with viewer.episode(name):
+                viewer.add(ViewerFrame(0, 0.0))
+    assert (target.written, viewer.episodes, str(viewer.error)) == ([0, 0], 1, "no space left")
+
+
+def test_the_end_of_a_live_viewer_that_takes_nothing_more_is_not_waited_for() -> None:
+    target = Slow(going=False, closing_s=0.05)
+    viewer = EpisodeViewer(target)
+    with viewer.episode("one"):
+        viewer.add(ViewerFrame(0, 0.0))
+    begun = time.monotonic()
+    viewer.close()
+    assert time.monotonic() - begun < 30
+    assert isinstance(viewer.error, TimeoutError)
+    target.go.set()
+
+
+def test_a_frame_is_a_copy_of_the_observation() -> None:
+    image, joints = np.full((4, 4, 3), 7, np.uint8), np.ones(2, np.float32)
+    frame = ViewerFrame.of(Obs({"front": image}, 0.25, {"joints": joints}, {"captured_at": 5.0}), 3)
+    image[:], joints[:] = 0, 0
+    assert (frame.tick, frame.time) == (3, 5.0)
+    assert frame.cameras["front"].min() == 7
+    assert {name: part.tolist() for name, part in frame.state.items()} == {"joints": [1, 1], "gripper": [0.25]}

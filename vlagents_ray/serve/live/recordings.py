@@ -1,0 +1,158 @@
+"""Shows the episodes of a replica's sessions in viewers, from what its tap keeps."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from vlagents_ray.naming import plain
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.live.tap import Answer, LiveTap, Seen
+from vlagents_ray.viewers.frame import ViewerFrame
+from vlagents_ray.viewers.targets import dated_name, open_target
+from vlagents_ray.viewers.viewer import EpisodeFormat, ViewerEpisode
+
+logger = logging.getLogger(__name__)
+
+_SHOWN_OPS = ("act", "reset")
+_PERIOD_S = 0.05
+_SHARE = 0.1  # of a core, at most
+_NICE = 5  # the thread runs after the policy's
+_CLOSING_S = 5.0
+_NAME = 8  # characters of a session's id in the name of a file: whoever lists the folder does not learn it
+
+
+@dataclass(slots=True)
+class _SessionEpisode:
+    writers: list[ViewerEpisode]
+    seen: int  # number of the last observation that was shown
+    acts: int = 0
+
+
+class SessionRecordings:
+    """Writes an episode for each `reset` of a session, until the next one or the session's end.
+
+    One thread reads the tap twenty times a second, and writes every answer with its chunk and times, ten of them a
+    second with the states and pictures that they answer. It takes at most a tenth of a core; when that is too little,
+    what the tap no longer has is not shown.
+    """
+
+    def __init__(self, engine: Engine, tap: LiveTap, targets: Mapping[str, str]) -> None:
+        """Show the sessions of `engine` at `targets`: the folder or the address, by the name of the viewer."""
+        self._engine = engine
+        self._tap = tap
+        self._targets = targets
+        self._formats: list[EpisodeFormat] = []
+        self._episodes: dict[str, _SessionEpisode] = {}  # by session
+        self._since = 0  # number of the last answer that was read
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def open(self) -> None:
+        """Begin to write, if there is a target.
+
+        Raises:
+            ConfigError: A target is the address of something else, or nothing listens there.
+            MissingDependency: A viewer's extra is not installed.
+        """
+        self._formats = [open_target(name, target) for name, target in self._targets.items()]
+        if self._formats:
+            self._thread = threading.Thread(target=self._run, name="vlagents-ray-recordings", daemon=True)
+            self._thread.start()
+
+    def close(self) -> None:
+        """Finish all episodes."""
+        self._stop.set()
+        if self._thread is not None:
+            self._thread.join(_CLOSING_S)  # a live viewer that is gone may hold it up
+
+    def _poll(self) -> None:
+        """Write what happened since the last call."""
+        self._tap.renew()
+        answers: dict[str, list[Answer]] = defaultdict(list)
+        for answer in self._tap.answers(self._since):
+            self._since = answer.number
+            if answer.op in _SHOWN_OPS:
+                answers[answer.session].append(answer)
+        sessions = {session.id: session.instruction for session in self._engine.sessions.all()}
+        for name, [*earlier, last] in answers.items():
+            for answer in earlier:
+                self._write(name, sessions.get(name), answer, None)
+            self._write(name, sessions.get(name), last, self._tap.seen(name))
+        for name in self._episodes.keys() - sessions.keys():
+            self._end(name)
+
+    def _write(self, name: str, instruction: str | None, answer: Answer, seen: Seen | None) -> None:
+        episode = self._episodes.get(name)
+        if episode is None and answer.reply.error is not None:  # there is no such session, maybe
+            return
+        shown = 0 if episode is None else episode.seen
+        if seen is not None and seen.number <= shown:
+            seen = None
+        if episode is None or (answer.op == "reset" and answer.reply.error is None):
+            self._end(name)
+            episode = self._episodes[name] = _SessionEpisode(self._begun(name, instruction), shown)
+        frame = _frame(episode, answer, seen)
+        for writer in list(episode.writers):
+            try:
+                writer.write(frame)
+            except Exception as error:  # noqa: BLE001 - the server goes on without this recording
+                logger.warning("session %s: the rest of its episode is not recorded: %s", name, error)
+                episode.writers.remove(writer)
+
+    def _begun(self, name: str, instruction: str | None) -> list[ViewerEpisode]:
+        file = f"{dated_name()}_{plain(name)[:_NAME]}"
+        try:
+            return [one.begin(file, instruction or "") for one in self._formats]
+        except Exception as error:  # noqa: BLE001 - likewise
+            logger.warning("session %s: its episode is not recorded: %s", name, error)
+            return []
+
+    def _end(self, name: str) -> None:
+        episode = self._episodes.pop(name, None)
+        for writer in () if episode is None else episode.writers:
+            try:
+                writer.close()
+            except Exception as error:  # noqa: BLE001 - likewise
+                logger.warning("session %s: the recording of its episode is not whole: %s", name, error)
+
+    def _run(self) -> None:
+        with contextlib.suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICE)
+        pause_s = _PERIOD_S
+        while not self._stop.wait(pause_s):
+            begun = time.thread_time()
+            self._poll()
+            pause_s = max(_PERIOD_S, (time.thread_time() - begun) / _SHARE)
+        self._poll()
+        for name in list(self._episodes):
+            self._end(name)
+        for one in self._formats:
+            one.close()
+
+
+def _frame(episode: _SessionEpisode, answer: Answer, seen: Seen | None) -> ViewerFrame:
+    """Return what an answer shows, with the observation if it is a new one; count them in the episode."""
+    act, error = answer.reply.act, answer.reply.error
+    rows = None if act is None else np.asarray(act.rows(), np.float32)
+    frame = ViewerFrame(
+        tick=episode.acts,
+        time=time.time(),
+        files={} if seen is None else seen.pictures(),
+        state={} if seen is None else seen.state,
+        planned=None if rows is None else rows[0],
+        chunk=rows,
+        numbers=dict(answer.reply.timing),
+        note="" if error is None else f"{error.code}: {error}",
+    )
+    episode.acts += act is not None
+    episode.seen = episode.seen if seen is None else seen.number
+    return frame
