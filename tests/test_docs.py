@@ -95,8 +95,9 @@ def test_the_file_of_runs_behind_the_reports_picture_is_accepted() -> None:
     assert [policy.source for policy in config.policies] == ["learner:Learner", "scripted", "random"]
 
 
-def test_files_of_runs_on_the_benchmarks_pages_and_on_placement_are_accepted() -> None:
-    pages = [*sorted((DOCS / "benchmarks").glob("*.md")), DOCS / "cluster" / "placement.md"]
+def test_files_of_runs_on_the_pages_are_accepted() -> None:
+    others = [DOCS / "cluster" / "placement.md", DOCS / "evaluation" / "robot.md"]
+    pages = [*sorted((DOCS / "benchmarks").glob("*.md")), *others]
     blocks = [
         block for page in pages for block in re.findall(r"```yaml\n(policies:.*?)```", page.read_text(), re.DOTALL)
     ]

@@ -14,14 +14,16 @@ from pydantic_core import PydanticUndefined
 from vlagents_ray.cli.evaluation.command import read_run
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig
 from vlagents_ray.evaluate.plan.cases import expand
-from vlagents_ray.evaluate.plan.config import ClockConfig, StopConfig, TrackingConfig
+from vlagents_ray.evaluate.plan.config import ClockConfig, RobotConfig, RobotTask, StopConfig, TrackingConfig
 from vlagents_ray.registry import env_suite, names
 from vlagents_ray.serve.launch.deployment_file import read_deployment
 
 ROOT = Path(__file__).parents[1]
 FILES = sorted((ROOT / "evaluations").glob("*.yaml"))
 PAGE = (ROOT / "docs" / "evaluation" / "running.md").read_text()
-MODELS = [EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig, ClockConfig, StopConfig, TrackingConfig]
+MODELS = [
+    EvalConfig, PolicyConfig, SuiteConfig, WorkerConfig, ClockConfig, StopConfig, TrackingConfig, RobotConfig, RobotTask
+]  # fmt: skip
 CAMERAS = {"libero": {"front", "wrist"}, "simpler": {"3rd_view_camera"}, "tabletop": {"front"}}
 # Of models that are not told which camera is which.
 WITHOUT_WORDS = {"openpi": {"image": "front", "wrist_image": "wrist"}, "openvla": {"image": "front"}, "lerobot": {}}

@@ -17,10 +17,12 @@ from vlagents_ray import registry
 MODULES = (
     "vlagents_ray",
     "vlagents_ray.robot",
+    "vlagents_ray.robot.teleoperation",
     "vlagents_ray.viewers",
     "vlagents_ray.testing",
     "vlagents_ray.envs",
     "vlagents_ray.evaluate",
+    "vlagents_ray.evaluate.robot",
     "vlagents_ray.learn",
 )
 UNFINISHED: tuple[str, ...] = ()

@@ -48,18 +48,20 @@ WANT = "want"  # in an observation: names of what the Act is to say beside the a
 BEHAVIOUR = "behaviour"  # in the Act: {name: number, or one for each row or token}, e.g. the action's "logprob", nats
 CAPTURED = "captured_at"  # in an observation: the time at which its first sensor was read, s since 1970 (`time.time`)
 DEADLINE = "deadline_ms"  # in an observation: the time after which `RemoteAgent` gives the request up, ms
-# Real-time chunking (Black, Galliker & Levine 2025, https://arxiv.org/abs/2506.07339), in an observation: the actions
-# that the robot executes during inference. The first DELAY rows of LEFTOVER will have been executed when the answer
-# arrives, so the new chunk begins with them; it should continue the later rows smoothly.
+# Real-time chunking (Black, Galliker & Levine 2025, https://arxiv.org/abs/2506.07339), in an observation: when the
+# answer arrives, DELAY rows of LEFTOVER have been executed; the new chunk begins with them, and continues the rest.
 LEFTOVER = "leftover_actions"  # (H', D) float32: the current plan from this observation's tick on
 DELAY = "delay_ticks"  # int: ticks until the answer arrives, the longest of the last ones; at most the rows of LEFTOVER
-# In the Act of a served policy: the weights that computed it, {"version": int, "fingerprint": str}. Version 0 is the
-# checkpoint that the server loaded, later ones were pushed; the replica computes the fingerprint from what it holds.
+EXECUTED = "executed_actions"  # in an observation, (N, D): others than the policy's, executed since the last request
+# In the Act of a served policy: its weights, {"version": int, "fingerprint": str}. Version 0 is the loaded checkpoint.
 POLICY = "policy"
 # In the Act of a chunk player:
 SAFE = "safe"  # str: the reason why this is the safe action; absent if the action is the policy's
+INTERVENTION = "intervention"  # True: a human's action; absent if it is not
+WANTED = "policy_action"  # (D,) float32: what the policy wanted in place of the human's action; absent if unknown
 AGE = "age_ticks"  # int: ticks since the observation from which the action was computed
 PLANNED = "planned"  # (H, D) float32: the chunk that the action comes from; `chunk` and `row` are its number and row
+AGE_MS = "age_ms"  # float: the same in ms, from its capture until the player returned the action
 SILENT = "silent_s"  # float: seconds since the oldest unanswered request, retries included; 0.0 if there is none
 
 

@@ -76,6 +76,7 @@ _EXTRAS = {
     "gymnasium": "sim",
     "av": "record",
     "pyarrow": "record",
+    "pyspacemouse": "spacemouse",
     "mani_skill": "maniskill",
     "sapien": "maniskill",
     "transforms3d": "maniskill",

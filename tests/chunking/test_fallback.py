@@ -56,6 +56,14 @@ def test_what_is_made_from_the_last_action_wants_one() -> None:
     assert SafeAction(LAST, ActionSpec())(Obs(), None).tolist() == LAST.tolist()
 
 
+def test_before_the_first_action_a_gripper_is_kept_as_it_is_measured() -> None:
+    spec = ActionSpec(dim=3, delta=True, gripper_open=1.0, gripper_closed=-1.0)
+    assert SafeAction("auto", spec)(Obs(gripper=0.75), None).tolist() == [0, 0, 0.5]
+    for unknown, obs in ((spec, Obs()), (ActionSpec(dim=3, delta=True, gripper_open=1.0), Obs(gripper=1.0))):
+        with pytest.raises(InvalidAction, match="before the first action"):
+            SafeAction("auto", unknown)(obs, None)
+
+
 def test_an_action_of_ones_own_is_taken_as_it_is() -> None:
     home = np.array([1.0, 2.0, 3.0])
     own: list[Safe] = [home, lambda obs: obs.state["joints"]]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import inspect
+import socket
 import sqlite3
 from contextlib import closing
 from pathlib import Path
@@ -15,6 +16,7 @@ from typer.testing import CliRunner
 
 import vlagents_ray.evaluate
 from vlagents_ray.cli.evaluation import command, policies, run, watch
+from vlagents_ray.cli.evaluation.live import live_address
 from vlagents_ray.cli.main import app
 from vlagents_ray.evaluate import EvalConfig, OutOfTime, PolicyConfig, Results, SuiteConfig, WorkerConfig
 from vlagents_ray.evaluate.episode.failures import Failure
@@ -58,7 +60,7 @@ def test_a_checkpoint_may_count_at_once_and_the_first_step_be_the_last(
     words = [*WORDS, "--out", str(tmp_path / "out"), "--watch", str(tmp_path), "--settle", "0", "--until", "0"]
     done = CliRunner().invoke(app, words)
     assert done.exit_code == 0, done.output
-    assert seen == [{"settle_s": 0.0, "until": 0}]
+    assert seen == [{"settle_s": 0.0, "until": 0, "live": None}]
 
 
 def test_out_of_time_has_an_exit_status_of_its_own(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -194,6 +196,39 @@ def test_each_option_that_is_a_setting_is_one_of_a_single_model() -> None:
         "end_at",
         "replica_per_gpu",
         "address",
+        "live",
+        "live_at",
+        "arm",
+        "operator",
+        "unblind",
     }
     assert {option for option, found in places.items() if len(found) != 1} == of_the_run_itself
     assert all(not places[option] for option in of_the_run_itself)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--live-at", "8050"], "want HOST:PORT"),
+        (["--live-at", "127.0.0.1:many"], "want HOST:PORT"),
+        (["--live-at", "0.0.0.0:8050"], "whoever reaches it would see all cameras"),
+        (["--live", "--dry-run"], "nothing is played"),
+    ],
+)
+def test_a_page_that_cannot_be_is_told_before_anything_starts(
+    words: list[str], said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(policies, "running_server", lambda *_, **__: pytest.fail("started a server"))
+    words = ["eval", "tabletop", "--policy", "scripted", "--out", str(tmp_path / "out"), *words]
+    done = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
+    assert done.exit_code == 2, done.output
+    assert said in " ".join(done.stderr.split())
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_page_has_a_port_of_its_own_if_another_has_the_usual_one() -> None:
+    assert live_address("[::1]:9000") == ("::1", 9000)
+    with closing(socket.socket()) as taken:
+        with contextlib.suppress(OSError):  # it may be taken already
+            taken.bind(("127.0.0.1", 8050))
+        assert live_address(None) == ("127.0.0.1", 0)

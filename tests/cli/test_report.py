@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
+from eval_fakes import wait_for
+from live_server import LivePage
 from recorded_results import record, runs
 from typer.testing import CliRunner, Result
 
@@ -41,3 +46,21 @@ def test_a_folder_without_results_is_refused(tmp_path: Path) -> None:
     done = report(str(tmp_path))
     assert done.exit_code == 2
     assert "want a folder that an evaluation wrote its results to" in done.stderr
+
+
+def test_results_that_another_process_writes_are_watched_until_ctrl_c(tmp_path: Path) -> None:
+    record(runs(tmp_path / "out", episodes=2))
+    page = LivePage()
+    command = [Path(sys.executable).parent / "vlagents-ray", "report", tmp_path / "out", "--live-at", page.address]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as watching:
+        wait_for(lambda: page.evaluation() or watching.poll() is not None)
+        said = page.evaluation()
+        watching.send_signal(signal.SIGINT)
+        printed, _ = watching.communicate(timeout=60)
+    assert (watching.returncode, printed) == (0, f"live: {page.url}/live\n")
+    assert (said["state"], said["done"], len(said["cells"])) == ("complete", 18, 9)
+    assert not (tmp_path / "out" / "report.html").exists()
+
+
+def test_one_folder_is_watched_at_a_time(tmp_path: Path) -> None:
+    assert "want one OUT" in report(str(tmp_path), str(tmp_path), "--live").stderr

@@ -15,7 +15,7 @@ from vlagents_ray.cli.evaluation import watch
 from vlagents_ray.cli.evaluation.policies import resolve_policies
 from vlagents_ray.cli.evaluation.watch import _watched, watch_training
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.evaluate import EvalConfig, Results, Summary
+from vlagents_ray.evaluate import EvalConfig, Progress, Results, Summary
 from vlagents_ray.evaluate.episode.records import EpisodeResult, Status
 from vlagents_ray.evaluate.plan.jobs import plan
 from vlagents_ray.evaluate.results.store import Store
@@ -66,7 +66,7 @@ def test_an_episode_lost_in_any_round_ends_watching_with_status_1_and_no_round_e
     config = EvalConfig.model_validate({"policies": [SWEPT], "suites": [{"envs": [LINE]}], "out": tmp_path / "o"})
     played: list[list[int]] = []
 
-    def play(config: EvalConfig) -> Summary:
+    def play(config: EvalConfig, _progress: Progress) -> Summary:
         played.append(config.policies[0].steps)
         with Store(config) as store:
             store.begin_run(config, {})

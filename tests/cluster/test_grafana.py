@@ -14,6 +14,7 @@ from vlagents_ray.errors import BY_CODE
 from vlagents_ray.interface import Agent
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.replica import metrics
+from vlagents_ray.serve.shadow.comparer import Comparer
 
 ROOT = Path(__file__).parents[2]
 DASHBOARD = json.loads((ROOT / "cluster/grafana/policy_server.json").read_text())
@@ -30,7 +31,7 @@ class Series(NamedTuple):
 
 @pytest.fixture(scope="module")
 def exported() -> dict[str, Series]:
-    """The series that the exporter of a replica declares, by the name that Prometheus reads."""
+    """The series that the exporters of a replica and of a candidate declare, by the name that Prometheus reads."""
     series = {}
 
     def declared(kind: str) -> Any:
@@ -50,6 +51,7 @@ def exported() -> dict[str, Series]:
             patch.setattr(metrics, kind, declared(kind))
         engine = Engine(Agent())
         metrics.Exporter(engine, dict.fromkeys(TAGS, "x"))
+        metrics.ShadowExporter(Comparer(None, "x"), dict.fromkeys(TAGS, "x"))
         engine.close()
     return series
 

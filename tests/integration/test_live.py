@@ -10,9 +10,11 @@ from contextlib import ExitStack, closing
 import numpy as np
 import pytest
 from live_server import ask
+from websockets.sync.client import connect
 
 from tests.integration.conftest import serving
 from vlagents_ray import Obs, RemoteAgent
+from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.transports.websocket import open_websocket
 from vlagents_ray.serve.launch.server import Server
@@ -56,3 +58,30 @@ def test_the_page_is_there(server: Server) -> None:
         assert b"/v1/live" in answer.read()
     with urllib.request.urlopen(f"{server.url}/v1/live", timeout=10) as answer:
         assert len(json.load(answer)["replicas"]) == 2
+
+
+def test_a_command_reaches_the_session_whichever_replica_it_is_at(server: Server) -> None:
+    with ExitStack() as stack:
+        inboxes, agents = [CommandInbox() for _ in range(4)], []
+        for inbox in inboxes:
+            agents.append(stack.enter_context(RemoteAgent(server.url, transport="websocket", commands=inbox)))
+            agents[-1].reset(Obs(), "wait")
+        with urllib.request.urlopen(f"{server.url}/v1/live", timeout=10) as answer:
+            sessions = {one["id"] for replica in json.load(answer)["replicas"] for one in replica["sessions"]}
+        for session in sessions:
+            body = json.dumps({"session": session, "do": "stop"}).encode()
+            headers = {"content-type": "application/json"}
+            request = urllib.request.Request(f"{server.url}/v1/live/command", body, headers)
+            with urllib.request.urlopen(request, timeout=10) as answer:
+                assert json.load(answer)["state"] == "waiting"
+        for agent in agents:
+            agent.act(Obs())
+        assert [[one.do for one in inbox.waiting] for inbox in inboxes] == [["stop"]] * 4
+
+
+def test_its_messages_are_not_compressed_again(server: Server) -> None:
+    with connect(f"{server.url.replace('http', 'ws')}/v1/live", proxy=None, compression="deflate") as socket:
+        assert socket.request is not None
+        assert "permessage-deflate" in socket.request.headers["sec-websocket-extensions"]
+        assert socket.response is not None
+        assert "sec-websocket-extensions" not in socket.response.headers

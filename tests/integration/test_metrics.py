@@ -10,8 +10,8 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-import ray
 from eval_fakes import wait_for
+from prometheus_series import scrape
 
 from tests.integration.conftest import serving
 from vlagents_ray import Obs, RemoteAgent
@@ -19,7 +19,15 @@ from vlagents_ray.serve.launch.server import Server
 
 ACTS = 30
 DASHBOARD = Path(__file__).parents[2] / "cluster/grafana/policy_server.json"
-NOT_YET = {"vlagents_hung_calls_total", "vlagents_weight_push_ms_bucket"}  # no call hung, no weights were pushed
+NOT_YET = {  # no call hung, no weights were pushed, there is no shadow
+    "vlagents_hung_calls_total",
+    "vlagents_weight_push_ms_bucket",
+    "vlagents_shadow_difference_bucket",
+    "vlagents_shadow_dropped_total",
+    "vlagents_shadow_joint_difference",
+    "vlagents_shadow_latency_ms_bucket",
+    "vlagents_shadow_observations_total",
+}
 STAGES = ("decode", "queue", "inference", "encode")
 
 
@@ -33,18 +41,12 @@ def server() -> Iterator[Server]:
 
 def scraped() -> dict[str, float]:
     """Our series of the node: name and tags, sorted, to value."""
-    (node,) = ray.nodes()
-    url = f"http://{node['NodeManagerAddress']}:{node['MetricsExportPort']}/metrics"
-    with urllib.request.urlopen(url, timeout=10) as answer:
-        text = answer.read().decode()
     found = {}
-    for name, tags, value in re.findall(r"^ray_(vlagents_\w+)\{(.*)\} (\S+)$", text, re.MULTILINE):
-        assert 'application="noop"' in tags
-        assert 'deployment="Policy"' in tags
-        assert 'policy="noop"' in tags
-        assert re.search(r'replica="\w+"', tags)
-        own = sorted(re.findall(r'(op|transport|class|code|stage|le)="([^"]*)"', tags))
-        found[" ".join([name, *(f"{key}={tag}" for key, tag in own)])] = float(value)
+    for one in scrape():
+        assert one.tags["application"] == one.tags["policy"] == "noop"
+        assert one.tags["deployment"] == "Policy"
+        assert one.tags["replica"]
+        found[one.key("op", "transport", "class", "code", "stage", "le")] = one.value
     return found
 
 

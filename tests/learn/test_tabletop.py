@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import subprocess
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, get_args
@@ -14,6 +15,7 @@ from typing import Any, get_args
 import numpy as np
 import pytest
 from eval_fakes import wait_for
+from live_server import LivePage
 from ray_processes import end, processes, ray_folder
 from tabletop_runs import ended, start_run, table
 
@@ -281,6 +283,24 @@ def test_killed_replicas_and_workers_change_nothing(folder: Path, undisturbed: d
         killed.touch()
         assert "once more, as the policy was restarted" in ended(run, folder)
     assert table(out) == undisturbed
+
+
+@pytest.mark.server
+@pytest.mark.torch
+@pytest.mark.slow
+def test_a_run_is_watched_while_it_learns_and_gets_the_same_table(
+    folder: Path, undisturbed: dict[str, Any], tmp_path: Path
+) -> None:
+    page, seen, states = LivePage(), set[int](), set[str]()
+    with start_run(folder, tmp_path / "run", "--live-at", page.address) as run:
+        while run.poll() is None:
+            seen |= set(page.steps())
+            states |= {page.evaluation().get("state", "")}
+            time.sleep(0.2)
+        assert f"live: {page.url}/live" in ended(run, folder)
+    assert table(tmp_path / "run") == undisturbed
+    assert {300, 400} <= seen  # those that are evaluated
+    assert "waiting" in states
 
 
 # A run that waits when the replica of `rpd` holds the weights of its second iteration, before episodes are played.

@@ -14,9 +14,11 @@ import termios
 import threading
 import time
 import weakref
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from vlagents_ray import Act, ActionSpec, Agent, CameraSpec, ConfigError, Contract, Obs, PolicyFailed, StateSpec
@@ -622,6 +624,19 @@ def test_a_run_of_safe_actions_does_not_look_like_success(
     assert (said.out + said.err + caplog.text).count("--deadline-ms") == 1
 
 
+def test_the_command_lets_a_human_take_over_and_records_that(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setattr("vlagents_ray.robot.__main__.RemoteAgent", Served)
+    monkeypatch.setattr(Served, "contract", Contract(action=ActionSpec(dim=2, delta=False)))
+    assert main([*SHORT, "--leader", "scripted_leader:HoldingLeader", "--record", str(tmp_path)]) == 0
+    said = capsys.readouterr().out
+    ticks = int(re.search(r"a human moved the robot: (\d+)", said)[1])  # type: ignore[index]
+    rows = pq.read_table(tmp_path / "data/chunk-000/file-000.parquet").to_pydict()
+    assert rows["intervention"] == [True] * ticks
+    assert rows["action"] == [[0.25, 0.25]] * ticks
+
+
 def test_a_setting_that_does_not_fit_is_refused_before_anything_is_timed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -645,6 +660,7 @@ def test_a_setting_that_does_not_fit_is_refused_before_anything_is_timed(
         (["--deadline-ms", "-1"], "argument --deadline-ms: got '-1', want a number from 0"),
         (["--silent-s", "soon"], "argument --silent-s: got 'soon', want a number above 0"),
         (["--mode", "open_loop", "--rtc"], "--merge and --rtc: got one of them with --mode open_loop"),
+        (["--leader", "elsewhere:Pedal"], "--leader elsewhere:Pedal: No module named 'elsewhere'; go to the folder of"),
         (["--robot", "elsewhere:Arm"], "--robot elsewhere:Arm: No module named 'elsewhere'; go to the folder of"),
     ],
 )

@@ -205,6 +205,8 @@ NOTHING_TO_DECODE = {
     "`POST /v1/probe`",
     "own port, another path",  # is refused
     "`WS /v1/weights`",  # is refused without the scope
+    "`POST /v1/live/command`",  # is refused without the scope
+    "`POST /v1/live/command`, scope `operate`",  # a name, a word and a text, in 16 KiB at most
     "`WS /v1/live`",  # is refused without the scope
     "`WS /v1/live`, scope `watch`",  # a viewer sends only names
 }

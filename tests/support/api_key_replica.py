@@ -531,6 +531,10 @@ def _read_pushed(data: bytes | str) -> str:
     return str(BY_CODE[answer["code"]].status) if "code" in answer else "done"
 
 
+def _press(mark: str) -> dict[str, str]:
+    return {"session": f"{mark.removeprefix('mark of ')}/robot-1", "do": "pause"}
+
+
 def _watch(_mark: str) -> bytes:
     return b'{"shown": []}'
 
@@ -582,6 +586,10 @@ WAYS: dict[str, Way] = {
     "`GET /live`": over_http("GET", "/live"),
     "`GET /v1/live`": over_http("GET", "/v1/live"),
     "`GET /v1/live`, scope `watch`": _with_scope("watch", over_http("GET", "/v1/live")),
+    "`POST /v1/live/command`": over_http("POST", "/v1/live/command", document=_press, session=True),
+    "`POST /v1/live/command`, scope `operate`": _with_scope(
+        "operate", over_http("POST", "/v1/live/command", document=_press, session=True)
+    ),
     "`WS /v1/live`": over_websocket("/v1/live", _watch, _read_seen),
     "`WS /v1/live`, scope `watch`": _with_scope("watch", over_websocket("/v1/live", _watch, _read_seen)),
     "own port": over_websocket("own", _stream_message, _read_reply),

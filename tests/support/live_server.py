@@ -1,11 +1,13 @@
-"""A server with the live page, without Ray, and a viewer of it."""
+"""A server with the live page, without Ray, and viewers: of it, and of the page of a command."""
 
 from __future__ import annotations
 
 import json
 import struct
+import urllib.error
+import urllib.request
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,12 +19,14 @@ from vlagents_ray.interface import Agent
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
 from vlagents_ray.serve.access.api_keys import Keys
+from vlagents_ray.serve.config.live import LiveArgs
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.live.endpoint import live_routes
 from vlagents_ray.serve.live.fleet import Fleet, OtherReplicas
 from vlagents_ray.serve.live.snapshot import ReplicaView
+from vlagents_ray.serve.ports import free_port
 
 METADATA = {
     "policy": "noop",
@@ -33,6 +37,44 @@ METADATA = {
     "local": None,
     "dialects": {},
 }
+
+
+class Address:
+    """An address of the web, as `browser.Page.open` takes files."""
+
+    def __init__(self, url: str) -> None:
+        self._url = url
+
+    def as_uri(self) -> str:
+        return self._url
+
+
+class LivePage:
+    """The page of a command that evaluates."""
+
+    def __init__(self) -> None:
+        self.address = f"127.0.0.1:{free_port()}"
+        self.url = f"http://{self.address}"
+
+    def document(self) -> dict[str, Any]:
+        """What it shows; {} while it is not there."""
+        with suppress(urllib.error.URLError, ConnectionError), urllib.request.urlopen(f"{self.url}/v1/live") as answer:
+            found: dict[str, Any] = json.load(answer)
+            return found
+        return {}
+
+    def evaluation(self) -> dict[str, Any]:
+        found: dict[str, Any] = self.document().get("evaluation", {})
+        return found
+
+    def steps(self) -> list[int]:
+        """Those in its learning curve."""
+        return [point["step"] for curve in self.evaluation().get("curves", []) for point in curve["points"]]
+
+    def text(self) -> bytes:
+        with urllib.request.urlopen(f"{self.url}/live") as answer:
+            text: bytes = answer.read()
+            return text
 
 
 @dataclass(frozen=True)
@@ -53,12 +95,17 @@ class LiveServer:
 
 @contextmanager
 def live_server(
-    agent: Agent | None = None, keys: Keys | None = None, others: OtherReplicas | None = None, *, insecure: bool = False
+    agent: Agent | None = None,
+    keys: Keys | None = None,
+    others: OtherReplicas | None = None,
+    *,
+    insecure: bool = False,
+    settings: LiveArgs | None = None,
 ) -> Iterator[LiveServer]:
     """A replica of `agent`, by default `noop`, until the end of the context."""
     engine = Engine(agent or Noop.from_config({}))
     engine.start()
-    view = ReplicaView(engine, "this", "here", lambda: METADATA)
+    view = ReplicaView(engine, "this", "here", lambda: METADATA, settings)
     fleet = Fleet(view, others)
     routes = live_routes(fleet, open_to_network=insecure)
     inside = build_http_app(engine, lambda: METADATA, DEFAULT_LIMITS, others=routes)

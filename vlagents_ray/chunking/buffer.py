@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
+import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
@@ -16,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from vlagents_ray.errors import ConfigError, PolicyFailed
-from vlagents_ray.interface import AGE, DELAY, LEFTOVER, PLANNED, SILENT, Act
+from vlagents_ray.interface import AGE, AGE_MS, DELAY, LEFTOVER, PLANNED, SILENT, Act
 
 Merge = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """(D,) of the older chunks and (D,) of a newer one -> (D,), for one tick."""
@@ -66,6 +67,7 @@ class Step(NamedTuple):
         chunk = self.chunk
         about = {
             AGE: tick - chunk.tick,
+            AGE_MS: (time.monotonic() - chunk.seen_at) * 1e3,
             "chunk": chunk.number,
             "row": self.row,
             PLANNED: chunk.rows,

@@ -30,8 +30,9 @@ class SafeAction:
 
     "hold" commands the last action again, which is right for absolute targets. "zero" commands no motion, which is
     right for deltas and velocities; the columns in `grippers` keep the last action's value, as 0 would half open a
-    gripper whose command is a position. "auto" chooses by the contract's `ActionSpec`. An array (D,), or a function of
-    the observation that returns one (for instance of the measured joints), is used unchanged.
+    gripper whose command is a position; before the first action, the last column gets the measured opening. "auto"
+    chooses by the contract's `ActionSpec`. An array (D,), or a function of the observation that returns one (for
+    instance of the measured joints), is used unchanged.
 
     Raises `ConfigError` where the choice would be a guess or would move the robot: a repeated delta continues the
     motion, and zeros as joint targets move the arm to its zero position. Only "hold" may be chosen where the contract
@@ -57,7 +58,7 @@ class SafeAction:
         else:
             self._make = safe if callable(safe) else np.asarray(safe, np.float32)
         self._grippers = list(grippers) if grippers is not None else [-1] if spec.gripper_open is not None else []
-        self._dim = spec.dim
+        self._spec = spec
         self.holds = spec.relative is False or (isinstance(safe, str) and safe == "hold")
         """Does the last action, commanded again, keep the robot where it is?"""
 
@@ -71,8 +72,8 @@ class SafeAction:
             return np.asarray(self._make(obs), np.float32)
         if isinstance(self._make, np.ndarray):
             return self._make.copy()
-        if last is None and self._make == "zero" and self._dim is not None and not self._grippers:
-            return np.zeros(self._dim, np.float32)
+        if last is None and self._make == "zero" and (first := self._first(obs)) is not None:
+            return first
         if last is None:
             raise InvalidAction(
                 f"safe: got {self._make!r} before the first action, which there is nothing to make from"
@@ -81,6 +82,19 @@ class SafeAction:
             return last.copy()
         action = np.zeros_like(last)
         action[self._grippers] = last[self._grippers]
+        return action
+
+    def _first(self, obs: Obs) -> np.ndarray | None:
+        """Return no motion with the gripper as it stands, (D,); None if the contract does not say enough for that."""
+        spec = self._spec
+        if spec.dim is None:
+            return None
+        action = np.zeros(spec.dim, np.float32)
+        if self._grippers:
+            ends = spec.gripper_closed, spec.gripper_open
+            if self._grippers != [-1] or obs.gripper is None or ends[0] is None or ends[1] is None:
+                return None
+            action[-1] = ends[0] + obs.gripper * (ends[1] - ends[0])
         return action
 
 

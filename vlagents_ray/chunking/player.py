@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import replace
-from typing import Any, Literal, get_args
+from typing import Any
 
 import numpy as np
 
@@ -15,17 +14,15 @@ from vlagents_ray.chunking.answer import LastAnswer
 from vlagents_ray.chunking.background import AsyncCaller, parts_of
 from vlagents_ray.chunking.buffer import DELAYS, ENSEMBLE, ENSEMBLE_M, ChunkBuffer, Merge, Step
 from vlagents_ray.chunking.capture_clock import CaptureClock, stamped
+from vlagents_ray.chunking.execution import PLAYED, Execution
 from vlagents_ray.chunking.fallback import LATE, OLD, STALE, STOPPED, WAITING, Safe, SafeAction
+from vlagents_ray.chunking.modes import Mode, require_settings
+from vlagents_ray.chunking.motion import Check, Motion
+from vlagents_ray.chunking.takeover import RELEASED, Leader, Takeover
 from vlagents_ray.contract import ActionSpec, Contract
-from vlagents_ray.errors import ConfigError, InvalidAction, InvalidInput, NotReset, VLAgentsError
+from vlagents_ray.errors import InvalidAction, InvalidInput, NotReset, VLAgentsError
 from vlagents_ray.interface import DEADLINE, SAFE, SILENT, Act, Agent, Obs, copied
 from vlagents_ray.validation import check_action
-
-Mode = Literal["open_loop", "ensemble", "async"]
-Check = Callable[[np.ndarray, "np.ndarray | None"], np.ndarray]
-"""The action and the one before it, (D,) each -> the action to be taken, or `InvalidAction`."""
-
-_Motion = Literal["stopped", "moving", "held"]
 
 
 class ChunkPlayer(Agent):
@@ -59,6 +56,9 @@ class ChunkPlayer(Agent):
         safe: Safe = "auto",
         grippers: Sequence[int] | None = None,
         check: Check | None = None,
+        override: Leader | None = None,
+        ask_for_help: float | None = None,
+        samples: int | None = None,
     ) -> None:
         """Play the chunks of a policy.
 
@@ -84,19 +84,15 @@ class ChunkPlayer(Agent):
                 policy's that it refuses the safe one is taken, and the plan is dropped; in place of a safe one the last
                 action, if that keeps the robot still; else `act` raises `InvalidAction`. It gets the last action, too;
                 a `Guard` with `measure` takes the measured pose where there is none, and after safe actions.
+            override: What a human moves the robot with. While it is engaged, `act` returns its actions with
+                `info["intervention"]` and, where known, `info["policy_action"]`. They pass `check`, too.
+            ask_for_help: The uncertainty above which the robot pauses (see `vlagents_ray.chunking.takeover`).
+            samples: The number of samples to ask for, from whose spread a policy's uncertainty is computed.
 
         Raises:
             ConfigError: Settings do not go together.
         """
-        if mode not in get_args(Mode):
-            raise ConfigError(f"mode: got {mode!r}, want one of {list(get_args(Mode))}")
-        for name, value in (("execute", execute), ("horizon", horizon)):
-            if value is not None and value < 1:
-                raise ConfigError(f"{name}: got {value}, want at least 1, or None")
-        if max_age_s is not None and not max_age_s > 0:
-            raise ConfigError(f"max_age_s: got {max_age_s}, want above 0, or None")
-        if mode != "async" and (merge != "newest" or real_time_chunking):
-            raise ConfigError(f"merge and real_time_chunking: got them with mode {mode!r}, want mode='async'")
+        require_settings(mode, execute, horizon, max_age_s, merge, real_time_chunking)
         self._agent = agent
         self._mode: Mode = mode
         self._execute = execute
@@ -105,6 +101,7 @@ class ChunkPlayer(Agent):
         self._horizon, self._max_age_s = horizon, max_age_s
         self._safe_choice, self._grippers = safe, grippers
         self.check = check
+        self.takeover = Takeover(override, ask_for_help, samples)
         self._real_time = real_time_chunking
         self._plan = ChunkBuffer(ENSEMBLE if mode == "ensemble" else merge, ensemble_m)
         self._asker: AsyncCaller | None = None
@@ -114,15 +111,13 @@ class ChunkPlayer(Agent):
     def _begin(self) -> None:
         self._plan.drop()
         self._tick: int | None = None  # tick of the next `act`; None outside an episode
-        self._answer = LastAnswer()
+        self._answer, self._execution = LastAnswer(), Execution()
         self._waiting_since: float | None = None
         self._trouble = WAITING
         self._captured = CaptureClock()
         self._delays: deque[int] = deque(maxlen=DELAYS)
-        self._last: np.ndarray | None = None  # the last commanded action
-        self._before: np.ndarray | None = None  # the action before it
-        self._motion: _Motion = "stopped"
-        self._safe: SafeAction | None = None
+        self._motion = Motion(self.check)
+        self.takeover.begin()
 
     @property
     def contract(self) -> Contract | None:
@@ -161,19 +156,31 @@ class ChunkPlayer(Agent):
         Earlier observations are not acted on any more, so the policy is asked again. `run_loop` calls this at each tick
         at which the watchdog has the robot stopped; call it in your own loop when you stop or take over the robot.
         """
-        self._plan.drop()
-        self._answer.drop()
-        self._trouble = STOPPED
-        self._last = self._before
-        self._motion = "stopped"
+        self._begin_again(STOPPED)
+        self._execution.interrupt(STOPPED)
+        self._motion.stop()
+        self.takeover.note_stopped()
 
-    def observe(self, obs: Obs) -> None:
-        """Show the policy an observation for which no action is needed."""
+    def observe(self, obs: Obs, action: np.ndarray | None = None) -> None:
+        """Show the policy an observation for which no action is needed.
+
+        Args:
+            obs: The observation.
+            action: What the robot executed in place of the policy's action, (D,), where your own loop decides that. It
+                counts as a tick, and the next request says so (`EXECUTED` in `vlagents_ray.interface`).
+
+        Raises:
+            InvalidAction: The check refuses the action.
+        """
         if self._asker is not None:
             self._asker.settle()
         while self._answer.rest is not None:
             self._read_part(self._answer.rest, self._tick or 0)
         self._agent.observe(obs)
+        if action is not None and self._tick is not None:
+            self.takeover.note_executed(self._motion.move(action, obs))
+            self._plan.advance()
+            self._tick += 1
 
     def act(self, obs: Obs) -> Act:
         """Return the action of this tick, (D,) float32."""
@@ -181,16 +188,22 @@ class ChunkPlayer(Agent):
         if tick is None:
             raise NotReset("act before reset; reset first")
         begun = time.monotonic()
-        if self._asker is None or self._deadline_s is None:
-            while (wanted := self._wants(tick, obs)) and self._answer.rest is not None:
-                self._read_part(self._answer.rest, tick)
-            if wanted:
-                self._note_asked(tick, obs)
-                self._read_part(parts_of(self._agent, stamped(obs, self._extras())), tick)
-        else:
-            self._ask_in_time(self._asker, obs, tick, begun + self._deadline_s)
+        if self.takeover.update():
+            self._begin_again(RELEASED)
+        led = self.takeover.state == "human"
+        try:
+            self._ask(obs, tick, begun)
+        except Exception as error:
+            if not led:
+                raise
+            self._trouble = str(error)  # the human goes on, and what the policy wants is not known
         self._tick = tick + 1
-        return self._chosen(obs, tick)
+        if not led:
+            return self._execution.note(self._chosen(obs, tick), self._plan.executed)
+        act = self.takeover.act(obs, self._next(), self._motion)
+        if SAFE not in act.info:  # the human's action is executed in place of a row
+            self._plan.advance()
+        return self._execution.note(act, self._plan.executed)
 
     def close(self) -> None:
         """Close the policy, at once or as soon as the request in progress is over."""
@@ -201,12 +214,25 @@ class ChunkPlayer(Agent):
         else:
             self._agent.close()
 
+    def _ask(self, obs: Obs, tick: int, begun: float) -> None:
+        """Take what the policy has answered, and ask it if that is due."""
+        if self._asker is None or self._deadline_s is None:
+            while (wanted := self._wants(tick, obs)) and self._answer.rest is not None:
+                self._read_part(self._answer.rest, tick)
+            if wanted:
+                self._note_asked(tick, obs)
+                self._read_part(parts_of(self._agent, stamped(obs, self._extras())), tick)
+        else:  # nobody waits for an action that is not executed
+            wait_s = self._deadline_s if self.takeover.state == "autonomous" else 0.0
+            self._ask_in_time(self._asker, obs, tick, begun + wait_s)
+
     def _choose_safe(self) -> None:
         """Choose the safe action; raises `ConfigError` if it does not fit the policy's actions."""
         self._contract = self._agent.contract
-        if self._deadline_s is not None:
-            spec = ActionSpec() if self._contract is None else self._contract.action
-            self._safe = SafeAction(self._safe_choice, spec, self._grippers)
+        spec = ActionSpec() if self._contract is None else self._contract.action
+        wanted = self._deadline_s is not None or self.takeover.used
+        safe = SafeAction(self._safe_choice, spec, self._grippers) if wanted else None
+        self._motion = Motion(self.check, self._contract, safe)
 
     def _note_asked(self, tick: int, obs: Obs) -> None:
         self._answer.ask(tick, self._plan.executed, self._captured(obs))
@@ -228,13 +254,11 @@ class ChunkPlayer(Agent):
 
     def _wants(self, tick: int, obs: Obs) -> bool:
         """Whether a request with this tick's observation is due."""
-        if self._is_old(self._captured(obs)):
+        if self.takeover.state == "paused" or self._is_old(self._captured(obs)):
             return False
         step = self._next()
-        if step is None:
-            return True
-        if step.chunk.done:
-            return False
+        if step is None or step.chunk.done:
+            return step is None
         if self._mode == "open_loop":
             return self._execute is not None and step.row >= self._execute
         last = step.chunk.end == self._plan.executed + 1  # also true for each answer of a single action
@@ -268,7 +292,7 @@ class ChunkPlayer(Agent):
             return
         if isinstance(answer, InvalidInput) or not isinstance(answer, VLAgentsError):
             raise answer
-        self._trouble = f"{answer.code}: {answer}"
+        self._trouble = self._execution.failed(answer)
 
     def _take(self, act: Act, now: int) -> None:
         answer = self._answer
@@ -288,63 +312,39 @@ class ChunkPlayer(Agent):
         self._trouble = WAITING if added or act.more else LATE
 
     def _extras(self) -> dict[str, Any]:
-        extras: dict[str, Any] = {}
+        extras = self.takeover.extras() | {PLAYED: self._execution.report(self._plan.executed, self._agent)}
         if self._timeout_s is not None:
             extras[DEADLINE] = self._timeout_s * 1e3
-        if self._real_time:
+        if self._real_time and self.takeover.state != "human":  # who executes other actions than those of the plan
             extras |= self._plan.continuation(self._delays)
         return extras
 
     def _chosen(self, obs: Obs, tick: int) -> Act:
         step = self._next()
-        silent_s = 0.0 if self._waiting_since is None else time.monotonic() - self._waiting_since
         reason = STALE if self._is_old(self._captured(obs)) else self._trouble
-        self._before = self._last
+        if step is not None and self.takeover.needs_help(step.chunk.info):
+            self._begin_again(RELEASED)
+            step = None
         if step is not None:
             try:
-                self._last = self._passed(step.action, obs)
-                self._motion = "moving"
+                action = self._motion.move(step.action, obs)
                 self._plan.advance()
-                return step.played(self._last, tick, silent_s)
+                return step.played(action, tick, self._silent_s())
             except InvalidAction as error:
                 self._plan.drop()  # the rest was planned from where this action would have led
                 if self._answer.parts:
                     self._answer.drop()
                 reason = str(error)
-                if self._safe is None:
+                if not self._motion.can_hold:
                     raise
-        if self._safe is None:
-            raise InvalidAction(f"no action for this tick: {reason}")
-        last = self._standing(obs) if self._motion == "stopped" else self._last
-        try:
-            self._last = self._checked(self._safe(obs, last), last)
-        except InvalidAction as refused:
-            reason = f"{reason}; the safe action is refused, too: {refused}"
-            if last is None or not self._safe.holds:
-                raise InvalidAction(
-                    f"no action for this tick: {reason}; let the guard pass it, or give another one (safe=)"
-                ) from refused
-            self._last = self._checked(last, last)
-        self._motion = "held" if self._motion == "moving" else self._motion
-        return Act(self._last.copy(), info={SAFE: reason, SILENT: silent_s})
+        action, reason = self._motion.hold(obs, self.takeover.reason or reason)
+        return Act(action, info={SAFE: reason, SILENT: self._silent_s()})
 
-    def _passed(self, action: np.ndarray, obs: Obs) -> np.ndarray:
-        """Return the policy's action, (D,) float32, if it is close enough to the robot's position or last target."""
-        if self._motion == "moving":
-            return self._checked(action, self._last)
-        if self._motion == "held":  # the last target; the robot may have been moved since, or never have arrived
-            with contextlib.suppress(InvalidAction):
-                return self._checked(action, self._last)
-        return self._checked(action, self._standing(obs))
+    def _begin_again(self, reason: str) -> None:
+        """Let the next action be of the answer to a new observation."""
+        self._plan.drop()
+        self._answer.drop()
+        self._trouble = reason
 
-    def _standing(self, obs: Obs) -> np.ndarray | None:
-        """Return the robot's position, (D,), as far as it is known."""
-        reference = getattr(self.check, "reference", None)
-        return self._last if reference is None else reference(obs, self._last)
-
-    def _checked(self, action: np.ndarray, last: np.ndarray | None) -> np.ndarray:
-        """Return a row, (D,) float32, that may be sent to the robot; raises `InvalidAction` for any other."""
-        action = check_action(action, self._contract)
-        if action.ndim != 1:
-            raise InvalidAction(f"action: got {action.shape}, want (D,), a single row")
-        return action if self.check is None else self.check(action, last)
+    def _silent_s(self) -> float:
+        return 0.0 if self._waiting_since is None else time.monotonic() - self._waiting_since

@@ -38,7 +38,7 @@ def new(
     rank: Annotated[str | None, typer.Option(help="'simulation': none of its requests goes before a robot's.")] = None,
     scope: Annotated[
         list[str],
-        typer.Option(help="'weights': it may also push new weights; 'watch': it sees all sessions; repeatable."),
+        typer.Option(help="What else it may: 'weights' push, 'watch' all sessions, 'operate' them; repeatable."),
     ] = [],  # noqa: B006
     days: Annotated[float | None, typer.Option(help="It expires after so many days.")] = None,
 ) -> None:

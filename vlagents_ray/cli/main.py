@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,10 +16,14 @@ from vlagents_ray.cli.evaluation.command import evaluate_command
 from vlagents_ray.cli.evaluation.results import export_command, merge_command, replay_command, report_command
 from vlagents_ray.cli.keys import keys
 from vlagents_ray.cli.new import new
-from vlagents_ray.cli.options import parse_list, read_run_file
+from vlagents_ray.cli.options import Live, LiveAt, parse_list, read_run_file
+from vlagents_ray.cli.robot.command import robot_command
 from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.cli.slurm import slurm
 from vlagents_ray.cli.tune.command import tune_command
+
+if TYPE_CHECKING:
+    from vlagents_ray.evaluate import Progress
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -58,6 +64,7 @@ app.command("export")(export_command)
 app.command("merge")(merge_command)
 app.command("replay")(replay_command)
 app.command("report")(report_command)
+app.command("robot")(robot_command)
 app.command("tune")(tune_command)
 app.add_typer(bench, name="bench")
 app.add_typer(env, name="env")
@@ -110,10 +117,13 @@ def learn_tabletop_command(
     seed: Annotated[int | None, typer.Option(min=0, help="Of the networks and of the training's episodes.")] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with what is in --out.")] = False,
     track: Annotated[str, typer.Option(help="Show success rates in: wandb, trackio, tensorboard.")] = "",
+    live: Live = False,
+    live_at: LiveAt = None,
 ) -> None:
     """A small policy learns to lift pucks, in minutes: from demonstrations, with a teacher's advice, and alone."""
+    from vlagents_ray.cli.evaluation.live import live_address, live_progress
     from vlagents_ray.cli.ray_session import RESUME, exit_if_ray_is_lost, quiet_ray
-    from vlagents_ray.evaluate import print_summary
+    from vlagents_ray.evaluate import SilentProgress, print_summary
     from vlagents_ray.learn.tabletop.plan import LearnPlan
     from vlagents_ray.learn.tabletop.progress import LearnBar
     from vlagents_ray.learn.tabletop.run import learn_tabletop
@@ -123,8 +133,13 @@ def learn_tabletop_command(
         settings = {} if file is None else read_run_file(file, "file of settings", "`methods`")
         settings |= {name: value for name, value in given.items() if value is not None}
         plan = LearnPlan.model_validate(settings)
+        page = live_address(live_at) if live or live_at else None
+
+        def watched(urls: Collection[str]) -> AbstractContextManager[Progress]:
+            return live_progress(plan.out, urls, page, SilentProgress(), goes_on=True)
+
         with quiet_ray(None), exit_if_ray_is_lost(RESUME), LearnBar(out) as bar:
-            summary = learn_tabletop(plan, bar)
+            summary = learn_tabletop(plan, bar, watched)
         print_summary(out, summary)
 
 

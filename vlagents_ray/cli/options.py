@@ -24,6 +24,14 @@ Address = Annotated[
     ),
 ]
 
+Live = Annotated[
+    bool, typer.Option("--live", help="Serve a page in the browser that fills up as it runs, on 127.0.0.1:8050.")
+]
+LiveAt = Annotated[
+    str | None,
+    typer.Option("--live-at", metavar="HOST:PORT", help="The same there; beyond this machine it wants API keys."),
+]
+
 
 def parse_settings(texts: Iterable[str], option: str) -> dict[str, Any]:
     """Parse `a.b=1` and the like to nested settings; the value is YAML, so `[1, 2]` and `true` work."""

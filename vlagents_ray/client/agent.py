@@ -10,6 +10,7 @@ from collections.abc import Generator, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
+from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.client.connection import Connection
 from vlagents_ray.client.credentials import Credentials
 from vlagents_ray.client.session import ClientSession, EpisodeState, call_with_recovery
@@ -65,6 +66,7 @@ class RemoteAgent(Agent):
         api_key: str | None = None,
         ca: str | os.PathLike[str] | None = None,
         certificate: tuple[str | os.PathLike[str], str | os.PathLike[str]] | None = None,
+        commands: CommandInbox | None = None,
     ) -> None:
         """Set the server; `initialize`, or the first `reset`, connects.
 
@@ -86,9 +88,9 @@ class RemoteAgent(Agent):
             rank: The class of the requests: a "robot" goes before a "simulation".
             resume: False raises the loss of a session as `ConnectionLost`; the episode then needs a new `reset`.
             api_key: The API key, for a server that requires one; by default the value of `VLAGENTS_RAY_API_KEY`.
-            ca: With `https://` and `wss://`, a PEM file of the authorities that may have signed the server's
-                certificate; by default the system's.
+            ca: With `https://`, `wss://`: PEM file of the server's authorities; by default the system's.
             certificate: The PEM files of this client's certificate and its key, for a server that requires one.
+            commands: Gets the commands from the live page to this agent's session; by default they are ignored.
 
         Raises:
             ConfigError: The URL has none of these forms, or does not fit the transport.
@@ -98,10 +100,15 @@ class RemoteAgent(Agent):
         choice = CodecChoice(codec)
         new_transport = partial(select_transport, url, transport, choice, Credentials(api_key, ca, certificate))
         renew = new_transport if resume else None
-        self._attach(Connection(url, new_transport(), choice, timeout_s, connect_timeout_s, renew), rank, resume)
+        self._attach(
+            Connection(url, new_transport(), choice, timeout_s, connect_timeout_s, renew), rank, resume, commands
+        )
 
-    def _attach(self, connection: Connection, rank: RankName, resume: bool) -> None:
+    def _attach(
+        self, connection: Connection, rank: RankName, resume: bool, commands: CommandInbox | None = None
+    ) -> None:
         self._connection = connection
+        self._commands = commands
         self._rank: RankName = rank
         self._resume = resume
         self._session = ClientSession(connection, rank)
@@ -136,6 +143,11 @@ class RemoteAgent(Agent):
     def link(self) -> LinkSpeed | None:
         """Round trip (s) and bandwidth (bytes/s) to the server; None if they were not measured to choose a codec."""
         return self._connection.codec.link
+
+    @property
+    def reconnects(self) -> int:
+        """The number of times that it has connected again, as the connection broke or the server asked for it."""
+        return self._connection.reconnects
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -228,7 +240,10 @@ class RemoteAgent(Agent):
         is their sum and the time between them. The client adds `round_trip_ms` and, as the rest of it, `wire_ms`: its
         own coding, the network, and proxies. `batch_size` is a number of requests, not a time.
         """
-        [act] = self.act_batch([obs], [self])
+        commands = self._commands
+        [act] = self.act_batch([obs if commands is None else commands.asking(obs)], [self])
+        if commands is not None:
+            commands.came(act)
         if isinstance(act, Exception):
             raise act
         return act
@@ -268,7 +283,8 @@ class RemoteAgent(Agent):
         """
         begun = time.perf_counter()
         session = self._session
-        request = session.act(obs)
+        commands = self._commands
+        request = session.act(obs if commands is None else commands.asking(obs))
         request.parts = self._connection.act_parts is not None
         timeout_s = min(self._connection.timeout_s, _deadline_s([obs]))
         [reply] = self._call([session], [request], timeout_s)
@@ -280,6 +296,8 @@ class RemoteAgent(Agent):
             if self._resume and isinstance(reply.error, (NotReset, UnknownSession)):  # which ask for a reset
                 reply.error = DeadlineExceeded("the session ended between two parts of a chunk; the next act begins it")
         act = self._take(session, obs, reply, (time.perf_counter() - begun) * 1e3)
+        if commands is not None:
+            commands.came(act)
         if isinstance(act, Exception):
             raise act
         yield act

@@ -74,6 +74,7 @@ class Connection:
         self.act_parts: Parts | None = None  # of the server that it was connected to last, as the contract
         self.users: set[object] = set()  # owners of the sessions
         self._connect_timeout_s = connect_timeout_s
+        self.reconnects = 0  # how often it has connected again
         self._must_reconnect = False  # connect again before the next request
         self._asked_to_move = False  # whether that is only because the replica asked for it
         self._prefix = uuid.uuid4().hex[:16]
@@ -87,6 +88,7 @@ class Connection:
     def open(self, timeout_s: float | None = None) -> None:
         """Connect, waiting for the server to become ready; raises `PolicyUnavailable` if it does not."""
         if self._must_reconnect:
+            self.reconnects += 1
             if self._silent and self._new_transport is not None:
                 self._close_old_transport()
                 self._old_transport, self.transport = self.transport, self._new_transport()

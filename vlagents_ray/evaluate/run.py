@@ -7,7 +7,7 @@ import logging
 from collections import Counter
 from collections.abc import Callable
 
-from vlagents_ray.errors import StorageFailed, from_code
+from vlagents_ray.errors import ConfigError, StorageFailed, from_code
 from vlagents_ray.evaluate.artifacts.provenance import (
     driver_code,
     policy_code,
@@ -101,6 +101,8 @@ def evaluate(
         EvaluationInterrupted: Ctrl-C or SIGTERM; `OutOfTime`, which is one, if `end_at` left episodes over.
         VLAgentsError: The last infrastructure error, after `config.abort_after` lost episodes in a row.
     """
+    if config.real_robot is not None:
+        raise ConfigError("robot.arm: got a real robot, want a plan in simulation; see vlagents_ray.evaluate.robot")
     factory = agents(config, agent_factory)
     tracking = TrackerFeed(config)
     require_envs(config)
@@ -114,7 +116,7 @@ def evaluate(
                 state, summary = run.play(factory)
         except BaseException:
             with contextlib.suppress(StorageFailed):  # of the same disk, it may be: what went wrong first is told
-                _conclude(config, store, "stopped")
+                conclude(config, store, "stopped")
             raise
     for stopped in (EvaluationInterrupted, OutOfTime):
         if state == stopped.why:
@@ -122,8 +124,8 @@ def evaluate(
     return summary
 
 
-def _conclude(config: EvalConfig, store: Store, state: str) -> Summary:
-    """Note how the run ended, and write what it came to."""
+def conclude(config: EvalConfig, store: Store, state: str) -> Summary:
+    """Note how the run ended, and write its summary and its report."""
     with storing(config.out):
         store.end_run(state)
         summary = summarize(Results.load(config.out))
@@ -139,7 +141,8 @@ def check(config: EvalConfig) -> None:
         ConfigError: An env is not registered or not installed, or the settings contradict the results in `config.out`.
     """
     require_envs(config)
-    Store(config).close()
+    if config.real_robot is None:  # a robot's results are written when all trials are judged
+        Store(config).close()
 
 
 class _Run:
@@ -185,7 +188,7 @@ class _Run:
         answers nobody, and Slurm kills the job a few seconds later.
         """
         if not len(self._queue):
-            return "complete", _conclude(self._config, self._store, "complete")
+            return "complete", conclude(self._config, self._store, "complete")
         with contextlib.nullcontext() if self._in_process else ray_cluster(self._config), stop_signals() as stop:
             self._progress.begin(self._store.cells, self._recorded, len(self._queue))
             try:
@@ -197,7 +200,7 @@ class _Run:
                         pool.close()
                     if stop.is_set():
                         state = EvaluationInterrupted.why
-                    return state, _conclude(self._config, self._store, state)
+                    return state, conclude(self._config, self._store, state)
             finally:
                 self._progress.end()
 

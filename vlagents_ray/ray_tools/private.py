@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import inspect
 import logging
 import pickle
 import sys
@@ -317,6 +318,20 @@ def http_options() -> Any:
     from ray.serve.context import _get_global_client
 
     return _get_global_client().http_config
+
+
+def compress_no_websockets() -> None:
+    """Let the HTTP server that Serve starts in this process compress no messages of WebSockets, as browsers offer.
+
+    Pictures are compressed already, and the work would be done on the event loop that robots wait for. Serve passes no
+    such option on to uvicorn, which compresses by default.
+    """
+    import uvicorn
+
+    defaults = inspect.signature(uvicorn.Config.__init__).parameters
+    if defaults["ws_per_message_deflate"].default:
+        without = functools.partialmethod(uvicorn.Config.__init__, ws_per_message_deflate=False)
+        uvicorn.Config.__init__ = without  # type: ignore[assignment, method-assign]
 
 
 def replica_is_ending() -> bool:

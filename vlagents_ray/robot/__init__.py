@@ -1,6 +1,7 @@
 """The control loop of a robot, with its guard, watchdog and recorder; its dependencies are those of `client`."""
 
+from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.robot.loop import LoopReport, Robot, run_loop
 from vlagents_ray.robot.safety import Guard, Watchdog
 
-__all__ = ["Guard", "LoopReport", "Robot", "Watchdog", "run_loop"]
+__all__ = ["CommandInbox", "Guard", "LoopReport", "Robot", "Watchdog", "run_loop"]

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import importlib
 import os
 import re
 import select
@@ -16,19 +15,18 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, get_args
-
-import numpy as np
+from functools import partial
+from typing import get_args
 
 from vlagents_ray.chunking.buffer import ENSEMBLE, MERGES
 from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.client.agent import RemoteAgent
-from vlagents_ray.errors import ConfigError, MissingState, VLAgentsError
-from vlagents_ray.interface import Obs
-from vlagents_ray.robot.loop import LoopReport, Restart, Robot, run_loop
+from vlagents_ray.client.commands import CommandInbox
+from vlagents_ray.errors import VLAgentsError
+from vlagents_ray.robot.loop import LoopReport, Restart, Robot, import_class, run_loop
 from vlagents_ray.robot.pacing import empty_loop
 from vlagents_ray.robot.record import Recorder
-from vlagents_ray.robot.safety import Guard, Watchdog
+from vlagents_ray.robot.safety import Guard, Watchdog, measured_state
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.viewers.targets import open_viewers
 
@@ -74,11 +72,13 @@ def _ended_by_signals() -> Iterator[None]:
 def _run(options: argparse.Namespace) -> LoopReport:
     say: Callable[[str], None] = lambda line: print(line, flush=True)  # noqa: E731, T201
     deadline_s = options.deadline_ms / 1e3 if options.deadline_ms is not None else WAIT_S * (options.mode != "async")
-    robot_class = _load(options.robot) if options.robot else None
+    make_robot = import_class("--robot", options.robot) if options.robot else None
+    leader = import_class("--leader", options.leader)() if options.leader else None
     with contextlib.ExitStack() as stack:
-        agent = RemoteAgent(
-            options.url, transport=options.transport, timeout_s=options.timeout_s
-        )  # the player closes it
+        commands = CommandInbox() if options.operate else None
+        agent = RemoteAgent(  # the player closes it
+            options.url, transport=options.transport, timeout_s=options.timeout_s, commands=commands
+        )
         agent.initialize()
         contract = agent.contract
         stated = contract is not None and contract.action.relative is not None
@@ -95,12 +95,15 @@ def _run(options: argparse.Namespace) -> LoopReport:
                 horizon=options.horizon,
                 max_age_s=options.max_age_s,
                 safe=options.safe,
-                check=Guard(contract, max_step=options.max_step, measure=_measure(options.measure)),
+                check=Guard(contract, max_step=options.max_step, measure=measured_state(options.measure)),
+                override=leader,
             )
         )
         player.initialize()  # refuses settings that do not fit, before anything is timed or moves
-        robot: Robot = SimulatedRobot(contract) if robot_class is None else robot_class()
-        recorder = stack.enter_context(Recorder(options.record, options.hz)) if options.record else None
+        robot: Robot = SimulatedRobot(contract) if make_robot is None else make_robot()
+        recorder = None
+        if options.record:
+            recorder = stack.enter_context(Recorder(options.record, options.hz, interventions=leader is not None))
         viewers = [stack.enter_context(viewer) for viewer in open_viewers(options.rerun, options.foxglove)]
         hangs_s = max(0.2, 5 / options.hz) + deadline_s
 
@@ -113,24 +116,28 @@ def _run(options: argparse.Namespace) -> LoopReport:
         if options.baseline > 0:
             say(_line(_HEADER))
             say(_row("empty loop", empty_loop(options.hz, options.baseline, real_time=options.real_time)))
-        report = run_loop(
+        play = partial(
+            run_loop,
             robot,
             player,
             hz=options.hz,
             seconds=options.seconds,
-            instruction=options.instruction,
             watchdog=watchdog,
             restart=options.restart,
             recorder=recorder,
             viewers=viewers,
             real_time=options.real_time,
+            commands=commands,
         )
+        report = _played(play, options.instruction, say)
         if options.baseline <= 0:
             say(_line(_HEADER))
         say(_row(f"{options.mode}, {agent.transport}", report.jitter))
         say(
             f"from a tick until its action is applied: p50 {report.work_p50_ms:.2f} ms, p99 {report.work_p99_ms:.2f} ms"
         )
+        if leader is not None:
+            say(f"ticks at which a human moved the robot: {report.interventions}")
         say(f"ticks without an action of the policy: {report.safe_ticks} of {report.jitter['ticks']:.0f}")
         for reason, ticks in sorted(report.safe.items(), key=lambda one: -one[1])[:5]:
             say(f"  {ticks} x {reason}")
@@ -144,6 +151,18 @@ def _run(options: argparse.Namespace) -> LoopReport:
     for viewer in viewers:
         say(viewer.report())
     return report
+
+
+def _played(play: Callable[..., LoopReport], instruction: str | None, say: Callable[[str], None]) -> LoopReport:
+    """Play an episode, and a further one whenever the live page asks for one; return the last report."""
+    while True:
+        report = play(instruction=instruction)
+        if report.outcome:
+            say(f"marked as a {report.outcome} on the live page")
+        if report.next_instruction is None:
+            return report
+        instruction = report.next_instruction
+        say(f"the live page asks for another episode: {instruction!r}")
 
 
 @contextlib.contextmanager
@@ -189,15 +208,6 @@ def _line_typed(terminal: int) -> bool:
     return False
 
 
-def _measure(part: str | None) -> Callable[[Obs], np.ndarray] | None:
-    def measured(obs: Obs) -> np.ndarray:
-        if part not in obs.state:
-            raise MissingState(str(part), obs.state)
-        return obs.state[part]
-
-    return None if part is None else measured
-
-
 def _number(kind: type[float] | type[int] = float, *, least: float = 0, above: bool = False) -> Callable[[str], float]:
     """Return a function with which argparse reads a number not below `least`, or above it."""
 
@@ -237,6 +247,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="MODULE:CLASS",
         help="your class of the robot, created without arguments; default: a simulated one",
     )
+    add("--leader", metavar="MODULE:CLASS", help="your class of what a human moves the robot with, see Leader")
     add("--mode", choices=("open_loop", "ensemble", "async"), default="async", help="see ChunkPlayer (%(default)s)")
     add("--execute", type=_number(int, least=1), metavar="N", help="rows of a chunk to execute before asking again")
     add("--horizon", type=_number(int, least=1), metavar="N", help="rows of a chunk that may be executed at all")
@@ -287,6 +298,7 @@ def _parser() -> argparse.ArgumentParser:
     add(
         "--foxglove", metavar="DIR", help="write an .mcap file there for Foxglove, or 'live': let it connect to the run"
     )
+    add("--operate", action="store_true", help="obey the buttons of the server's live page: pause, stop, ...")
     add("--real-time", action="store_true", help="ask for SCHED_FIFO in place of a nice value")
     add(
         "--baseline",
@@ -296,19 +308,6 @@ def _parser() -> argparse.ArgumentParser:
         help="first measure an empty loop for this long (%(default)s)",
     )
     return parser
-
-
-def _load(name: str) -> Any:
-    module, colon, attribute = name.partition(":")
-    if not colon:
-        raise ConfigError(f"--robot: got {name!r}, want module:Class")
-    try:
-        return getattr(importlib.import_module(module), attribute)
-    except (ImportError, AttributeError) as error:
-        raise ConfigError(
-            f"--robot {name}: {error}; go to the folder of its module ({os.getcwd()} is this one), add that to "
-            f"PYTHONPATH, or install it"
-        ) from error
 
 
 def _row(name: str, jitter: dict[str, float]) -> str:

@@ -22,7 +22,7 @@ from vlagents_ray.contract import ActionSpec
 from vlagents_ray.dataset_contract import INFO, STATISTICS
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import require
-from vlagents_ray.robot.episode import ACTION, Finished, RobotEpisode
+from vlagents_ray.robot.episode import ACTION, INTERVENTION_COLUMN, Finished, RobotEpisode
 from vlagents_ray.robot.statistics import Stats, joined, of_values
 
 VERSION = "v3.0"
@@ -33,15 +33,24 @@ UNFINISHED = "unfinished"  # folder of the running episodes
 
 
 class Dataset:
-    """A dataset to which episodes are added; opening an existing one continues it."""
+    """A dataset to which episodes are added; opening an existing one continues it, with the columns that it has."""
 
-    def __init__(self, root: Path, fps: float, robot_type: str | None = None, *, lossless: bool = False) -> None:
+    def __init__(
+        self,
+        root: Path,
+        fps: float,
+        robot_type: str | None = None,
+        *,
+        interventions: bool = False,
+        lossless: bool = False,
+    ) -> None:
         """Open or begin a dataset.
 
         Args:
             root: Its folder.
             fps: The rate of its frames, Hz.
             robot_type: The robot's name, if it has one.
+            interventions: Whether its frames have the columns of interventions.
             lossless: Whether the videos of new episodes keep each pixel, see `Mp4`.
 
         Raises:
@@ -49,6 +58,7 @@ class Dataset:
             MissingDependency: The extra "record" is not installed.
         """
         self.root = root
+        self.interventions = interventions
         self._lossless = lossless
         self._pq: Any = require("pyarrow.parquet")
         self._pa: Any = require("pyarrow")
@@ -90,8 +100,15 @@ class Dataset:
         unfinished = self.root / UNFINISHED
         unfinished.mkdir(parents=True, exist_ok=True)
         folder = Path(tempfile.mkdtemp(dir=unfinished))
-        features = self.info["features"] or None
-        return RobotEpisode(folder, instruction, self.info["fps"], features, lossless=self._lossless, meaning=meaning)
+        return RobotEpisode(
+            folder,
+            instruction,
+            self.info["fps"],
+            self.info["features"] or None,
+            interventions=self.interventions,
+            lossless=self._lossless,
+            meaning=meaning,
+        )
 
     def save(self, episode: Finished) -> None:
         """Add an episode to the dataset."""
@@ -112,6 +129,8 @@ class Dataset:
         stats = {key: of_values(values.reshape(frames, -1)) for key, values in numbers.items()}
         stats |= episode.images
         about: dict[str, Any] = {"episode_index": number, "tasks": [episode.instruction], "length": frames}
+        if self.interventions:
+            about["label"] = episode.label or "none"
         about |= {f"data/{name}": value for name, value in place.items()}
         about |= {"dataset_from_index": first, "dataset_to_index": first + frames}
         for key in episode.videos:
@@ -141,7 +160,13 @@ class Dataset:
         for key, mine in (("codebase_version", VERSION), ("fps", fps), ("data_path", DATA), ("video_path", VIDEO)):
             if info.get(key) != mine:
                 raise ConfigError(f"{self.root}: has {key} {info.get(key)!r}, want {mine!r}; record into a new folder")
-        self.info = info
+        has = INTERVENTION_COLUMN in info["features"]
+        if self.interventions and not has:
+            raise ConfigError(
+                f"{self.root}: was recorded without interventions, so its frames lack the column "
+                f"{INTERVENTION_COLUMN!r}; record into a new folder"
+            )
+        self.info, self.interventions = info, has
         stats = json.loads((self.root / "meta/stats.json").read_text())
         stats.pop(STATISTICS, None)
         self._stats = {key: {name: np.array(value) for name, value in one.items()} for key, one in stats.items()}

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -26,6 +26,12 @@ MOMENTS = {  # further columns of each recorded frame
     "tick": "int64",  # of the control loop; gaps are missed or dropped frames
     "safe": "bool",  # whether the action is a safe one, not the policy's
 }
+WANTED_ACTION, INTERVENTION_COLUMN = "policy_action", "intervention"
+INTERVENTIONS = {  # further columns of a recording with interventions, beside `WANTED_ACTION`, (D,) float32
+    INTERVENTION_COLUMN: "bool",  # whether the action is a human's
+    "policy_known": "bool",  # whether it is known what the policy wanted; if not, `WANTED_ACTION` is zeros
+}
+Label = Literal["success", "failure", "discard"]
 INDEX = {  # columns that the dataset adds to each frame
     "timestamp": "float32",  # s, frame_index / fps
     "frame_index": "int64",
@@ -47,6 +53,7 @@ class Finished:
     images: dict[str, Stats]  # statistics of the videos' frames
     videos: dict[str, Path]  # MP4 files with at least N frames, of which the first N count
     about: DatasetContract  # the same for each episode of a dataset
+    label: Label | None = None
     folder: Path | None = None  # of the running episode, which is removed with what is left in it
 
 
@@ -60,6 +67,7 @@ class RobotEpisode:
         fps: float,
         features: dict[str, Any] | None,
         *,
+        interventions: bool = False,
         lossless: bool = False,
         meaning: ActionSpec | None = None,
     ) -> None:
@@ -70,6 +78,7 @@ class RobotEpisode:
             instruction: The task in words.
             fps: The rate of the frames, Hz.
             features: The dataset's features, which the frames must have; None in the first episode.
+            interventions: Whether the frames have the columns of interventions.
             lossless: Whether its videos keep each pixel, see `Mp4`.
             meaning: The meaning of its actions' numbers, if that is known.
         """
@@ -80,6 +89,7 @@ class RobotEpisode:
         self.images: dict[str, ImageStatistics] = {}
         self._folder = folder
         self._fps = fps
+        self._interventions = interventions
         self._lossless = lossless
         self._meaning = meaning or ActionSpec()
         self._about = DatasetContract(Contract())
@@ -91,6 +101,8 @@ class RobotEpisode:
         captured_at: float,
         tick: int,
         safe: bool,
+        intervention: bool = False,
+        wanted: np.ndarray | None = None,
         more: Mapping[str, Any] = MappingProxyType({}),
     ) -> None:
         """Append a frame.
@@ -101,6 +113,8 @@ class RobotEpisode:
             captured_at: The time of the observation, s since 1970.
             tick: The tick of the control loop.
             safe: Whether the action is a safe one, not the policy's.
+            intervention: Whether a human moved the robot at this tick.
+            wanted: The policy's action, (D,), where another one was executed; None if it is not known.
             more: Further columns by name, the same in each frame: a bool, int, float, text, or (D,) float32.
 
         Raises:
@@ -115,19 +129,29 @@ class RobotEpisode:
                 f"recording: got cameras {sorted(obs.cameras)}, want those of {sorted(self.videos)}"
             )
         for name, shape in ((STATE, values.shape), (ACTION, action.shape)):
-            wanted = tuple(self.features[name]["shape"]) if name in self.features else (0,)
-            if shape != wanted:
-                raise InvalidObservation(f"recording: got {name} of {shape}, want {wanted} as in the first frame")
+            first = tuple(self.features[name]["shape"]) if name in self.features else (0,)
+            if shape != first:
+                raise InvalidObservation(f"recording: got {name} of {shape}, want {first} as in the first frame")
         for name, image in obs.cameras.items():
             self.videos[keys[name]][1].add(image)
             self.images[keys[name]].add(image)
-        frame = {ACTION: np.asarray(action, np.float32), "captured_at": captured_at, "tick": tick, "safe": safe, **more}
+        frame: dict[str, Any] = {
+            ACTION: np.asarray(action, np.float32),
+            "captured_at": captured_at,
+            "tick": tick,
+            "safe": safe,
+            **more,
+        }
         if len(values):
             frame[STATE] = values
+        if self._interventions:
+            policy = wanted if safe or intervention else action
+            frame[WANTED_ACTION] = np.zeros_like(frame[ACTION]) if policy is None else np.asarray(policy, np.float32)
+            frame |= {INTERVENTION_COLUMN: intervention, "policy_known": policy is not None}
         for key, value in frame.items():
             self.rows.setdefault(key, []).append(value)
 
-    def finish(self) -> Finished:
+    def finish(self, label: Label | None = None) -> Finished:
         """Complete the videos, and return the episode."""
         for _, video in self.videos.values():
             video.finish()
@@ -138,6 +162,7 @@ class RobotEpisode:
             {key: images.result() for key, images in self.images.items()},
             {key: path for key, (path, _) in self.videos.items()},
             self._about,
+            label,
             self._folder,
         )
 
@@ -160,6 +185,8 @@ class RobotEpisode:
         if names:
             features[STATE] = vector_feature(names)
         features[ACTION] = vector_feature([f"action_{i}" for i in range(action_dim)])
+        if self._interventions:
+            features |= {WANTED_ACTION: features[ACTION]} | number_features(INTERVENTIONS)
         features |= number_features(MOMENTS | INDEX)
         features |= {name: _feature(value) for name, value in more.items()}
         if self.features and self.features != features:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import gc
+import importlib
 import logging
+import os
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -13,8 +15,10 @@ from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 
+from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.errors import ConfigError, InvalidAction
-from vlagents_ray.interface import CAPTURED, SAFE, SILENT, Agent, Obs
+from vlagents_ray.interface import CAPTURED, INTERVENTION, SAFE, SILENT, WANTED, Agent, Obs
+from vlagents_ray.robot.operation.operated_loop import OperatedLoop
 from vlagents_ray.robot.pacing import KEPT_TICKS, SPIN_S, Pacer, jitter, undisturbed
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import Guard, Watchdog
@@ -52,6 +56,28 @@ class Robot(Protocol):
         ...
 
 
+def import_class(option: str, name: str) -> Any:
+    """Import the class that an option of a command names.
+
+    Args:
+        option: The option, for the error message: "--robot".
+        name: "module:Class".
+
+    Raises:
+        ConfigError: The name has another form, or there is no such class.
+    """
+    module, colon, attribute = name.partition(":")
+    if not colon:
+        raise ConfigError(f"{option}: got {name!r}, want module:Class")
+    try:
+        return getattr(importlib.import_module(module), attribute)
+    except (ImportError, AttributeError) as error:
+        raise ConfigError(
+            f"{option} {name}: {error}; go to the folder of its module ({os.getcwd()} is this one), add that to "
+            f"PYTHONPATH, or install it"
+        ) from error
+
+
 @dataclass(slots=True)
 class LoopReport:
     """The outcome of a run of the control loop: its timing, and the ticks without an action of the policy."""
@@ -62,8 +88,11 @@ class LoopReport:
     work_p99_ms: float = 0.0
     safe: dict[str, int] = field(default_factory=dict)  # reason -> ticks with the safe action or without any
     barks: list[str] = field(default_factory=list)  # the watchdog's reasons to stop the robot
+    interventions: int = 0  # ticks at which a human moved the robot
     done: bool = False  # the policy considered its task finished
     means: list[str] = field(default_factory=list)  # the measures taken against jitter
+    outcome: str = ""  # "success" or "failure", if it was marked on the live page
+    next_instruction: str | None = None  # the live page asked for another episode with this instruction
 
     @property
     def safe_ticks(self) -> int:
@@ -111,6 +140,7 @@ def run_loop(
     real_time: bool = False,
     spin_s: float = SPIN_S,
     until: Callable[[], bool] = lambda: False,
+    commands: CommandInbox | None = None,
 ) -> LoopReport:
     """Reset an agent and let it drive a robot at a fixed rate, until it is done or the time is over.
 
@@ -136,17 +166,20 @@ def run_loop(
         restart: With "manual" motion is restarted by a call of `watchdog.restart()`, made by a person who sees the
             robot; it has no effect while the silence lasts. With "auto" the end of the silence restarts it. The default
             is "auto" for a simulated robot and "manual" for any other.
-        recorder: Records the run as one episode, also if it ends by an exception.
+        recorder: Records the run as one episode, also if it ends by an exception. A player with `override` wants one
+            with `interventions=True`.
         viewers: Show the run as one episode (see `vlagents_ray.viewers`).
         real_time: Run the thread with SCHED_FIFO (see `vlagents_ray.robot.pacing.undisturbed`).
         spin_s: How long before each tick the thread spins instead of sleeping, s.
-        until: Ends the loop when it returns True; called before each tick.
+        until: Ends the loop when it returns True; called before each tick, and after the last one.
+        commands: What the live page has the loop do, from `RemoteAgent(url, commands=...)`; see `OperatedLoop`.
 
     Returns:
         The timing of the loop, and the reasons of the ticks without an action of the policy.
 
     Raises:
-        ConfigError: `hz`, `seconds` or `restart` has a wrong value, or `guard` differs from the agent's own.
+        ConfigError: `hz`, `seconds` or `restart` has a wrong value, `guard` differs from the agent's own, or the
+            recorder has no place for interventions.
         InvalidAction: An action is a chunk, or does not pass the guard.
     """
     if restart is None:
@@ -155,6 +188,11 @@ def run_loop(
         raise ConfigError(f"restart: got {restart!r}, want one of {list(get_args(Restart))}")
     if seconds is not None and not seconds > 0:
         raise ConfigError(f"seconds: got {seconds}, want above 0, or None")
+    takeover = getattr(agent, "takeover", None)
+    if takeover is not None and takeover.leader is not None and recorder is not None and not recorder.interventions:
+        raise ConfigError(
+            "recorder: got one without interventions for a player with override=; want Recorder(…, interventions=True)"
+        )
     report = LoopReport(hz)
     barks = len(watchdog.barks) if watchdog is not None else 0
     agent.initialize()
@@ -169,7 +207,9 @@ def run_loop(
             report.means = stack.enter_context(undisturbed(real_time=real_time))
             if watchdog is not None:
                 stack.enter_context(watchdog)
-            _drive(robot, agent, guard, watchdog, restart, recorder, shown, report, Pacer(hz, spin_s), seconds, until)
+            operated = OperatedLoop(commands, watchdog, manual=restart == "manual")
+            pacer = Pacer(hz, spin_s)
+            _drive(robot, agent, guard, watchdog, recorder, shown, report, pacer, seconds, until, operated)
         finally:
             robot.stop()  # before the watchdog and the recorder end
     if watchdog is not None:
@@ -184,13 +224,13 @@ def _drive(
     agent: Agent,
     guard: Guard,
     watchdog: Watchdog | None,
-    restart: Restart,
     recorder: Recorder | None,
     shown: LoopView,
     report: LoopReport,
     pacer: Pacer,
     seconds: float | None,
     until: Callable[[], bool],
+    operated: OperatedLoop,
 ) -> None:
     work_s: deque[float] = deque(maxlen=KEPT_TICKS)
     collected = time.monotonic()
@@ -200,7 +240,7 @@ def _drive(
     interrupt = getattr(agent, "interrupt", lambda: None)
     standing = True  # before the first action, and after a stop until the next one
     try:
-        while not report.done and not until():
+        while not (until() or report.done):
             if (
                 time.monotonic() - collected > _COLLECT_S
             ):  # while idle, as automatic collection is off and failed requests leave cycles
@@ -215,20 +255,22 @@ def _drive(
             if act.action.ndim != 1:
                 raise InvalidAction(f"action: got {act.action.shape}, want one row; wrap the agent in a ChunkPlayer")
             report.done = act.done
+            led = bool(act.info.get(INTERVENTION))
             reason = act.info.get(SAFE)
+            stop = operated.holds()  # before this tick counts as a sign of life: it may be late
+            if operated.over:
+                break
             if watchdog is not None:
-                stop = _why_stopped(watchdog)  # before this tick counts as a sign of life: it may be late
                 watchdog.heard("loop")
                 watchdog.heard("server", act.info.get(SILENT, 0.0))
-                if stop is not None:
-                    if not standing:
-                        robot.stop()  # again, as the watchdog may have stopped it just before the last action
-                    standing = True
-                    interrupt()
-                    report.count(stop)
-                    if restart == "auto":
-                        watchdog.restart()
-                    continue
+            if stop is not None:
+                if not standing:
+                    robot.stop()  # again, as the watchdog may have stopped it just before the last action
+                standing = True
+                interrupt()
+                report.count(stop)
+                operated.stood()
+                continue
             if reason is not None:
                 report.count(reason)
                 if standing:  # a robot at rest gets no command
@@ -239,22 +281,17 @@ def _drive(
             standing, last = False, action
             robot.apply(action)
             work_s.append(pacer.since_tick_s())
+            report.interventions += led
             if recorder is not None:
-                recorder.add(obs, action, tick=tick, safe=reason is not None)
+                safe, wanted = reason is not None, act.info.get(WANTED)
+                recorder.add(obs, action, tick=tick, safe=safe, intervention=led, wanted=wanted)
             shown.add(obs, act, action, tick, work_s[-1])
     finally:
+        report.outcome, report.next_instruction = operated.outcome, operated.next_instruction
         report.jitter = jitter(pacer.late_s, pacer.missed, pacer.ticks)
         if work_s:
             report.work_p50_ms = float(np.median(work_s)) * 1e3
             report.work_p99_ms = float(np.quantile(work_s, 0.99)) * 1e3
-
-
-def _why_stopped(watchdog: Watchdog) -> str | None:
-    if not watchdog.stopped:
-        return None
-    silent = watchdog.silent
-    cause = f"no signal from the {' and the '.join(silent)}" if silent else "waiting for a restart (Watchdog.restart)"
-    return f"stopped by the watchdog: {cause}"
 
 
 def _guard(agent: Agent, given: Guard | None) -> Guard:

@@ -10,13 +10,14 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import CAPTURED, Obs, copied
 from vlagents_ray.robot.dataset import Dataset
-from vlagents_ray.robot.episode import RobotEpisode
+from vlagents_ray.robot.episode import Label, RobotEpisode
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -30,6 +31,8 @@ class _Frame:
     action: np.ndarray
     tick: int
     safe: bool
+    intervention: bool
+    wanted: np.ndarray | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +42,7 @@ class _Begin:
 
 @dataclass(frozen=True, slots=True)
 class _End:
-    pass
+    label: Label | None
 
 
 class Recorder:
@@ -59,16 +62,28 @@ class Recorder:
         fps: The rate of the frames, Hz.
         robot_type: The robot's name, for the dataset's `info.json`.
         frames: The largest number of frames in the queue.
+        interventions: Whether a human may take over: frames then also have `intervention` (bool), `policy_action`, what
+            the policy wanted, and `policy_known` (bool), and episodes a label. A dataset that has these columns gets
+            them in any case.
 
     Raises:
-        ConfigError: The folder has other files, or a dataset of another rate or version.
+        ConfigError: The folder has other files, or a dataset of another rate or version, or without these columns.
         MissingDependency: The extra "record" is not installed.
     """
 
-    def __init__(self, root: str | Path, fps: float, *, robot_type: str | None = None, frames: int = 100) -> None:
+    def __init__(
+        self,
+        root: str | Path,
+        fps: float,
+        *,
+        robot_type: str | None = None,
+        frames: int = 100,
+        interventions: bool = False,
+    ) -> None:
         self.dropped = 0
         self.error: Exception | None = None  # the first error in writing
-        self._dataset = Dataset(Path(root), fps, robot_type)
+        self._dataset = Dataset(Path(root), fps, robot_type, interventions=interventions)
+        self._label: Label | None = None
         self._frames = frames
         self._queue: queue.SimpleQueue[_Frame | _Begin | _End | None] = queue.SimpleQueue()
         self._put = 0  # frames added, counted by the loop's thread
@@ -81,16 +96,50 @@ class Recorder:
         """The number of episodes in the dataset."""
         return self._dataset.episodes
 
+    @property
+    def interventions(self) -> bool:
+        """Whether the frames have the columns of interventions."""
+        return self._dataset.interventions
+
     @contextlib.contextmanager
     def episode(self, instruction: str) -> Iterator[None]:
-        """Make the frames that are added within the context one episode, which is kept however the context ends."""
+        """Make the frames that are added within the context one episode.
+
+        It is kept however the context ends, unless it has the label "discard".
+        """
+        self._label = None
         self._queue.put(_Begin(instruction))
         try:
             yield
         finally:
-            self._queue.put(_End())
+            self._queue.put(_End(self._label))
 
-    def add(self, obs: Obs, action: np.ndarray, *, tick: int, safe: bool = False) -> None:
+    def label(self, label: Label) -> None:
+        """Label the running episode; the last label counts. May be called from any thread.
+
+        Args:
+            label: "success" or "failure", which the dataset keeps in the column `label` of its episodes; "discard"
+                drops the episode.
+
+        Raises:
+            ConfigError: There is no such label, or no place for it, as the dataset has no columns of interventions.
+        """
+        if label not in get_args(Label):
+            raise ConfigError(f"label: got {label!r}, want one of {list(get_args(Label))}")
+        if label != "discard" and not self.interventions:
+            raise ConfigError(f"label: got {label!r} for a dataset without labels; give interventions=True")
+        self._label = label
+
+    def add(
+        self,
+        obs: Obs,
+        action: np.ndarray,
+        *,
+        tick: int,
+        safe: bool = False,
+        intervention: bool = False,
+        wanted: np.ndarray | None = None,
+    ) -> None:
         """Record a frame; never waits.
 
         Args:
@@ -98,6 +147,8 @@ class Recorder:
             action: The action that was applied after it, (D,) float32.
             tick: The tick of the control loop.
             safe: Whether the action is a safe one, not the policy's.
+            intervention: Whether a human moved the robot at this tick.
+            wanted: The policy's action, (D,), where another one was applied; None if it is not known.
         """
         if self._put - self._got >= self._frames:
             self.dropped += 1
@@ -105,7 +156,7 @@ class Recorder:
         if CAPTURED not in obs.info:
             obs = Obs(obs.cameras, obs.gripper, obs.state, {CAPTURED: time.time()})
         self._put += 1
-        self._queue.put(_Frame(copied(obs), np.array(action), tick, safe))
+        self._queue.put(_Frame(copied(obs), np.array(action), tick, safe, intervention, wanted))
 
     def close(self) -> None:
         """Write the frames in the queue, and raise the first error that occurred."""
@@ -145,10 +196,11 @@ class Recorder:
         if episode is None:  # abandoned after an error
             return None
         if isinstance(item, _Frame):
-            episode.add(item.obs, item.action, float(item.obs.info[CAPTURED]), item.tick, item.safe)
+            at = float(item.obs.info[CAPTURED])
+            episode.add(item.obs, item.action, at, item.tick, item.safe, item.intervention, item.wanted)
             return episode
-        if episode.rows:
-            self._dataset.save(episode.finish())
+        if episode.rows and item.label != "discard":
+            self._dataset.save(episode.finish(item.label))
         else:
             episode.abandon()
         return None

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from vlagents_ray.contract import ActionSpec, Contract
-from vlagents_ray.errors import ConfigError, InvalidAction
+from vlagents_ray.errors import ConfigError, InvalidAction, MissingState
 from vlagents_ray.interface import Obs
 
 
@@ -119,6 +119,21 @@ class Guard:
         return action
 
 
+def measured_state(part: str | None) -> Callable[[Obs], np.ndarray] | None:
+    """Return a `measure` of a `Guard`: a part of the state.
+
+    Args:
+        part: The name of the part, such as "joints"; None measures nothing.
+    """
+
+    def measured(obs: Obs) -> np.ndarray:
+        if part not in obs.state:
+            raise MissingState(str(part), obs.state)
+        return obs.state[part]
+
+    return None if part is None else measured
+
+
 def _bounds(
     name: str, stricter: Callable[[float, float], float], stated: float | None, own: float | np.ndarray | None
 ) -> np.ndarray | None:
@@ -190,6 +205,13 @@ class Watchdog:
     def stopped(self) -> bool:
         """Whether the robot was stopped and motion has not been restarted since."""
         return self._stopped
+
+    def trip(self, reason: str) -> None:
+        """Stop the robot now, on the caller's thread; motion is restarted as after a silence."""
+        with self._changed:
+            self._stopped = True
+        self.barks.append(reason)
+        self._stop(reason)
 
     def restart(self) -> bool:
         """Allow motion again after a stop; may be called from any thread and from a signal handler.

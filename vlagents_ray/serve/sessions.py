@@ -47,6 +47,7 @@ class Session(Generic[M]):
     weights: WeightsVersion | None = None  # version of the model's weights with which it acts
     instruction: str = ""  # of its last reset
     follows: bool = True  # whether it takes the newest version of the weights, otherwise the pinned one
+    told_to_follow: bool | None = None  # what an operator wants of its later episodes; None: what their resets say
     over: bool = False  # whether the session has ended, so that no table contains it
     resetting: PendingRequest | None = None  # reset that waits for its checkpoint
     owner: str = ""  # connection with which it ends; if empty, it ends when it is closed or idle for long

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.families.diffusion_policy import tiny
+from tests.families.diffusion_policy.conftest import LIBRARIES, Checkpoint, begun, loaded, made, seen
 from vlagents_ray import Obs
 from vlagents_ray.contract import StateSpec
 from vlagents_ray.errors import MissingCamera, PolicyFailed
@@ -20,27 +19,10 @@ from vlagents_ray.policies.diffusion_policy import DiffusionPolicy
 from vlagents_ray.policies.diffusion_policy.noise import noise_of
 from vlagents_ray.testing import check_agent
 
-pytestmark = [
-    pytest.mark.source("DIFFUSION_POLICY_SRC"),
-    # The authors' save_checkpoint leaves its file open; robomimic 0.2.0 asks torchvision for a network as of old.
-    pytest.mark.filterwarnings("ignore:unclosed file .*latest.ckpt:ResourceWarning"),
-    pytest.mark.filterwarnings("ignore:The parameter 'pretrained' is deprecated:UserWarning"),
-    pytest.mark.filterwarnings("ignore:Arguments other than a weight enum:UserWarning"),
-]
+pytestmark = [pytest.mark.source("DIFFUSION_POLICY_SRC"), *LIBRARIES]
 
 ATOL = 1e-5  # float32 on a CPU, actions between -3 and 5; measured: 2e-6
 KINDS = ["unet", "transformer", "image", "hybrid"]
-Checkpoint = Callable[[str], Path]
-
-
-def made(checkpoint: Path, **config: Any) -> DiffusionPolicy:
-    return DiffusionPolicy.from_config({"checkpoint": str(checkpoint), "trust_checkpoint": True, **config})
-
-
-def loaded(checkpoint: Path, **config: Any) -> DiffusionPolicy:
-    policy = made(checkpoint, **config)
-    policy.initialize()
-    return policy
 
 
 @pytest.fixture(scope="module")
@@ -54,24 +36,6 @@ def policies(checkpoint: Checkpoint) -> Callable[[str], DiffusionPolicy]:
         return kept[kind]
 
     return of
-
-
-def seen(seed: int, size: tuple[int, int] = (48, 48), **info: Any) -> Obs:
-    rng = np.random.default_rng(seed)
-    return Obs(
-        cameras={"front": rng.integers(0, 256, (*size, 3), dtype=np.uint8)},
-        state={
-            "agent_pos": rng.uniform(-2, 1, 2).astype(np.float32),
-            "state": rng.uniform(-2, 1, 4).astype(np.float32),
-        },
-        info=info,
-    )
-
-
-def begun(policy: DiffusionPolicy, seed: int = 0) -> DiffusionPolicy:
-    session = copy.copy(policy)
-    session.reset(seen(0), None, seed=seed)
-    return session
 
 
 class TorchDraws:

@@ -9,16 +9,11 @@ from typing import Any
 import pytest
 
 from tests.families.diffusion_policy import tiny
+from tests.families.diffusion_policy.conftest import LIBRARIES
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.diffusion_policy import DiffusionPolicy
 
-pytestmark = [
-    pytest.mark.source("DIFFUSION_POLICY_SRC"),
-    # The authors' save_checkpoint leaves its file open; robomimic 0.2.0 asks torchvision for a network as of old.
-    pytest.mark.filterwarnings("ignore:unclosed file .*latest.ckpt:ResourceWarning"),
-    pytest.mark.filterwarnings("ignore:The parameter 'pretrained' is deprecated:UserWarning"),
-    pytest.mark.filterwarnings("ignore:Arguments other than a weight enum:UserWarning"),
-]
+pytestmark = [pytest.mark.source("DIFFUSION_POLICY_SRC"), *LIBRARIES]
 
 Checkpoint = Callable[[str], Path]
 

@@ -41,6 +41,7 @@ def save(folder: Path, kind: str = "unet", *, normalizer: bool = True, use_ema: 
     from diffusion_policy.workspace.base_workspace import BaseWorkspace
     from omegaconf import OmegaConf
 
+    torch.set_num_threads(1)  # the models are too small for more: threads would wait for one another
     torch.manual_seed(0)
     settings = OmegaConf.create({"policy": _policy(kind), "training": {"use_ema": use_ema}, "task": {}})
     workspace: Any = BaseWorkspace(settings, output_dir=str(folder))

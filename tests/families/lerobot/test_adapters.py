@@ -17,6 +17,9 @@ from peft_adapters import merge, pairs, save
 
 from tests.families.lerobot import tiny
 from tests.families.lerobot.conftest import FILTERS, TASKS, Load, Made, begun, view
+from vlagents_ray import Obs
+from vlagents_ray.contract import ActionSpec, Contract, StateSpec
+from vlagents_ray.dataset_contract import DatasetContract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import DELAY, DISTRIBUTION, LEFTOVER, SAMPLES, Act
 from vlagents_ray.policies.lerobot import LeRobot
@@ -56,12 +59,17 @@ def saved(made: Made, loaded: Load, tmp_path_factory: pytest.TempPathFactory) ->
         merge(policy, values)
         policy.save_pretrained(whole)
         if name == "units":
-            dataset = {key: {k: 2 * v + 0.5 for k, v in one.items()} for key, one in tiny.statistics().items()}
-            for pipeline in make_pre_post_processors(policy.config, dataset_stats=dataset):
-                pipeline.save_pretrained(whole)
-                pipeline.save_pretrained(folders[name])
+            write_processors(policy.config, {}, whole, folders[name])
         folders[f"merged/{name}"] = whole
     return folders
+
+
+def write_processors(settings: Any, beside: dict[str, Any], *folders: Path) -> None:
+    """Write the processors of a training on another dataset than the base's, with statistics `beside` its own."""
+    dataset = {key: {k: 2 * v + 0.5 for k, v in one.items()} for key, one in tiny.statistics().items()}
+    for pipeline in make_pre_post_processors(settings, dataset_stats=dataset | beside):
+        for folder in folders:
+            pipeline.save_pretrained(folder)
 
 
 @pytest.fixture(scope="module")
@@ -148,3 +156,86 @@ def test_processors_of_another_kind_are_refused(made: Made, saved: dict[str, Pat
     Path(file).write_text(json.dumps(pipeline))
     with pytest.raises(ConfigError, match=r"adapter 'expert': .*other steps than those of the base"):
         LeRobot.from_config(config).initialize()
+
+
+def arm(control_hz: float) -> DatasetContract:
+    """The contract of a dataset whose first joint is near a half turn."""
+    action = ActionSpec(dim=tiny.ACTION, space="joints", delta=False)
+    contract = Contract(state={"joints": StateSpec(tiny.STATE - 1)}, gripper=True, action=action, control_hz=control_hz)
+    return DatasetContract(contract, ("joints", "gripper"), {"observation.images.top": "front"}, {0: 3.0})
+
+
+@pytest.fixture(scope="module")
+def stated(saved: dict[str, Path], loaded: Load, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """Folders of the adapter "units" with the contracts of two datasets, and "whole", the first one merged."""
+    root, settings = tmp_path_factory.mktemp("stated"), loaded("smolvla").model.kind.policy.config
+    folders = {name: shutil.copytree(saved["units"], root / name) for name in ("ten", "twenty", "again")}
+    folders["whole"] = shutil.copytree(saved["merged/units"], root / "whole")
+    write_processors(settings, arm(10.0).to_statistics(9), folders["ten"], folders["again"], folders["whole"])
+    write_processors(settings, arm(20.0).to_statistics(9), folders["twenty"])
+    return folders
+
+
+def served(base: Path, adapters: dict[str, Path], **config: Any) -> LeRobot:
+    named = {name: str(folder) for name, folder in adapters.items()}
+    policy = LeRobot.from_config({"checkpoint": str(base), "adapters": named, **config})
+    policy.initialize()
+    return policy
+
+
+def test_a_base_that_states_no_dataset_gets_the_contract_of_its_adapters(
+    made: Made, saved: dict[str, Path], stated: dict[str, Path]
+) -> None:
+    adapters = {"expert": saved["expert"], "ten": stated["ten"], "again": stated["again"]}
+    policy, alone = served(made("smolvla"), adapters), served(stated["whole"], {})
+    assert alone.contract is not None
+    assert alone.contract.gripper
+    assert policy.contract == alone.contract
+    joints = np.linspace(-3.1, 3.1, tiny.STATE - 1).astype(np.float32)  # the first one is wrapped to 3.18
+    seen = Obs({"front": view(0).cameras["top"]}, 0.5, {"joints": joints})
+    acts = []
+    for one, name in ((policy, "ten"), (alone, None)):
+        session = AgentCopies(one).make()
+        session.reset(seen, TASKS[0], seed=1, adapter=name)
+        acts.append(session.act(seen).action)
+    np.testing.assert_allclose(acts[0], acts[1], atol=ATOL)
+
+
+def test_adapters_of_different_contracts_are_refused(made: Made, stated: dict[str, Path]) -> None:
+    with pytest.raises(ConfigError, match=r"adapter 'twenty': .*its dataset has another contract"):
+        served(made("smolvla"), {"ten": stated["ten"], "twenty": stated["twenty"]})
+    with pytest.raises(ConfigError, match=r"adapter 'twenty': .*its dataset has another contract"):
+        served(stated["whole"], {"twenty": stated["twenty"]})
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"chunk_size": 7}, r"was trained with {'chunk_size': 7}, the base with {'chunk_size': 8}, want the same"),
+        ({"input_features": {"observation.images.side": {"type": "VISUAL", "shape": [3, 64, 64]}}}, "cameras.*side"),
+        ({"input_features": [3]}, "is no config of a LeRobot policy"),
+    ],
+)
+def test_an_adapter_that_was_trained_with_another_network_is_refused(
+    made: Made, saved: dict[str, Path], tmp_path: Path, change: dict[str, Any], says: str
+) -> None:
+    folder, base = shutil.copytree(saved["units"], tmp_path / "units"), made("smolvla")
+    config = json.loads((base / "config.json").read_text())
+    (folder / "config.json").write_text(json.dumps(config))
+    served(base, {"units": folder})
+    (folder / "config.json").write_text(json.dumps(config | change))
+    with pytest.raises(ConfigError, match=f"adapter 'units': .*{says}"):
+        served(base, {"units": folder})
+
+
+def test_an_adapter_whose_instructions_were_other_tokens_is_refused(
+    made: Made, saved: dict[str, Path], tmp_path: Path
+) -> None:
+    folder = shutil.copytree(saved["units"], tmp_path / "units")
+    file = folder / "policy_preprocessor.json"
+    pipeline = json.loads(file.read_text())
+    [tokens] = [step["config"] for step in pipeline["steps"] if step["registry_name"] == "tokenizer_processor"]
+    tokens["max_length"] += 1
+    file.write_text(json.dumps(pipeline))
+    with pytest.raises(ConfigError, match=r"adapter 'units': .*other settings of \['tokenizer_processor'\]"):
+        served(made("smolvla"), {"units": folder})

@@ -15,6 +15,8 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from vlagents_ray.dataset_contract import BYTES, STATISTICS, DatasetContract
 from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
 from vlagents_ray.evaluate.exports import to_lerobot
+from vlagents_ray.interface import Obs
+from vlagents_ray.robot.record import Recorder
 
 
 def test_lerobot_reads_what_an_evaluation_recorded(tmp_path: Path) -> None:
@@ -56,3 +58,27 @@ def test_lerobots_tools_leave_out_episodes_and_merge_datasets_of_ours(tmp_path: 
     fewer = delete_episodes(datasets[0], [1], tmp_path / "fewer", "evaluation/fewer")
     assert fewer.num_episodes == 2
     assert fewer.meta.stats["observation.state.position"]["mean"].shape == (2,), "by which the parts are told"
+
+
+def test_lerobot_reads_what_a_human_corrected(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "dataset", 10, interventions=True) as recorder:
+        for label in ("success", "discard", "failure"):
+            with recorder.episode("stack the cups"):
+                for i in range(6):
+                    camera = np.full((32, 48, 3), 20 * i, np.uint8)
+                    obs = Obs({"front": camera}, state={"joints": np.full(3, i, np.float32)})
+                    human = i >= 3
+                    wanted = np.full(2, -i, np.float32) if i == 3 else None
+                    recorder.add(obs, np.full(2, i, np.float32), tick=i, intervention=human, wanted=wanted)
+                recorder.label(label)  # type: ignore[arg-type]
+    dataset = LeRobotDataset("corrections/cups", root=tmp_path / "dataset")
+    assert (dataset.num_episodes, dataset.num_frames) == (2, 12)
+    frames = [dataset[i] for i in range(6)]
+    assert [bool(frame["intervention"]) for frame in frames] == [False] * 3 + [True] * 3
+    assert [bool(frame["policy_known"]) for frame in frames] == [True] * 4 + [False] * 2
+    assert [frame["policy_action"].tolist() for frame in frames] == [[0, 0], [1, 1], [2, 2], [-3, -3], [0, 0], [0, 0]]
+    assert [frame["action"].tolist() for frame in frames] == [[i, i] for i in range(6)]
+    assert list(dataset.meta.episodes["label"]) == ["success", "failure"]
+    assert dataset.meta.stats["policy_action"]["count"] == [12]
+    kept = delete_episodes(dataset, [1], tmp_path / "kept", "corrections/kept")
+    assert [bool(kept[i]["intervention"]) for i in range(6)] == [False] * 3 + [True] * 3

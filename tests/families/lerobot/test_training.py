@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -29,9 +30,10 @@ from vlagents_ray.contract import Contract, StateSpec, require_match
 from vlagents_ray.dataset_contract import BYTES, STATISTICS, DatasetContract
 from vlagents_ray.envs import make_env
 from vlagents_ray.evaluate.exports import to_lerobot
-from vlagents_ray.interface import Act
+from vlagents_ray.interface import Act, Obs
 from vlagents_ray.policies.lerobot import LeRobot
 from vlagents_ray.policies.scripted import Scripted
+from vlagents_ray.robot.record import Recorder
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 
 STEPS = 10
@@ -207,3 +209,18 @@ def test_a_contract_of_another_width_is_not_used(
     assert "has 3 numbers of state, the policy takes 9" in caplog.text
     assert contract is not None
     assert contract.state == {"joints": StateSpec(9)}
+
+
+def test_lerobots_trainer_takes_what_a_human_corrected(tmp_path: Path) -> None:
+    with Recorder(tmp_path / "corrected", 10, interventions=True) as recorder, recorder.episode("stack the cups"):
+        for i in range(20):
+            seen = Obs({"front": np.full((32, 48, 3), 10 * i, np.uint8)}, state={"joints": np.full(3, i, np.float32)})
+            recorder.add(seen, np.full(2, i, np.float32), tick=i, intervention=i > 9)
+        recorder.label("success")
+    policy = LeRobot.from_config({"checkpoint": str(train(tmp_path / "corrected", tmp_path / "run")), "device": "cpu"})
+    policy.initialize()
+    assert policy.contract is not None
+    assert (policy.contract.action.dim, list(policy.contract.state or {})) == (2, ["joints"])
+    config = json.loads((tmp_path / f"run/checkpoints/{STEPS:06d}/pretrained_model/config.json").read_text())
+    assert set(config["output_features"]) == {"action"}, "it does not learn what the policy wanted"
+    assert not any("policy" in name or "intervention" in name for name in config["input_features"])

@@ -107,6 +107,11 @@ def test_an_adapter_with_other_statistics_is_refused(
     shutil.copy(folder / "processor_config.json", own)
     load(folder, adapters={"own": str(own)})
     processor = json.loads((own / "processor_config.json").read_text())
+    (own / "processor_config.json").write_text(json.dumps(processor | {"state_mean": None}))  # it states none
+    load(folder, adapters={"own": str(own)})
+    (own / "processor_config.json").write_text("[3]")
+    with pytest.raises(ConfigError, match=r"adapter 'own': .*is no processor's config"):
+        load(folder, adapters={"own": str(own)})
     processor["state_mean"][0] += 1
     (own / "processor_config.json").write_text(json.dumps(processor))
     with pytest.raises(ConfigError, match=r"adapter 'own': .*got other \['state_mean'\] than the base has"):

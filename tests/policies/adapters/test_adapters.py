@@ -3,80 +3,27 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
+from adapted_network import DIM, LAYERS, Small, base
 from peft_adapters import merge, pairs, save
 
 from vlagents_ray import Obs
-from vlagents_ray.contract import ActionSpec, Contract, StateSpec
 from vlagents_ray.errors import ConfigError, NotTrainable, UnknownCheckpoint, UnknownSession
 from vlagents_ray.interface import DISTRIBUTION, POLICY, SAMPLES, Act
-from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row, shared_frames
-from vlagents_ray.policies.base.checkpoint import find_checkpoint
+from vlagents_ray.policies.adapters.peft_folder import read_adapter
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 
 pytestmark = pytest.mark.torch
 
-HORIZON, DIM, VIEWS = 3, 4, 2
-LAYERS = ("see", "look", "head.0", "head.2")
 RTOL = 1e-5
-
-
-class Small(ModelPolicy):
-    """A network that sees two views of a state at once, as numbers and as images, and adds noise."""
-
-    Config = ModelConfig
-    adaptable = True
-    trainable = network = "model"
-    passes: ClassVar[list[int]] = []
-
-    @property
-    def contract(self) -> Contract:
-        return Contract(state={"joints": StateSpec(DIM)}, action=ActionSpec(dim=DIM), chunk=HORIZON)
-
-    def load(self) -> Any:
-        import torch
-
-        find_checkpoint(self.config.checkpoint)
-        torch.manual_seed(0)
-        head = torch.nn.Sequential(torch.nn.Linear(8, 8), torch.nn.Tanh(), torch.nn.Linear(8, HORIZON * DIM))
-        parts = {"see": torch.nn.Linear(DIM, 8), "look": torch.nn.Conv2d(3, 8, 2, stride=2, padding=1), "head": head}
-        return torch.nn.ModuleDict({**parts, "attention": torch.nn.MultiheadAttention(8, 2)})
-
-    def perceive(self, obs: Obs) -> np.ndarray:
-        return obs.state["joints"].copy()
-
-    def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
-        import torch
-
-        self.passes.append(len(rows))
-        firsts, owners = shared_frames(rows)
-        states = torch.from_numpy(np.stack([rows[i].frames[-1] for i in firsts]))
-        with torch.inference_mode():
-            with self.adapters.rows([rows[i].adapter for i in firsts]):
-                views = torch.stack([states, -states], 1).flatten(0, 1)  # two entries for each observation
-                image = torch.cat([views, -views, views**2], 1).view(-1, 3, 2, 2)
-                both = self.model["see"](views) + self.model["look"](image).mean((2, 3))
-                seen = torch.tanh(both).unflatten(0, (len(firsts), VIEWS)).mean(1)[owners]
-            noise = torch.from_numpy(np.stack([row.noise(8) for row in rows]))
-            with self.adapters.rows([row.adapter for row in rows]):
-                chunks = self.model["head"](seen + noise).unflatten(1, (HORIZON, DIM))
-        return [Prediction(chunk) for chunk in chunks.numpy()]
 
 
 class Plain(Small):
     adaptable = False
-
-
-def base(tmp_path: Path) -> Path:
-    folder = tmp_path / "base"
-    folder.mkdir(exist_ok=True)
-    (folder / "weights.bin").write_bytes(b"base")
-    return folder
 
 
 def loaded(tmp_path: Path, **config: Any) -> Small:
@@ -328,3 +275,35 @@ def test_an_adapter_of_another_base_is_refused(tmp_path: Path) -> None:
         json.dumps(config | {"base_model_name_or_path": str(tmp_path / "base")})
     )
     loaded(tmp_path, adapters=paths(tmp_path, "stack"))
+
+
+def test_a_file_of_the_folder_is_not_the_adapter(tmp_path: Path) -> None:
+    folder = save(tmp_path / "stack", pairs(network(tmp_path), LAYERS, 2))
+    with pytest.raises(ConfigError, match=r"adapter 'stack': .*got a file, want the folder with adapter_config.json"):
+        loaded(tmp_path, adapters={"stack": str(folder / "adapter_model.safetensors")})
+
+
+@pytest.mark.parametrize("named", ["/" + 300 * "a", "~nobody_here/base", "\0"])
+def test_a_base_that_cannot_be_looked_up_is_unknown(tmp_path: Path, named: str) -> None:
+    save(tmp_path / "stack", pairs(network(tmp_path), LAYERS, 2), base_model_name_or_path=named)
+    loaded(tmp_path, adapters=paths(tmp_path, "stack"))
+
+
+@pytest.mark.parametrize("content", ["[" * 100_000, '{"peft_type": "LORA", "base_model_name_or_path": 3}', "\0"])
+def test_a_damaged_config_is_refused(tmp_path: Path, content: str) -> None:
+    folder = save(tmp_path / "stack", pairs(network(tmp_path), LAYERS, 2))
+    (folder / "adapter_config.json").write_text(content)
+    with pytest.raises(ConfigError, match="adapter 'stack': "):
+        loaded(tmp_path, adapters=paths(tmp_path, "stack"))
+
+
+def test_values_are_scaled_before_they_are_rounded(tmp_path: Path) -> None:
+    small = network(tmp_path).half()
+    values = pairs(small, LAYERS, 2)
+    folder = save(tmp_path / "tiny", {name: value * np.float32(1e-9) for name, value in values.items()}, lora_alpha=2e9)
+    _, scaled = read_adapter(folder, small)["see"]
+    wanted = values["base_model.model.see.lora_B.weight"]
+    np.testing.assert_allclose(scaled.float().numpy(), wanted, rtol=1e-3)
+    huge = save(tmp_path / "huge", values, lora_alpha=2e6)
+    with pytest.raises(ConfigError, match=r"got NaN or infinite values as torch\.float16"):
+        read_adapter(huge, small)

@@ -233,6 +233,16 @@ def test_an_ensemble_averages_what_the_chunks_say_of_a_tick() -> None:
     assert second[0] == pytest.approx((1 + 10) / 2, abs=0.1)
 
 
+@pytest.mark.parametrize("actions", ["queue", "ensemble"])
+def test_a_plan_in_whose_place_others_were_executed_is_dropped(actions: str) -> None:
+    session = begun(loaded(actions=actions))
+    session.act(at(0.0))
+    told = session.act(at(10.0, executed_actions=np.ones((3, DIM), np.float32)))
+    assert told.action[0] == pytest.approx(10, abs=0.1), "row 0 of the chunk for what a human left"
+    assert session.episode is not None
+    assert len(session.episode.frames) == 2, "its history is what it has seen"
+
+
 def test_samples_come_with_their_mean_and_change_no_action() -> None:
     policy = loaded()
     plain, asked = begun(policy), begun(policy)

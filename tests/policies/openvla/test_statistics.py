@@ -47,3 +47,10 @@ def test_fine_tunings_statistics_go_before_the_base_models(tmp_path: Path) -> No
     assert Statistics.of(tmp_path).key(None) == "base"
     (tmp_path / "dataset_statistics.json").write_text(json.dumps(ONE))
     assert Statistics.of(tmp_path).key(None) == "libero_goal_no_noops"
+
+
+@pytest.mark.parametrize(("content", "says"), [("{", "is no JSON .*; copy it again"), ("[3]", "got no normalisation")])
+def test_damaged_statistics_are_refused(tmp_path: Path, content: str, says: str) -> None:
+    (tmp_path / "dataset_statistics.json").write_text(content)
+    with pytest.raises(ConfigError, match=says):
+        Statistics.of(tmp_path)

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from live_server import METADATA
 
+from vlagents_ray.errors import UnknownSession
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.live import fleet
@@ -27,6 +28,9 @@ class Others:
 
     async def views(self) -> dict[str, Other]:
         return {name: partial(self._read, name) for name in self.names}
+
+    async def press(self, session: str, do: str, text: str, by: str) -> dict[str, Any] | None:
+        return {"do": do, "by": by} if session == "of b" else None
 
     async def _read(self, name: str, since: int, shown: Collection[str]) -> Snapshot:
         self.asked.append((name, since, shown))
@@ -60,6 +64,15 @@ def test_pictures_go_to_those_who_show_them(own: ReplicaView) -> None:
     assert [one["sessions"][0]["pictures"] for one in second["replicas"][:2]] == [{"front": 0}, {"front": 1}]
     assert their_files == [b"b", b"c"]
     assert others.asked[0][2] == {"of b", "of c"}
+
+
+def test_a_command_reaches_the_replica_that_has_the_session(own: ReplicaView) -> None:
+    gathered = Fleet(own, Others("b"))
+    assert asyncio.run(gathered.press("of b", "stop", "", "lab")) == {"do": "stop", "by": "lab"}
+    with pytest.raises(UnknownSession):
+        asyncio.run(gathered.press("of c", "stop", "", "lab"))
+    with pytest.raises(UnknownSession):
+        asyncio.run(Fleet(own).press("of b", "stop", "", "lab"))
 
 
 def test_a_replica_that_does_not_answer_is_left_out_and_asked_again_from_where_it_was(own: ReplicaView) -> None:
@@ -130,3 +143,22 @@ def test_an_error_of_a_reading_does_not_end_the_next(own: ReplicaView, monkeypat
         return document
 
     assert asyncio.run(watch())["replicas"][0]["name"] == "own"
+
+
+def test_what_is_beside_the_replicas_is_sent_when_it_has_changed() -> None:
+    said: list[dict[str, Any]] = [{"evaluation": {"done": 1}}]
+
+    async def watch() -> list[dict[str, Any]]:
+        gathered = Fleet(None, beside=lambda: said[-1])
+        viewer = gathered.add()
+        found = [(await viewer.next())[0] for _ in range(2)]
+        said.append({"evaluation": {"done": 2}})
+        while "evaluation" not in (last := (await viewer.next())[0]):
+            pass
+        gathered.remove(viewer)
+        return [*found, last]
+
+    first, second, last = asyncio.run(watch())
+    assert (first["evaluation"], last["evaluation"]) == ({"done": 1}, {"done": 2})
+    assert "evaluation" not in second
+    assert first["replicas"] == []

@@ -2,36 +2,35 @@
 
 from __future__ import annotations
 
+import json
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 
 import numpy as np
 import pytest
 from browser import Page, browser
 from eval_fakes import wait_for
 from in_memory_keys import ChangingKeys
-from live_server import LiveServer, live_server
+from live_server import Address, LiveServer, live_server
 
 from vlagents_ray import Obs, RemoteAgent
+from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.client.commands import CommandInbox
+from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import RankName
+from vlagents_ray.robot.loop import LoopReport, run_loop
+from vlagents_ray.robot.simulated import SimulatedRobot
+from vlagents_ray.serve.access import api_keys
+from vlagents_ray.serve.config.live import LiveArgs
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 CARDS = "document.querySelectorAll('article').length"
 PICTURES = "[...document.querySelectorAll('article img')].filter((one) => one.naturalWidth === 48).length"
 STATUS = "document.getElementById('connection').textContent"
-
-
-class Address:
-    """An address of the web, as `Page.open` takes files."""
-
-    def __init__(self, url: str) -> None:
-        self._url = url
-
-    def as_uri(self) -> str:
-        return self._url
 
 
 @pytest.fixture(scope="module")
@@ -112,6 +111,35 @@ def test_a_card_says_what_its_session_does(page: Page, server: LiveServer) -> No
     until(page, CARDS, 0)  # it ended
 
 
+def test_a_card_compares_what_was_planned_with_what_was_executed(page: Page, server: LiveServer) -> None:
+    over = threading.Event()
+
+    def play() -> None:
+        with RemoteAgent(server.url) as agent:
+            player = ChunkPlayer(agent, mode="async", deadline_s=0.01, safe="hold")
+            obs = Obs(state={"joints": np.zeros(7, np.float32)})
+            player.reset(obs, "play")
+            while not over.wait(0.02):
+                player.act(obs)
+            player.close()
+
+    robot = threading.Thread(target=play)
+    robot.start()
+    try:
+        show(page, server)
+        until(page, "document.querySelectorAll('.compared polyline').length > 2", want=True)
+        page.value(
+            "(() => { const joint = document.querySelector('.compared select'); joint.value = '6';"
+            "joint.dispatchEvent(new Event('change')); })()"
+        )
+        assert page.value("document.querySelector('.compared svg').ariaLabel").startswith("Joint 7, ")
+        until(page, "document.querySelector('article').innerText.includes('age when executed')", want=True)
+        assert page.said == []
+    finally:
+        over.set()
+        robot.join()
+
+
 def test_sixteen_simulations_are_found_by_name(page: Page, server: LiveServer) -> None:
     with acting(server, 16, "simulation"):
         show(page, server)
@@ -125,6 +153,54 @@ def test_sixteen_simulations_are_found_by_name(page: Page, server: LiveServer) -
             page.value("[...document.querySelectorAll('article')].filter((one) => one.checkVisibility()).length") == 1
         )
         assert "simulation" in page.value("document.querySelector('article').innerText")
+
+
+PRESS = "(text) => [...document.querySelectorAll('article button')].find((one) => one.textContent === text).click()"
+
+
+@contextmanager
+def operated(server: LiveServer, key: str | None = None) -> Iterator[list[LoopReport]]:
+    """A simulated robot that obeys the page."""
+    commands, over, reports = CommandInbox(), threading.Event(), []
+    with RemoteAgent(server.url, api_key=key, commands=commands) as agent:
+        robot, player = SimulatedRobot(Contract(action=ActionSpec(7))), ChunkPlayer(agent, mode="async", safe="hold")
+        thread = threading.Thread(
+            target=lambda: reports.append(
+                run_loop(robot, player, hz=50, instruction="wipe the table", commands=commands, until=over.is_set)
+            )
+        )
+        thread.start()
+        try:
+            yield reports
+        finally:
+            over.set()
+            thread.join()
+            player.close()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("width", [360, 1400])
+def test_buttons_act_on_a_session(page: Page, server: LiveServer, width: int, scheme: str) -> None:
+    outcome = "document.querySelector('article .operate [role=status]')?.textContent"
+    with operated(server) as reports:
+        show(page, server, width=width, scheme=scheme)
+        until(page, "document.querySelectorAll('.compared polyline').length > 2", want=True)
+        page.value(f"({PRESS})('Pause')")
+        until(page, outcome, "pause: done")
+        until(page, "document.querySelector('article').innerText.includes('stopped')", want=True)
+        assert page.value("document.documentElement.scrollWidth") <= width
+        page.value(f"({PRESS})('Resume')")
+        until(page, outcome, "resume: done")
+        page.value(f"({PRESS})('Follow versions')")  # a robot is pinned unless it is told otherwise
+        until(page, outcome, "follow: done")
+        until(page, "[...document.querySelectorAll('article button')].some((one) => one.value === 'pin')", want=True)
+        page.value("document.querySelector('article input').value = 'fold the cloth'")
+        page.value(f"({PRESS})('Change')")
+        wait_for(lambda: reports, 30)
+        assert reports[0].next_instruction == "fold the cloth"
+        assert page.said == []
+        outside = [url for url in page.asked if not url.startswith(("blob:", "data:", server.url))]
+        assert outside == []
 
 
 def test_it_asks_for_a_key_and_watches_with_one(page: Page) -> None:
@@ -142,6 +218,36 @@ def test_it_asks_for_a_key_and_watches_with_one(page: Page) -> None:
             until(page, STATUS, told)
         until(page, PICTURES, 1)
         assert "plain/" in page.value("document.querySelector('article h3').textContent")
+
+
+def test_a_session_is_saved(page: Page, tmp_path: Path) -> None:
+    outcome = "document.querySelector('article .operate [role=status]')?.textContent"
+    policy = Noop.from_config({"action_dim": 7, "chunk": 8})
+    with live_server(policy, settings=LiveArgs(folder=str(tmp_path))) as server, operated(server):
+        show(page, server)
+        until(page, "[...document.querySelectorAll('article img')].length", 2)
+        page.value(f"({PRESS})('Save last 30 s')")
+        until(page, f"({outcome} || '').startsWith('save: done, in {tmp_path}')", want=True)
+    [info] = tmp_path.rglob("info.json")
+    assert json.loads(info.read_text())["total_episodes"] == 1
+
+
+def test_a_key_without_the_scope_sees_no_buttons(page: Page, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(api_keys, "_CHECK_S", 0.0)
+    keys = ChangingKeys()
+    for name, scopes, buttons in (("watching", ["watch"], 0), ("lab", ["watch", "operate"], 7)):
+        key = keys.add(name, scopes=scopes)
+        with live_server(Noop.from_config({"action_dim": 7}), keys=keys.keys) as server, operated(server, key):
+            show(page, server)
+            until(page, "document.getElementById('key').hidden", want=False)
+            page.value(
+                f"(() => {{ document.getElementById('key-text').value = '{key}';"
+                "document.querySelector('#key button').click(); })()"
+            )
+            until(page, STATUS, "Live")
+            until(page, CARDS, 1)
+            shown = "[...document.querySelectorAll('article button')].filter((one) => one.checkVisibility()).length"
+            until(page, shown, buttons)
 
 
 def test_it_says_so_when_the_server_is_gone(page: Page) -> None:

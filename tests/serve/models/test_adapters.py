@@ -11,7 +11,7 @@ import pytest
 from numbered_checkpoints import begin
 
 from vlagents_ray import Act, Agent, Obs
-from vlagents_ray.errors import UnknownCheckpoint
+from vlagents_ray.errors import ConfigError, UnknownCheckpoint
 from vlagents_ray.interface import POLICY
 from vlagents_ray.policies.adapters import ADAPTER
 from vlagents_ray.protocol.messages import Reply, Request
@@ -70,7 +70,7 @@ def serve(made: list[Adapted]) -> Iterator[Callable[..., Engine]]:
 
 def told(engine: Engine, session: str, **kwargs: Any) -> dict[str, Any]:
     """What a reset says."""
-    reply = begin(engine, session, **kwargs).get(timeout=10)
+    reply = begin(engine, session, **kwargs).get(timeout=120)
     if reply.error is not None:
         raise reply.error
     assert reply.info is not None
@@ -87,7 +87,7 @@ def test_sessions_of_one_base_act_in_one_batch_and_say_what_acted(
     assert told(engine, "s3", checkpoint="late") == {"checkpoint": "/runs/b", "weights": "whole:/runs/b"}
     replies: list[queue.SimpleQueue[Reply]] = [queue.SimpleQueue() for _ in range(4)]
     engine.queue.put(*(engine.ticket(f"s{i}", Request("act", Obs()), replies[i].put) for i in range(4)))
-    acts = [one.get(timeout=10).act for one in replies]
+    acts = [one.get(timeout=120).act for one in replies]
     assert [one.info[POLICY]["fingerprint"] for one in acts if one is not None][:2] == ["stack", "pour"]
     assert [agent.batches for agent in made] == [[["stack", "pour", ""]], [[""]]]
 
@@ -120,6 +120,7 @@ def test_a_swap_keeps_the_adapters(serve: Callable[..., Engine], made: list[Adap
     [
         ({"checkpoint": "fold"}, r"got 'fold', want one of \['late', 'pour', 'stack'\]"),
         ({"checkpoint": "stack", "checkpoint_step": 3}, "got 3 with the adapter 'stack', which has none"),
+        ({"checkpoint": "stack", "adapter": "pour"}, "got 'pour' and checkpoint 'stack', want one of them"),
     ],
 )
 def test_what_is_not_offered_is_refused(serve: Callable[..., Engine], options: dict[str, Any], says: str) -> None:
@@ -132,3 +133,17 @@ def test_an_adapter_stands_alone(settings: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=r"stack: got .*, want \{adapter: FOLDER or org/name@COMMIT\} alone") as error:
         CheckpointArgs(choices={"stack": settings})
     assert "choices" in str(wrong_settings(error.value, CheckpointArgs))
+
+
+def of(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings that a deployment with adapters makes of its policy's."""
+    return CheckpointArgs(choices=CHOICES).of(lambda _: Agent(), settings).config
+
+
+def test_adapters_of_the_settings_stay_beside_those_of_the_deployment() -> None:
+    both = of({"checkpoint": "/runs/a", "adapters": {"fold": "/runs/fold", "stack": "/runs/stack"}})
+    assert both["adapters"] == {"fold": "/runs/fold", "stack": "/runs/stack", "pour": "org/pour@main"}
+    with pytest.raises(ConfigError, match=r"got \['stack'\] both in the policy's settings and among"):
+        of({"checkpoint": "/runs/a", "adapters": {"stack": "/runs/other"}})
+    with pytest.raises(ConfigError, match=r"adapters: got \['stack'\], want a folder or hub id by the name"):
+        of({"checkpoint": "/runs/a", "adapters": ["stack"]})

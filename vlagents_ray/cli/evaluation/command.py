@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from vlagents_ray.cli.console import errors
-from vlagents_ray.cli.options import YAML_SUFFIXES, Address, Set, parse_list, parse_settings, parse_time, read_run_file
+from vlagents_ray.cli.options import (
+    YAML_SUFFIXES,
+    Address,
+    Live,
+    LiveAt,
+    Set,
+    parse_list,
+    parse_settings,
+    parse_time,
+    read_run_file,
+)
 from vlagents_ray.cli.ray_session import RESUME, exit_if_ray_is_lost
 from vlagents_ray.errors import ConfigError
 
@@ -103,7 +113,26 @@ def evaluate_command(
             help="With --address: a policy has a replica on each GPU of the cluster, unless its deployment says more.",
         ),
     ] = False,
+    arm: Annotated[
+        str | None,
+        typer.Option(
+            "--robot",
+            metavar="MODULE:CLASS",
+            help="Play the file's trials on a real robot, of this class: a person resets the scene and judges, and "
+            "does not see which policy plays.",
+        ),
+    ] = None,
+    operator: Annotated[
+        str | None,
+        typer.Option(metavar="page|terminal", help="With --robot: where that person is asked; default: page"),
+    ] = None,
+    unblind: Annotated[
+        bool,
+        typer.Option("--unblind", help="With --robot: write the results of the judged trials; play none."),
+    ] = False,
     address: Address = None,
+    live: Live = False,
+    live_at: LiveAt = None,
 ) -> None:
     """Evaluate policies: episodes in parallel, success rates with confidence intervals, videos.
 
@@ -125,21 +154,49 @@ def evaluate_command(
             raise ConfigError("--dry-run and --watch exclude each other: nobody knows yet which steps there will be")
         if end_at is not None and watch is not None:
             raise ConfigError("--end-at and --watch exclude each other: watching ends with --until, or by Ctrl-C")
+        on_robot = evaluation.real_robot is not None
+        _require_robot(given, on_robot)
         if replica_per_gpu and address is None:
             raise ConfigError("--replica-per-gpu: want --address, a cluster whose GPUs can be counted")
+        if dry_run and (live or live_at):
+            raise ConfigError("--dry-run and --live exclude each other: nothing is played that could be watched")
+        if on_robot:
+            from vlagents_ray.cli.evaluation.robot import run_on_robot
+
+            run_on_robot(evaluation, address, operator=operator or "page", unblinded=unblind)
+            return
         if dry_run:
             from vlagents_ray.cli.evaluation.dry_run import print_plan
 
             print_plan(evaluation)
-        elif watch is not None:
+            return
+        page = None
+        if live or live_at:
+            from vlagents_ray.cli.evaluation.live import live_address
+
+            page = live_address(live_at)
+        if watch is not None:
             from vlagents_ray.cli.evaluation.watch import watch_training
 
-            watch_training(evaluation, watch, address, **watching)
+            watch_training(evaluation, watch, address, live=page, **watching)
         else:
             from vlagents_ray.cli.evaluation.run import run_evaluation
 
             end = None if end_at is None else parse_time(end_at, "--end-at")
-            run_evaluation(evaluation, address, end_at=end, replica_per_gpu=replica_per_gpu)
+            run_evaluation(evaluation, address, end_at=end, replica_per_gpu=replica_per_gpu, live=page)
+
+
+def _require_robot(options: Mapping[str, Any], on_robot: bool) -> None:
+    """Raise `ConfigError` for options that need a robot without one, or that exclude one."""
+    if not on_robot:
+        if needing := [f"--{name}" for name in ("operator", "unblind") if options[name]]:
+            raise ConfigError(f"got {needing} without --robot")
+        return
+    names = ("watch", "dry_run", "end_at", "track", "live", "live_at")
+    if excluded := [f"--{name.replace('_', '-')}" for name in names if options[name]]:
+        raise ConfigError(f"--robot and {excluded} exclude each other")
+    if options["operator"] not in (None, "page", "terminal"):
+        raise ConfigError(f"--operator: got {options['operator']!r}, want page or terminal")
 
 
 def config_from_options(options: Mapping[str, Any]) -> EvalConfig:
@@ -173,6 +230,8 @@ def config_from_options(options: Mapping[str, Any]) -> EvalConfig:
         if "source" not in policy or "out" not in run:
             raise ConfigError("want --policy and --out, or a file of runs (.yaml)")
         fields = {"policies": [policy], "suites": [{"envs": list(what)} | suite], **run}
+    if options["arm"] is not None:
+        fields["robot"] = {**(fields.get("robot") or {}), "arm": options["arm"]}
     return _with_resources(EvalConfig.model_validate(fields), worker)
 
 

@@ -60,7 +60,8 @@ def served(config: EvalConfig, address: str | None = None, *, replica_per_gpu: b
             _require_gpus(config)
             for part in parts.values():
                 require_packages(part)
-        _require_match(config, parts)
+        if config.real_robot is None:
+            _require_match(config, parts)
         check(config)
         if parts and replica_per_gpu:
             parts = spread_over_gpus(parts, kept=config.workers * most_gpus(config))

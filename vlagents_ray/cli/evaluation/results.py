@@ -9,7 +9,8 @@ from typing import Annotated, Any
 import typer
 
 from vlagents_ray.cli.console import errors, fresh, out
-from vlagents_ray.cli.options import Address, parse_list
+from vlagents_ray.cli.evaluation.open_loop import is_dataset, replay_dataset
+from vlagents_ray.cli.options import Address, Live, LiveAt, parse_list
 from vlagents_ray.errors import ConfigError
 
 
@@ -29,13 +30,25 @@ def report_command(
     videos: Annotated[
         Videos, typer.Option(help="In the page as far as they fit, beside it, or stills alone.")
     ] = Videos.LINK,
+    live: Live = False,
+    live_at: LiveAt = None,
 ) -> None:
-    """Write a page of what came out: success with intervals, comparisons, latency, failures, and all that made it."""
+    """Write a page of what came out: success with intervals, comparisons, latency, failures, and all that made it.
+
+    With --live it writes none: it shows the results in OUT as another process adds to them, until Ctrl-C.
+    """
     from vlagents_ray.evaluate import Results
     from vlagents_ray.evaluate.report.html import FILE, write_report
     from vlagents_ray.evaluate.results.combine import combined
 
     with errors():
+        if live or live_at:
+            from vlagents_ray.cli.evaluation.live import follow, live_address
+
+            if len(folders) != 1 or html is not None:
+                raise ConfigError("--live shows one folder, and writes no file: want one OUT, and no --html")
+            follow(folders[0], live_address(live_at))
+            return
         results = combined([Results.load(folder) for folder in folders])
         path = html or (folders[0] / FILE if len(folders) == 1 else Path(FILE))
         written = write_report(results, path, videos=videos.value)
@@ -101,31 +114,72 @@ def merge_command(
 
 
 def replay_command(
-    folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the results.")],
-    episode: Annotated[str, typer.Argument(help="Its key, or ENV#NUMBER: 'tabletop#3'.")],
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Folder of results, or a LeRobotDataset.")],
+    episode: Annotated[
+        str | None, typer.Argument(help="Of results: its key, or ENV#NUMBER: 'tabletop#3'.", show_default=False)
+    ] = None,
     policy: Annotated[
         str | None, typer.Option(help="A registered name, a deployment file, or a URL, in place of the run's own.")
     ] = None,
     out_dir: Annotated[
-        Path | None, typer.Option("--out", help="Folder of the replay, with its video; default: a new one below OUT.")
+        Path | None, typer.Option("--out", help="Folder of the replay: its video, or its report. Default: a new one.")
     ] = None,
     address: Address = None,
+    episodes: Annotated[str | None, typer.Option(help="Of a dataset: these, as 0-9,12. Default: all.")] = None,
+    horizon: Annotated[int | None, typer.Option(min=1, help="Of a dataset: rows of a chunk that are compared.")] = None,
+    every: Annotated[
+        int, typer.Option(min=1, help="Of a dataset without recorded answers: ask at each so many-th frame.")
+    ] = 1,
+    at_once: Annotated[int, typer.Option(min=1, help="Of a dataset: episodes that share a batch.")] = 8,
+    cameras: Annotated[
+        str | None, typer.Option(help="Of a dataset: the policy's cameras by its own, as base=top,wrist=left.")
+    ] = None,
+    state: Annotated[
+        str | None, typer.Option(help="Of a dataset: parts of observation.state in order, as joints,gripper.")
+    ] = None,
 ) -> None:
-    """Play an episode of an evaluation again, and compare: exit code 0 if every action and its outcome is the same."""
+    """Play an episode of an evaluation again: exit code 0 if all is the same. Or play a dataset to another policy.
+
+    A dataset is what a server recorded, or any LeRobotDataset: its errors by joint and by step of the horizon are
+    printed, and written as JSON and as a page.
+    """
+    with errors():
+        if is_dataset(folder):
+            if episode is not None:
+                raise ConfigError(f"{folder}: is a dataset, got {episode!r}; want --episodes, or none of it")
+            replay_dataset(
+                folder,
+                policy,
+                out_dir or fresh(Path("runs/replay")),
+                episodes=episodes,
+                horizon=horizon,
+                every=every,
+                at_once=at_once,
+                cameras=cameras,
+                state=state,
+            )
+            return
+        if episode is None:
+            raise ConfigError(f"{folder}: holds results, and wants an episode: its key, or ENV#NUMBER")
+        same = _same(folder, episode, policy, out_dir, address)
+    raise typer.Exit(not same)
+
+
+def _same(folder: Path, episode: str, policy: str | None, out_dir: Path | None, address: str | None) -> bool:
+    """Play an episode again, print what differs, and return whether nothing does."""
     from vlagents_ray.cli.evaluation.run import play_one
     from vlagents_ray.evaluate import Results
     from vlagents_ray.evaluate.replay import compare, find
 
-    with errors():
-        recorded = find(Results.load(folder), episode)
-        other: dict[str, Any] | None = None
-        if policy is not None:
-            other = {"source": policy, "url": None, "config": {}, "checkpoint": None}
-        into = out_dir or fresh(folder / "replays" / "replay")
-        summary = play_one(recorded.config(into, policy=other), address, recorded.number_and_seed)
-        found = compare(recorded, summary.results)
+    recorded = find(Results.load(folder), episode)
+    other: dict[str, Any] | None = None
+    if policy is not None:
+        other = {"source": policy, "url": None, "config": {}, "checkpoint": None}
+    into = out_dir or fresh(folder / "replays" / "replay")
+    summary = play_one(recorded.config(into, policy=other), address, recorded.number_and_seed)
+    found = compare(recorded, summary.results)
     steps = recorded.episode.result.steps
     lines = found or [f"the same: {steps} actions byte for byte, and what came of them"]
     for line in [*lines, f"replay: {into}"]:
         out.print(line)
-    raise typer.Exit(bool(found))
+    return not found

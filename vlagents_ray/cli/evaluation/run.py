@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING
 
 from vlagents_ray.cli.console import fail, out
@@ -9,16 +10,34 @@ from vlagents_ray.cli.evaluation.policies import served
 from vlagents_ray.slurm.script import UNFINISHED
 
 if TYPE_CHECKING:
-    from vlagents_ray.evaluate import EvalConfig, Summary
+    from vlagents_ray.evaluate import EvalConfig, Progress, Summary
 
 
 def run_evaluation(
-    config: EvalConfig, address: str | None = None, *, end_at: float | None = None, replica_per_gpu: bool = False
+    config: EvalConfig,
+    address: str | None = None,
+    *,
+    end_at: float | None = None,
+    replica_per_gpu: bool = False,
+    live: tuple[str, int] | None = None,
 ) -> None:
-    """Serve the policies that are not at a URL, evaluate them all, print the table; `end_at` as in `evaluate`."""
-    with served(config, address, replica_per_gpu=replica_per_gpu) as ready:
-        summary = evaluate_and_print(ready, end_at)
+    """Serve the policies that are not at a URL, evaluate them all, print the table.
+
+    `end_at` is as in `evaluate`, and `live` the address of the live page, as for `live_progress`.
+    """
+    with served(config, address, replica_per_gpu=replica_per_gpu) as ready, shown_progress(ready, live) as progress:
+        summary = evaluate_and_print(ready, progress, end_at)
     require_results(ready, summary)
+
+
+def shown_progress(
+    config: EvalConfig, live: tuple[str, int] | None, *, goes_on: bool = False
+) -> AbstractContextManager[Progress]:
+    """Return the progress of an evaluation: on the terminal, and on the live page if that has an address."""
+    from vlagents_ray.cli.evaluation.live import live_progress
+    from vlagents_ray.evaluate import progress_for
+
+    return live_progress(config.out, [one.url for one in config.policies], live, progress_for(out), goes_on=goes_on)
 
 
 def play_one(config: EvalConfig, address: str | None, only: tuple[int, int]) -> Summary:
@@ -29,12 +48,12 @@ def play_one(config: EvalConfig, address: str | None, only: tuple[int, int]) -> 
         return evaluate(ready, progress=progress_for(out), only=only)
 
 
-def evaluate_and_print(config: EvalConfig, end_at: float | None = None) -> Summary:
+def evaluate_and_print(config: EvalConfig, progress: Progress, end_at: float | None = None) -> Summary:
     """Evaluate policies that are at their URLs; an interrupted evaluation prints what it has."""
-    from vlagents_ray.evaluate import EvaluationInterrupted, OutOfTime, evaluate, print_summary, progress_for
+    from vlagents_ray.evaluate import EvaluationInterrupted, OutOfTime, evaluate, print_summary
 
     try:
-        summary = evaluate(config, progress=progress_for(out), end_at=end_at)
+        summary = evaluate(config, progress=progress, end_at=end_at)
     except EvaluationInterrupted as interrupted:
         print_summary(out, interrupted.summary)
         if isinstance(interrupted, OutOfTime):

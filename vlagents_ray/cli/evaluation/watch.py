@@ -9,7 +9,7 @@ from typing import Any
 from vlagents_ray.cli.console import out
 from vlagents_ray.cli.doctor.listing import require_packages
 from vlagents_ray.cli.evaluation.policies import policy_deployment, resolve_policies, served
-from vlagents_ray.cli.evaluation.run import evaluate_and_print, require_results
+from vlagents_ray.cli.evaluation.run import evaluate_and_print, require_results, shown_progress
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, PolicyConfig
 from vlagents_ray.evaluate.checkpoint_watcher import CheckpointWatcher, rounds
@@ -30,12 +30,13 @@ def watch_training(
     until: int | None = None,
     settle_s: float = 10.0,
     marker: str | None = None,
+    live: tuple[str, int] | None = None,
 ) -> None:
     """Evaluate each step of the one policy whose checkpoint holds `{step}` once it is whole.
 
     All go into one folder, and one server stays up for them. Policies without `{step}` are evaluated in the first
-    round. Ends as `rounds` does, or by Ctrl-C; to go on, resume. An episode without a result ends the command with
-    status 1, after the last round.
+    round. `live` is the address of the live page, as for `live_progress`. Ends as `rounds` does, or by Ctrl-C; to go
+    on, resume. An episode without a result ends the command with status 1, after the last round.
     """
     place, pattern = _watched(config)
     if (config.out / FILE).is_file() and not config.resume:  # said now, not when the first checkpoint is there
@@ -58,12 +59,16 @@ def watch_training(
     first = next(found, None)
     if first is None:
         raise ConfigError(f"{watcher.folder}: watching ended without a checkpoint; still waiting: {watcher.waiting()}")
-    with served(_at(config, place, first), address) as ready, ray_cluster(ready):
-        summary = evaluate_and_print(ready)
+    with (
+        served(_at(config, place, first), address) as ready,
+        ray_cluster(ready),
+        shown_progress(ready, live, goes_on=True) as progress,
+    ):
+        summary = evaluate_and_print(ready, progress)
         every = [*first]
         for steps in found:
             every += steps
-            summary = evaluate_and_print(_at(ready, place, steps).model_copy(update={"resume": True}))
+            summary = evaluate_and_print(_at(ready, place, steps).model_copy(update={"resume": True}), progress)
     require_results(_at(ready, place, every), summary)
 
 

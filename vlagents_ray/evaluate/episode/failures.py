@@ -29,7 +29,7 @@ from vlagents_ray.errors import (
     VLAgentsError,
 )
 
-Cause = Literal["user", "policy", "worker"]
+Cause = Literal["user", "policy", "worker", "operator"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,8 @@ class Failure:
     """Why an attempt failed, and which side can correct it.
 
     "user": a mistake in the settings, which stops the evaluation; "policy": the connection to the policy; "worker": the
-    simulator or its process, which is then replaced.
+    simulator or its process, which is then replaced, or a real robot; "operator": a person had a trial of a real robot
+    repeated.
     """
 
     cause: Cause

@@ -13,6 +13,8 @@ from vlagents_ray.errors import ConfigError, UnknownEnv
 from vlagents_ray.evaluate.plan.config import (
     EvalConfig,
     PolicyConfig,
+    RobotConfig,
+    RobotTask,
     SuiteConfig,
     WorkerConfig,
     fingerprint,
@@ -32,6 +34,14 @@ class EvalCase:
     suite: SuiteConfig
     env: str  # full name
     worker: WorkerConfig
+    robot: RobotConfig | None = None  # the real robot; None: `env` is simulated
+
+    @property
+    def on_robot(self) -> tuple[RobotConfig, RobotTask]:
+        """The real robot and its task; only of a cell on one."""
+        if self.robot is None:
+            raise TypeError(f"{self.env}: this cell is simulated")
+        return self.robot, self.robot.tasks[self.env]
 
     @property
     def contender(self) -> str:
@@ -53,6 +63,7 @@ class EvalCase:
         """All that an episode depends on, apart from its number and seed."""
         pushed = self.policy.pushed_weights
         return {
+            **({} if self.robot is None else {"robot": _settings(*self.on_robot)}),
             **({} if pushed is None else {"pushed_weights": pushed.model_dump()}),  # older results have no such setting
             "env": self.env,
             "env_options": self.suite.env_options,
@@ -88,6 +99,10 @@ class EvalCase:
         return self.suite.episodes * len(self.suite.seeds)
 
 
+def _settings(robot: RobotConfig, task: RobotTask) -> dict[str, Any]:
+    return robot.model_dump(exclude={"tasks", "key"}) | {"task": task.model_dump()}
+
+
 def contender(policy: str, step: int | None) -> str:
     """A policy at its checkpoint, in a word."""
     return policy if step is None else f"{policy}@{step}"
@@ -100,13 +115,19 @@ def cells(config: EvalConfig) -> list[EvalCase]:
     in two suites that do not differ: their episodes would have the same keys; and for names that differ only by signs
     that a file's name cannot have: their episodes would have the same files.
     """
-    envs = [(suite, env) for suite in config.suites for pattern in suite.envs for env in expand(pattern)]
+    robot = config.real_robot
+    envs = [
+        (suite, env)
+        for suite in config.suites
+        for pattern in suite.envs
+        for env in (expand(pattern) if robot is None else _tasks(robot, pattern))
+    ]
     contenders: list[tuple[PolicyConfig, int | None]] = []
     for policy in config.policies:
         alone = None if policy.pushed_weights is None else policy.pushed_weights.version
         contenders += [(policy, step) for step in policy.steps] or [(policy, alone)]
     found = [
-        EvalCase(policy, step, suite, env, suite.worker or config.worker)
+        EvalCase(policy, step, suite, env, suite.worker or config.worker, robot)
         for policy, step in contenders
         for suite, env in envs
     ]
@@ -132,7 +153,8 @@ def cells(config: EvalConfig) -> list[EvalCase]:
 def require_envs(config: EvalConfig) -> None:
     """`UnknownEnv` for a task that nobody knows, `ConfigError` for options that its env does not take."""
     for cell in cells(config):
-        env_arguments(cell.env, cell.suite.env_options)
+        if cell.robot is None:
+            env_arguments(cell.env, cell.suite.env_options)
 
 
 def expand(pattern: str) -> list[str]:
@@ -147,4 +169,10 @@ def expand(pattern: str) -> list[str]:
     known = [f"{suite}/{task}" for task in cls.tasks()]
     if not (found := fnmatch.filter(known, pattern)):
         raise UnknownEnv(f"{pattern!r}: matches none of the tasks of {suite!r}, which knows {known}")
+    return found
+
+
+def _tasks(robot: RobotConfig, pattern: str) -> list[str]:
+    if not (found := fnmatch.filter(robot.tasks, pattern)):
+        raise UnknownEnv(f"{pattern!r}: matches none of the plan's `robot.tasks`, which are {sorted(robot.tasks)}")
     return found

@@ -202,6 +202,33 @@ class TrackingConfig(_PlanModel):
     videos: NonNegativeInt = 4  # of each cell that are uploaded, failures first
 
 
+class RobotTask(_PlanModel):
+    """A task of a real robot, which suites name in their `envs`."""
+
+    instruction: Name  # to the policy, and to the operator
+    setup: str = ""  # how the operator sets the scene
+    max_steps: PositiveInt = 600  # control ticks after which a trial ends
+    rubric: dict[Name, PositiveFloat] = {}  # the points of each part of the task, for a partial success
+
+
+class RobotConfig(_PlanModel):
+    """The robot of an evaluation, its control loop, and its tasks (see `vlagents_ray.evaluate.robot`)."""
+
+    arm: str | None = None  # "module:Class" of the robot; None: the plan is played in simulation
+    tasks: dict[Name, RobotTask] = Field(min_length=1)
+    # Draws which policy plays when; None: one is drawn, and kept in the folder of results.
+    key: Annotated[str, Field(min_length=8)] | None = None
+    hz: PositiveFloat = 10.0  # control rate
+    # As in `ChunkPlayer` and `Guard`:
+    mode: Literal["open_loop", "ensemble", "async"] = "async"
+    deadline_s: NonNegativeFloat | None = None  # None: 0 in "async", else 1
+    max_age_s: PositiveFloat | None = None
+    safe: Literal["auto", "hold", "zero"] = "auto"
+    max_step: PositiveFloat | None = None
+    measure: str | None = None  # the part of the state that is the measured pose
+    silent_s: PositiveFloat = 2.0  # a server that is silent for longer ends the trial, which is repeated
+
+
 class EvalConfig(_PlanModel):
     """The settings of an evaluation: the policies, the envs, and the folder of results."""
 
@@ -219,6 +246,7 @@ class EvalConfig(_PlanModel):
     stop: StopConfig | None = None  # early stopping; None: every episode is played
     track: list[Tracker] = []  # where rates and videos are shown beside `out`, against the training step
     tracking: TrackingConfig = TrackingConfig()
+    robot: RobotConfig | None = None  # a real robot and its tasks
 
     # What happens when something breaks.
     retries: NonNegativeInt = 3  # further attempts after an infrastructure failure
@@ -241,6 +269,11 @@ class EvalConfig(_PlanModel):
         if repeated := sorted({name for name in names if names.count(name) > 1}):
             raise ValueError(f"two policies are named {repeated}; give each a `name` of its own")
         return policies
+
+    @property
+    def real_robot(self) -> RobotConfig | None:
+        """The robot, if the plan is played on one; else None."""
+        return self.robot if self.robot is not None and self.robot.arm is not None else None
 
 
 def canonical(value: object) -> str:

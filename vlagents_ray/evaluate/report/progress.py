@@ -238,8 +238,14 @@ def _stopped_line(cell: EvalCase, at: int) -> str:
     return f"{' '.join(filter(None, cell.name))}: certain enough, stopped after {at} of {cell.planned} episodes"
 
 
+def seconds_left(episodes: int, played: int, elapsed_s: float) -> float | None:
+    """Estimate how long so many further episodes take, s; None if nothing is left or nothing was played yet."""
+    return episodes * elapsed_s / played if episodes > 0 and played else None
+
+
 def _left(episodes: int, played: int, elapsed_s: float) -> str:
-    if episodes <= 0 or not played:
+    left_s = seconds_left(episodes, played, elapsed_s)
+    if left_s is None:
         return ""
-    seconds = round(episodes * elapsed_s / played)
+    seconds = round(left_s)
     return f"{seconds // 3600}:{seconds // 60 % 60:02d}:{seconds % 60:02d} left"

@@ -84,10 +84,15 @@ class Store:
         database.close(self._db)
         os.close(self._lock)
 
-    def begin_run(self, config: EvalConfig, versions: dict[str, Any]) -> None:
-        """Record that a run over the plan begins."""
+    def begin_run(self, config: EvalConfig, versions: dict[str, Any], started: float | None = None) -> None:
+        """Record that a run over the plan begins, or began at `started`, s since 1970."""
         with self._db:
-            row = (time.time(), "running", config.model_dump_json(), canonical(versions))
+            row = (
+                time.time() if started is None else started,
+                "running",
+                config.model_dump_json(),
+                canonical(versions),
+            )
             cursor = self._db.execute("INSERT INTO runs (started, state, config, versions) VALUES (?, ?, ?, ?)", row)
             self._run = int(cursor.lastrowid or 0)
 
@@ -101,9 +106,16 @@ class Store:
         return {key for (key,) in self._db.execute("SELECT key FROM episodes WHERE status != 'infra_failed'")}
 
     def record(
-        self, result: EpisodeResult, attempts: int, videos: Sequence[str] = (), trajectory: str | None = None
+        self,
+        result: EpisodeResult,
+        attempts: int,
+        videos: Sequence[str] = (),
+        trajectory: str | None = None,
+        finished: float | None = None,
     ) -> None:
-        """Record an episode. It replaces one that infrastructure failed; any other stays as it is.
+        """Record an episode, finished now or at `finished`, s since 1970.
+
+        It replaces one that infrastructure failed; any other stays as it is.
 
         Raises `ConfigError` if it was played by another checkpoint than the episodes of its cell before, as after a
         swap, or by other weights of the same name or than the pushed ones of its cell: a rate is that of one
@@ -124,7 +136,7 @@ class Store:
             "trajectory": trajectory,
             "attempts": attempts,
             "run": self._run,
-            "finished": time.time(),
+            "finished": time.time() if finished is None else finished,
         }
         with self._db:
             self._db.execute("DELETE FROM episodes WHERE key = ? AND status = 'infra_failed'", (row["key"],))

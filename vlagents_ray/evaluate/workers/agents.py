@@ -9,12 +9,13 @@ from vlagents_ray.client import RemoteAgent
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.plan.config import EvalConfig, PolicyConfig
 from vlagents_ray.interface import Agent
+from vlagents_ray.protocol.messages import RankName
 
 AgentFactory = Callable[[PolicyConfig], Agent]
 
 
-def agents(config: EvalConfig, own: Callable[[], Agent] | None) -> AgentFactory:
-    """Return the factory that a worker calls: `own`, or one of connections.
+def agents(config: EvalConfig, own: Callable[[], Agent] | None, rank: RankName = "simulation") -> AgentFactory:
+    """Return the factory that a worker calls: `own`, or one of connections with this `rank`.
 
     Raises:
         ConfigError: A policy to connect to has no URL.
@@ -26,14 +27,14 @@ def agents(config: EvalConfig, own: Callable[[], Agent] | None) -> AgentFactory:
             raise ConfigError(
                 f"policy {policy.name!r}: got no url, want that of its server, e.g. http://localhost:8000"
             )
-    return functools.partial(_remote_agent, config)
+    return functools.partial(_remote_agent, config, rank)
 
 
 def _own_agent(make: Callable[[], Agent], _policy: PolicyConfig) -> Agent:
     return make()
 
 
-def _remote_agent(config: EvalConfig, policy: PolicyConfig) -> RemoteAgent:
+def _remote_agent(config: EvalConfig, rank: RankName, policy: PolicyConfig) -> RemoteAgent:
     assert policy.url is not None  # noqa: S101 - `agents` has checked it
     return RemoteAgent(
         policy.url,
@@ -41,6 +42,6 @@ def _remote_agent(config: EvalConfig, policy: PolicyConfig) -> RemoteAgent:
         timeout_s=config.policy_timeout_s,
         connect_timeout_s=config.connect_timeout_s,
         codec=policy.codec,
-        rank="simulation",
+        rank=rank,
         resume=False,  # an interrupted episode is played again, so that its result depends only on its key
     )

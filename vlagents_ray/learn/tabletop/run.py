@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import contextlib
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
 from vlagents_ray.client import RemoteAgent
 from vlagents_ray.errors import ConfigError, PolicyUnavailable, WeightsLost
-from vlagents_ray.evaluate import EvalConfig, PolicyConfig, SuiteConfig
+from vlagents_ray.evaluate import EvalConfig, PolicyConfig, Progress, SuiteConfig
 from vlagents_ray.evaluate.artifacts.storage import whole
 from vlagents_ray.evaluate.results.summary import Summary
 from vlagents_ray.learn.columns import EXTRA, arrays
@@ -48,14 +49,16 @@ _METHODS: dict[Method, _MethodParts] = {
     "grpo": _MethodParts("token_student:TokenStudent", GRPOLearner, grouped=True),
 }
 Played = TypeVar("Played")
+WatchedBy = Callable[[Collection[str]], contextlib.AbstractContextManager[Progress]]
 
 
-def learn_tabletop(plan: LearnPlan, progress: LearnBar) -> Summary:
+def learn_tabletop(plan: LearnPlan, progress: LearnBar, watched: WatchedBy | None = None) -> Summary:
     """Record demonstrations, clone them, improve the clone by each method, and compare all of it.
 
     Args:
         plan: How much is learned.
         progress: Shows what was done.
+        watched: Makes what shows the evaluations, and the servers at these URLs; by default nothing does.
 
     Returns:
         The summary of all versions, whose numbers are the optimizer's steps: "bc@2000", "rpd@4500", …
@@ -72,8 +75,10 @@ def learn_tabletop(plan: LearnPlan, progress: LearnBar) -> Summary:
         app: deployment(f"vlagents_ray.learn.tabletop.{source}", batch={"max_size": 64})
         for app, source in sources.items()
     }
-    with running_server(together(policies), ingress=False):
-        return _LearnRun(plan, checkpoints, progress).summary()
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(running_server(together(policies), ingress=False))
+        shown = None if watched is None else stack.enter_context(watched([_url(app) for app in policies]))
+        return _LearnRun(plan, checkpoints, progress, shown).summary()
 
 
 class RunCheckpoints:
@@ -109,8 +114,10 @@ class RunCheckpoints:
 class _LearnRun:
     """A run, against the servers of the students and of their teacher."""
 
-    def __init__(self, plan: LearnPlan, checkpoints: RunCheckpoints, progress: LearnBar) -> None:
-        self._plan, self._checkpoints, self._progress = plan, checkpoints, progress
+    def __init__(
+        self, plan: LearnPlan, checkpoints: RunCheckpoints, progress: LearnBar, shown: Progress | None
+    ) -> None:
+        self._plan, self._checkpoints, self._progress, self._shown = plan, checkpoints, progress, shown
         self._clones: dict[str, dict[str, Any]] = {}  # checkpoints of learners, by the student that they train
 
     def summary(self) -> Summary:
@@ -216,7 +223,7 @@ class _LearnRun:
             track=mine.track,
             tracking=mine.tracking,
         )
-        summary = TrainingEvaluation(_url(method), plan).play(version)
+        summary = TrainingEvaluation(_url(method), plan, progress=self._shown).play(version)
         [newest] = [total for total in summary.totals if total.contender == f"{method}@{version}"]
         self._progress.say(
             f"{newest.contender}: {newest.success_once.rate:.1%} of {mine.held_out} held-out episodes solved"

@@ -37,7 +37,12 @@ _INITIAL = (True, False, None, "gaussian", "orthogonal", "eva")  # others change
 
 def base_of(folder: Path) -> str | None:
     """Return the checkpoint that the adapter's training names as its base; None if it names none."""
-    return _config(folder).get("base_model_name_or_path") or None
+    named = _config(folder).get("base_model_name_or_path") or None
+    if named is not None and not isinstance(named, str):
+        raise ConfigError(
+            f"{folder / CONFIG}: got {type(named).__name__} as base_model_name_or_path, want the name of a checkpoint"
+        )
+    return named
 
 
 def read_adapter(folder: Path, network: Any) -> dict[str, tuple[Any, Any]]:
@@ -66,8 +71,8 @@ def read_adapter(folder: Path, network: Any) -> dict[str, tuple[Any, Any]]:
 def _config(folder: Path) -> dict[str, Any]:
     try:
         config = json.loads((folder / CONFIG).read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ConfigError(f"{folder / CONFIG}: is no JSON ({error}); copy it again") from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise ConfigError(f"{folder / CONFIG}: cannot be read as JSON ({error}); copy it again") from error
     if not isinstance(config, dict) or config.get("peft_type") != "LORA":
         got = config.get("peft_type") if isinstance(config, dict) else type(config).__name__
         raise ConfigError(
@@ -95,7 +100,7 @@ def _tensors(file: Path) -> Mapping[str, Any]:
         if reader.received != reader.size:
             raise MalformedMessage(f"safetensors: got {reader.received} bytes of values, want {reader.size}")
         return reader.values()
-    except (MalformedMessage, struct.error, OverflowError, MemoryError) as error:
+    except (OSError, MalformedMessage, struct.error, OverflowError, MemoryError) as error:
         raise ConfigError(f"{file}: is damaged, or of another format ({error}); copy it again") from error
 
 
@@ -146,9 +151,10 @@ def _require_adaptable(folder: Path, names: list[str], modules: Mapping[str, Any
 def _layer(
     folder: Path, name: str, saved: Mapping[str, Any], config: Mapping[str, Any], weight: Any
 ) -> tuple[Any, Any]:
-    from torch import isfinite
+    from torch import float32, isfinite
 
-    down, up = (converted(saved[f"{_PREFIX}{name}{end}"], weight) for end in (_DOWN, _UP))
+    # scaled before they are rounded to the type of the weights
+    down, up = (converted(saved[f"{_PREFIX}{name}{end}"], weight.new_empty(0, dtype=float32)) for end in (_DOWN, _UP))
     (outputs, *inputs), rank = weight.shape, down.shape[0] if down.ndim else 0
     wanted = (rank, *inputs), (outputs, rank, *(1 for _ in inputs[1:]))
     if (tuple(down.shape), tuple(up.shape)) != wanted or not rank:
@@ -156,12 +162,14 @@ def _layer(
             f"{folder / WEIGHTS}: {name}: got A {tuple(down.shape)} and B {tuple(up.shape)}, want them for weights "
             f"{tuple(weight.shape)}; want an adapter that was trained on this checkpoint"
         )
-    if not (isfinite(down).all() and isfinite(up).all()):
+    alpha = config.get("lora_alpha")
+    if isinstance(alpha, bool) or not isinstance(alpha, int | float) or not math.isfinite(alpha):
+        raise ConfigError(f"{folder / CONFIG}: got lora_alpha {alpha!r}, want a number")
+    scaled = up.flatten(1) * (alpha / (math.sqrt(rank) if config.get("use_rslora") else rank))
+    down, scaled = down.to(weight.dtype), scaled.to(weight.dtype)
+    if not (isfinite(down).all() and isfinite(scaled).all()):
         raise ConfigError(
             f"{folder / WEIGHTS}: {name}: got NaN or infinite values as {weight.dtype}, want finite ones; take an "
             f"earlier step of the training"
         )
-    alpha = config.get("lora_alpha")
-    if isinstance(alpha, bool) or not isinstance(alpha, int | float) or not math.isfinite(alpha):
-        raise ConfigError(f"{folder / CONFIG}: got lora_alpha {alpha!r}, want a number")
-    return down, up.flatten(1) * (alpha / (math.sqrt(rank) if config.get("use_rslora") else rank))
+    return down, scaled

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -90,6 +91,8 @@ def find_adapter(source: str, checkpoint: str, base: Sequence[Path], digest_of_b
         ConfigError: There is no such adapter, or it was trained on another base.
     """
     folder = find_checkpoint(source, needs=FILES)
+    if not folder.is_dir():
+        raise ConfigError(f"{folder}: got a file, want the folder with {', '.join(FILES)}, as PEFT saves it")
     trained_on = base_of(folder)
     if trained_on is not None and _is_other(trained_on, checkpoint, base, digest_of_base):
         raise ConfigError(
@@ -101,8 +104,8 @@ def find_adapter(source: str, checkpoint: str, base: Sequence[Path], digest_of_b
 
 def _is_other(trained_on: str, checkpoint: str, base: Sequence[Path], digest_of_base: str) -> bool:
     """Whether the base that an adapter names is known to be another one than `checkpoint`, at the paths `base`."""
-    path = Path(trained_on).expanduser()
-    if path.exists():
+    path = Path(os.path.expanduser(trained_on))  # unlike a Path's own, these raise nothing, neither for a user nor
+    if os.path.exists(path):  # for a folder of the trainer's that is not to be seen from here
         ours = {parent for one in base for parent in (one.resolve(), *one.resolve().parents)}
         return path.resolve() not in ours and digest([path]) != digest_of_base
     names = [name.partition("@")[0] for name in (trained_on, checkpoint)]

@@ -17,7 +17,7 @@ import numpy as np
 from vlagents_ray.chunking.buffer import ENSEMBLE, Chunk, ChunkBuffer
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, InvalidAction, InvalidObservation, NotReset, PolicyFailed
-from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, Act, Agent, Obs
+from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, EXECUTED, LEFTOVER, Act, Agent, Obs
 from vlagents_ray.policies.adapters import ADAPTER, Adapters, require_base_alone
 from vlagents_ray.policies.base.checkpoint import find_adapter, used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
@@ -212,8 +212,7 @@ class ModelPolicy(Agent, abc.ABC):
         return self.model
 
     def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
-        # numpy accepts no negative seed; each int64 maps to its own number modulo 2**64
-        seeds = [self.config.seed, seed % 2**64]
+        seeds = [self.config.seed, seed % 2**64]  # numpy accepts no negative seed; no two int64 share a number
         self.episode = PolicyEpisode(
             instruction,
             deque(maxlen=self.history),
@@ -233,6 +232,8 @@ class ModelPolicy(Agent, abc.ABC):
         episode = session._begun()
         samples, want = wanted_samples(obs, self.config), wanted_behaviour(obs)
         session.notice(obs)
+        if EXECUTED in obs.info:  # others than those of the plan
+            episode.plan.drop()
         rows_left = self.config.actions == "queue" and episode.plan.next is not None
         if rows_left and self.history == 1:
             return []
@@ -253,8 +254,7 @@ class ModelPolicy(Agent, abc.ABC):
         )
         if not samples:
             return [own]
-        # each with a generator of its own, as they may be computed in several passes
-        seeds = episode.draws.integers(2**63, size=samples)
+        seeds = episode.draws.integers(2**63, size=samples)  # one each, as they may be computed in several passes
         return [own, *(drawn(own, np.random.default_rng(seed)) for seed in seeds)]
 
     def _act(self, session: ModelPolicy, found: list[Prediction | Exception]) -> Act | Exception:

@@ -23,7 +23,6 @@ class DiffusionPolicyConfig(ModelConfig):
         description="a checkout of Diffusion Policy; unset: the installed one, or that of DIFFUSION_POLICY_SRC",
     )
     dtype: Literal["auto", "float32"] = Field(default="auto", description="float32, as its authors compute")
-    compile: Literal[False] = Field(default=False, description="not supported for this family")
     actions: Literal["chunk", "queue", "ensemble"] = Field(
         default="queue",
         description="as in all models; 'queue' because the model sees the last frames, those within a chunk too, "

@@ -22,6 +22,7 @@ from vlagents_ray.policies.base.model_inputs import (
 from vlagents_ray.policies.diffusion_policy.config import DiffusionPolicyConfig
 from vlagents_ray.policies.diffusion_policy.network import OBS, DiffusionNetwork
 from vlagents_ray.policies.diffusion_policy.noise import noise_of
+from vlagents_ray.policies.diffusion_policy.passes import compile_with
 from vlagents_ray.registry import require
 
 USUAL_CAMERAS = {  # those of the authors' tasks
@@ -72,6 +73,8 @@ class DiffusionPolicy(ModelPolicy):
         """Read the checkpoint; raises `ConfigError` for cameras that it does not have."""
         network = DiffusionNetwork.load(self.config)
         self._cameras(network)
+        if self.config.compile:
+            compile_with(network, self.compilation)
         return network
 
     def perceive(self, obs: Obs) -> dict[str, np.ndarray]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -59,6 +59,7 @@ class LoadedLeRobot:
     environment: list[str]  # parts of the environment's state; empty if the policy has none
     contract: Contract
     trained: DatasetContract  # of the dataset; empty if it stated none
+    renames: dict[str, str]  # of the dataset's cameras, to the policy's observation keys
     own: dict[str, Processors] = field(default_factory=dict)  # of adapters that were trained with other statistics
 
 
@@ -117,8 +118,14 @@ class LeRobot(ModelPolicy):
             )
         self.config = _with_defaults(self.config, kind)
         processors = Processors(folder, settings, self.config)
-        trained = _trained(settings, processors)
-        cameras = _cameras(settings, self.config, processors.rename_map, trained.cameras)
+        return self._described(kind, processors, _trained(settings, processors), processors.rename_map)
+
+    def _described(
+        self, kind: Kind, processors: Processors, trained: DatasetContract, renames: dict[str, str]
+    ) -> LoadedLeRobot:
+        """Return what is loaded with the contract that follows from that of the training."""
+        settings = kind.config
+        cameras = _cameras(settings, self.config, renames, trained.cameras)
         parts = list(self.config.state or trained.state or [JOINTS]) if settings.robot_state_feature else []
         inputs = [*cameras, *(key for key in (STATE, ENVIRONMENT) if key in settings.input_features)]
         processors.require_statistics(settings, inputs)
@@ -137,14 +144,28 @@ class LeRobot(ModelPolicy):
             history=kind.steps,
             behaviour=self.offered(OFFERED if self.config.noise_level else ()),
         )
-        return LoadedLeRobot(kind, processors, cameras, parts, environment, contract, trained)
+        return LoadedLeRobot(kind, processors, cameras, parts, environment, contract, trained, renames)
 
     def adapt(self, adapter: str, folder: Path) -> None:
-        """Keep the processors beside an adapter, if there are any, for the state and the actions of its rows."""
+        """Keep the processors beside an adapter, if there are any, for the state and the actions of its rows.
+
+        A base that says nothing about its dataset, such as one of many robots, gets the contract of the adapter's.
+        """
         model: LoadedLeRobot = self.model
         own = own_processors(folder, model.kind.config, self.config, model.processors)
-        if own is not None:
-            model.own[adapter] = own
+        if own is None:
+            return
+        stated, renames = own.dataset(), model.renames or own.rename_map
+        trained = model.trained if stated is None else _trained(model.kind.config, own)
+        unsaid = model.trained.contract == Contract() and model.trained.state in ((), trained.state)
+        if own.rename_map not in ({}, renames) or not (unsaid or stated in (None, model.trained)):
+            raise ConfigError(
+                f"{folder}: its dataset has another contract, or its cameras other names, than that of the base or of "
+                f"an adapter before, want the same; serve it in a deployment of its own"
+            )
+        if trained != model.trained:
+            self.model = model = replace(self._described(model.kind, model.processors, trained, renames), own=model.own)
+        model.own[adapter] = own
 
     def perceive(self, obs: Obs) -> dict[str, np.ndarray]:
         """Return images by the policy's keys, (H, W, 3) uint8, and its state vectors, float32."""

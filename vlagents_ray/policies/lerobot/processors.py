@@ -20,8 +20,17 @@ from vlagents_ray.registry import require
 
 PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
 STATE, ACTION = "observation.state", "action"
+_NAME = "tokenizer_name"  # a hub id, or a folder of the trainer's
 _DEVICE, _RENAME, _TOKENIZER = "device_processor", "rename_observations_processor", "tokenizer_processor"
+_NORMALIZERS = ("normalizer_processor", "unnormalizer_processor")
 _STATE_IN_PROMPT = ("pi05", "pi0_fast")  # their prompts differ at each act
+_CONFIG = "config.json"
+# Settings of a policy, beside its cameras, that make another model of the same weights.
+_NETWORK = (
+    *("type", "n_obs_steps", "chunk_size", "empty_cameras", "tokenizer_max_length", "image_resolution"),
+    *("resize_imgs_with_padding", "adapt_to_pi_aloha", "use_delta_joint_actions_aloha", "add_image_special_tokens"),
+    *("attention_mode", "prefix_length", "self_attn_every_n_layers", "min_period", "max_period"),
+)
 _STATISTICS = {
     "MEAN_STD": ("mean", "std"),
     "MIN_MAX": ("min", "max"),
@@ -41,6 +50,12 @@ class Processors:
         if unknown:
             raise ConfigError(f"processors: got {unknown}, the checkpoint has {[sorted(steps) for steps in saved]}")
         self.steps = [list(steps) for steps in saved]  # the registered names, of both pipelines
+        self.step_settings = {  # of those steps that do not depend on the dataset and the machine
+            name: {key: value for key, value in step.items() if key not in (_NAME, *config.processors.get(name, ()))}
+            for steps in saved
+            for name, step in steps.items()
+            if name not in (_DEVICE, _RENAME, *_NORMALIZERS)
+        }
         own = {_DEVICE: {"device": settings.device}, _RENAME: {"rename_map": {}}}  # `perceive` uses the policy's names
         overrides = {**own, **config.processors}
         trained = saved[0].get(_RENAME, {}).get("rename_map") or {}
@@ -173,8 +188,10 @@ def own_processors(folder: Path, settings: Any, config: LeRobotConfig, base: Pro
         The processors; None if there are none, so that the base's are used.
 
     Raises:
-        ConfigError: They differ from the base's in more than the statistics of state and actions.
+        ConfigError: They differ from the base's in more than the statistics of state and actions, or the policy's
+            config beside them is of another network.
     """
+    _require_same_network(folder / _CONFIG, settings, config)
     if not any((folder / name).is_file() for name in PIPELINES):
         return None
     if missing := [name for name in PIPELINES if not (folder / name).is_file()]:
@@ -187,12 +204,13 @@ def own_processors(folder: Path, settings: Any, config: LeRobotConfig, base: Pro
     own.require_statistics(settings, [key for key in features if key != ACTION])
     changed = {key for key in features if own.normalises(features[key]) and own.statistics(key) != base.statistics(key)}
     sizes = [[len(one.statistics(key).get("mean", ())) for key in (STATE, ACTION)] for one in (own, base)]
+    odd = [name for name, one in own.step_settings.items() if base.step_settings.get(name, one) != one]
     allowed = {ACTION} if settings.type in _STATE_IN_PROMPT else {STATE, ACTION}
     other = {
         "steps": own.steps != base.steps,
+        f"settings of {odd}": bool(odd),
         f"numbers {sizes[0]} of state and actions, not {sizes[1]}": sizes[0] != sizes[1],
         f"statistics of {sorted(changed - allowed)}": bool(changed - allowed),
-        "contract of the dataset": own.dataset() not in (None, base.dataset()),
     }
     if any(other.values()):
         said = ", ".join(what for what, differs in other.items() if differs)
@@ -200,7 +218,32 @@ def own_processors(folder: Path, settings: Any, config: LeRobotConfig, base: Pro
             f"{folder}: its processors have other {said} than those of the base, want the same but for the statistics "
             f"of {sorted(allowed)}; merge the adapter into its base, and serve that as a checkpoint of its own"
         )
-    return own if changed else None
+    return own
+
+
+def _require_same_network(file: Path, settings: Any, config: LeRobotConfig) -> None:
+    """Raise `ConfigError` if the policy's config beside an adapter has cameras or passes other than the base's."""
+    if not file.is_file():
+        return
+    try:
+        saved = json.loads(file.read_text(encoding="utf-8"))
+        cameras = [key for key, one in (saved.get("input_features") or {}).items() if one["type"] == "VISUAL"]
+    except (ValueError, AttributeError, KeyError, TypeError) as error:
+        raise ConfigError(f"{file}: is no config of a LeRobot policy ({error!r}); copy it again") from error
+    base = {name: getattr(settings, name) for name in _NETWORK if hasattr(settings, name)}
+    other = {
+        name: [saved[name], value]
+        for name, value in json.loads(json.dumps(base)).items()
+        if name not in config.overrides and name in saved and saved[name] != value
+    }
+    if cameras and cameras != list(settings.image_features):
+        other["cameras"] = [cameras, list(settings.image_features)]
+    if other:
+        raise ConfigError(
+            f"{file}: was trained with { ({name: theirs for name, (theirs, _) in other.items()}) }, the base with "
+            f"{ ({name: ours for name, (_, ours) in other.items()}) }, want the same; merge the adapter into its base, "
+            f"and serve that as a checkpoint of its own"
+        )
 
 
 def require_known_steps(file: Path) -> None:

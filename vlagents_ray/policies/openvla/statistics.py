@@ -56,12 +56,15 @@ class Statistics:
     @classmethod
     def of(cls, checkpoint: Path, bounds: Bounds = "q99") -> Statistics:
         """Read the statistics in the folder; raises `ConfigError` if there are none."""
-        file = checkpoint / FILE
-        if file.is_file():
+        own = (checkpoint / FILE).is_file()
+        file = checkpoint / (FILE if own else "config.json")
+        try:
             found = json.loads(file.read_text(encoding="utf-8"))
-        else:
-            found = json.loads((checkpoint / "config.json").read_text(encoding="utf-8")).get("norm_stats")
-        if not found:
+        except ValueError as error:
+            raise ConfigError(f"{file}: is no JSON ({error}); copy it again") from error
+        if not own:
+            found = found.get("norm_stats")
+        if not found or not isinstance(found, dict):
             raise ConfigError(
                 f"checkpoint {checkpoint}: got no normalisation statistics, want {FILE}, or norm_stats in config.json; "
                 f"copy it from where the training run saved it"

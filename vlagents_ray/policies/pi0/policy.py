@@ -151,9 +151,12 @@ class Pi0(StreamingPolicy):
     def adapt(self, adapter: str, folder: Path) -> None:
         """Refuse an adapter beside which other statistics lie than those of the base."""
         file = folder / _PROCESSOR
-        saved = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-        base = self._loaded().processor
-        other = [name for name in _STATISTICS if name in saved and list(saved[name]) != list(getattr(base, name))]
+        try:
+            saved = dict(json.loads(file.read_text(encoding="utf-8"))) if file.is_file() else {}
+        except (TypeError, ValueError) as error:
+            raise ConfigError(f"{file}: is no processor's config ({error}); copy it again") from error
+        base = {name: list(getattr(self._loaded().processor, name)) for name in _STATISTICS}
+        other = [name for name in _STATISTICS if saved.get(name) not in (None, base[name])]
         if other:
             raise ConfigError(
                 f"{file}: got other {other} than the base has, want the same; merge the adapter into its base, and "

@@ -217,10 +217,10 @@ class Caller:
             self._keys.audit.refused(self.name, error.code)
             raise
 
-    def refusal(self) -> str | None:
-        """Return the reason if the key is no longer valid; None if it is valid."""
+    def refusal(self, scope: str | None = None) -> str | None:
+        """Return the reason if the key is no longer valid, or lacks the `scope`; None if it is valid."""
         try:
-            self._admit(free=True)
+            self._admit(free=True, scope=scope)
         except VLAgentsError as error:
             return str(error)
         return None

@@ -4,9 +4,11 @@
     key arm-1: reset session 'robot-1'
     key arm-1: refused: too_many_requests (57 more like this since the last line)
     key (none): refused: an unknown key
+    key lab: pressed 'pause' for session 'arm-1/7f3a'
 
-A kind of event is logged at once, and again after `_EVERY_S` at the earliest, with the number of events left out. Only
-names of keys are written, never keys. Refusals have the level WARNING, all other events INFO.
+A kind of event is logged at once, and again after `_EVERY_S` at the earliest, with the number of events left out; but
+each button that is pressed on the live page is logged, also on a server without keys. Only names of keys are written,
+never keys. Refusals have the level WARNING, all other events INFO.
 """
 
 from __future__ import annotations
@@ -29,6 +31,11 @@ def write_audit() -> None:
         handler = logging.StreamHandler()
         handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
         logger.addHandler(handler)
+
+
+def log_pressed(name: str, what: str) -> None:
+    """Log that the key `name` commanded a session, each time; an empty name stands for a server without keys."""
+    logger.info("key %s: pressed %s", name or "(none)", what)
 
 
 @dataclass(slots=True)

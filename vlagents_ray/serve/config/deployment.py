@@ -8,19 +8,23 @@ from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.adapters import ADAPTER
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.serve.access.api_keys import Keys, load_keys
 from vlagents_ray.serve.config.dialects import DialectArgs
+from vlagents_ray.serve.config.live import LiveArgs
 from vlagents_ray.serve.config.python_env import EnvironmentArgs
+from vlagents_ray.serve.config.shadow import ShadowArgs
 from vlagents_ray.serve.config.viewers import ViewerArgs
 from vlagents_ray.serve.models.checkpoints import Checkpoints
 from vlagents_ray.serve.queue.call_limits import CallLimits
+from vlagents_ray.settings import wrong_settings
 
-POLICY, GATEWAY = "Policy", "Gateway"  # the deployments of an application
+POLICY, GATEWAY, SHADOW = "Policy", "Gateway", "Shadow"  # the deployments of an application
 
 
 class _DeploymentModel(BaseModel):
@@ -299,10 +303,16 @@ class ServerArgs(_DeploymentModel):
     limits: LimitArgs = LimitArgs()
     access: AccessArgs = AccessArgs()
     stream: StreamArgs = StreamArgs()
+    live: LiveArgs | None = Field(
+        default=None, description="keeps the last seconds of each session, for the live page; unset: nothing is kept"
+    )
     resources: ResourceArgs = ResourceArgs()
     record: RecordArgs | None = Field(default=None, description="keeps requests and answers; unset: nothing is kept")
     environment: EnvironmentArgs = Field(default=EnvironmentArgs(), description="the Python that the policy runs in")
     dialects: DialectArgs = Field(default=DialectArgs(), description="other systems' clients that may connect")
+    shadow: ShadowArgs | None = Field(
+        default=None, description="a candidate that acts on live observations; its actions are never executed"
+    )
     viewers: ViewerArgs = Field(default=ViewerArgs(), description="recordings of all sessions for Rerun and Foxglove")
 
     @field_validator("answer_while_loading")
@@ -322,3 +332,18 @@ class ServerArgs(_DeploymentModel):
         if self.replicas is not None and self.autoscaling is not None:
             raise ValueError("replicas and autoscaling exclude each other; keep one")
         return self
+
+
+def candidate_of(shadow: ShadowArgs) -> ServerArgs:
+    """Return the settings of a shadow's candidate, which stand in `policy` in place of a file.
+
+    Raises:
+        ConfigError: One of them is wrong, or the candidate has a shadow itself.
+    """
+    try:
+        args = ServerArgs.model_validate(shadow.policy)
+    except ValidationError as error:
+        raise ConfigError(f"shadow.policy: {wrong_settings(error, ServerArgs)}") from error
+    if args.shadow is not None:
+        raise ConfigError("shadow: the candidate has a shadow itself, want one candidate; leave its `shadow:` out")
+    return args

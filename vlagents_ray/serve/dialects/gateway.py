@@ -48,7 +48,7 @@ class Gateway:
         listeners = {name: reserve(name, one.host or LOOPBACK, one.port) for name, one in wanted.items()}
         try:
             app = serve.get_replica_context().app_name
-            contract = _wait_for_policy(app)
+            contract = wait_for_policy(app)
             require_fit(args.dialects, contract)
             limits = args.limits.limits()
             admission = Admission(limits.in_flight_bytes)
@@ -85,7 +85,7 @@ class Gateway:
             await asyncio.to_thread(dialect.close)
 
 
-def _wait_for_policy(app: str) -> Contract | None:
+def wait_for_policy(app: str) -> Contract | None:
     """Wait until the policy can act and return its contract; raise the error if it does not load."""
     with RemoteAgent(f"serve://{app}", transport="handle", connect_timeout_s=_LOADING_S) as agent:
         return agent.contract

@@ -52,7 +52,8 @@ _PATHS = f"""\
     New weights from a learner, with a key of the scope `weights`; see `vlagents_ray.learn.Publisher`. The versions
     that act.
 `GET /live`
-    A page that shows what the sessions do now. With keys, it asks for one with the scope `watch`.
+    A page that shows what the sessions do now. With keys, it asks for one with the scope `watch`, and has buttons for
+    one that also has the scope `operate`.
 `GET /v1/metadata`
     Policy, checkpoint, contract, protocol version, every way in.
 `GET /healthz`

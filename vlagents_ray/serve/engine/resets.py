@@ -56,6 +56,8 @@ class Resets:
                     f"session {ticket.session_id!r}: reset elsewhere, or ended, while this reset waited"
                 )
             session = self._sessions.open(ticket.session_id, ticket.owner, ticket.transport, ticket.connection)
+            if session.told_to_follow is not None:
+                ticket.follows = session.told_to_follow
             session.agent, session.weights, session.follows = None, None, ticket.follows
             session.steps, session.resetting = ticket.first, ticket
             session.first, session.moves = ticket.first, 0

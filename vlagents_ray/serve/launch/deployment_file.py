@@ -17,11 +17,13 @@ from vlagents_ray.policies.base.checkpoint import STEP as STEP_PLACE
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
 from vlagents_ray.registry import names, policy_class
-from vlagents_ray.serve.config.deployment import POLICY, ServerArgs
+from vlagents_ray.serve.config.deployment import POLICY, ServerArgs, candidate_of
+from vlagents_ray.serve.config.shadow import ShadowArgs
 from vlagents_ray.serve.dialects.routes import require_fit, require_packages
 from vlagents_ray.serve.models.checkpoints import CHOICE, STEP
 from vlagents_ray.serve.python_env.child_main import unloaded_contract
 from vlagents_ray.serve.python_env.probe import check_policy, with_process
+from vlagents_ray.serve.shadow.comparison import require_comparable
 from vlagents_ray.settings import wrong_settings
 
 IMPORT_PATH = "vlagents_ray.serve.app:build"
@@ -46,20 +48,7 @@ def read_deployment(
     Raises:
         ConfigError: The file or a setting is invalid.
     """
-    path = Path(source)
-    if path.suffix in (".yaml", ".yml"):
-        if not path.is_file():
-            raise ConfigError(f"deployment file {source!r} does not exist")
-        if overrides:
-            raise ConfigError(f"{source!r} holds the settings; edit it instead of giving {sorted(overrides)}")
-        try:
-            document = yaml.safe_load(path.read_text())
-        except yaml.YAMLError as error:
-            raise ConfigError(f"{source}: not YAML ({error})") from error
-        return _checked(document, source, step_follows)
-    if ":" not in source and source not in names("policies"):
-        policy_class(source)  # raises with the list of what there is
-    return _of_name(source, overrides or {}, step_follows)
+    return _read(source, overrides, step_follows=step_follows)
 
 
 def server_args(source: str, app: str | None = None) -> ServerArgs:
@@ -69,13 +58,7 @@ def server_args(source: str, app: str | None = None) -> ServerArgs:
 
 def policy_application(source: str, app: str | None = None) -> ServeApplicationSchema:
     """Return one application of a deployment that serves a policy: that of the name `app`, or the only one."""
-    ours = {one.name: one for one in _ours(read_deployment(source))}
-    if app is None and len(ours) == 1:
-        [app] = ours
-    if app not in ours:
-        raise ConfigError(f"{source}: holds the policies {sorted(ours)}, got {app!r}; name one of them as the app")
-    application: ServeApplicationSchema = ours[app]
-    return application
+    return _only(read_deployment(source), source, app)
 
 
 def with_gateways_at(config: ServeDeploySchema, host: str) -> ServeDeploySchema:
@@ -97,6 +80,25 @@ def with_dialect(config: ServeDeploySchema, name: str, settings: Mapping[str, An
     dialects[name] = {**(dialects.get(name) or {}), **settings}
     ServerArgs(**args)
     return changed
+
+
+def with_candidate(shadow: ShadowArgs) -> ShadowArgs:
+    """Return the settings of a shadow, with those of its candidate in place of a file or a name.
+
+    Raises:
+        ConfigError: The candidate's deployment cannot be used as one.
+    """
+    if not isinstance(shadow.policy, str):
+        return shadow
+    app = _only(_read(shadow.policy, shadows=False), shadow.policy, None)
+    if app.runtime_env:
+        raise ConfigError("shadow: the candidate states a runtime_env; state its packages under `environment:`")
+    return shadow.model_copy(update={"policy": {**app.args, "config": own_settings(app)}})
+
+
+def gpus_of_candidate(args: ServerArgs) -> float:
+    """Return the number of GPUs of the shadow's candidate; 0 if there is none."""
+    return 0.0 if args.shadow is None else candidate_of(with_candidate(args.shadow)).resources.num_gpus
 
 
 def together(policies: Mapping[str, ServeDeploySchema]) -> ServeDeploySchema:
@@ -144,7 +146,8 @@ def with_replicas_on(config: ServeDeploySchema, gpus: float) -> ServeDeploySchem
     changed = config.model_copy(deep=True)
     for app in _ours(changed):
         resources = {"num_gpus": 1.0} | app.args.get("resources", {})
-        replicas = int(gpus / resources["num_gpus"]) if resources["num_gpus"] else 0
+        left = gpus - gpus_of_candidate(ServerArgs(**app.args))
+        replicas = int(left / resources["num_gpus"]) if resources["num_gpus"] else 0
         if replicas and app.args.get("replicas") is None and app.args.get("autoscaling") is None:
             app.args |= {"replicas": replicas, "resources": resources}
     return changed
@@ -183,13 +186,44 @@ def stated_contract(config: ServeDeploySchema) -> Contract | None:
     return unloaded_contract(offered.make(settings))
 
 
+def _read(
+    source: str, overrides: Mapping[str, Any] | None = None, *, step_follows: bool = False, shadows: bool = True
+) -> ServeDeploySchema:
+    """See `read_deployment`. Without `shadows`, a file with a shadow is refused, as a candidate has none."""
+    path = Path(source)
+    if path.suffix in (".yaml", ".yml"):
+        if not path.is_file():
+            raise ConfigError(f"deployment file {source!r} does not exist")
+        if overrides:
+            raise ConfigError(f"{source!r} holds the settings; edit it instead of giving {sorted(overrides)}")
+        try:
+            document = yaml.safe_load(path.read_text())
+        except yaml.YAMLError as error:
+            raise ConfigError(f"{source}: not YAML ({error})") from error
+        return _checked(document, source, step_follows, shadows=shadows)
+    if ":" not in source and source not in names("policies"):
+        policy_class(source)  # raises with the list of what there is
+    return _of_name(source, overrides or {}, step_follows, shadows=shadows)
+
+
+def _only(config: ServeDeploySchema, source: str, app: str | None) -> ServeApplicationSchema:
+    ours: dict[str, ServeApplicationSchema] = {one.name: one for one in _ours(config)}
+    if app is None and len(ours) == 1:
+        [app] = ours
+    if app not in ours:
+        raise ConfigError(f"{source}: holds the policies {sorted(ours)}, got {app!r}; name one of them as the app")
+    return ours[app]
+
+
 def _ours(config: ServeDeploySchema) -> list[Any]:
     return [app for app in config.applications if app.import_path == IMPORT_PATH]
 
 
-def _of_name(policy: str, args: Mapping[str, Any], step_follows: bool = False) -> ServeDeploySchema:
+def _of_name(
+    policy: str, args: Mapping[str, Any], step_follows: bool = False, *, shadows: bool = True
+) -> ServeDeploySchema:
     app = _application(policy, {"policy": policy, **args})
-    return _checked({"applications": [app]}, f"policy {policy!r}", step_follows)
+    return _checked({"applications": [app]}, f"policy {policy!r}", step_follows, shadows=shadows)
 
 
 def _application(name: str, args: dict[str, Any]) -> dict[str, Any]:
@@ -197,7 +231,7 @@ def _application(name: str, args: dict[str, Any]) -> dict[str, Any]:
     return {"name": short, "route_prefix": "/", "import_path": IMPORT_PATH, "args": args}
 
 
-def _checked(document: object, source: str, step_follows: bool = False) -> ServeDeploySchema:
+def _checked(document: object, source: str, step_follows: bool = False, *, shadows: bool = True) -> ServeDeploySchema:
     """Return the document as Serve's schema, with the `args` of this package checked before anything starts."""
     try:
         config = ServeDeploySchema.model_validate(document)
@@ -210,7 +244,16 @@ def _checked(document: object, source: str, step_follows: bool = False) -> Serve
                 app.args["environment"] = args.environment.model_dump(exclude_unset=True)
             if args.record is not None:
                 app.args["record"] = args.record.model_dump(exclude_unset=True)
-            _require_policy(args, own_settings(app), installed=not (app.runtime_env or {}), step_follows=step_follows)
+            installed = not (app.runtime_env or {})
+            contract = _require_policy(args, own_settings(app), installed=installed, step_follows=step_follows)
+            if args.shadow is not None:
+                if not shadows:
+                    raise ConfigError(f"shadow: {source} has a shadow itself; a candidate has none, leave it out there")
+                shadow = with_candidate(args.shadow)
+                app.args["shadow"] = shadow.model_dump(exclude_unset=True)
+                candidate = candidate_of(shadow)
+                theirs = _require_policy(candidate, candidate.config, installed=True, step_follows=False)
+                require_comparable(contract, theirs)
     except ValidationError as error:
         model = ServerArgs if error.title == ServerArgs.__name__ else ServeDeploySchema
         raise ConfigError(f"{source}: {wrong_settings(error, model)}") from error
@@ -226,7 +269,7 @@ def _runtime_envs(config: ServeDeploySchema) -> Iterator[Mapping[str, Any]]:
             yield options.get("runtime_env") or {}
 
 
-def _require_policy(args: ServerArgs, own: dict[str, Any], *, installed: bool, step_follows: bool) -> None:
+def _require_policy(args: ServerArgs, own: dict[str, Any], *, installed: bool, step_follows: bool) -> Contract | None:
     """Build the policy in its environment, with each kind of settings, and check that the dialects fit its contract.
 
     A replica repeats the check.
@@ -236,6 +279,9 @@ def _require_policy(args: ServerArgs, own: dict[str, Any], *, installed: bool, s
         own: The settings of the policy.
         installed: Whether its packages are installed here; False if the application's `runtime_env` brings them.
         step_follows: Whether a missing step is set later; then everything else is checked.
+
+    Returns:
+        The contract of the policy with its own settings; None if it states none before it is loaded.
     """
     environment = args.environment
     if not installed:
@@ -243,18 +289,22 @@ def _require_policy(args: ServerArgs, own: dict[str, Any], *, installed: bool, s
             policy_class(args.policy)
         else:
             with_process(environment)
-        return
+        return None
     require_packages(args.dialects)
     offered = args.checkpoints.of(partial(build_agent, args.policy, wrappers=args.wrappers), own)
+    contracts: list[Contract | None] = []
     for choice in offered.examples():
         settings = offered.settings(choice, offered.config)
         if step_follows and STEP_PLACE in str(settings.get(CHOICE)) and settings.get(STEP) is None:
             settings |= {STEP: 0}
-        if environment.python is not None:
-            require_fit(args.dialects, check_policy(environment, args.policy, settings, args.wrappers))
-            continue
         try:
-            require_fit(args.dialects, unloaded_contract(offered.make(settings)))
+            if environment.python is not None:
+                contracts.append(check_policy(environment, args.policy, settings, args.wrappers))
+            else:
+                contracts.append(unloaded_contract(offered.make(settings)))
         except (MissingDependency, UnknownPolicy, UnknownWrapper):
             if environment.requirements is None:  # otherwise the requirements may install it
                 raise
+        else:
+            require_fit(args.dialects, contracts[-1])
+    return contracts[0] if contracts else None

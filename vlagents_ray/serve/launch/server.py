@@ -31,7 +31,7 @@ from vlagents_ray.ray_tools.warm_cluster import owned_apps, this_warm_cluster
 from vlagents_ray.serve.access.api_keys import require_access, warn_of_plain_http
 from vlagents_ray.serve.access.tls import Tls
 from vlagents_ray.serve.config.deployment import AccessArgs, ServerArgs
-from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH, with_gateways_at, with_replicas_on
+from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH, gpus_of_candidate, with_gateways_at, with_replicas_on
 from vlagents_ray.serve.launch.haproxy import PublicListener, wait_for_haproxy
 from vlagents_ray.serve.launch.private_cluster import own_ray
 from vlagents_ray.serve.launch.readiness import wait_until_ready
@@ -221,11 +221,11 @@ def _missing_gpus(config: ServeDeploySchema, here: float | None = None) -> str |
 
 
 def _gpus(args: ServerArgs) -> float:
-    """Return the number of GPUs that the initial replicas need together."""
+    """Return the number of GPUs that the initial replicas need together, with the candidate of a shadow."""
     replicas = args.replicas or 1
     if args.autoscaling is not None:
         replicas = max(args.autoscaling.min_replicas, args.autoscaling.initial_replicas or 0)
-    return replicas * args.resources.num_gpus
+    return replicas * args.resources.num_gpus + gpus_of_candidate(args)
 
 
 def _our_apps(config: ServeDeploySchema) -> list[Any]:

@@ -3,6 +3,8 @@
     GET /live      the page: it holds no data, and needs no key
     GET /v1/live   what the replicas do now, as JSON without pictures; keys need the scope "watch"
     WS  /v1/live   the same with pictures, at most ten times a second
+    POST /v1/live/command   {"session": …, "do": "pause"}: see `CommandBoard.press`; keys need the scope "operate"
+    GET /v1/live/videos/7   a video to which the document refers by its number, where an evaluation is watched
 
 The viewer asks for each message, with the sessions whose pictures it shows: {"shown": ["arm-1", …]}. So a slow viewer
 misses what is old, and delays nobody. The answer is the length of a JSON document (32 bits, little-endian), the
@@ -19,19 +21,23 @@ import hashlib
 import json
 import logging
 import struct
+from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
 from importlib.resources import files as package_files
+from pathlib import Path
 from typing import Any
 
+from starlette.requests import ClientDisconnect
 from starlette.requests import Request as HttpRequest
-from starlette.responses import HTMLResponse, JSONResponse, Response
+from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from vlagents_ray.errors import Forbidden, MalformedMessage, Overloaded, VLAgentsError
+from vlagents_ray.errors import Forbidden, MalformedMessage, MessageTooLarge, Overloaded, VLAgentsError
 from vlagents_ray.protocol.json_messages import problem
 from vlagents_ray.serve.access.api_keys import Caller, current_caller
+from vlagents_ray.serve.access.audit import log_pressed
 from vlagents_ray.serve.endpoints.access_middleware import LIVE_PAGE
 from vlagents_ray.serve.endpoints.http_messages import problem_response, request_id
 from vlagents_ray.serve.live.fleet import Fleet, Viewer
@@ -40,34 +46,48 @@ logger = logging.getLogger(__name__)
 
 PATH = "/v1/live"
 _PROTOCOL = "vlagents.live"
-_SCOPE = "watch"
+_COMMAND = f"{PATH}/command"
+_WATCH, _OPERATE = "watch", "operate"  # scopes of keys
+_COMMAND_BYTES = 2**14  # longest command
 _VIEWERS = 32  # most viewers at once
 _SILENT_S = 30.0  # longest time between two messages of a viewer
+_SCRIPTS = ("evaluation.js", "live.js")
 _CHARACTERS = 2**16  # longest message of a viewer
 _POLICY_VIOLATION, _TRY_AGAIN_LATER = 1008, 1013  # WebSocket close codes
 
+VideoFiles = Callable[[int], Path | None]
+"""Returns the file of the video with a number; None if there is none."""
 
-def live_routes(fleet: Fleet, *, open_to_network: bool) -> list[BaseRoute]:
+
+def live_routes(fleet: Fleet, *, open_to_network: bool, videos: VideoFiles | None = None) -> list[BaseRoute]:
     """Return the routes of the live page.
 
     Args:
         fleet: Gathers what the page shows.
         open_to_network: Whether other machines reach this server without a key; nobody may then watch, as the pictures
             of all robots would be public.
+        videos: Finds the videos to which the document refers, if it does.
     """
-    endpoint = _LiveEndpoint(fleet, open_to_network)
-    return [Route(LIVE_PAGE, _page), Route(PATH, endpoint.show), WebSocketRoute(PATH, endpoint.watch)]
+    endpoint = _LiveEndpoint(fleet, open_to_network, videos)
+    routes: list[BaseRoute] = [
+        Route(LIVE_PAGE, _page),
+        Route(PATH, endpoint.show),
+        WebSocketRoute(PATH, endpoint.watch),
+        Route(_COMMAND, endpoint.press, methods=["POST"]),
+    ]
+    return routes if videos is None else [*routes, Route(f"{PATH}/videos/{{number:int}}", endpoint.video)]
 
 
 class _LiveEndpoint:
-    def __init__(self, fleet: Fleet, open_to_network: bool) -> None:
+    def __init__(self, fleet: Fleet, open_to_network: bool, videos: VideoFiles | None) -> None:
         self._fleet = fleet
         self._open_to_network = open_to_network
+        self._videos = videos
         self._watching = 0
 
     async def show(self, http: HttpRequest) -> Response:
         try:
-            self._require_scope()
+            self._require_scope(_WATCH)
         except VLAgentsError as error:
             return problem_response(error, request_id(http))
         viewer = self._fleet.add()
@@ -77,10 +97,32 @@ class _LiveEndpoint:
         finally:
             self._fleet.remove(viewer)
 
+    async def video(self, http: HttpRequest) -> Response:
+        try:
+            self._require_scope(_WATCH)
+        except VLAgentsError as error:
+            return problem_response(error, request_id(http))
+        path = None if self._videos is None else self._videos(http.path_params["number"])
+        return Response(status_code=404) if path is None else FileResponse(path, media_type="video/mp4")
+
+    async def press(self, http: HttpRequest) -> Response:
+        try:
+            self._require_scope(_OPERATE)
+            session, do, text = _command(await _body(http))
+            caller = current_caller()
+            by = caller.name if isinstance(caller, Caller) else ""
+            pressed = await self._fleet.press(session, do, text, by)
+        except ClientDisconnect:
+            return Response(status_code=499)
+        except VLAgentsError as error:
+            return problem_response(error, request_id(http))
+        log_pressed(by, f"{do!r} {text!r} for session {session!r}" if text else f"{do!r} for session {session!r}")
+        return JSONResponse(pressed)
+
     async def watch(self, socket: WebSocket) -> None:
         offered = socket.scope.get("subprotocols") or []
         try:
-            self._require_scope()
+            self._require_scope(_WATCH)
             if self._watching >= _VIEWERS:
                 raise Overloaded(f"live: {_VIEWERS} viewers watch already; close one")
         except VLAgentsError as error:
@@ -111,8 +153,8 @@ class _LiveEndpoint:
         while True:
             viewer.shown = frozenset(await self._asked(socket))
             document, files = await viewer.next()
-            self._require_scope()
-            await socket.send_bytes(_message(document, files))
+            self._require_scope(_WATCH)
+            await socket.send_bytes(_message({**document, "may_operate": self._may(_OPERATE)}, files))
 
     async def _asked(self, socket: WebSocket) -> list[str]:
         try:
@@ -130,15 +172,44 @@ class _LiveEndpoint:
             raise MalformedMessage(f'live: got {text[:80]!r}, want {{"shown": ["SESSION", ...]}}') from error
         return list(shown)
 
-    def _require_scope(self) -> None:
+    def _may(self, scope: str) -> bool:
+        caller = current_caller()
+        return caller.refusal(scope) is None if isinstance(caller, Caller) else not self._open_to_network
+
+    def _require_scope(self, scope: str) -> None:
         caller = current_caller()
         if isinstance(caller, Caller):
-            caller.admit(free=True, scope=_SCOPE)
+            caller.admit(free=True, scope=scope)
         elif self._open_to_network:
             raise Forbidden(
                 f"live: a server with `--insecure` shows nothing; make a key with `vlagents-ray keys new NAME --scope "
-                f"{_SCOPE}` and serve with `--keys`, or serve on loopback without `--insecure`"
+                f"{scope}` and serve with `--keys`, or serve on loopback without `--insecure`"
             )
+
+
+async def _body(http: HttpRequest) -> bytes:
+    """Return the body of a command; of a longer one no more is read."""
+    kind = http.headers.get("content-type", "").partition(";")[0].strip().lower()
+    if kind != "application/json":  # which no other site's page can send unasked
+        raise MalformedMessage(f"content-type: got {kind or 'none'!r}, want application/json")
+    parts = b""
+    async for part in http.stream():
+        parts += part
+        if len(parts) > _COMMAND_BYTES:
+            raise MessageTooLarge(f"live: a command of more than {_COMMAND_BYTES} bytes")
+    return parts
+
+
+def _command(body: bytes) -> tuple[str, str, str]:
+    """Return session, command and text in a body."""
+    try:
+        stated = json.loads(body)
+        found = stated["session"], stated["do"], stated.get("text", "")
+        if not all(isinstance(one, str) for one in found):
+            raise TypeError
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise MalformedMessage(f'live: got {body[:80]!r}, want {{"session": ..., "do": ..., "text": ...}}') from error
+    return found
 
 
 def _message(document: dict[str, Any], files: list[bytes]) -> bytes:
@@ -156,11 +227,14 @@ async def _page(_: HttpRequest) -> Response:
 def live_page() -> tuple[str, str]:
     """Return the page with its style and script in it, and the policy that lets a browser load nothing else."""
     folder = package_files("vlagents_ray.serve.live") / "page"
-    style, script = (folder.joinpath(name).read_text(encoding="utf-8") for name in ("live.css", "live.js"))
+    parts = {name: folder.joinpath(name).read_text(encoding="utf-8") for name in ("live.css", *_SCRIPTS)}
     html = folder.joinpath("live.html").read_text(encoding="utf-8")
-    html = html.replace("/* live.css */", style).replace("/* live.js */", script)
-    own = f"script-src {_digest(script)}; style-src {_digest(style)}; connect-src 'self'; img-src blob: data:"
-    return html, f"default-src 'none'; {own}; base-uri 'none'; form-action 'none'"
+    for name, part in parts.items():
+        html = html.replace(f"/* {name} */", part)
+    scripts = " ".join(_digest(parts[name]) for name in _SCRIPTS)
+    own = f"script-src {scripts}; style-src {_digest(parts['live.css'])}; connect-src 'self'"
+    media = "img-src blob: data:; media-src blob:"
+    return html, f"default-src 'none'; {own}; {media}; base-uri 'none'; form-action 'none'"
 
 
 def _digest(text: str) -> str:

@@ -10,18 +10,19 @@ from typing import Any
 
 import numpy as np
 
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.protocol.json_messages import plain_values
 from vlagents_ray.protocol.messages import Reply
+from vlagents_ray.serve.config.live import LiveArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import SAMPLE, STAGES, LoadMeter
-from vlagents_ray.serve.live.tap import RATE, Answer, LiveTap, Seen
+from vlagents_ray.serve.live.commands import CommandBoard
+from vlagents_ray.serve.live.ring import Ring
+from vlagents_ray.serve.live.tap import ENCODING_SHARE, RATE, ROWS, VALUES, Answer, LiveTap, Played, Seen
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.periodic import each_half_second
 from vlagents_ray.serve.sessions import Session
 
-_SHARE = 0.04  # of a core, for encoding pictures
-_VALUES = 64  # most numbers of one part of a state or of one row of a chunk
-_ROWS = 128  # most rows of a chunk
 _SESSIONS = 256  # most sessions of a replica that are described
 _TEXT = 200  # most characters of a text in an act's info
 _STATE_S = 0.5  # time for which slow things are not looked up again
@@ -42,12 +43,24 @@ class Snapshot:
 class ReplicaView:
     """Makes the snapshots of one replica; each viewer of another process states how far it has read."""
 
-    def __init__(self, engine: Engine, name: str, node: str, metadata: Callable[[], Mapping[str, Any]]) -> None:
-        """Create the view of the replica `name` on `node`, whose `engine` acts as `metadata` describes."""
+    def __init__(
+        self,
+        engine: Engine,
+        name: str,
+        node: str,
+        metadata: Callable[[], Mapping[str, Any]],
+        settings: LiveArgs | None = None,
+    ) -> None:
+        """Create the view of the replica `name` on `node`, whose `engine` acts as `metadata` describes.
+
+        With `settings`, the last seconds of each session are held, from `open` on.
+        """
         self._engine = engine
-        self._about = {"name": name, "node": node}
+        self._about = {"name": name, "node": node, "ring_s": None if settings is None else settings.ring_s}
         self._metadata = metadata
-        self.tap = LiveTap(self._show)
+        self.commands = CommandBoard(engine.sessions, self._see_all, save=self._save)
+        self.tap = LiveTap(self._show, commands=self.commands)
+        self.ring = None if settings is None else Ring(self.tap, engine.sessions, settings, name)
         self._meter: LoadMeter | None = None
         self._slow: dict[str, Any] = {}
         self._measured = float("-inf")
@@ -56,9 +69,13 @@ class ReplicaView:
     def open(self) -> None:
         """Begin to end the leases of viewers that no longer look."""
         each_half_second.add(self.tap.expire)
+        if self.ring is not None:
+            self.ring.open()
 
     def close(self) -> None:
         """Stop that."""
+        if self.ring is not None:
+            self.ring.close()
         each_half_second.remove(self.tap.expire)
         self._engine.watchers.remove(self.tap)
 
@@ -72,18 +89,24 @@ class ReplicaView:
         answers = tap.answers(since)
         snapshot = Snapshot(answers[-1].number if answers else since, {})
         last = {one.session: one for one in answers if one.op in _SHOWN_OPS}
+        played: dict[str, list[Played]] = {}
+        for one in answers:
+            if one.played is not None:
+                played.setdefault(one.session, []).append(one.played)
         tap.forget_others(engine.sessions.ids())
+        self.commands.forget_others(engine.sessions.ids())
         held = sorted(engine.sessions.all(), key=lambda one: one.id)[:_SESSIONS]
-        sessions = {session.id: _session(session, last.get(session.id)) for session in held}
+        sessions = {session.id: _session(session, last.get(session.id), played.get(session.id, [])) for session in held}
         begun = time.thread_time()
         longest_without = sorted(sessions, key=lambda name: self._pictured.get(name, 0))
         for name in longest_without:
             seen, described = tap.seen(name), sessions[name]
+            described["commands"] = self.commands.of(name)
             if seen is None or seen.number <= since:
                 continue
             snapshot.number = max(snapshot.number, seen.number)
-            described["state"] = {part: _numbers(values[:_VALUES]) for part, values in seen.state.items()}
-            if name in shown and time.thread_time() - begun < _SHARE / RATE:
+            described["state"] = {part: _numbers(values[:VALUES]) for part, values in seen.state.items()}
+            if name in shown and time.thread_time() - begun < ENCODING_SHARE / RATE:
                 described["pictures"] = _pictures(seen, snapshot.files)
                 self._pictured[name] = seen.number
         snapshot.document = {
@@ -95,6 +118,14 @@ class ReplicaView:
             "sessions_held": len(engine.sessions),
         }
         return snapshot
+
+    def _save(self, session: str) -> str:
+        if self.ring is None:
+            raise ConfigError("save: this server keeps nothing; state `live: {folder: ...}` in its deployment file")
+        return self.ring.save(session)
+
+    def _see_all(self, seconds: float) -> None:
+        self.tap.renew(seconds)
 
     def _show(self, tap: LiveTap | None) -> None:
         if tap is None:
@@ -122,8 +153,8 @@ class ReplicaView:
         return self._slow
 
 
-def _session(session: Session[LoadedModel], last: Answer | None) -> dict[str, Any]:
-    """Return a session as a viewer needs it, with its last answer if there is a new one."""
+def _session(session: Session[LoadedModel], last: Answer | None, played: list[Played]) -> dict[str, Any]:
+    """Return a session as a viewer needs it, with its last answer and what it executed, if there is something new."""
     weights = session.weights
     described = {
         "id": session.id,
@@ -132,16 +163,22 @@ def _session(session: Session[LoadedModel], last: Answer | None) -> dict[str, An
         "instruction": session.instruction,
         "silent_s": round(time.monotonic() - session.used, 2),
         "version": None if weights is None else weights.number,
+        "follows": session.follows,
         "pictures": {},
     }
+    if played:
+        said: dict[str, Any] = plain_values(played[-1].said)
+        steps = [step for one in played for step in one.steps.tolist()]
+        rows = [row for one in played for row in _numbers(one.rows)]
+        described["played"] = said | {"steps": steps[-ROWS:], "rows": rows[-ROWS:]}
     return described if last is None else described | {"rank": last.rank, "last": _act(last)}
 
 
 def _pictures(seen: Seen, files: list[bytes]) -> dict[str, int]:
-    """Add the pictures of an observation to `files`; return their indices."""
-    pictures = seen.pictures()
-    files += pictures.values()
-    return dict(zip(pictures, range(len(files) - len(pictures), len(files)), strict=True))
+    """Add the pictures of an observation to `files`, encoding those that came as pixels; return their indices."""
+    found = seen.pictures()
+    files += found.values()
+    return dict(zip(found, range(len(files) - len(found), len(files)), strict=True))
 
 
 def _act(answer: Answer) -> dict[str, Any]:
@@ -154,10 +191,12 @@ def _act(answer: Answer) -> dict[str, Any]:
         rows = reply.act.rows()
         found |= {
             "rows": len(rows),
-            "action": _numbers(rows[:_ROWS, :_VALUES]),
+            "action": _numbers(rows[:ROWS, :VALUES]),
             "done": reply.act.done,
             "info": _info(reply.act.info),
         }
+        if answer.played is not None:
+            found["at"] = answer.played.said.get("step")
     return found
 
 

@@ -9,22 +9,53 @@ its client wants back.
 from __future__ import annotations
 
 import itertools
+import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from vlagents_ray.chunking.execution import PLAYED
 from vlagents_ray.images.codecs import JPEG, DecodedFiles
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.responses import Done
+from vlagents_ray.serve.live.commands import CommandBoard
 
+ENCODING_SHARE = 0.04  # of a core, for encoding pictures
 RATE = 10.0  # observations a second and session that are kept
 LEASE_S = 2.0  # time after the last reading at which nobody looks any more
 _ANSWERS = 4096  # most answers that are kept
+VALUES = 64  # most numbers of one part of a state, or of one action
+ROWS = 128  # most actions of a chunk, or executed before a request
+_SAID = ("step", "age_ms", "safe", "safe_ticks", "safe_spells", "late", "reconnects")
+_ENCODING = threading.Lock()
 _KEPT_S = 1.0  # time for which the pictures of an observation are kept if nobody reads them
+
+
+@dataclass(frozen=True, slots=True)
+class Played:
+    """What a client states of the actions that it executed: `vlagents_ray.chunking.execution`."""
+
+    steps: np.ndarray  # (n,) int64, the steps of the rows
+    rows: np.ndarray  # (n, D) float32
+    said: dict[str, Any]  # `step`, `age_ms`, `safe`, … as far as they are numbers and texts
+
+    @classmethod
+    def of(cls, request: Request) -> Played | None:
+        """Return a copy of what a request states; None if that is nothing, or has another form."""
+        stated = None if request.obs is None else request.obs.info.get(PLAYED)
+        if not isinstance(stated, dict):
+            return None
+        steps, rows = stated.get("steps"), stated.get("rows")
+        if not isinstance(steps, np.ndarray) or not isinstance(rows, np.ndarray) or rows.ndim != 2:
+            return None
+        if steps.shape != rows.shape[:1] or steps.dtype.kind not in "iu" or rows.dtype.kind != "f":
+            return None
+        said = {name: stated[name] for name in _SAID if isinstance(stated.get(name), (int, float, str))}
+        return cls(np.array(steps[:ROWS]), np.array(rows[:ROWS, :VALUES]), said)
 
 
 class Answer(NamedTuple):
@@ -35,6 +66,7 @@ class Answer(NamedTuple):
     op: str
     rank: str
     reply: Reply
+    played: Played | None = None  # what the client executed before this request
 
 
 @dataclass(slots=True)
@@ -46,21 +78,35 @@ class Seen:
     state: dict[str, np.ndarray]  # (D,) float32, with the gripper as a part
     cameras: dict[str, np.ndarray]  # (H, W, 3) uint8 RGB; empty once they are encoded
     files: dict[str, bytes]  # JPEG or PNG files by camera: those that the client sent, or encoded by the reader
+    reply: Reply | None = None  # its answer, once that was sent
 
     def pictures(self) -> dict[str, bytes]:
-        """Return a file for each camera, encoding those that came as pixels."""
-        for camera, image in self.cameras.items():
-            self.files[camera] = JPEG.file(image)
-        self.cameras = {}
-        return self.files
+        """Return the files of all cameras; those that came as pixels are encoded now, which may take milliseconds."""
+        with _ENCODING:  # several may read
+            for camera, image in self.cameras.items():
+                self.files[camera] = JPEG.file(image)
+            self.cameras = {}
+            return dict(self.files)
 
 
 class LiveTap:
     """The latest answers and observations of a replica. Thread-safe."""
 
-    def __init__(self, show: Callable[[LiveTap | None], None], clock: Callable[[], float] = time.monotonic) -> None:
-        """Create a tap that nobody looks at; `show` makes it the one of the engine, or takes it away (None)."""
+    def __init__(
+        self,
+        show: Callable[[LiveTap | None], None],
+        clock: Callable[[], float] = time.monotonic,
+        commands: CommandBoard | None = None,
+    ) -> None:
+        """Create a tap that nobody looks at.
+
+        Args:
+            show: Makes the tap the one of the engine, or takes it away (None).
+            clock: The time, s.
+            commands: What is to be said to the sessions in their answers.
+        """
         self._show = show
+        self._commands = commands
         self._clock = clock
         self._until = float("-inf")  # end of the lease, s
         self._shown = False
@@ -73,9 +119,9 @@ class LiveTap:
         """Whether a viewer looks."""
         return self._clock() < self._until
 
-    def renew(self) -> None:
-        """Keep what happens for `LEASE_S` more."""
-        self._until = self._clock() + LEASE_S
+    def renew(self, lease_s: float = LEASE_S) -> None:
+        """Keep what happens for `lease_s` more."""
+        self._until = max(self._until, self._clock() + lease_s)
         if not self._shown:
             self._shown = True
             self._show(self)
@@ -111,18 +157,24 @@ class LiveTap:
         Returns:
             `done`, which also keeps the answers.
         """
-        kinds = []
+        kinds: list[tuple[str, str, str, Played | None, Seen | None]] = []
         for session, item in zip(sessions, items, strict=True):
             if isinstance(item, Reply):
-                kinds.append((session, "unknown", "robot"))
+                kinds.append((session, "unknown", "robot", None, None))
                 continue
-            kinds.append((session, item.op, item.rank))
-            self._keep(session, item, files)
+            kinds.append((session, item.op, item.rank, Played.of(item), self._keep(session, item, files)))
+            if self._commands is not None:
+                self._commands.note(session, item)
 
         def answer(replies: list[Reply]) -> None:
+            if self._commands is not None:
+                for session, reply in zip(sessions, replies, strict=True):
+                    self._commands.send(session, reply)
             done(replies)
-            for (session, op, rank), reply in zip(kinds, replies, strict=True):
-                self._answers.append(Answer(next(self._numbers), session, op, rank, reply))
+            for (session, op, rank, played, seen), reply in zip(kinds, replies, strict=True):
+                if seen is not None:
+                    seen.reply = reply
+                self._answers.append(Answer(next(self._numbers), session, op, rank, reply, played))
 
         return answer
 
@@ -140,13 +192,15 @@ class LiveTap:
         for session in self._seen.keys() - set(sessions):
             self._seen.pop(session, None)
 
-    def _keep(self, session: str, request: Request, files: DecodedFiles) -> None:
+    def _keep(self, session: str, request: Request, files: DecodedFiles) -> Seen | None:
+        """Keep a request's observation, unless one was kept just before."""
         obs, now, before = request.obs, self._clock(), self._seen.get(session)
         if obs is None or (before is not None and now - before.time < 1 / RATE):
-            return
+            return None
         state = {name: np.array(part) for name, part in obs.state.items()}
         if obs.gripper is not None:
             state["gripper"] = np.array([obs.gripper], np.float32)
         sent = {name: bytes(files[id(image)][1]) for name, image in obs.cameras.items() if id(image) in files}
         cameras = {name: image for name, image in obs.cameras.items() if name not in sent}
-        self._seen[session] = Seen(next(self._numbers), now, state, cameras, sent)
+        seen = self._seen[session] = Seen(next(self._numbers), now, state, cameras, sent)
+        return seen

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from vlagents_ray.errors import UnknownCheckpoint
+from vlagents_ray.errors import ConfigError, UnknownCheckpoint
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.adapters import ADAPTER
 from vlagents_ray.policies.base.checkpoint import at_step
@@ -53,8 +53,22 @@ class Checkpoints:
         self.config = self.own(config or {})
 
     def own(self, config: Mapping[str, Any]) -> dict[str, Any]:
-        """Return the deployment's own settings `config`, with its adapters."""
-        return {**config, **({_ADAPTERS: self._adapters} if self._adapters else {})}
+        """Return the deployment's own settings `config`, with its adapters beside those that stand there.
+
+        Raises:
+            ConfigError: Two adapters have the same name, or those that stand there are no mapping.
+        """
+        if not self._adapters:
+            return dict(config)
+        named = config.get(_ADAPTERS) or {}
+        if not isinstance(named, Mapping):
+            raise ConfigError(f"adapters: got {named!r}, want a folder or hub id by the name of each")
+        if double := sorted(name for name, source in self._adapters.items() if named.get(name, source) != source):
+            raise ConfigError(
+                f"adapters: got {double} both in the policy's settings and among the deployment's checkpoints, want "
+                f"each name once; rename one"
+            )
+        return {**config, _ADAPTERS: {**named, **self._adapters}}
 
     def split_options(self, options: Mapping[str, Any]) -> tuple[CheckpointChoice, dict[str, Any]]:
         """Split the options of a reset into the chosen checkpoint and the options for the policy.
@@ -69,6 +83,8 @@ class Checkpoints:
                 raise UnknownCheckpoint(
                     f"{STEP}: got {step!r} with the adapter {choice!r}, which has none; leave it out"
                 )
+            if rest.get(ADAPTER, choice) not in (None, choice):
+                raise UnknownCheckpoint(f"{ADAPTER}: got {rest[ADAPTER]!r} and {CHOICE} {choice!r}, want one of them")
             return DEFAULT, {**rest, ADAPTER: choice}
         if choice is not None and (not isinstance(choice, str) or choice not in self._choices):
             raise UnknownCheckpoint(f"{CHOICE}: got {choice!r}, want {self._offered()}")

@@ -145,7 +145,7 @@ class EpisodeWriter:
             ROWS: rows,
             CHUNK: padded(frame.chunk, running.shelf.rows).ravel(),
         }
-        running.episode.add(frame.obs, frame.chunk[0], frame.captured_at, frame.tick, False, columns)
+        running.episode.add(frame.obs, frame.chunk[0], frame.captured_at, frame.tick, False, more=columns)
         running.reset = ""
         running.frames += 1
         running.size += columns[CHUNK].nbytes + sum(len(text) for text in columns.values() if isinstance(text, str))

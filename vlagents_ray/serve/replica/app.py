@@ -9,9 +9,11 @@ from typing import Any
 from ray import serve
 from ray.serve import Application
 
-from vlagents_ray.serve.config.deployment import GATEWAY, POLICY, ServerArgs
+from vlagents_ray.serve.config.deployment import GATEWAY, POLICY, SHADOW, ServerArgs, candidate_of
+from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.dialects.gateway import Gateway
 from vlagents_ray.serve.python_env.probe import with_process
+from vlagents_ray.serve.replica.candidate import CandidateReplica
 from vlagents_ray.serve.replica.replica import PolicyReplica
 
 _FAILURES = 3  # number of consecutive failed health checks after which Serve replaces a replica
@@ -30,25 +32,11 @@ def build(args: ServerArgs) -> Application:
     """Build the Serve application of one policy; raises `ConfigError` if its environment cannot run it."""
     args = args.model_copy(update={"environment": with_process(args.environment)})
     options: dict[str, Any] = {
-        "name": POLICY,
+        **_options(args, POLICY),
         # A WebSocket session counts as a request as long as it lasts, so the limit must allow all sessions and two
         # batches. It is no protection against overload, since requests wait in the batch queue.
         "max_ongoing_requests": args.sessions.limit + 2 * args.batch.max_size,
         "graceful_shutdown_timeout_s": 20,
-        "health_check_period_s": 1 if args.environment.process == "child" else 5,  # Serve wants three failures
-        # A replica that does not reply is frozen, or its policy holds the interpreter's lock: then only these checks
-        # limit the time of a call. Together they take the limit of a call; Serve's default is 95 s for any policy.
-        "health_check_timeout_s": max(_LEAST_ANSWER_S, args.limits.act_s / _FAILURES),
-        # A policy that failed to load once will fail again. While other replicas run, Serve retries for ever.
-        "max_constructor_retry_count": 1,
-        "user_config": {},  # settings of the policy that a file states beside `args`; they change without a restart
-        "ray_actor_options": {
-            "num_cpus": args.resources.num_cpus,
-            "num_gpus": args.resources.num_gpus,
-            "resources": args.resources.custom,
-            **({} if args.resources.memory is None else {"memory": args.resources.memory}),
-            "runtime_env": args.environment.runtime_env(),
-        },
     }
     if args.autoscaling is not None:
         options["autoscaling_config"] = args.autoscaling.options()
@@ -67,7 +55,48 @@ def build(args: ServerArgs) -> Application:
         policy = serve.deployment(**options)(replica)
     gateways = args.dialects.gateways()
     settings = args.model_dump(mode="json", exclude=_OUTSIDE | {"dialects": set(gateways)})
-    return policy.bind(settings, _gateway(args)) if gateways else policy.bind(settings)
+    parts: dict[str, Any] = {}
+    if gateways:
+        parts["gateway"] = _gateway(args)
+    if args.shadow is not None:
+        candidate = candidate_of(args.shadow)
+        settings["shadow"]["policy"] = candidate.policy
+        parts["candidate"] = _shadow(candidate, args.shadow.record)
+    return policy.bind(settings, **parts)
+
+
+def _options(args: ServerArgs, name: str) -> dict[str, Any]:
+    """Return Serve's options that hold for a deployment of any policy."""
+    return {
+        "name": name,
+        "health_check_period_s": 1 if args.environment.process == "child" else 5,  # Serve wants three failures
+        # A replica that does not reply is frozen, or its policy holds the interpreter's lock: then only these checks
+        # limit the time of a call. Together they take the limit of a call; Serve's default is 95 s for any policy.
+        "health_check_timeout_s": max(_LEAST_ANSWER_S, args.limits.act_s / _FAILURES),
+        # A policy that failed to load once will fail again. While other replicas run, Serve retries for ever.
+        "max_constructor_retry_count": 1,
+        "user_config": {},  # settings of the policy that a file states beside `args`; they change without a restart
+        "ray_actor_options": {
+            "num_cpus": args.resources.num_cpus,
+            "num_gpus": args.resources.num_gpus,
+            "resources": args.resources.custom,
+            **({} if args.resources.memory is None else {"memory": args.resources.memory}),
+            "runtime_env": args.environment.runtime_env(),
+        },
+    }
+
+
+def _shadow(candidate: ServerArgs, record: str | None) -> Application:
+    """Build the deployment of the candidate: one replica, which only the live policy's replicas call."""
+    args = candidate.model_copy(update={"environment": with_process(candidate.environment), "dialects": DialectArgs()})
+    options = {
+        **_options(args, SHADOW),
+        "num_replicas": 1,
+        "graceful_shutdown_timeout_s": 10,
+        "graceful_shutdown_wait_loop_s": 0.1,  # the live policy does not wait for a comparison
+    }
+    settings = args.model_dump(mode="json", exclude=_OUTSIDE)
+    return serve.deployment(**options)(CandidateReplica).bind(settings, record)
 
 
 def _gateway(args: ServerArgs) -> Application:

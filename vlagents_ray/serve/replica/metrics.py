@@ -14,13 +14,19 @@
 | `vlagents_weight_push_ms` | histogram | from new weights at the replica that received them until all act with them |
 | `vlagents_uncompiled` | gauge | batch sizes that run without compilation, although the policy's `compile` is set |
 | `vlagents_hung_calls` | counter | op; calls of the policy that took longer than `limits` allow |
+| `vlagents_shadow_dropped` | counter | observations that the candidate of a shadow did not get |
+| `vlagents_shadow_observations` | counter | outcome ("compared", "failed"); observations that the candidate got |
+| `vlagents_shadow_difference` | histogram | rows ("all", "first"); absolute difference of two actions, mean of joints |
+| `vlagents_shadow_joint_difference` | gauge | joint; mean absolute difference, of the last second with comparisons |
+| `vlagents_shadow_latency_ms` | histogram | waiting and inference of the candidate |
 | `vlagents_recorded_frames` | counter | outcome ("saved", "lost"); acts of sessions that `record` names |
 | `vlagents_recording` | gauge | 1 while sessions are recorded, 0 once that has ended or if `record` is not set |
 | `vlagents_keys_unreadable_s` | gauge | time since which the file of API keys cannot be read; 0 if it can |
 
 All series have the tags `application`, `deployment`, `replica` and `policy`. Transport is `shm`, `plasma`, `websocket`,
 `http` or `handle`, class is `robot` or `simulation`. Counters are exact; a histogram takes a random sample of up to 100
-values per second for each kind of request and for the batches.
+values per second for each kind of request and for the batches. The candidate of a shadow exports the series
+`vlagents_shadow_*` but the first, with the deployment `Shadow` and the candidate as the policy.
 """
 
 from __future__ import annotations
@@ -28,7 +34,8 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from typing import Any, TypeVar
 
 from ray import serve
@@ -37,7 +44,9 @@ from ray.util.metrics import Counter, Gauge, Histogram
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import STAGES, Collected, LoadMeter
+from vlagents_ray.serve.periodic import Periodic
 from vlagents_ray.serve.recording.recorder import SessionRecorder
+from vlagents_ray.serve.shadow.comparer import Comparer
 
 logger = logging.getLogger(__name__)
 
@@ -46,6 +55,7 @@ _SLICE_S = 50e-6
 _PAUSE_S = 300e-6
 _MS = [0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0, 10_000.0]
 _SIZES = [1.0, 2.0, 4.0, 8.0, 12.0, 16.0, 24.0, 32.0, 48.0, 64.0, 128.0, 256.0]
+_DIFFERENCES = [1e-6, 1e-5, 1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0]  # units of the action
 _TRANSPORTS = ("shm", "plasma", "websocket", "http", "handle")
 
 T = TypeVar("T")
@@ -59,6 +69,7 @@ class Exporter:
         engine: Engine,
         tags: dict[str, str],
         keys: Keys | None = None,
+        shadow_drops: Callable[[], int] = lambda: 0,
         recorder: SessionRecorder | None = None,
     ) -> None:
         """Create the series.
@@ -67,14 +78,10 @@ class Exporter:
             engine: The engine whose stats are exported.
             tags: The tags of every series: application, deployment, replica, policy.
             keys: The API keys of the server; None if it has none.
+            shadow_drops: Returns the number of observations since the last call that the candidate did not get.
             recorder: Records the sessions; None if nothing does.
         """
-        common = tuple(tags)
-
-        def make(kind: Any, name: str, text: str, *own: str, **options: Any) -> Any:
-            metric = kind(f"vlagents_{name}", description=text, tag_keys=(*common, *own), **options)
-            return metric.set_default_tags(tags)
-
+        make = partial(_series, tags)
         self._engine = engine
         self._requests = make(Counter, "requests", "Requests answered.", "op", "transport", "class", "code")
         self._latency = make(
@@ -91,6 +98,8 @@ class Exporter:
         self._hung = make(Counter, "hung_calls", "Calls of the policy over their time limit.", "op")
         self._uncompiled = make(Gauge, "uncompiled", "Batch sizes that run without the compilation that is set.")
         self._unreadable = make(Gauge, "keys_unreadable_s", "Time in which the key file could not be read.")
+        self._dropped = make(Counter, "shadow_dropped", "Observations that the candidate did not get.")
+        self._shadow_drops = shadow_drops
         self._recorded = make(Counter, "recorded_frames", "Acts of recorded sessions.", "outcome")
         self._recording = make(Gauge, "recording", "Whether sessions are recorded.")
         self._keys, self._recorder = keys, recorder
@@ -132,6 +141,8 @@ class Exporter:
             self._pushes.observe(took_ms)
         self._version.set(self._engine.weights.number)
         self._uncompiled.set(len(self._engine.models.uncompiled))
+        if dropped := self._shadow_drops():
+            self._dropped.inc(dropped)
         self._unreadable.set(0.0 if self._keys is None else self._keys.unreadable_s)
         self._export_recording()
 
@@ -162,6 +173,51 @@ class Exporter:
             self._hung.inc(calls, {"op": op})
         if collected.padding:
             self._padding.inc(collected.padding)
+
+
+class ShadowExporter:
+    """Exports the comparisons of a candidate to Ray once a second, until `close`."""
+
+    def __init__(self, comparer: Comparer, tags: dict[str, str]) -> None:
+        """Create the series with these tags: application, deployment, replica, policy."""
+        make = partial(_series, tags)
+        self._comparer = comparer
+        self._observations = make(Counter, "shadow_observations", "Observations that the candidate got.", "outcome")
+        self._difference = make(
+            Histogram, "shadow_difference", "Difference of two actions.", "rows", boundaries=_DIFFERENCES
+        )
+        self._joints = make(Gauge, "shadow_joint_difference", "Mean absolute difference.", "joint")
+        self._latency = make(Histogram, "shadow_latency_ms", "Time of the candidate for an act.", boundaries=_MS)
+        self._periodic = Periodic(PERIOD_S)
+
+    def start(self) -> None:
+        """Start to export."""
+        self._periodic.add(self.export)
+
+    def close(self) -> None:
+        """Export what remains, and end."""
+        self._periodic.remove(self.export)
+        self.export()
+
+    def export(self) -> None:
+        """Export the comparisons since the last call."""
+        compared = self._comparer.collect()
+        for outcome, count in compared.outcomes.items():
+            self._observations.inc(count, {"outcome": outcome})
+        for rows, sample in compared.differences.items():
+            for value in sample.values:
+                self._difference.observe(value, {"rows": rows})
+        for took_ms in compared.latencies_ms.values:
+            self._latency.observe(took_ms)
+        if compared.joints is not None:
+            for joint, total in enumerate(compared.joints):
+                self._joints.set(float(total) / compared.outcomes["compared"], {"joint": str(joint)})
+
+
+def _series(tags: Mapping[str, str], kind: Any, name: str, text: str, *own: str, **options: Any) -> Any:
+    """Create a series of `kind`, with `tags` and those that each value has of its `own`."""
+    metric = kind(f"vlagents_{name}", description=text, tag_keys=(*tags, *own), **options)
+    return metric.set_default_tags(tags)
 
 
 def _in_slices(values: Iterable[T]) -> Iterator[T]:

@@ -18,9 +18,8 @@ from ray.serve.exceptions import RayServeException
 from starlette.types import ASGIApp
 
 from vlagents_ray.client.transports.serve_handle import ClientApi
-from vlagents_ray.errors import PolicyFailed, PolicyUnavailable, VLAgentsError
-from vlagents_ray.protocol.frames import decode_requests
-from vlagents_ray.protocol.messages import PROTOCOL_VERSION, SERVERS_MACHINE, Reply, boot_id
+from vlagents_ray.errors import PolicyUnavailable
+from vlagents_ray.protocol.messages import PROTOCOL_VERSION, SERVERS_MACHINE, boot_id
 from vlagents_ray.ray_tools.git_state import code_of
 from vlagents_ray.ray_tools.private import http_options, replica_is_ending
 from vlagents_ray.registry import names
@@ -36,16 +35,15 @@ from vlagents_ray.serve.endpoints.local.shm import ShmServer
 from vlagents_ray.serve.endpoints.local.unix_messages import Admit
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.endpoints.weights import weights_routes
-from vlagents_ray.serve.engine.dispatch import Dispatcher
-from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import LoadMeter, RequestTrace
 from vlagents_ray.serve.live.endpoint import live_routes
 from vlagents_ray.serve.models.checkpoints import resolved
 from vlagents_ray.serve.ports import EVERYWHERE, HOST, LOOPBACK
-from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
+from vlagents_ray.serve.replica.engine_replica import EngineReplica
 from vlagents_ray.serve.replica.live import ReplicaLive
 from vlagents_ray.serve.replica.metrics import Exporter, tags_of
 from vlagents_ray.serve.replica.recording import open_recorder
+from vlagents_ray.serve.replica.shadow import ReplicaShadow
 from vlagents_ray.serve.replica.weights import ReplicaWeights
 from vlagents_ray.serve.scaling.autoscaling import SESSIONS, UTILISATION, WAITING
 from vlagents_ray.serve.scaling.held_sessions import PEER_METHODS
@@ -62,16 +60,17 @@ _STDERR = 2
 _GATEWAY_POLL_S = 10.0
 
 
-class PolicyReplica(ReplicaWeights, ReplicaLive, ClientApi, SiblingApi):
-    """Loads the policy in its first `reconfigure`, so that Serve reports RUNNING only when the policy can act.
+class PolicyReplica(EngineReplica, ReplicaWeights, ReplicaLive, ReplicaShadow, ClientApi, SiblingApi):
+    """One replica of the policy, with all the ways in that clients use.
 
-    A policy that does not load therefore makes the start fail, with the reason in `serve status`. Until the first
-    replica runs, Serve's proxies reply for the application: see `vlagents_ray.serve.scaling.router` and
+    Until the first replica runs, Serve's proxies reply for the application: see `vlagents_ray.serve.scaling.router` and
     `vlagents_ray.serve.launch.haproxy`.
     """
 
-    async def __init__(self, args: dict[str, Any], gateway: Any = None) -> None:  # type: ignore[misc]
-        """Serve awaits the constructor. `gateway` is a handle, which makes the gateway a part of the application."""
+    async def __init__(  # type: ignore[misc]  # Serve awaits it
+        self, args: dict[str, Any], gateway: Any = None, candidate: Any = None
+    ) -> None:
+        """Make the replica with the settings `args`; handles make the other two a part of the application."""
         self._gateway = gateway
         self._gateways: dict[str, Any] = {}
         self._args = ServerArgs(**args)
@@ -83,29 +82,18 @@ class PolicyReplica(ReplicaWeights, ReplicaLive, ClientApi, SiblingApi):
             write_audit()
             if not self._args.access.plain_http:
                 warn_of_plain_http(_plain_host())
-        self._limits = self._args.limits.limits()
         self._peers = SiblingReplicas()
         self._migrator = SessionMigrator(self._peers.others, asyncio.get_running_loop())
-        self._engine = Engine(
-            self._args.checkpoints.of(partial(make_agent, self._args), self._args.config),
-            max_batch_size=self._args.batch.max_size,
-            patience=self._args.batch.patience,
-            batch_sizes=self._args.batch.sizes or (),
-            session_limit=self._args.sessions.limit,
-            session_idle_s=self._args.sessions.idle_s,
-            version=version_of(self._args),
-            check=partial(require_fit, self._args.dialects),
-            limits=self._args.limits.call_limits(),
-            reply_bytes=self._limits.reply_bytes,
-            in_flight_bytes=self._limits.in_flight_bytes,
-            finder=self._migrator,
-        )
+        self._open_engine(self._args, partial(require_fit, self._args.dialects), self._migrator)
         self._migrator.start(self._engine)
         self._open_weights(self._engine, self._peers)
-        self._open_live(self._engine, self._peers, self.metadata, self._args.viewers)
+        self._open_live(self._engine, self._peers, self.metadata, self._args.live, self._args.viewers)
+        self._open_shadow(self._engine, self._args.shadow, candidate)
         self._meter = LoadMeter(self._engine.queue)
         self._recorder = open_recorder(self._engine, self._args.record, self._peers.own_name, self.metadata)
-        self._metrics = Exporter(self._engine, tags_of(self._args.policy), self._keys, self._recorder)
+        self._metrics = Exporter(
+            self._engine, tags_of(self._args.policy), self._keys, self._shadow_drops, self._recorder
+        )
         self._metrics.start()
         self._rebalancer = Rebalancer(self._engine, self._peers, self._load_of)
         has_files = hasattr(os, "memfd_create")
@@ -115,32 +103,9 @@ class PolicyReplica(ReplicaWeights, ReplicaLive, ClientApi, SiblingApi):
         for endpoint in (self._local, self._plasma, self._stream):
             if endpoint is not None:
                 endpoint.open()
-        self._configured = False
-
-    async def reconfigure(self, settings: dict[str, Any] | None, rank: Any) -> None:
-        """Apply the file's `user_config`; called by Serve before the replica is ready, and when the settings change.
-
-        An error of the first call makes the start of the replica fail. Later calls return at once and raise nothing, as
-        an error would end the replica: the metadata and the log show the result of the swap. `rank` is not used, but
-        Serve calls a method with this parameter also without a `user_config`.
-        """
-        config = {**self._args.config, **(settings or {})}
-        if self._configured:
-            logger.info("new settings, to be loaded beside the present ones: %s", config)
-        self._engine.models.configure(config)
-        if not self._configured:
-            self._configured = True
-            await self._start()
 
     async def _start(self) -> None:
-        try:
-            await asyncio.to_thread(self._engine.start)
-        except PolicyFailed as error:
-            if not isinstance(error.__cause__, VLAgentsError):
-                raise
-            logger.exception("the policy did not load")
-            # Errors of this package say what to do: `serve status` would show the tracebacks of both before it.
-            raise PolicyFailed(str(error)) from None
+        await super()._start()
         await self._follow_others()
         self._rebalancer.start()
         self._shutdown_watch = asyncio.ensure_future(self._watch_shutdown())
@@ -188,6 +153,7 @@ class PolicyReplica(ReplicaWeights, ReplicaLive, ClientApi, SiblingApi):
             "dialects": describe(self._args.dialects) | self._gateways,
             "local": None if self._local is None else asdict(self._local.address),
             "stream": None if self._stream is None else asdict(self._stream.address),
+            "shadow": self._shadow_description,
         }
 
     def _stream_endpoint(self) -> WebSocketServer | None:
@@ -266,23 +232,12 @@ class PolicyReplica(ReplicaWeights, ReplicaLive, ClientApi, SiblingApi):
     async def call(self, session_id: str, frame: Any) -> bytes:
         """Execute a frame of requests from inside the cluster, a buffer that is read in place from plasma."""
         trace = RequestTrace(self._engine.stats, "handle")
-        sender = Dispatcher(self._engine, "handle", session_id, caller=NoKey.INSIDE, connected=False)
-        try:
-            admission = sender.admission(self._limits)  # the frame is in plasma
-            requests = await admission.decoded(partial(decode_requests, memoryview(frame)))
-            trace.decoded(requests)
-            replies = await sender.ask(requests, admission)
-        except VLAgentsError as error:
-            replies = [Reply(error=error)]
+        _, replies = await self._ask(session_id, frame, trace)
         return trace.frame(replies)
 
     async def peer(self, method: str, *args: Any) -> Any:
         """Call one of `PEER_METHODS` for another replica, about sessions that migrate."""
         return await PEER_METHODS[method](self._migrator.held, *args)
-
-    async def check_health(self) -> None:
-        """Raise if the policy died or hangs; Serve calls this once the policy has loaded, and replaces the replica."""
-        await asyncio.to_thread(self._engine.check_health)  # includes the policy's own check
 
     def record_autoscaling_stats(self) -> dict[str, float]:
         """Return the load since the last call, for `MeasuredLoad`; called periodically by Serve."""
@@ -326,6 +281,7 @@ class PolicyReplica(ReplicaWeights, ReplicaLive, ClientApi, SiblingApi):
         if self._engine.draining:
             await self._migrator.hand_over()
         await asyncio.to_thread(self._close_live)
+        self._close_shadow()
         self._rebalancer.close()
         await self._migrator.close()
         for part in (self._engine, self._recorder, self._metrics):

@@ -6,7 +6,6 @@ import asyncio
 import logging
 import time
 from collections.abc import Awaitable, Callable, Collection, Iterator
-from functools import partial
 from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 import ray
@@ -14,7 +13,6 @@ from ray import serve
 
 from vlagents_ray.client.transports.serve_handle import call_replica
 from vlagents_ray.errors import VLAgentsError
-from vlagents_ray.serve.live.fleet import Other
 from vlagents_ray.serve.live.snapshot import Snapshot
 from vlagents_ray.serve.scaling.held_sessions import HeldSessions, Peer, PeerEnded, PeerUnreachable
 from vlagents_ray.serve.scaling.replica_selection import ReplicaLoad
@@ -30,7 +28,6 @@ _NAMESPACE = "serve"
 _ANSWER_S = 3.0  # default time limit for an answer; a replica that still loads does not answer
 _TRANSFER_S = 600.0  # time limit for an answer that weights are sent with
 _QUICK_S = 0.3  # time limit for an answer while a client waits to connect
-_VIEW_S = 2.0  # time for which the replicas that were found for viewers are not looked up again
 _SILENT_S = 3.0  # time for which a replica that did not answer is not asked for its load again
 
 
@@ -51,6 +48,10 @@ class SiblingApi(Protocol):
 
     async def live(self, since: int, shown: Collection[str]) -> Snapshot:
         """Return what happened since a snapshot, with pictures of the sessions `shown`."""
+        ...
+
+    async def press(self, session: str, do: str, text: str, by: str) -> dict[str, Any] | None:
+        """Give a command to a session from the live page; None if the session is not here."""
         ...
 
 
@@ -112,10 +113,9 @@ class SiblingReplicas:
 
     def __init__(self) -> None:
         context = serve.get_replica_context()
-        self._prefix = f"SERVE_REPLICA::{context.app_name}#{context.deployment}#"
+        self.app = context.app_name
+        self._deployment = context.deployment
         self.own_name = context.replica_id.to_full_id_str()
-        self._views: dict[str, Other] = {}  # found last, for viewers, which ask often
-        self._viewed = float("-inf")
         self._silent: dict[str, float] = {}  # time until which a silent replica is not asked, by its name
 
     async def others(self) -> list[_Replica]:
@@ -125,15 +125,6 @@ class SiblingReplicas:
     async def other_weights(self) -> list[_WeightsOf]:
         """Return all other replicas, for pushes of weights."""
         return await asyncio.to_thread(lambda: [_WeightsOf(name, actor) for name, actor in self._actors()])
-
-    async def views(self) -> dict[str, Other]:
-        """Return the readers of the snapshots of all other replicas, by name, for viewers."""
-        if time.monotonic() - self._viewed > _VIEW_S:
-            self._viewed = time.monotonic()
-            self._views = await asyncio.to_thread(
-                lambda: {name: partial(_view, actor) for name, actor in self._actors()}
-            )
-        return self._views
 
     def loads(self) -> list[ReplicaLoad]:
         """Return the loads of the replicas that answer within 0.3 s."""
@@ -161,18 +152,18 @@ class SiblingReplicas:
         return _result(reference, _QUICK_S)
 
     def _actors(self) -> Iterator[tuple[str, Any]]:
-        for entry in ray.util.list_named_actors(all_namespaces=True):
-            name = entry["name"]
-            if entry["namespace"] == _NAMESPACE and name.startswith(self._prefix) and name != self.own_name:
-                try:
-                    yield name, ray.get_actor(name, namespace=_NAMESPACE)
-                except ValueError:  # the replica has ended meanwhile
-                    continue
+        return ((name, one) for name, one in replica_actors(self.app, self._deployment) if name != self.own_name)
 
 
-async def _view(actor: Any, since: int, shown: Collection[str]) -> Snapshot:
-    snapshot: Snapshot = await asyncio.wait_for(call_replica(actor, SiblingApi.live, since, shown), _QUICK_S)
-    return snapshot
+def replica_actors(app: str, deployment: str) -> Iterator[tuple[str, Any]]:
+    """Find the replicas of an application's deployment in this cluster; yield the name and the actor of each."""
+    for entry in ray.util.list_named_actors(all_namespaces=True):
+        name = entry["name"]
+        if entry["namespace"] == _NAMESPACE and name.startswith(f"SERVE_REPLICA::{app}#{deployment}#"):
+            try:
+                yield name, ray.get_actor(name, namespace=_NAMESPACE)
+            except ValueError:  # the replica has ended meanwhile
+                continue
 
 
 def _result(reference: Any, timeout_s: float = _ANSWER_S) -> Any:

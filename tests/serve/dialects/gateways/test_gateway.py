@@ -57,7 +57,7 @@ def test_a_gateway_serves_each_dialect_of_the_deployment_on_its_port(
     replicas: Replicas, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(module.serve, "get_replica_context", lambda: SimpleNamespace(app_name="noop"))
-    monkeypatch.setattr(module, "_wait_for_policy", lambda _app: None)
+    monkeypatch.setattr(module, "wait_for_policy", lambda _app: None)
     monkeypatch.setattr(module, "_connector", lambda *_, **_options: lambda *_: replicas.agent())
     ports = {"vlagents": free_port(), "gr00t": free_port()}
     stated = {name: {"port": port} for name, port in ports.items()} | {"openvla": {}}

@@ -4,6 +4,8 @@
 const KEPT_S = 10; // times and rates are of the last seconds
 const POINTS = 120; // of a sparkline
 const LINES = 8; // most lines in one plot
+const EXECUTED = 300; // actions that a card keeps
+const PLANS = 12; // chunks that a card keeps
 const STAGES = ["decode", "queue", "inference", "encode"];
 const COLOURS = ["--c0", "--c1", "--c2", "--c3", "--c4", "--c5"];
 const SVG = "http://www.w3.org/2000/svg";
@@ -12,6 +14,7 @@ const byId = (id) => document.getElementById(id);
 const replicas = new Map(); // by name: its last document, and what was counted lately
 const cards = new Map(); // by session
 let key = sessionStorage.getItem("vlagents.key") || "";
+let mayOperate = false; // whether this key may press buttons
 let wait = 500; // before the next attempt to connect, ms
 
 function element(tag, properties = {}, ...children) {
@@ -30,7 +33,7 @@ function connect() {
   let heard = false;
   const ask = () => socket.send(JSON.stringify({ shown: visibleSessions() }));
   socket.binaryType = "arraybuffer";
-  socket.onopen = ask;
+  socket.onopen = () => { forgetFailures(); ask(); };
   socket.onmessage = (event) => {
     if (typeof event.data === "string") return say(JSON.parse(event.data).detail, false);
     if (!heard) say("Live", true);
@@ -43,6 +46,7 @@ function connect() {
   };
   socket.onclose = (event) => {
     if (!heard) askForKey();
+    else if (evaluation && !UNDER_WAY.includes(evaluation.state)) say("Ended", false);
     else say(event.reason || "Disconnected; connecting again …", false);
     setTimeout(() => { if (byId("key").hidden) connect(); }, wait);
     wait = Math.min(wait * 2, 10000);
@@ -90,18 +94,21 @@ function read(data) {
 // ---- what is shown
 
 function show(said, files) {
+  mayOperate = said.may_operate;
   const present = new Set();
   for (const replica of said.replicas) {
     count(replica, said.time);
     for (const session of replica.sessions) {
       present.add(session.id);
       if (!cards.has(session.id)) cards.set(session.id, new Card(session.id));
-      cards.get(session.id).update(session, files);
+      cards.get(session.id).update(session, files, replica.ring_s);
     }
   }
   const names = new Set(said.replicas.map((one) => one.name));
   for (const [name, one] of replicas) if (!names.has(name) && said.time - one.time > 3) replicas.delete(name);
   for (const [id, card] of cards) if (!present.has(id) && ++card.missed > 5) { card.remove(); cards.delete(id); }
+  if (said.evaluation) showEvaluation(said.evaluation, said.time);
+  for (const section of document.querySelectorAll(".of-server")) section.hidden = evaluation !== null && !replicas.size;
   showFleet(said.time);
   showTimes();
   byId("session-count").textContent = cards.size ? `(${cards.size})` : "";
@@ -118,9 +125,12 @@ function count(said, now) {
 function showFleet(now) {
   const policies = [...replicas.values()].map((one) => one.said);
   if (!policies.length) return;
-  byId("policy").textContent = policies[0].policy;
-  byId("checkpoint").textContent = policies[0].checkpoint || "";
-  document.title = `${policies[0].policy}, live`;
+  if (!evaluation) {
+    byId("policy").textContent = policies[0].policy;
+    byId("checkpoint").textContent = policies[0].checkpoint || "";
+    document.title = `${policies[0].policy}, live`;
+  }
+  const several = new Set(policies.map((one) => one.policy)).size > 1;
   const rows = [...replicas].sort().map(([name, one]) => {
     const { said, events } = one;
     const seconds = Math.min(KEPT_S, Math.max(1, now - one.since));
@@ -129,7 +139,7 @@ function showFleet(now) {
     const busy = said.utilisation ?? 0;
     const meter = element("meter", { max: 1, value: busy, high: 0.9, ariaLabel: `busy ${Math.round(busy * 100)} %` });
     return element("tr", {},
-      element("th", { scope: "row" }, `${name} on ${said.node}`, said.ready ? "" : ` (loading${said.step ? `: ${said.step}` : ""})`),
+      element("th", { scope: "row" }, `${several ? `${said.policy}: ` : ""}${name} on ${said.node}`, said.ready ? "" : ` (loading${said.step ? `: ${said.step}` : ""})`),
       element("td", {}, meter, `${Math.round(busy * 100)} %`),
       ...[(events.reduce((sum, event) => sum + event.acts, 0) / seconds).toFixed(1), mean ? mean.toFixed(1) : "–",
         said.waiting.robot, said.waiting.simulation, `${said.sessions_held} of ${said.session_limit}`,
@@ -160,6 +170,34 @@ function showTimes() {
 
 // ---- cards
 
+const pressed = (said) => `${said.do}${said.by ? `, pressed by ${said.by}` : ""}`;
+const OUTCOMES = { // what became of a command
+  waiting: (said) => `${pressed(said)}: waits for the robot's next request`,
+  sent: (said) => `${pressed(said)}: sent, not answered yet`,
+  saving: (said) => `${pressed(said)}: being written`,
+  done: (said) => `${pressed(said)}: done${said.why ? `, in ${said.why}` : ""}`,
+  refused: (said) => `${pressed(said)}: refused: ${said.why}`,
+  ignored: (said) => `${pressed(said)}: ignored; the robot obeys no commands`,
+  "too late": (said) => `${pressed(said)}: not sent, as the robot made no request for 5 s`,
+};
+const number = (value) => String(Number(value.toPrecision(3)));
+
+function svgElement() {
+  const svg = document.createElementNS(SVG, "svg");
+  svg.setAttribute("viewBox", "0 0 100 100");
+  svg.setAttribute("preserveAspectRatio", "none");
+  svg.setAttribute("role", "img");
+  return svg;
+}
+
+function polyline(points, colour, kind = "") {
+  const line = document.createElementNS(SVG, "polyline");
+  line.setAttribute("points", points.join(" "));
+  line.setAttribute("class", kind);
+  line.style.stroke = `var(${colour})`;
+  return line;
+}
+
 class Card {
   constructor(id) {
     this.id = id;
@@ -173,14 +211,21 @@ class Card {
     this.cameras = element("div", { className: "cameras" });
     this.drawn = element("div", { className: "plots" });
     this.told = element("dl");
+    this.plans = []; // the last chunks: the step of their first row, and their rows
+    this.executed = new Map(); // action by step
+    this.joint = element("select", { onchange: () => this.compare() });
+    this.compared = element("figure", { className: "compared", hidden: true }, svgElement(),
+      element("figcaption", {}, element("label", {}, "Planned and executed, joint ", this.joint), element("span")));
     const title = element("h3", { id: `session-${cards.size}-${Date.now()}` }, id);
-    this.root = element("article", {}, element("div", {}, title, this.badge), this.instruction, this.cameras, this.drawn, this.told);
+    this.outcome = element("p", { className: "note", role: "status" });
+    this.operated = this.buttons();
+    this.root = element("article", {}, element("div", {}, title, this.badge), this.instruction, this.cameras, this.drawn, this.compared, this.told, this.operated);
     this.root.setAttribute("aria-labelledby", title.id);
     byId("sessions").append(this.root);
     this.filter();
   }
 
-  update(said, files) {
+  update(said, files, ring) {
     this.missed = 0;
     if (said.rank) this.badge.textContent = `${said.rank === "robot" ? "robot" : "simulation"}, ${said.transport}`;
     this.instruction.textContent = said.instruction ? `“${said.instruction}”` : "";
@@ -192,7 +237,14 @@ class Card {
       this.series.set(part, rows);
       this.plot(`state: ${part}`, rows);
     }
+    this.operated.hidden = !mayOperate;
+    this.follows.textContent = said.follows ? "Pin version" : "Follow versions";
+    this.save.hidden = !ring;
+    this.save.textContent = `Save last ${ring} s`;
+    this.follows.value = said.follows ? "pin" : "follow";
+    this.commands(said.commands);
     if (said.last) this.act(said.last);
+    if (said.played) this.played(said.played);
     this.root.classList.toggle("silent", said.silent_s > 5);
     this.tell({ step: said.step, "weights version": said.version, "last request": `${said.silent_s.toFixed(1)} s ago` });
   }
@@ -200,12 +252,93 @@ class Card {
   act(act) {
     this.root.classList.toggle("failed", Boolean(act.error));
     this.tell({ error: act.error ? `${act.error}: ${act.detail}` : null });
+    if (act.action && act.at != null) this.plans = [...this.plans, { at: act.at, rows: act.action }].slice(-PLANS);
     if (act.action) this.plot(act.rows > 1 ? `plan: ${act.rows} rows` : "action", this.planned(act));
     const ms = act.ms;
     if (ms.inference_ms !== undefined) {
       this.tell({ server: ms.total_ms === undefined ? null : `${ms.total_ms.toFixed(1)} ms: ${STAGES.filter((name) => ms[`${name}_ms`] !== undefined).map((name) => `${name} ${ms[`${name}_ms`].toFixed(1)}`).join(", ")}`, "batch of": ms.batch_size });
     }
     this.tell(act.info || {});
+  }
+
+  // ---- for those who may operate the session
+
+  buttons() {
+    const button = (text, command, className = "") => element("button", { type: "button", className, value: command,
+      ariaLabel: `${text}: ${this.id}`, onclick: (event) => this.press(event.currentTarget.value) }, text);
+    const text = element("input", { name: "text", maxLength: 1000, required: true, placeholder: "another instruction", ariaLabel: `Instruction for ${this.id}` });
+    const instruct = element("form", { className: "row", onsubmit: (event) => {
+      event.preventDefault();
+      this.press("instruct", text.value.trim());
+      text.value = "";
+    } }, text, element("button", { className: "quiet" }, "Change"));
+    this.follows = button("Pin version", "pin", "quiet");
+    this.save = button("Save", "save", "quiet");
+    return element("div", { className: "operate", hidden: true },
+      element("div", { className: "row" }, button("Stop", "stop", "stop"), button("Pause", "pause"), button("Resume", "resume")),
+      element("div", { className: "row" }, button("Success", "success", "quiet"), button("Failure", "failure", "quiet"), this.follows, this.save),
+      instruct, this.outcome);
+  }
+
+  async press(command, text = "") {
+    this.say(`${command}: on its way`);
+    const headers = { "content-type": "application/json", ...(key ? { authorization: `Bearer ${key}` } : {}) };
+    try {
+      const answer = await fetch(`${path()}/command`, { method: "POST", headers, body: JSON.stringify({ session: this.id, do: command, text }) });
+      const said = await answer.json();
+      this.say(answer.ok ? OUTCOMES[said.state](said) : `${command}: ${said.detail}`, !answer.ok);
+    } catch (error) {
+      this.say(`${command}: the server was not reached`, true);
+    }
+  }
+
+  say(text, failed = false) {
+    if (this.outcome.textContent === text) return; // a screen reader would say it again
+    this.outcome.textContent = text;
+    this.outcome.classList.toggle("bad", failed);
+  }
+
+  commands(said) {
+    const last = said[said.length - 1];
+    const state = last && `${last.id} ${last.state}`;
+    if (!last || state === this.last) return;
+    this.last = state;
+    this.say(OUTCOMES[last.state](last), ["refused", "ignored", "too late"].includes(last.state));
+  }
+
+  // What the robot executed, as its chunk player states it with each request.
+  played(said) {
+    if (said.step < this.step) { this.executed.clear(); this.plans = []; } // another player
+    this.step = said.step;
+    said.steps.forEach((step, i) => { this.executed.delete(step); this.executed.set(step, said.rows[i]); });
+    while (this.executed.size > EXECUTED) this.executed.delete(this.executed.keys().next().value);
+    const spells = said.safe_spells ? `${said.safe_ticks} ticks in ${said.safe_spells} ${said.safe_spells === 1 ? "spell" : "spells"}` : "none";
+    this.tell({ "age when executed": said.age_ms == null ? null : `${said.age_ms.toFixed(0)} ms`, "safe action now": said.safe || null,
+      "safe actions": spells, "answers too late": said.late, reconnects: said.reconnects });
+    this.compare();
+  }
+
+  // One joint of the last chunks (dashed) and of the actions that were executed (solid), by step.
+  compare() {
+    const { plans, executed } = this;
+    if (!plans.length || !executed.size) return;
+    const plan = plans[plans.length - 1];
+    this.compared.hidden = false;
+    const joints = plan.rows[0].length;
+    if (this.joint.length !== joints) this.joint.replaceChildren(...plan.rows[0].map((_, i) => element("option", { value: i }, `${i + 1} of ${joints}`)));
+    const joint = Number(this.joint.value), first = plan.at - 2 * plan.rows.length;
+    const lines = [
+      ...plans.map((one) => one.rows.map((row, i) => [one.at + i, row[joint]])),
+      [...executed].sort((a, b) => a[0] - b[0]).map(([step, row]) => [step, row[joint]]),
+    ].map((line) => line.filter(([step, value]) => step >= first && value != null));
+    const values = lines.flat().map(([, value]) => value), steps = lines.flat().map(([step]) => step);
+    if (!values.length) return;
+    const low = Math.min(...values), range = Math.max(...values) - low || 1, from = Math.min(...steps), length = Math.max(1, Math.max(...steps) - from);
+    const [svg, caption] = this.compared.children;
+    svg.replaceChildren(...lines.map((line, i) => polyline(line.map(([step, value]) => `${(100 * (step - from)) / length},${95 - (90 * (value - low)) / range}`), COLOURS[i < plans.length ? 1 : 0], i < plans.length ? "planned" : "executed")));
+    const told = `${number(low)} to ${number(Math.max(...values))}; dashed: planned, solid: executed, up to step ${this.step}`;
+    caption.lastChild.textContent = told;
+    svg.setAttribute("aria-label", `Joint ${joint + 1}, ${told}`);
   }
 
   // A chunk is drawn as it is; single actions as the last of them.
@@ -234,10 +367,7 @@ class Card {
     let svg = this.plots.get(name);
     if (!svg) {
       for (const other of this.plots.keys()) if (name.startsWith("plan") && other.startsWith("plan")) this.removePlot(other);
-      svg = document.createElementNS(SVG, "svg");
-      svg.setAttribute("viewBox", "0 0 100 100");
-      svg.setAttribute("preserveAspectRatio", "none");
-      svg.setAttribute("role", "img");
+      svg = svgElement();
       this.plots.set(name, svg);
       this.drawn.append(element("div", {}, element("span", { className: "plot-name" }), svg));
     }
@@ -246,13 +376,9 @@ class Card {
     const lines = [];
     for (let joint = 0; joint < Math.min(LINES, rows[0].length); joint++) {
       const points = rows.map((row, i) => row[joint] == null ? null : `${(100 * i) / Math.max(1, rows.length - 1)},${range ? 95 - (90 * (row[joint] - low)) / range : 50}`);
-      const line = document.createElementNS(SVG, "polyline");
-      line.setAttribute("points", points.filter(Boolean).join(" "));
-      line.style.stroke = `var(${COLOURS[joint % COLOURS.length]})`;
-      lines.push(line);
+      lines.push(polyline(points.filter(Boolean), COLOURS[joint % COLOURS.length]));
     }
     svg.replaceChildren(...lines);
-    const number = (value) => String(Number(value.toPrecision(3)));
     const told = `${name}, ${range ? `${number(low)} to ${number(high)}` : number(low)}`;
     svg.previousSibling.textContent = told;
     svg.setAttribute("aria-label", told);

@@ -1,0 +1,268 @@
+"""What the live page costs: acts of robots with nobody, one and four viewers, side by side in one run.
+
+One cluster serves two applications, each with one replica of a policy that takes 5 ms: one as it is, and one whose
+dispatcher lacks the lines for the tap. Both serve the same robots, which are in processes of their own, as are the
+viewers: two robots of 50 Hz, and one that acts as fast as it is answered. The settings take turns within each round. A
+viewer shows the pictures of all sessions, and asks for a message as soon as it has one, as the page does.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+import json
+import re
+import statistics
+import sys
+import textwrap
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Annotated, Any, NamedTuple
+
+import numpy as np
+import typer
+from websockets.sync.client import connect
+
+from vlagents_ray.bench.clients import observation
+from vlagents_ray.bench.line_process import START_S, LineProcess, our_environment
+from vlagents_ray.bench.peers.peer import die_with_parent, own_stdout
+from vlagents_ray.cli.bench import Json
+from vlagents_ray.cli.console import errors, out, progress, save, table
+from vlagents_ray.client.agent import RemoteAgent
+from vlagents_ray.client.transports.select import TransportName
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.policies.noop import Noop
+from vlagents_ray.serve.engine import dispatch
+from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.server import running_server
+
+ABSENT, NOBODY = "tap absent", "nobody"
+HZ, SATURATED_HZ = 50.0, 1e9
+_CHUNK = 8
+_CONFIG = {"base_ms": 5.0, "action_dim": 7, "chunk": _CHUNK}
+_WARM_S = 0.5
+
+
+class Untapped(Noop):
+    """`noop` in a replica whose dispatcher was compiled without the lines for the live page."""
+
+    def initialize(self) -> None:
+        """Replace the methods of this process."""
+        super().initialize()
+        looked_for = r"    if \(\w+ := self\._engine\.[\w.]+\) is not None:\n(        .*\n)+"
+        _without(dispatch.Dispatcher.send, looked_for, "")
+        _without(dispatch.Dispatcher.admission, r"keep = self\._engine\..*", "keep = False")
+
+
+def _without(method: Callable[..., Any], lines: str, instead: str) -> None:
+    """Compile a method of the dispatcher again with something else in place of the only lines that match."""
+    source, found_lines = re.subn(lines, instead, textwrap.dedent(inspect.getsource(method)))
+    if found_lines != 1:
+        raise ConfigError(f"{method.__name__}: got {found_lines} places with the lines for the tap, want 1; look there")
+    found: dict[str, Any] = {}
+    exec(source, vars(dispatch), found)  # noqa: S102 - the package's own source
+    setattr(dispatch.Dispatcher, method.__name__, found[method.__name__])
+
+
+class Turn(NamedTuple):
+    """What the robots measured in one turn of one setting."""
+
+    acts_per_s: float  # of the saturated robot
+    saturated_ms: list[float]
+    paced_ms: list[float]  # of those of 50 Hz
+    messages_per_s: float  # of all viewers
+    mb_per_s: float
+
+
+class Robots:
+    """The robots of one application: a process of those with a rate, and one of the saturated one."""
+
+    def __init__(self, stack: contextlib.ExitStack, name: str, url: str, transport: str) -> None:
+        self._processes = [
+            stack.enter_context(_process(f"{kind} of {name}", {"url": url, "hz": hz, "transport": transport}))
+            for kind, hz in (("robots", [HZ, HZ]), ("saturated robot", [SATURATED_HZ]))
+        ]
+        for process in self._processes:
+            process.read(START_S)
+
+    def act(self, seconds: float) -> list[list[float]]:
+        """Let all act; returns the milliseconds of each act, of the paced and of the saturated ones."""
+        for process in self._processes:
+            process.send(json.dumps(seconds))
+        return [process.read(seconds + START_S) for process in self._processes]
+
+
+def measure_live(
+    rounds: int,
+    seconds: float,
+    viewers: Sequence[int],
+    transport: TransportName,
+    progress: Callable[[str], None] = lambda _: None,
+) -> dict[str, Any]:
+    """Measure each setting once in each round, for so many seconds; returns plain JSON values."""
+    tapped = deployment("noop", config=_CONFIG)
+    untapped = deployment("benchmarks.live:Untapped", config=_CONFIG)
+    untapped.applications[0].name, untapped.applications[0].route_prefix = "untapped", "/untapped"
+    both = tapped.model_copy(update={"applications": [*tapped.applications, *untapped.applications]})
+    turns: dict[str, list[Turn]] = {}
+    with contextlib.ExitStack() as stack:
+        server = stack.enter_context(running_server(both))
+        fleets = {name: Robots(stack, name, server.apps[name], transport) for name in ("noop", "untapped")}
+        watching = [
+            stack.enter_context(_process(f"viewer {number}", {"watch": server.apps["noop"]}))
+            for number in range(max(viewers, default=0))
+        ]
+        extensions = {str(one.read(START_S)) for one in watching}
+        settings = [(ABSENT, "untapped", 0), (NOBODY, "noop", 0), *((_name(n), "noop", n) for n in viewers)]
+        for number in range(rounds):
+            shift = number % len(settings)  # so that none is always first
+            for name, app, looking in settings[shift:] + settings[:shift]:
+                turns.setdefault(name, []).append(_turn(fleets[app], watching[:looking], seconds))
+            progress(
+                f"round {number + 1}/{rounds}: "
+                + ", ".join(f"{name} {turns[name][-1].acts_per_s:.0f}/s" for name, *_ in settings)
+            )
+    return {
+        "transport": transport,
+        "rounds": rounds,
+        "seconds": seconds,
+        "websocket_extensions": sorted(extensions),
+        "settings": {name: _figures(turns[name], turns[_base(name)]) for name, *_ in settings},
+    }
+
+
+def _name(viewers: int) -> str:
+    return f"{viewers} viewer{'s' * (viewers != 1)}"
+
+
+def _base(name: str) -> str:
+    """The setting that another is compared with: without viewers a build without the tap, otherwise nobody."""
+    return ABSENT if name in (ABSENT, NOBODY) else NOBODY
+
+
+def _turn(robots: Robots, watching: Sequence[LineProcess], seconds: float) -> Turn:
+    for viewer in watching:
+        viewer.send(json.dumps(seconds + 2 * _WARM_S))
+    time.sleep(_WARM_S if watching else 2 * _WARM_S + 2.0)  # the lease of the viewers before has ended
+    paced, saturated = robots.act(seconds)
+    seen = [viewer.read(seconds + START_S) for viewer in watching]
+    messages, size = (sum(one[i] for one in seen) / (seconds + 2 * _WARM_S) for i in (0, 1))
+    return Turn(len(saturated) / seconds, saturated, paced, messages, size / 1e6)
+
+
+def _figures(turns: list[Turn], base: list[Turn]) -> dict[str, Any]:
+    ratios = [mine.acts_per_s / theirs.acts_per_s for mine, theirs in zip(turns, base, strict=True)]
+    found = {
+        "acts_per_s": statistics.median(turn.acts_per_s for turn in turns),
+        "ratios": ratios,
+        "median_ratio": statistics.median(ratios),
+        "messages_per_s": statistics.median(turn.messages_per_s for turn in turns),
+        "mb_per_s": statistics.median(turn.mb_per_s for turn in turns),
+    }
+    for name in ("paced_ms", "saturated_ms"):
+        values = np.concatenate([getattr(turn, name) for turn in turns])
+        found |= {f"{name}_p50": float(np.quantile(values, 0.5)), f"{name}_p99": float(np.quantile(values, 0.99))}
+    return found
+
+
+@contextlib.contextmanager
+def _process(name: str, settings: dict[str, Any]) -> Iterator[LineProcess]:
+    command = [sys.executable, "-m", "benchmarks.live", json.dumps(settings)]
+    with LineProcess(name, command, our_environment()) as process:
+        yield process
+
+
+def child(settings: dict[str, Any]) -> None:
+    """Run a process of robots or of a viewer: each line that it reads is the length of a turn, s."""
+    die_with_parent()
+    file = own_stdout()
+    with contextlib.ExitStack() as stack:
+        act, said = (_viewer if "watch" in settings else _robots)(stack, **settings)
+        print(json.dumps(said), file=file, flush=True)
+        for line in sys.stdin:
+            print(json.dumps(act(float(line))), file=file, flush=True)
+
+
+def _robots(
+    stack: contextlib.ExitStack, url: str, hz: Sequence[float], transport: TransportName
+) -> tuple[Callable[[float], list[float]], str]:
+    agents = [stack.enter_context(RemoteAgent(url, transport=transport, codec="jpeg")) for _ in hz]
+    pool = stack.enter_context(ThreadPoolExecutor(len(hz)))
+    for agent in agents:
+        agent.reset(observation(), "measure")
+
+    def play(agent: RemoteAgent, hz: float, seconds: float) -> list[float]:
+        taken: list[float] = []
+        begun = tick = time.monotonic()
+        while (now := time.monotonic()) < begun + seconds:
+            agent.act(observation())
+            taken.append((time.monotonic() - now) * 1e3)
+            tick = max(tick + 1 / hz, time.monotonic())
+            time.sleep(max(0.0, tick - time.monotonic()))
+        return taken
+
+    def act(seconds: float) -> list[float]:
+        played = [pool.submit(play, agent, each, seconds) for agent, each in zip(agents, hz, strict=True)]
+        return [ms for one in played for ms in one.result()]
+
+    return act, agents[0].transport
+
+
+def _viewer(_: contextlib.ExitStack, watch: str) -> tuple[Callable[[float], tuple[int, int]], str]:
+    """Connect as a browser does, which offers to compress messages."""
+    address = f"{watch.replace('http', 'ws', 1)}/v1/live"
+    with connect(address, proxy=None, max_size=None) as socket:
+        said = socket.response.headers.get("sec-websocket-extensions", "") if socket.response else ""
+
+    def look(seconds: float) -> tuple[int, int]:
+        messages = size = 0
+        shown: list[str] = []
+        until = time.monotonic() + seconds
+        with connect(address, proxy=None, max_size=None) as socket:
+            while time.monotonic() < until:
+                socket.send(json.dumps({"shown": shown}))
+                data = socket.recv()
+                messages, size = messages + 1, size + len(data)
+                document = json.loads(bytes(data[4 : 4 + int.from_bytes(data[:4], "little")]))  # type: ignore[arg-type]
+                shown = [one["id"] for replica in document["replicas"] for one in replica["sessions"]]
+        return messages, size
+
+    return look, said
+
+
+def main(
+    rounds: Annotated[int, typer.Option(min=1, help="Turns of each setting.")] = 8,
+    seconds: Annotated[float, typer.Option(help="Length of a turn, s.")] = 5.0,
+    viewers: Annotated[list[int], typer.Option(help="Viewers at once, repeatable.")] = [1, 4],  # noqa: B006
+    transport: Annotated[str, typer.Option(help="Of the robots.")] = "websocket",
+    json_file: Json = None,
+) -> None:
+    """What the live page costs robots, with nobody, one and four viewers."""
+    with errors():
+        found = measure_live(rounds, seconds, viewers, transport, progress)  # type: ignore[arg-type]
+    rows = [
+        [
+            name,
+            f"{one['acts_per_s']:.1f}",
+            f"{one['median_ratio']:.3f} ({min(one['ratios']):.3f} to {max(one['ratios']):.3f})",
+            f"{one['paced_ms_p50']:.1f} / {one['paced_ms_p99']:.1f}",
+            f"{one['saturated_ms_p50']:.1f} / {one['saturated_ms_p99']:.1f}",
+            f"{one['messages_per_s']:.1f}",
+            f"{one['mb_per_s']:.2f}",
+        ]
+        for name, one in found["settings"].items()
+    ]
+    shown = table("who looks", "acts/s", "ratio", "50 Hz p50/p99 ms", "saturated p50/p99 ms", "messages/s", "MB/s")
+    for row in rows:
+        shown.add_row(*row)
+    out.print(shown)
+    out.print(f"compression of the viewers' messages: {', '.join(found['websocket_extensions']) or 'none'}")
+    save(found, json_file)
+
+
+if __name__ == "__main__":
+    if len(sys.argv) == 2 and sys.argv[1].startswith("{"):
+        child(json.loads(sys.argv[1]))
+    else:
+        typer.run(main)

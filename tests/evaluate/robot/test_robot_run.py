@@ -1,0 +1,412 @@
+"""Trials on a simulated arm with a scripted person: what they see, what is recorded, and what comes out."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from robot_trials import (
+    NAMES,
+    URLS,
+    Arm,
+    Policies,
+    Reaching,
+    ScriptedPerson,
+    captured_output,
+    judged,
+    plan,
+    tasks,
+    typed,
+)
+
+from vlagents_ray.errors import ConfigError, ConnectionLost, MissingState, PolicyFailed
+from vlagents_ray.evaluate import EvalConfig, Results, compare, evaluate
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.plan.cases import cells
+from vlagents_ray.evaluate.plan.jobs import plan as jobs
+from vlagents_ray.evaluate.results.store import Store
+from vlagents_ray.evaluate.results.summary import summarize
+from vlagents_ray.evaluate.robot import TrialsInterrupted, Verdict, evaluate_on_robot, schedule, unblind
+from vlagents_ray.images.jpeg_png import decode
+from vlagents_ray.interface import Act, Obs
+
+KEY = b"a key of the plan"
+
+
+def names_by_trial(config: EvalConfig) -> list[str]:
+    return [trial.job.cell.contender for trial in schedule(cells(config), KEY)]
+
+
+def test_what_tells_the_policy_is_nowhere_until_all_are_judged(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    told = [*NAMES, *URLS.values(), "step-4711", "fingerprint-of", "digest-of"]  # none can be base64 by chance
+    looks = 0
+
+    def look() -> None:
+        nonlocal looks
+        looks += 1
+        seen = [output(), "\n".join(person.printed).encode(), caplog.text.encode()]
+        for path in tmp_path.rglob("*"):
+            seen += [str(path.relative_to(tmp_path)).encode(), path.read_bytes() if path.is_file() else b""]
+        found = [text for text in told if any(text.encode() in one for one in seen)]
+        assert not found, f"before question {looks}"
+
+    config = plan(tmp_path / "out", record="all", suite={"episodes": 2})
+    with captured_output() as output, caplog.at_level(logging.DEBUG):
+        person = ScriptedPerson(judged("sf"), look)
+        summary = evaluate_on_robot(config, person, agent_factory=Policies(Talkative))
+    assert looks == 3 * 8, "ready, verdict and note of each trial"
+    assert (tmp_path / "out" / "recordings" / "trial0008-1" / "meta" / "info.json").is_file()
+    found = summary.results
+    assert found.contenders == list(NAMES), "and then it is told"
+    assert b"step-4711" in (tmp_path / "out" / "results.db").read_bytes()
+    assert {one.result.weights for cell in found.of(NAMES[0]) for one in cell.episodes} == {f"digest-of-{NAMES[0]}"}
+
+
+class Talkative(Reaching):
+    """A policy whose connection logs its name."""
+
+    def act(self, obs: Obs) -> Act:
+        logging.getLogger("vlagents_ray.client.recovery").warning("%s: slow, at %s", self.name, URLS[self.name])
+        logging.getLogger("ray.serve").error("replica of %s", self.name)
+        return super().act(obs)
+
+
+def test_sealed_lines_have_one_length_whatever_the_policy_says_of_itself(tmp_path: Path) -> None:
+    config = plan(tmp_path / "out", suite={"episodes": 2, "envs": ["drawer"]})
+    evaluate_on_robot(config, ScriptedPerson(judged("s")), agent_factory=Policies())
+    lines = [json.loads(line) for line in (tmp_path / "out" / "trials.jsonl").read_text().splitlines()]
+    assert len({len(line["sealed"]) for line in lines if "sealed" in line}) == 1
+    judged_lines = [line for line in lines if "outcome" in line]
+    assert [set(line) for line in judged_lines] == [SHOWN] * 4
+
+
+SHOWN = {"trial", "attempt", "at", "outcome", "earned", "note", "score", "ending", "sealed"}
+
+
+def test_the_policies_play_in_the_drawn_order(tmp_path: Path) -> None:
+    config, policies = plan(tmp_path / "out"), Policies()
+    evaluate_on_robot(config, ScriptedPerson(judged("s")), agent_factory=policies)
+    assert policies.made[:2] == sorted(NAMES), "each is rehearsed, in an order that tells nothing"
+    assert policies.made[2:] == names_by_trial(config)
+    assert Counter(policies.made[2:]) == dict.fromkeys(NAMES, 8)
+
+
+def test_without_a_key_one_is_drawn_that_this_user_alone_can_read(tmp_path: Path) -> None:
+    orders = set()
+    for number in range(2):
+        config = plan(tmp_path / str(number), robot={"key": None})
+        policies = Policies()
+        evaluate_on_robot(config, ScriptedPerson(judged("s")), agent_factory=policies)
+        key = tmp_path / str(number) / "trials.key"
+        assert key.stat().st_mode & 0o777 == 0o600
+        drawn = [trial.job.cell.contender for trial in schedule(cells(config), key.read_bytes())]
+        assert policies.made[2:] == drawn, "who has the key draws the same"
+        orders.add(key.read_bytes())
+    assert len(orders) == 2
+
+
+def test_the_report_is_that_of_a_simulation_with_the_same_outcomes(tmp_path: Path) -> None:
+    """Intervals, paired test and table: only where and how long it was played differs."""
+    config = plan(tmp_path / "robot")
+    outcomes = dict(
+        zip(map(str, (trial.job.key for trial in schedule(cells(config), KEY))), "ssfsffsfsfsssfss", strict=True)
+    )
+    real = evaluate_on_robot(config, ScriptedPerson(judged("".join(outcomes.values()))), agent_factory=Policies())
+    with Store(config.model_copy(update={"out": tmp_path / "simulated"})) as store:
+        store.begin_run(config, {})
+        for job in jobs(store.cells):
+            success = outcomes[str(job.key)] == "s"
+            store.record(EpisodeResult(job.key, "done", success, success, steps=1), 1)
+        store.end_run("complete")
+    simulated = summarize(Results.load(tmp_path / "simulated"))
+    for mine, other in zip((*real.cells, *real.totals), (*simulated.cells, *simulated.totals), strict=True):
+        assert (mine.contender, mine.env, mine.planned) == (other.contender, other.env, other.planned)
+        assert mine.success_once == other.success_once
+        assert mine.success_at_end == other.success_at_end
+    assert compare(real.results, *NAMES).to_json() == compare(simulated.results, *NAMES).to_json()
+    assert real.state == "complete"
+    report = (tmp_path / "robot" / "report.html").read_text()
+    assert all(name in report for name in NAMES)
+
+
+def test_a_partial_success_is_none_and_its_score_is_the_share_of_the_rubrics_points(tmp_path: Path) -> None:
+    def answer(question: str) -> str:
+        if "grasped" in question:
+            return "y"
+        return "p" if question.startswith("verdict") else ""
+
+    config = plan(tmp_path / "out", suite={"envs": ["cups"], "episodes": 1})
+    summary = evaluate_on_robot(config, ScriptedPerson(answer), agent_factory=Policies())
+    [one, other] = [episode.result for cell in summary.results.cells for episode in cell.episodes]
+    assert (one.success_once, one.episode_return) == (other.success_once, other.episode_return) == (False, 0.25)
+    assert summary.total.mean_return == 0.25
+    line = json.loads((tmp_path / "out" / "trials.jsonl").read_text().splitlines()[2])
+    assert (line["outcome"], line["earned"]) == ("partial", ["the cup is grasped"])
+
+
+def test_a_task_without_a_rubric_knows_no_partial_success() -> None:
+    with pytest.raises(ConfigError, match="got a partial success, want some of the rubric's"):
+        Verdict("partial", ("lid",)).score({})
+    with pytest.raises(ConfigError, match=r"got the parts \['lid'\]"):
+        Verdict("partial", ("lid",)).score({"cup": 1})
+    with pytest.raises(ConfigError, match="without a reason"):
+        Verdict("repeat").score({})
+
+
+def test_a_repeated_trial_is_counted_with_its_reason_and_played_by_the_same_policy(tmp_path: Path) -> None:
+    lines = ["", "r", "", "r", "somebody walked into the scene", "", "s", "", *["", "s", ""] * 3]
+    config, policies = plan(tmp_path / "out", suite={"episodes": 2, "envs": ["drawer"]}), Policies()
+    person = ScriptedPerson(typed(lines))
+    summary = evaluate_on_robot(config, person, agent_factory=policies)
+    order = names_by_trial(config)
+    assert policies.made[2:] == [order[0], *order]
+    assert any("without a reason" in line for line in person.printed)
+    assert any("played again: somebody walked into the scene" in line for line in person.printed)
+    [attempt] = [attempt for cell in summary.results.cells for attempt in cell.attempts]
+    assert (attempt.cause, attempt.error, attempt.retried) == ("operator", "somebody walked into the scene", True)
+    assert summary.total.retries == 1
+    assert sorted(one.attempts for cell in summary.results.cells for one in cell.episodes) == [1, 1, 1, 2]
+
+
+def test_an_arm_that_fails_is_stopped_and_its_trial_played_again_by_the_same_policy(tmp_path: Path) -> None:
+    arm, policies = Arm(fails_at=7), Policies()
+    config = plan(tmp_path / "out", suite={"episodes": 1})
+    person = ScriptedPerson(judged("s"))
+    summary = evaluate_on_robot(config, person, robot=arm, agent_factory=policies)
+    order = names_by_trial(config)
+    assert policies.made[2:] == [order[0], order[1], order[1], *order[2:]]
+    assert any("joint 3 is too hot" in line for line in person.printed), "the person is told what to mend"
+    assert arm.stops >= 5
+    [attempt] = [attempt for cell in summary.results.cells for attempt in cell.attempts]
+    assert (attempt.cause, attempt.code) == ("worker", "env_failed")
+    assert summary.total.episodes == 4
+
+
+@pytest.mark.parametrize(("where", "code"), [("reset", "connection_lost"), ("act", "unavailable")])
+def test_a_lost_connection_is_told_without_the_policy_and_is_no_failure_of_it(
+    tmp_path: Path, where: str, code: str
+) -> None:
+    class Losing(Reaching):
+        def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:
+            self.lost = len(policies.made) == 4  # in the second trial
+            return self._lose("reset") or super().reset(obs, instruction, **kwargs)
+
+        def act(self, obs: Obs) -> Act:
+            self.acts += 1
+            return self._lose("act") or super().act(obs)
+
+        def _lose(self, here: str) -> None:
+            if self.lost and here == where and (here == "reset" or self.acts > 1):
+                raise ConnectionLost(f"{URLS[self.name]} went away")
+
+    policies = Policies(Losing)
+    config = plan(tmp_path / "out", suite={"episodes": 1, "envs": ["drawer"]}, robot={"tasks": tasks(max_steps=12)})
+    person = ScriptedPerson(judged("f"))
+    summary = evaluate_on_robot(config, person, agent_factory=policies)
+    [told] = [line for line in person.printed if "played again" in line]
+    assert told.strip() == f"played again: it could not be played ({code})"
+    [attempt] = [attempt for cell in summary.results.cells for attempt in cell.attempts]
+    assert attempt.cause == "policy"
+    assert ".example" in attempt.error, "what was sealed is told at the end"
+    assert summary.total.episodes == 2
+
+
+def test_a_policy_that_fails_has_failed_without_a_verdict(tmp_path: Path) -> None:
+    failing = iter([False] * 2 + [True] + [False] * 100)
+
+    class Failing(Reaching):
+        def act(self, obs: Obs) -> Act:
+            if next(failing):
+                raise PolicyFailed(f"{self.name}: NaN")
+            return super().act(obs)
+
+    config = plan(tmp_path / "out", suite={"episodes": 1, "envs": ["drawer"]})
+    person = ScriptedPerson(judged("s"))
+    summary = evaluate_on_robot(config, person, agent_factory=Policies(Failing))
+    assert sum(question.startswith("verdict") for question in person.printed) == 1
+    assert any("trial 1: the policy failed, so it counts as a failure" in line for line in person.printed)
+    assert not any("zebra" in line or "walrus" in line for line in person.printed)
+    assert (summary.total.policy_errors, summary.total.success_once.successes) == (1, 1)
+
+
+def test_a_mistake_in_the_settings_shows_before_the_first_trial(tmp_path: Path) -> None:
+    config = plan(tmp_path / "out", robot={"measure": "elbow", "max_step": 0.1})
+    person = ScriptedPerson(judged("s"))
+    with pytest.raises(MissingState, match="elbow"):
+        evaluate_on_robot(config, person, agent_factory=Policies())
+    assert person.printed == []
+
+
+def test_the_guard_sees_each_action(tmp_path: Path) -> None:
+    class Wild(Reaching):
+        def act(self, obs: Obs) -> Act:
+            return Act(np.full((4, 2), 7.0, np.float32))
+
+    arm = Arm()
+    config = plan(tmp_path / "out", suite={"episodes": 1, "envs": ["drawer"]})
+    evaluate_on_robot(config, ScriptedPerson(judged("f")), robot=arm, agent_factory=Policies(Wild))
+    assert np.abs(arm.observe().state["joints"]).max() < 1.0
+
+
+@pytest.mark.parametrize("mode", ["async", "ensemble"])
+def test_it_plays_in_each_mode_of_the_chunk_player_and_closes_what_it_opened(tmp_path: Path, mode: str) -> None:
+    closed: list[str] = []
+
+    class Closing(Reaching):
+        def close(self) -> None:
+            closed.append(self.name)
+
+    arm, policies = Arm(), Policies(Closing)
+    robot = {"mode": mode, "tasks": tasks(max_steps=20)}
+    config = plan(tmp_path / "out", suite={"episodes": 2, "envs": ["drawer"]}, robot=robot)
+    summary = evaluate_on_robot(config, ScriptedPerson(judged("s")), robot=arm, agent_factory=policies)
+    assert sorted(closed) == sorted(policies.made)
+    results = [episode.result for cell in summary.results.cells for episode in cell.episodes]
+    assert sum(result.steps for result in results) == arm.applied > 0
+    assert all(0 < result.steps <= 20 and result.acts > 0 for result in results)
+    assert {result.policy_fingerprint for result in results} == {f"fingerprint-of-{name}" for name in NAMES}
+
+
+def test_the_arm_stays_still_while_nobody_is_there(tmp_path: Path) -> None:
+    arm, applied = Arm(), []
+
+    def nobody(question: str) -> str:
+        applied.append(arm.applied)
+        raise EOFError
+
+    config = plan(tmp_path / "out")
+    with pytest.raises(TrialsInterrupted, match="after 0 of 16 trials; go on with --resume"):
+        evaluate_on_robot(config, ScriptedPerson(nobody), robot=arm, agent_factory=Policies())
+    assert applied == [0]
+    assert arm.applied == 0
+
+
+def test_it_goes_on_with_the_next_trial(tmp_path: Path) -> None:
+    config, policies = plan(tmp_path / "out"), Policies()
+    lines = ["", "s", "", "", "s", "", ""]  # the third trial is played, and never judged
+    with pytest.raises(TrialsInterrupted, match="after 2 of 16"):
+        evaluate_on_robot(config, ScriptedPerson(typed(lines)), agent_factory=policies)
+    assert not (tmp_path / "out" / "results.db").exists()
+    with pytest.raises(ConfigError, match="already has trials; resume them"):
+        evaluate_on_robot(config, ScriptedPerson(typed([])), agent_factory=policies)
+    again = config.model_copy(update={"resume": True})
+    later = Policies()
+    person = ScriptedPerson(judged("f"))
+    summary = evaluate_on_robot(again, person, agent_factory=later)
+    assert later.made[2:] == names_by_trial(config)[2:]
+    assert any("played again: the evaluation ended before the verdict" in line for line in person.printed)
+    assert (summary.total.episodes, summary.total.success_once.successes, summary.total.retries) == (16, 2, 1)
+    assert evaluate_on_robot(again, ScriptedPerson(typed([])), agent_factory=Policies()).total.episodes == 16
+
+
+def test_a_line_that_a_killed_process_left_half_written_is_dropped(tmp_path: Path) -> None:
+    config = plan(tmp_path / "out")
+    with pytest.raises(TrialsInterrupted):
+        evaluate_on_robot(config, ScriptedPerson(typed(["", "s", "", "", "s", ""])), agent_factory=Policies())
+    log = tmp_path / "out" / "trials.jsonl"
+    whole = log.read_bytes()
+    log.write_bytes(whole[:-40])
+    again = config.model_copy(update={"resume": True})
+    with pytest.raises(TrialsInterrupted, match="after 1 of 16"):
+        evaluate_on_robot(again, ScriptedPerson(typed([])), agent_factory=Policies())
+    last = json.loads(log.read_text().splitlines()[-1])
+    assert (last["trial"], last["again"]) == (2, "the evaluation ended before the verdict")
+
+
+@pytest.mark.parametrize(
+    "changes", [{"robot": {"key": "another key"}}, {"suite": {"episodes": 5}}, {"robot": {"hz": 100}}]
+)
+def test_another_plan_or_key_is_refused(tmp_path: Path, changes: dict[str, Any]) -> None:
+    with pytest.raises(TrialsInterrupted):
+        evaluate_on_robot(plan(tmp_path / "out"), ScriptedPerson(typed(["", "s", ""])), agent_factory=Policies())
+    other = plan(tmp_path / "out", resume=True, **changes)
+    with pytest.raises(ConfigError, match="is of another plan, robot or key"):
+        evaluate_on_robot(other, ScriptedPerson(typed([])), agent_factory=Policies())
+
+
+def test_a_policy_that_changed_between_trials_ends_it_without_being_named(tmp_path: Path) -> None:
+    class Swapped(Reaching):
+        def __init__(self, name: str) -> None:
+            super().__init__(name, f"/weights/{name}/{len(policies.made) > 4}")
+
+    policies = Policies(Swapped)
+    with pytest.raises(ConfigError, match="the checkpoint of a policy has changed since its earlier trials") as raised:
+        evaluate_on_robot(plan(tmp_path / "out"), ScriptedPerson(judged("s")), agent_factory=policies)
+    assert not any(name in str(raised.value) for name in NAMES)
+
+
+def test_a_task_ends_early_once_all_its_policies_are_certain(tmp_path: Path) -> None:
+    config = plan(tmp_path / "out", suite={"episodes": 20}, stop={"target": 0.5})
+    order = names_by_trial(config)
+    policies = Policies()
+    person = ScriptedPerson(judged("s"))
+    summary = evaluate_on_robot(config, person, agent_factory=policies)
+    stopped = {cell.stopped_at for cell in summary.results.cells}
+    assert len(stopped) == 1
+    [at] = stopped
+    assert at is not None
+    assert at < 20
+    assert len(policies.made) - 2 == 2 * 2 * at
+    assert policies.made[2 : 2 + 2 * at] == order[: 2 * at]
+    assert summary.state == "complete"
+    assert all(cell.missing == 0 for cell in summary.results.cells)
+
+
+def test_results_can_be_told_before_the_end_which_the_log_says(tmp_path: Path) -> None:
+    config = plan(tmp_path / "out", robot={"key": None})
+    with pytest.raises(TrialsInterrupted):
+        evaluate_on_robot(config, ScriptedPerson(typed(["", "s", "", "", "f", ""])), agent_factory=Policies())
+    summary = unblind(tmp_path / "out")
+    assert (summary.state, summary.total.episodes) == ("interrupted", 2)
+    assert "unblinded" in json.loads((tmp_path / "out" / "trials.jsonl").read_text().splitlines()[-1])
+    with pytest.raises(ConfigError, match="cannot be read with this key"):
+        unblind(tmp_path / "out", "another key")
+    with pytest.raises(ConfigError, match="want the folder of an evaluation on a robot"):
+        unblind(tmp_path)
+    again = config.model_copy(update={"resume": True})
+    whole = evaluate_on_robot(again, ScriptedPerson(judged("s")), agent_factory=Policies())
+    assert whole.total.episodes == 16
+
+
+def test_the_first_start_of_a_scene_is_what_later_trials_of_it_are_set_to(tmp_path: Path) -> None:
+    def answer(question: str) -> str:
+        if question.startswith("Enter"):
+            return next(looks)
+        return "s" if question.startswith("verdict") else ""
+
+    looks = iter(["l", "", "l", ""])
+    config = plan(tmp_path / "out", suite={"episodes": 1, "envs": ["drawer"]})
+    person = ScriptedPerson(answer)
+    evaluate_on_robot(config, person, agent_factory=Policies())
+    start = tmp_path / "out" / "scenes" / "drawer-scene1" / "front.jpg"
+    overlay = start.parent.with_name("overlay-front.jpg")
+    assert [line.strip() for line in person.printed if "scene" in line and "start picture" in line and "yet" in line]
+    assert any(str(start) in line for line in person.printed)
+    assert str(overlay) in person.printed[-6] or any(line.strip() == str(overlay) for line in person.printed)
+    assert decode(start.read_bytes()).shape == decode(overlay.read_bytes()).shape == (32, 32, 3)
+
+
+def test_a_first_trial_that_is_repeated_takes_the_start_pictures_again(tmp_path: Path) -> None:
+    pictures: list[bytes] = []
+
+    def keep() -> None:
+        pictures.extend(path.read_bytes() for path in tmp_path.rglob("front.jpg"))
+
+    lines = ["", "r", "the cup stood on another mark", "", "s", "", "", "s", ""]
+    config = plan(tmp_path / "out", suite={"episodes": 1, "envs": ["drawer"]})
+    evaluate_on_robot(config, ScriptedPerson(typed(lines), keep), agent_factory=Policies())
+    assert len(pictures) == 8, "at every question but the first"
+    assert list(dict.fromkeys(pictures)) == [pictures[0], pictures[3]]
+    assert pictures[3:] == [pictures[3]] * 5, "the second policy is not asked for another start"
+
+
+def test_a_plan_on_a_robot_is_not_taken_for_a_simulation(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="want a plan in simulation"):
+        evaluate(plan(tmp_path / "out"))

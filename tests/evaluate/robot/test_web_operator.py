@@ -1,0 +1,156 @@
+"""The operator's page: what it answers, to whom, and a whole evaluation over it."""
+
+from __future__ import annotations
+
+import json
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from eval_fakes import wait_for
+from robot_trials import NAMES, URLS, Arm, Evaluation, plan, tasks
+
+from vlagents_ray.evaluate.robot import PageOperator, TrialsInterrupted
+from vlagents_ray.images.jpeg_png import decode
+
+
+class Person:
+    """A person at the page, over HTTP; `read` is all that they were shown."""
+
+    def __init__(self, url: str) -> None:
+        self.url = url
+        self.read = b""
+
+    def get(self, path: str) -> bytes:
+        with urllib.request.urlopen(self.url + path, timeout=30) as answer:
+            data: bytes = answer.read()
+        self.read += data
+        return data
+
+    def state(self) -> dict[str, Any]:
+        return dict(json.loads(self.get("now/state")))
+
+    def until(self, phase: str) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+
+        def is_there() -> bool:
+            nonlocal found
+            found = self.state()
+            return found["phase"] == phase and not found["answered"]
+
+        wait_for(is_there)
+        return found
+
+    def answer(self, do: str, state: dict[str, Any], **more: Any) -> int:
+        about = {"phase": state["phase"], "trial": state["trial"]["number"], "attempt": state["trial"]["attempt"]}
+        return self.post(json.dumps({**about, "do": do, **more}).encode())
+
+    def post(self, body: bytes, kind: str = "application/json") -> int:
+        request = urllib.request.Request(self.url + "now/answer", body, {"content-type": kind})
+        try:
+            with urllib.request.urlopen(request, timeout=30) as answer:
+                return int(answer.status)
+        except urllib.error.HTTPError as error:
+            self.read += error.read()
+            return error.code
+
+
+@pytest.fixture
+def operator() -> Iterator[PageOperator]:
+    with PageOperator(say=lambda _: None) as made:
+        yield made
+
+
+def test_a_whole_evaluation_over_the_page_shows_no_policy(tmp_path: Path, operator: PageOperator) -> None:
+    person = Person(operator.url)
+    config = plan(tmp_path / "out", suite={"episodes": 1})
+    run = Evaluation(config, operator, Arm())
+    for file in ("", "operator.css", "operator.js"):
+        person.get(file)
+    for number in range(1, 5):
+        scene = person.until("scene")
+        assert (scene["trial"]["number"], scene["trial"]["total"]) == (number, 4)
+        assert scene["trial"]["start"] == (["front"] if number % 2 == 0 else [])
+        wait_for(lambda: person.state()["cameras"] == ["front"])
+        assert decode(person.get("now/camera/front")).shape == (32, 32, 3)
+        if number % 2 == 0:
+            assert decode(person.get("start/front")).shape == (32, 32, 3)
+        assert person.answer("ready", scene) == 200
+        verdict = person.until("verdict")
+        assert verdict["ending"] == "the time is over"
+        assert person.answer("repeat", verdict) == 400, "it wants a reason"
+        earned = ["the cup is on the plate"]
+        assert person.answer("partial" if number < 3 else "success", verdict, earned=earned, note="slowly") == 200
+    run.join()
+    assert run.error is None
+    assert run.summary is not None
+    assert run.summary.total.success_once.successes == 2
+    assert run.summary.total.mean_return == pytest.approx((0.75 + 0.75 + 1 + 1) / 4)
+    for text in (*NAMES, *URLS.values(), "4711", "digest-of", "fingerprint-of"):
+        assert text.encode() not in person.read
+
+
+def test_an_answer_counts_for_the_question_that_was_shown(tmp_path: Path, operator: PageOperator) -> None:
+    person = Person(operator.url)
+    run = Evaluation(plan(tmp_path / "out"), operator, arm := Arm())
+    scene = person.until("scene")
+    assert person.answer("success", scene) == 400
+    assert person.answer("stop", {**scene, "phase": "playing"}) == 409
+    assert person.answer("ready", {**scene, "trial": {**scene["trial"], "number": 2}}) == 409
+    assert person.post(b"[" * 9999) == 400
+    assert person.post(b"{}") == 400
+    assert person.post(b" " * 20_000) == 413
+    assert person.post(b"{}", "text/plain") == 415, "what a form of another site can send without being asked"
+    assert arm.applied == 0, "and nothing moved"
+    assert person.answer("end", scene) == 200
+    run.join()
+    assert isinstance(run.error, TrialsInterrupted)
+
+
+def test_without_the_addresss_random_part_there_is_no_answer(operator: PageOperator) -> None:
+    assert len(operator.url.split("/")[3]) == 32
+    stranger = Person(operator.url[: operator.url.index("/", 8) + 1] + "x" * 32 + "/")
+    for path in ("", "now/state", "operator.js"):
+        with pytest.raises(urllib.error.HTTPError, match="404"):
+            stranger.get(path)
+    assert stranger.post(b"{}") == 404
+
+
+def test_the_page_may_load_nothing_from_elsewhere(operator: PageOperator) -> None:
+    with urllib.request.urlopen(operator.url, timeout=30) as answer:
+        policy, html = answer.headers["content-security-policy"], answer.read().decode()
+    assert policy.startswith("default-src 'none'; script-src 'self'; style-src 'self'; connect-src 'self';")
+    assert "http" not in html.replace("http-equiv", "")
+
+
+@pytest.mark.parametrize("how", ["stop", "leave"])
+def test_a_trial_is_stopped_by_the_button_or_when_the_page_is_gone(
+    tmp_path: Path, operator: PageOperator, how: str
+) -> None:
+    person = Person(operator.url)
+    config = plan(tmp_path / "out", robot={"tasks": tasks(max_steps=200 * 60)}, suite={"envs": ["drawer"]})
+    run = Evaluation(config, operator, arm := Arm())
+    assert person.answer("ready", person.until("scene")) == 200
+    playing = person.until("playing")
+    wait_for(lambda: arm.applied > 10)
+    begun = time.monotonic()
+    if how == "stop":
+        assert person.answer("stop", playing) == 200
+    else:
+        wait_for(lambda: arm.stopped)
+        assert 2 < time.monotonic() - begun < 20
+    verdict = person.until("verdict")
+    assert arm.stopped
+    applied = arm.applied
+    assert verdict["ending"] == "stopped by the operator"
+    assert person.answer("repeat", verdict, note="I was away") == 200
+    again = person.until("scene")
+    assert again["trial"]["message"] == "played again: I was away"
+    assert again["trial"]["attempt"] == 2
+    assert arm.applied == applied
+    person.answer("end", again)
+    run.join()

@@ -1,0 +1,146 @@
+"""A candidate beside a live policy, as users deploy it: what it sees, and that nobody who is served notices."""
+
+from __future__ import annotations
+
+import json
+import time
+import urllib.request
+from collections.abc import Iterator
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import numpy as np
+import pytest
+import ray
+from eval_fakes import wait_for
+from prometheus_series import scrape
+
+from tests.integration.conftest import serving
+from vlagents_ray import Obs, RemoteAgent
+from vlagents_ray.serve.launch.server import Server
+
+ACTS = 40
+AGENT = "shadowed_agents:Seeded"
+LIVE = {"config": {"ms": 5.0}}
+OFFSET = 0.25
+TENFOLD = {"policy": AGENT, "config": {"ms": 50.0, "offset": OFFSET}}
+TRANSPORTS = ("shm", "websocket", "http", "handle")
+
+
+def frames(session: int) -> list[Obs]:
+    rng = np.random.default_rng(session)
+    return [
+        Obs({"front": rng.integers(0, 255, (64, 64, 3), np.uint8)}, 1.0, {"joints": rng.random(7, np.float32)})
+        for _ in range(ACTS)
+    ]
+
+
+def played(server: Server, transport: str, session: int = 0) -> tuple[bytes, list[float]]:
+    """The actions of an episode, to the bit, and the round trips, ms."""
+    url = f"serve://{next(iter(server.apps))}" if transport == "handle" else server.url
+    actions, took = b"", []
+    with RemoteAgent(url, transport=transport) as agent:
+        agent.reset(Obs(), "stack", seed=session)
+        for obs in frames(session):
+            begun = time.perf_counter()
+            actions += agent.act(obs).action.tobytes()
+            took.append((time.perf_counter() - begun) * 1e3)
+    return actions, took
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("shadow")
+
+
+@pytest.fixture(scope="module")
+def alone() -> dict[str, tuple[bytes, list[float]]]:
+    """What the same live policy does without a candidate."""
+    with serving(AGENT, **LIVE) as server:
+        return {transport: played(server, transport) for transport in TRANSPORTS}
+
+
+@pytest.fixture(scope="module")
+def server(alone: object, folder: Path) -> Iterator[Server]:
+    """A live policy with a candidate that takes ten times as long, for all sessions."""
+    shadow = {"policy": TENFOLD, "share": 1.0, "record": str(folder)}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_metrics_report_interval_ms", "500")  # instead of 10 s
+        with serving(AGENT, shadow=shadow, **LIVE) as server:
+            yield server
+
+
+def recorded(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for file in folder.glob("*.jsonl") for line in file.read_text().splitlines()]
+
+
+def test_the_live_actions_are_the_same_to_the_bit(server: Server, alone: dict[str, tuple[bytes, list[float]]]) -> None:
+    beside = {transport: played(server, transport) for transport in TRANSPORTS}
+    assert {name: actions for name, (actions, _) in beside.items()} == {n: actions for n, (actions, _) in alone.items()}
+    slower = median(beside["shm"][1]) / median(alone["shm"][1])
+    assert slower < 1.5, "the live policy waits for its candidate"
+
+
+def test_each_comparison_is_recorded(server: Server, folder: Path) -> None:
+    """The candidate is behind: what it has missed is counted; up to there, it differs by what its settings say."""
+    actions, _ = played(server, "shm", session=7)
+    live = np.frombuffer(actions, np.float32).reshape(ACTS, 4, 7)
+
+    def acts() -> list[dict[str, Any]]:
+        lines = recorded(folder)
+        starts = [place for place, line in enumerate(lines) if line["op"] == "reset"]
+        return lines[starts[-1] + 1 :]
+
+    wait_for(lambda: len(acts()) >= 3 and acts()[-1]["dropped"] > 0)
+    complete = [line for line in acts() if line["dropped"] == 0]
+    assert len(complete) >= 2
+    for number, line in enumerate(complete):
+        assert np.array_equal(np.float32(line["live"]["action"]), live[number])
+        assert line["difference"]["rows"] == 4
+        assert line["difference"]["by_joint"] == pytest.approx([OFFSET] * 7, abs=1e-4)
+        assert line["difference"]["first_row"] == pytest.approx([OFFSET] * 7, abs=1e-4)
+        assert line["candidate"]["timing"]["inference_ms"] > 5 * line["live"]["timing"]["inference_ms"]
+        assert line["live"]["policy"]["version"] == line["candidate"]["policy"]["version"] == 0
+    assert [line["step"] for line in complete] == list(range(complete[0]["step"], complete[0]["step"] + len(complete)))
+
+
+def series() -> dict[str, float]:
+    return {one.key("outcome", "rows", "joint"): one.value for one in scrape() if "_bucket" not in one.name}
+
+
+def test_prometheus_reads_the_comparisons(server: Server) -> None:
+    played(server, "shm")
+    wanted = {
+        "vlagents_shadow_observations_total outcome=compared",
+        "vlagents_shadow_difference_count rows=all",
+        "vlagents_shadow_difference_count rows=first",
+        "vlagents_shadow_joint_difference joint=6",
+        "vlagents_shadow_latency_ms_count",
+        "vlagents_shadow_dropped_total",
+    }
+    wait_for(lambda: wanted <= series().keys())
+    found = series()
+    assert found["vlagents_shadow_dropped_total"] > 0
+    assert found["vlagents_shadow_latency_ms_sum"] / found["vlagents_shadow_latency_ms_count"] >= 50
+
+
+def test_clients_learn_of_it_and_do_not_reach_it(server: Server) -> None:
+    with urllib.request.urlopen(f"{server.url}/v1/metadata", timeout=10) as answer:
+        metadata = json.load(answer)
+    assert metadata["shadow"] == {"policy": AGENT, "share": 1.0}
+
+
+def test_a_candidate_that_dies_is_followed_again_and_the_live_policy_goes_on(
+    server: Server, folder: Path, alone: dict[str, tuple[bytes, list[float]]]
+) -> None:
+    [name] = [one["name"] for one in ray.util.list_named_actors(all_namespaces=True) if "#Shadow#" in one["name"]]
+    before = set(folder.glob("*.jsonl"))
+    ray.kill(ray.get_actor(name, namespace="serve"))
+    assert played(server, "shm")[0] == alone["shm"][0]
+
+    def compared() -> bool:
+        assert played(server, "websocket")[0] == alone["websocket"][0]
+        return set(folder.glob("*.jsonl")) > before
+
+    wait_for(compared)

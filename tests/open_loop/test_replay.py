@@ -1,0 +1,299 @@
+"""Datasets that are played to a policy: the same checkpoint makes no error, another one does."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from live_server import live_server
+from recorded_sessions import Brightness, recorded, seen
+from typer.testing import CliRunner
+
+from vlagents_ray.cli.evaluation.open_loop import parse_episodes
+from vlagents_ray.cli.main import app
+from vlagents_ray.contract import ActionSpec, Contract, StateSpec
+from vlagents_ray.errors import ConfigError, PolicyFailed
+from vlagents_ray.images import jpeg_png
+from vlagents_ray.images.mp4 import Mp4
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.open_loop.candidates import LocalAgent, Sessions, candidate
+from vlagents_ray.open_loop.recorded import Names, RecordedDataset
+from vlagents_ray.open_loop.replay import ReplayPlan, replay
+from vlagents_ray.open_loop.report import line_chart, write_files
+from vlagents_ray.policies.random import Random
+from vlagents_ray.robot.record import Recorder
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.recording import episodes
+
+
+class Follow(Agent):
+    """Predicts that the state goes on by one each frame."""
+
+    @property
+    def contract(self) -> Contract:
+        return Contract(state={"joints": StateSpec(2)}, gripper=True, action=ActionSpec(dim=2), chunk=3)
+
+    def act(self, obs: Obs) -> Act:
+        assert obs.gripper == 0.5
+        return Act(obs.state["joints"] + np.array([[1, 2], [2, 4], [3, 6]], np.float32))
+
+
+@contextmanager
+def loaded(agent: Agent) -> Iterator[Sessions]:
+    engine = Engine(agent)
+    engine.start()
+    try:
+        yield partial(LocalAgent, engine)
+    finally:
+        engine.close()
+
+
+def record(folder: Path, agent: Agent | None = None, sessions: int = 3, **settings: Any) -> None:
+    with recorded(folder, agent, **settings) as server:
+        for number in range(sessions):
+            robot = server.robot()
+            robot.play(4, seed=number, first=10 * number)
+
+
+def demonstrate(folder: Path, frames: int = 6) -> None:
+    """A dataset of demonstrations, two episodes, whose state goes up by one and two."""
+    with Recorder(folder, 10) as recorder:
+        for _ in range(2):
+            with recorder.episode("count"):
+                for i in range(frames):
+                    obs = Obs({"front": seen(i).cameras["front"]}, 0.5, {"joints": np.array([i, 2 * i], np.float32)})
+                    recorder.add(obs, np.array([i + 1, 2 * i + 2], np.float32), tick=i)
+
+
+def test_the_same_checkpoint_makes_no_error(tmp_path: Path) -> None:
+    record(tmp_path)
+    with loaded(Brightness()) as sessions:
+        result = replay(tmp_path, sessions, ReplayPlan()).to_json()
+    assert (result["mae"], result["max"], result["frames"], result["sessions"]) == (0.0, 0.0, 12, 3)
+    assert result["against"] == "answers"
+
+
+def test_small_pictures_make_an_error(tmp_path: Path) -> None:
+    record(tmp_path, pictures="small")
+    with loaded(Brightness()) as sessions:
+        assert replay(tmp_path, sessions, ReplayPlan()).to_json()["mae"] > 0
+
+
+def test_another_checkpoint_makes_an_error_by_joint_and_by_step(tmp_path: Path) -> None:
+    record(tmp_path)
+    with loaded(Brightness(gain=1.5, chunk=3)) as sessions:
+        result = replay(tmp_path, sessions, ReplayPlan(at_once=2)).to_json()
+    assert len(result["by_step"]) == 3, "as many rows as both have"
+    assert [one["frames"] for one in result["by_step"]] == [12] * 3
+    assert result["by_joint"][1]["joint"] == "action_1"
+    assert result["by_step"][0]["mae"] > 0
+    assert result["worst"][0]["mae"] == max(one["mae"] for one in result["worst"])
+
+
+def test_noise_of_the_same_seeds_makes_no_error_and_of_others_it_does(tmp_path: Path) -> None:
+    record(tmp_path, Random.from_config({"action_dim": 2}))
+    with loaded(Random.from_config({"action_dim": 2})) as sessions:
+        assert replay(tmp_path, sessions, ReplayPlan()).to_json()["max"] == 0
+    with loaded(Random.from_config({"action_dim": 2, "seed": 1})) as sessions:
+        assert replay(tmp_path, sessions, ReplayPlan()).to_json()["max"] > 0
+
+
+def test_a_session_of_several_episodes_is_reset_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(episodes, "_FRAMES", 3)
+    record(tmp_path)
+    with loaded(Brightness()) as sessions:
+        result = replay(tmp_path, sessions, ReplayPlan()).to_json()
+    assert (result["max"], len(result["by_episode"]), result["sessions"]) == (0.0, 6, 3)
+
+
+def test_missing_acts_are_told(tmp_path: Path) -> None:
+    with recorded(tmp_path) as server:
+        robot = server.robot()
+        robot.play(1)
+        held, server.recorder._held_bytes = server.recorder._held_bytes, 0
+        robot.act(seen(1))
+        server.recorder._held_bytes = held
+        robot.act(seen(2))
+    with loaded(Brightness()) as sessions:
+        assert replay(tmp_path, sessions, ReplayPlan()).to_json()["missing_acts"] == 1
+
+
+def test_the_actions_of_a_dataset_without_answers_are_those_of_the_frames_ahead(tmp_path: Path) -> None:
+    demonstrate(tmp_path)
+    with loaded(Follow()) as sessions:
+        result = replay(tmp_path, sessions, ReplayPlan()).to_json()
+    assert (result["against"], result["frames"], result["max"]) == ("actions", 12, 0.0)
+    assert [one["frames"] for one in result["by_step"]] == [12, 10, 8], "to the end of each episode"
+
+
+def test_every_nth_frame_of_some_episodes_and_a_shorter_horizon(tmp_path: Path) -> None:
+    demonstrate(tmp_path)
+    with loaded(Follow()) as sessions:
+        result = replay(tmp_path, sessions, ReplayPlan([1], horizon=2, every=4)).to_json()
+    assert [one["frames"] for one in result["by_step"]] == [2, 2]
+    assert [one["episode"] for one in result["by_episode"]] == [1]
+
+
+def test_a_public_dataset_of_the_older_version_with_other_names(tmp_path: Path) -> None:
+    """Without a contract of ours, with a picture in the table, and with a state of unnamed numbers."""
+    image = seen(0).cameras["front"]
+    rows = {
+        "action": [[i + 1.0, 2 * i + 2.0] for i in range(4)],
+        "observation.state": [[float(i), 2.0 * i, 0.5] for i in range(4)],
+        "observation.images.top": [{"bytes": jpeg_png.encode_png(image), "path": "0.png"}] * 4,
+        "episode_index": [0] * 4,
+    }
+    for name in ("data/chunk-000", "meta", "videos/chunk-000/observation.images.side"):
+        (tmp_path / name).mkdir(parents=True)
+    pq.write_table(pa.table(rows), tmp_path / "data/chunk-000/episode_000000.parquet")
+    video = Mp4(tmp_path / "videos/chunk-000/observation.images.side/episode_000000.mp4", (32, 32, 3), 10)
+    for _ in range(4):
+        video.add(np.full((32, 32, 3), 100, np.uint8))
+    video.finish()
+    info = {
+        "codebase_version": "v2.1",
+        "fps": 10,
+        "chunks_size": 1000,
+        "data_path": "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet",
+        "video_path": "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4",
+        "features": {
+            "action": {"dtype": "float32", "shape": [2], "names": {"motors": ["shoulder", "elbow"]}},
+            "observation.state": {"dtype": "float32", "shape": [3], "names": None},
+            "observation.images.top": {"dtype": "image", "shape": [33, 48, 3], "names": None},
+            "observation.images.side": {"dtype": "video", "shape": [32, 32, 3], "names": None},
+        },
+    }
+    (tmp_path / "meta/info.json").write_text(json.dumps(info))
+    (tmp_path / "meta/episodes.jsonl").write_text('{"episode_index": 0, "tasks": ["count"], "length": 4}\n')
+    with loaded(Follow()) as sessions:
+        result = replay(tmp_path, sessions, ReplayPlan()).to_json()
+    assert (result["max"], result["by_joint"][1]["joint"]) == (0.0, "elbow")
+    dataset = RecordedDataset(tmp_path)
+    [play] = dataset.plays()
+    steps = list(dataset.steps(play.parts[0], Names({"base": "top", "wrist": "side"}), None))
+    np.testing.assert_array_equal(steps[3].obs.cameras["base"], image)
+    assert abs(float(steps[3].obs.cameras["wrist"].mean()) - 100) < 3
+    assert steps[3].obs.state["joints"].tolist() == [3, 6, 0.5]
+    with pytest.raises(ConfigError, match="tip"):
+        next(dataset.steps(play.parts[0], Names({"base": "tip"}), None))
+
+
+def test_a_state_that_cannot_be_divided_names_the_option(tmp_path: Path) -> None:
+    demonstrate(tmp_path)
+    info = json.loads((tmp_path / "meta/info.json").read_text())
+    del info["vlagents_ray"]
+    (tmp_path / "meta/info.json").write_text(json.dumps(info))
+    dataset = RecordedDataset(tmp_path)
+    steps = dataset.steps(dataset.plays()[0].parts[0], Names(state=["arm", "hand"]), None)
+    with pytest.raises(ConfigError, match="--state"):
+        next(steps)
+
+
+def test_a_policy_of_another_robot_is_refused(tmp_path: Path) -> None:
+    demonstrate(tmp_path)
+    with loaded(Random.from_config({"action_dim": 7})) as sessions, pytest.raises(ConfigError, match="7"):
+        replay(tmp_path, sessions, ReplayPlan())
+
+
+def test_an_error_of_the_policy_says_where(tmp_path: Path) -> None:
+    class Fails(Follow):
+        def act(self, obs: Obs) -> Act:
+            if obs.state["joints"][0] == 3:
+                raise ValueError("no")
+            return super().act(obs)
+
+    demonstrate(tmp_path)
+    with loaded(Fails()) as sessions, pytest.raises(PolicyFailed, match="episode 0, frame 3"):
+        replay(tmp_path, sessions, ReplayPlan(at_once=1))
+
+
+def test_a_server_at_a_url_is_asked_in_the_same_way(tmp_path: Path) -> None:
+    record(tmp_path)
+    with live_server(Brightness()) as server, candidate(server.url) as sessions:
+        result = replay(tmp_path, sessions, ReplayPlan(at_once=2)).to_json()
+    assert (result["max"], result["frames"]) == (0.0, 12)
+
+
+def test_the_command_writes_numbers_and_pictures(tmp_path: Path) -> None:
+    demonstrate(tmp_path / "data")
+    out = tmp_path / "report"
+    done = CliRunner().invoke(
+        app, ["replay", str(tmp_path / "data"), "--policy", policy_file(tmp_path), "--out", str(out)]
+    )
+    assert done.exit_code == 0, done.output
+    assert "mean absolute error 5.25" in done.output
+    document = json.loads((out / "open_loop.json").read_text())
+    assert document["by_joint"][0]["mae"] == pytest.approx(np.mean([1, 2, 3, 4, 5, 6]))
+    page = (out / "open_loop.html").read_text()
+    assert page.count("<svg") == 3
+    assert "http" not in page.replace("http://www.w3.org", "")
+
+
+def policy_file(folder: Path) -> str:
+    """A policy of zeros with two numbers."""
+    args = {"policy": "noop", "config": {"action_dim": 2}}
+    application = {"name": "noop", "route_prefix": "/", "import_path": "vlagents_ray.serve.app:build", "args": args}
+    path = folder / "policy.yaml"
+    path.write_text(json.dumps({"applications": [application]}))
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["DATA"], "--policy"),
+        (["DATA", "tabletop#3"], "--episodes"),
+        (["DATA", "--policy", "noop", "--episodes", "3-"], "--episodes"),
+        (["DATA", "--policy", "noop", "--episodes", "7"], "episodes"),
+        (["DATA", "--policy", "noop", "--cameras", "base"], "--cameras"),
+    ],
+)
+def test_wrong_options_are_told(words: list[str], said: str, tmp_path: Path) -> None:
+    demonstrate(tmp_path / "data", 2)
+    given = [str(tmp_path / "data") if word == "DATA" else word for word in words]
+    done = CliRunner().invoke(app, ["replay", *given, "--out", str(tmp_path / "out")])
+    assert done.exit_code == 2
+    assert said in done.output
+
+
+def test_numbers_and_ranges() -> None:
+    assert list(parse_episodes("0-2,7")) == [0, 1, 2, 7]
+
+
+def test_a_folder_without_a_dataset(tmp_path: Path) -> None:
+    with loaded(Follow()) as sessions, pytest.raises(ConfigError, match="LeRobotDataset"):
+        replay(tmp_path, sessions, ReplayPlan())
+
+
+def test_datasets_of_other_actions_are_not_mixed(tmp_path: Path) -> None:
+    demonstrate(tmp_path / "one", 2)
+    record(tmp_path / "two")
+    shutil.move(next((tmp_path / "two").iterdir()), tmp_path / "three")
+    (tmp_path / "two").rmdir()
+    with loaded(Follow()) as sessions, pytest.raises(ConfigError, match="one by one"):
+        replay(tmp_path, sessions, ReplayPlan())
+
+
+def test_a_line_of_one_value_is_drawn() -> None:
+    chart = line_chart("error", "step", [("policy", [0.0])])
+    assert chart.lines[0][1].startswith("M")
+
+
+def test_names_of_others_are_text_on_the_page(tmp_path: Path) -> None:
+    demonstrate(tmp_path / "data", 2)
+    with loaded(Follow()) as sessions:
+        result = replay(tmp_path / "data", sessions, ReplayPlan())
+    result.joints[0] = "<script>"
+    write_files(result, "<b>", tmp_path / "out")
+    page = (tmp_path / "out/open_loop.html").read_text()
+    assert "<script>" not in page
+    assert "<b>" not in page

@@ -1,0 +1,209 @@
+"""Interventions in the control loop: how long they take to begin, what the robot gets, and what is recorded."""
+
+from __future__ import annotations
+
+import json
+import threading
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from eval_fakes import wait_for
+from scripted_leader import ScriptedLeader
+
+from vlagents_ray import Act, ActionSpec, Agent, ConfigError, Contract, Obs
+from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.robot import Guard, Watchdog, run_loop
+from vlagents_ray.robot.record import Recorder
+from vlagents_ray.robot.simulated import SimulatedRobot
+
+HZ = 50.0
+MAX_STEP = 0.05
+
+
+class SimulatedTime:
+    """A clock that goes on when somebody sleeps, in place of the module `time`."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def perf_counter(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += max(seconds, 1e-4)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> SimulatedTime:
+    clock = SimulatedTime()
+    monkeypatch.setattr("vlagents_ray.robot.pacing.time", clock)
+    return clock
+
+
+class Going(Agent):
+    """Goes on by 0.01 a tick from where the robot stands."""
+
+    contract = Contract(action=ActionSpec(dim=2, delta=False, low=-3.0, high=3.0))
+
+    def act(self, obs: Obs) -> Act:
+        return Act((obs.state["joints"] + 0.01 * np.arange(1, 5)[:, np.newaxis]).astype(np.float32))
+
+
+class Arm(SimulatedRobot):
+    """Keeps what it was commanded, and stands there at once."""
+
+    def __init__(self) -> None:
+        super().__init__(Going.contract)
+        self.commanded: list[np.ndarray] = []
+
+    def observe(self) -> Obs:
+        return Obs(state={"joints": (self.commanded[-1] if self.commanded else np.zeros(2)).astype(np.float32)})
+
+    def apply(self, action: np.ndarray) -> None:
+        self.commanded.append(action)
+
+
+def rows(root: Path, episode: int = 0) -> dict[str, Any]:
+    return pq.read_table(root / f"data/chunk-000/file-{episode:03d}.parquet").to_pydict()
+
+
+def back(obs: Obs) -> np.ndarray:
+    return np.asarray(obs.state["joints"] - np.float32(0.04), np.float32)
+
+
+@pytest.mark.parametrize(
+    "options", [{"mode": "open_loop"}, {"mode": "ensemble"}, {"mode": "async", "deadline_s": 30.0}]
+)
+def test_a_correction_of_a_second_is_recorded_from_its_first_tick_with_both_actions(
+    tmp_path: Path, clock: SimulatedTime, options: dict[str, Any]
+) -> None:
+    arm, guarded = Arm(), []
+
+    class Seen(Guard):
+        def __call__(self, action: np.ndarray, last: np.ndarray | None = None) -> np.ndarray:
+            guarded.append(action.tolist())
+            return super().__call__(action, last)
+
+    leader = ScriptedLeader(back, lambda: 1.0 <= clock.now < 2.0)
+    guard = Seen(Going.contract, max_step=MAX_STEP, measure=lambda obs: obs.state["joints"])
+    recorder = Recorder(tmp_path, HZ, frames=1000, interventions=True)
+
+    def answered() -> bool:
+        """Let the policy answer within a tick, as no time passes between ticks."""
+        wait_for(lambda: player._asker is None or player._asker._job is None)
+        return False
+
+    with recorder, ChunkPlayer(Going(), override=leader, check=guard, **options) as player:
+        report = run_loop(arm, player, hz=HZ, seconds=3.0, instruction="go", recorder=recorder, until=answered)
+    seen = rows(tmp_path)
+    led = [tick for tick, human in zip(seen["tick"], seen["intervention"], strict=True) if human]
+    assert 49 <= len(led) <= 51
+    assert report.interventions == len(led) == len(leader.given)
+    assert led == list(range(led[0], led[0] + len(led)))
+    assert abs(led[0] - round(1.0 * HZ)) <= 1, "at the first tick after the human wants the robot"
+    first = seen["tick"].index(led[0])
+    human = np.array(seen["action"])[first : first + len(led)]
+    policy = np.array(seen["policy_action"])[first : first + len(led)]
+    assert human == pytest.approx(np.array(leader.given))
+    assert all(seen["policy_known"][first : first + len(led)])
+    assert (policy > human).all(), "it wants to go the other way"
+    others = [i for i in range(len(seen["tick"])) if not seen["intervention"][i] and not seen["safe"][i]]
+    assert [seen["policy_action"][i] for i in others] == [seen["action"][i] for i in others]
+    steps = np.abs(np.diff(np.stack([np.zeros(2), *arm.commanded]), axis=0))
+    assert steps.max() <= MAX_STEP + 1e-6, "at the release, too"
+    assert all(action.tolist() in guarded for action in arm.commanded)
+
+
+def test_a_silent_server_stops_no_robot_that_a_human_moves() -> None:
+    """A silent policy gives safe actions; a human's count as signs of life of whoever moves the robot."""
+    gate = threading.Event()
+
+    class Hanging(Going):
+        asked = 0
+
+        def act(self, obs: Obs) -> Act:
+            self.asked += 1
+            assert self.asked == 1 or gate.wait(30)
+            return super().act(obs)
+
+    arm, leader = Arm(), ScriptedLeader(back)
+    leader.held = True
+    watchdog = Watchdog(lambda _: arm.stop(), {"server": 1.0})
+    with ChunkPlayer(Hanging(), override=leader, mode="async") as player:
+
+        def over() -> bool:
+            if len(arm.commanded) == 75 and leader.held:
+                assert watchdog.barks == []
+                leader.held = False  # from here on, nobody moves it but the silent policy
+            return bool(watchdog.barks)
+
+        report = run_loop(arm, player, hz=HZ, until=over, watchdog=watchdog)
+        gate.set()
+    assert report.interventions == 75
+    assert report.barks[0].startswith("server: silent")
+
+
+def add(recorder: Recorder, label: Any = None) -> None:
+    with recorder.episode("stack"):
+        recorder.add(Obs(state={"joints": np.zeros(2, np.float32)}), np.ones(2, np.float32), tick=0)
+        recorder.add(Obs(state={"joints": np.zeros(2, np.float32)}), np.ones(2, np.float32), tick=1, intervention=True)
+        if label is not None:
+            recorder.label(label)
+
+
+def test_what_the_policy_wanted_is_marked_where_it_is_not_known(tmp_path: Path) -> None:
+    with Recorder(tmp_path, HZ, interventions=True) as recorder:
+        add(recorder)
+    seen = rows(tmp_path)
+    assert (seen["policy_action"], seen["policy_known"]) == ([[1, 1], [0, 0]], [True, False])
+
+
+def test_episodes_have_a_label_and_discarded_ones_are_dropped(tmp_path: Path) -> None:
+    with Recorder(tmp_path, HZ, interventions=True) as recorder:
+        for label in ("success", "discard", "failure", None):
+            add(recorder, label)
+        with pytest.raises(ConfigError, match="want one of"):
+            recorder.label("good")  # type: ignore[arg-type]
+    about = [pq.read_table(path).to_pylist()[0] for path in sorted(tmp_path.glob("meta/episodes/*/*.parquet"))]
+    assert [one["label"] for one in about] == ["success", "failure", "none"]
+    assert json.loads((tmp_path / "meta/info.json").read_text())["total_episodes"] == 3
+
+
+def test_an_episode_of_any_dataset_can_be_discarded_and_only_some_have_labels(tmp_path: Path) -> None:
+    with Recorder(tmp_path, HZ) as recorder:
+        add(recorder, "discard")
+        add(recorder)
+        with pytest.raises(ConfigError, match="interventions=True"):
+            recorder.label("success")
+    assert json.loads((tmp_path / "meta/info.json").read_text())["total_episodes"] == 1
+
+
+def test_a_dataset_from_before_goes_on_without_interventions_or_is_refused(tmp_path: Path) -> None:
+    with Recorder(tmp_path, HZ) as recorder:
+        add(recorder)
+    with pytest.raises(ConfigError, match="recorded without interventions"):
+        Recorder(tmp_path, HZ, interventions=True)
+    with Recorder(tmp_path, HZ) as recorder:
+        add(recorder)
+    assert json.loads((tmp_path / "meta/info.json").read_text())["total_episodes"] == 2
+    assert "intervention" not in rows(tmp_path, 1)
+
+
+def test_a_dataset_with_interventions_keeps_its_columns(tmp_path: Path) -> None:
+    with Recorder(tmp_path, HZ, interventions=True) as recorder:
+        add(recorder)
+    with Recorder(tmp_path, HZ) as recorder:
+        assert recorder.interventions
+        add(recorder, "success")
+    assert rows(tmp_path, 1)["intervention"] == [False, True]
+
+
+def test_a_recorder_without_a_place_for_interventions_is_refused_before_anything_moves(tmp_path: Path) -> None:
+    arm = Arm()
+    player = ChunkPlayer(Going(), override=ScriptedLeader(back))
+    with Recorder(tmp_path, HZ) as recorder, player, pytest.raises(ConfigError, match="interventions=True"):
+        run_loop(arm, player, hz=HZ, seconds=1.0, recorder=recorder)
+    assert arm.commanded == []

@@ -1,0 +1,305 @@
+"""What a human moves a robot with: keys of a terminal, a SpaceMouse, commands from elsewhere."""
+
+from __future__ import annotations
+
+import os
+import pty
+import sys
+import termios
+from collections.abc import Iterator
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from manual_clock import Clock
+
+from vlagents_ray import Act, ActionSpec, Agent, ConfigError, Contract, Obs
+from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.envs import make_env
+from vlagents_ray.errors import InvalidAction, MissingDependency, MissingState
+from vlagents_ray.interface import INTERVENTION, SAFE
+from vlagents_ray.robot import run_loop
+from vlagents_ray.robot.teleoperation import AxesLeader, Keyboard, RelayedLeader, SpaceMouse, TeleoperatedAgent
+from vlagents_ray.robot.teleoperation.environment import EnvRobot
+
+DELTAS = Contract(
+    action=ActionSpec(dim=4, delta=True, gripper_open=1.0, gripper_closed=-1.0, low=-1.0, high=1.0), gripper=True
+)
+JOINTS = Contract(action=ActionSpec(dim=3, delta=False, low=-1.0, high=1.0))
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    for module in ("keyboard", "relay"):
+        monkeypatch.setattr(f"vlagents_ray.robot.teleoperation.{module}.time.monotonic", clock)
+    return clock
+
+
+class Terminal:
+    """A terminal at which the test types."""
+
+    def __init__(self) -> None:
+        self._ours, self.its = pty.openpty()
+
+    def type(self, keys: str) -> None:
+        os.write(self._ours, keys.encode())
+
+
+@pytest.fixture
+def terminal() -> Iterator[Terminal]:
+    made = Terminal()
+    yield made
+    os.close(made._ours)
+    os.close(made.its)
+
+
+def test_keys_move_along_their_axes_while_they_are_pressed(clock: Clock, terminal: Terminal) -> None:
+    with Keyboard(terminal=terminal.its) as device:
+        assert not device.engaged()
+        terminal.type("wd")
+        assert device.engaged()
+        assert device.axes().tolist() == [1, -1, 0, 0, 0, 0]
+        clock.now = 0.15
+        terminal.type("s")  # the other way at once
+        device.engaged()
+        assert device.axes().tolist() == [-1, -1, 0, 0, 0, 0]
+        clock.now = 0.25
+        assert device.axes().tolist() == [-1, 0, 0, 0, 0, 0]
+        clock.now = 1.0
+        assert device.axes().tolist() == [0] * 6
+        assert device.engaged(), "until Enter gives back"
+
+
+def test_enter_takes_over_and_gives_back_and_other_keys_do_what_was_said(terminal: Terminal) -> None:
+    pressed: list[str] = []
+    with Keyboard({"y": lambda: pressed.append("y")}, terminal=terminal.its) as device:
+        engaged = []
+        for keys in ("\n", "\n", "w", "\n", "y", " "):
+            terminal.type(keys)
+            engaged.append(device.engaged())
+        assert engaged == [True, False, True, False, False, True]
+        assert device.axes().tolist() == [0] * 6, "a robot given back is not moved by keys of before"
+        assert (pressed, device.gripper_presses(), device.gripper_presses()) == (["y"], 1, 0)
+
+
+def test_the_terminal_is_as_it_was_afterwards(terminal: Terminal) -> None:
+    before = termios.tcgetattr(terminal.its)
+    with Keyboard(terminal=terminal.its):
+        assert not termios.tcgetattr(terminal.its)[3] & termios.ECHO
+    assert termios.tcgetattr(terminal.its) == before
+
+
+def test_a_keyboard_wants_a_terminal_and_keys_of_its_own(terminal: Terminal) -> None:
+    reading, writing = os.pipe()
+    with pytest.raises(ConfigError, match="no terminal"):
+        Keyboard(terminal=reading)
+    os.close(reading)
+    os.close(writing)
+    with pytest.raises(ConfigError, match="'w'"):
+        Keyboard({"w": lambda: None}, terminal=terminal.its)
+
+
+class Stick:
+    """A device that the test moves."""
+
+    def __init__(self) -> None:
+        self.at = np.zeros(6, np.float32)
+        self.presses = 0
+        self.held = True
+
+    def engaged(self) -> bool:
+        return self.held
+
+    def axes(self) -> np.ndarray:
+        return self.at
+
+    def gripper_presses(self) -> int:
+        presses, self.presses = self.presses, 0
+        return presses
+
+
+def test_axes_become_relative_actions_within_half_of_the_bound() -> None:
+    stick = Stick()
+    leader = AxesLeader(DELTAS, stick)
+    stick.at[:3] = (1, -0.5, 0)
+    assert leader.engaged()
+    assert leader.action(Obs(gripper=1.0)).tolist() == [0.5, -0.25, 0, 1]
+    assert AxesLeader(DELTAS, stick, step=0.1).action(Obs(gripper=1.0))[:2] == pytest.approx([0.1, -0.05])
+
+
+def test_a_gripper_that_may_hold_something_stays_closed_until_its_button_is_pressed() -> None:
+    stick = Stick()
+    leader = AxesLeader(DELTAS, stick)
+    leader.engaged()
+    assert leader.action(Obs(gripper=0.58))[-1] == -1
+    assert leader.action(Obs(gripper=1.0))[-1] == -1
+    stick.presses = 1
+    assert leader.action(Obs(gripper=0.1))[-1] == 1
+    stick.held = False
+    leader.engaged()
+    stick.held = True
+    leader.engaged()
+    assert leader.action(Obs(gripper=0.1))[-1] == -1, "when it is taken over again, as it is"
+
+
+def test_absolute_targets_begin_where_the_robot_stands_and_stay_within_the_bounds() -> None:
+    stick = Stick()
+    leader = AxesLeader(JOINTS, stick, step=0.1)
+    obs = Obs(state={"joints": np.array([0.5, 0.85, 0], np.float32)})
+    stick.at[:3] = (-1, 1, 0)
+    leader.engaged()
+    for expected in ([0.4, 0.95, 0], [0.3, 1, 0]):
+        assert leader.action(obs) == pytest.approx(expected)
+    stick.held = False
+    leader.engaged()
+    stick.held = True
+    leader.engaged()
+    assert leader.action(obs) == pytest.approx([0.4, 0.95, 0])
+    with pytest.raises(MissingState):
+        AxesLeader(JOINTS, stick, step=0.1).action(Obs())
+    measured = AxesLeader(JOINTS, stick, step=0.1, measure=lambda _: np.array([-0.5, 0, 0]))
+    assert measured.action(Obs()) == pytest.approx([-0.6, 0.1, 0])
+
+
+@pytest.mark.parametrize("contract", [None, Contract(), Contract(action=ActionSpec(dim=7)), JOINTS])
+def test_axes_need_a_contract_that_says_what_actions_are(contract: Contract | None) -> None:
+    with pytest.raises(ConfigError, match=r"teleoperation|step"):
+        AxesLeader(contract, Stick())
+
+
+class Mouse:
+    """A SpaceMouse of pyspacemouse 2.1, which has a report for each `read` until there are none."""
+
+    def __init__(self) -> None:
+        self.reports: list[dict[str, Any]] = []
+        self.closed = False
+        self._state = SimpleNamespace(t=-1.0, x=0, y=0, z=0, roll=0, pitch=0, yaw=0, buttons=[0, 0])
+
+    def read(self) -> SimpleNamespace:
+        if self.reports:
+            self._state.__dict__.update(self.reports.pop(0), t=self._state.t + 1)
+        return self._state
+
+    def close(self) -> None:
+        self.closed = True
+
+
+@pytest.fixture
+def mouse(monkeypatch: pytest.MonkeyPatch) -> Mouse:
+    made = Mouse()
+    library = ModuleType("pyspacemouse")
+    library.AxisConvention = SimpleNamespace(ROS="ros")  # type: ignore[attr-defined]
+    library.open = lambda **_: made  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "pyspacemouse", library)
+    return made
+
+
+def test_a_spacemouse_takes_over_when_it_is_moved_and_gives_back_by_its_last_button(mouse: Mouse) -> None:
+    with SpaceMouse() as device:
+        mouse.reports = [{"x": 0.05}]
+        assert not device.engaged(), "the cap never rests exactly in the middle"
+        mouse.reports = [{"x": 0.9}, {"x": 0.4, "yaw": -2.0}, {"buttons": [1, 0]}, {"buttons": [0, 0]}]
+        assert device.engaged()
+        assert device.axes() == pytest.approx([0.4, 0, 0, 0, 0, -1])
+        assert mouse.reports == [], "what was sent since the last tick has been read"
+        assert device.gripper_presses() == 1
+        mouse.reports = [{"x": 0.0, "yaw": 0.0}, {"buttons": [0, 1]}, {"buttons": [0, 0]}]
+        assert not device.engaged()
+    assert mouse.closed
+
+
+def test_without_a_spacemouse_or_its_library_the_cure_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pyspacemouse", None)
+    with pytest.raises(MissingDependency, match="spacemouse"):
+        SpaceMouse()
+
+    def none_there(axis_convention: object) -> None:
+        raise RuntimeError("No connected or supported devices found.")
+
+    library = ModuleType("pyspacemouse")
+    library.AxisConvention, library.open = SimpleNamespace(ROS="ros"), none_there  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "pyspacemouse", library)
+    with pytest.raises(ConfigError, match="plug one in"):
+        SpaceMouse()
+
+
+def test_a_relayed_command_counts_until_its_deadline(clock: Clock) -> None:
+    leader = RelayedLeader(0.2)
+    assert not leader.engaged()
+    assert leader.command(np.ones(2))
+    clock.now = 0.19
+    assert leader.engaged()
+    assert leader.action(Obs()).tolist() == [1, 1]
+    clock.now = 0.5
+    assert leader.engaged(), "only a human lets the policy go on"
+    with pytest.raises(InvalidAction, match=r"no command for 0\.50 s"):
+        leader.action(Obs())
+    assert leader.command(np.zeros(2), ago_s=0.1)
+    assert leader.action(Obs()).tolist() == [0, 0]
+
+
+def test_a_relayed_command_that_comes_too_late_or_out_of_order_does_not_count(clock: Clock) -> None:
+    clock.now = 1.0
+    leader = RelayedLeader(0.2)
+    assert not leader.command(np.ones(2), ago_s=0.3)
+    assert not leader.engaged()
+    assert leader.command(np.ones(2), ago_s=0.05)
+    assert not leader.command(np.zeros(2), ago_s=0.1)
+    assert leader.action(Obs()).tolist() == [1, 1]
+    leader.release()
+    assert not leader.command(np.ones(2), ago_s=0.01), "one from before the release takes no robot back"
+    assert not leader.engaged()
+
+
+def test_a_silent_human_can_give_the_robot_back(clock: Clock) -> None:
+    leader = RelayedLeader(0.2, silence="release")
+    leader.command(np.ones(2))
+    clock.now = 0.1
+    assert leader.engaged()
+    clock.now = 0.3
+    assert not leader.engaged()
+    with pytest.raises(InvalidAction):
+        leader.action(Obs())
+    for wrong in ({"deadline_s": 0.0}, {"silence": "stop"}):
+        with pytest.raises(ConfigError, match="want"):
+            RelayedLeader(**wrong)  # type: ignore[arg-type]
+
+
+def test_a_robot_whose_human_is_silent_holds_still(clock: Clock) -> None:
+    class Standing(Agent):
+        contract = Contract(action=ActionSpec(dim=2, delta=False))
+
+        def act(self, obs: Obs) -> Act:
+            return Act(np.zeros(2, np.float32))
+
+    leader = RelayedLeader(0.2)
+    with ChunkPlayer(Standing(), override=leader) as player:
+        player.reset(Obs(), "stack")
+        leader.command(np.ones(2))
+        assert player.act(Obs()).action.tolist() == [1, 1]
+        clock.now = 0.5
+        act = player.act(Obs())
+        assert (act.action.tolist(), act.info[INTERVENTION]) == ([1, 1], True)
+        assert "no command" in act.info[SAFE]
+        leader.release()
+        assert player.act(Obs()).action.tolist() == [0, 0]
+
+
+def test_a_human_drives_an_environment_through_the_same_loop() -> None:
+    stick = Stick()
+    with make_env("tabletop/lift", width=32, height=32, max_steps=4) as env:
+        robot = EnvRobot(env, 0)
+        agent = TeleoperatedAgent(AxesLeader(env.contract, stick), env.contract)
+        before = robot.observe().state["xyzrpy"]
+        stick.at[0] = 1
+        report = run_loop(robot, agent, hz=200.0, until=lambda: robot.ended)
+        moved = robot.observe().state["xyzrpy"] - before
+        assert moved[0] == pytest.approx(4 * 0.5 * 0.03, abs=1e-5)
+        assert (robot.steps, robot.ended, robot.success, report.interventions) == (4, True, False, 4)
+        robot.apply(np.zeros(4, np.float32))
+        assert robot.steps == 4
+        endless = EnvRobot(env, 0, endless=True)
+        run_loop(endless, agent, hz=200.0, until=lambda: endless.steps >= 6)
+        assert not endless.ended

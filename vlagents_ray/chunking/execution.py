@@ -1,0 +1,84 @@
+"""What a chunk player executed, stated in its requests for those who watch the server."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import DeadlineExceeded, VLAgentsError
+from vlagents_ray.interface import AGE_MS, SAFE, Act, Agent
+
+PLAYED = "played"  # the entry of `Obs.info`
+_ROWS = 64  # most actions between two requests that are stated; older ones are left out
+
+
+class Execution:
+    """Collects what one episode executes, and states it once in the next request."""
+
+    def __init__(self) -> None:
+        """Begin an episode."""
+        self._rows: deque[tuple[int, np.ndarray]] = deque(maxlen=_ROWS)
+        self._age_ms: float | None = None
+        self._safe = ""
+        self._safe_ticks = self._spells = self._late = 0
+
+    def note(self, act: Act, executed: int) -> Act:
+        """Note the action of a tick, and return it.
+
+        Args:
+            act: The action that the player returns, (D,).
+            executed: The number of the policy's actions that the plan counts as executed, this one included.
+        """
+        reason = act.info.get(SAFE)
+        if reason is None:
+            self._rows.append((executed - 1, act.action.copy()))  # the caller may change its own
+            self._age_ms = act.info.get(AGE_MS)
+            self._safe = ""
+        else:
+            self._note_safe(reason)
+        return act
+
+    def interrupt(self, reason: str) -> None:
+        """Note that the last action was not executed, since the robot was stopped or moved."""
+        if not self._safe and self._rows:
+            self._rows.pop()
+        self._note_safe(reason)
+
+    def failed(self, error: VLAgentsError) -> str:
+        """Note a request without an answer; return the reason for the ticks without an action."""
+        self._late += isinstance(error, DeadlineExceeded)
+        return f"{error.code}: {error}"
+
+    def report(self, executed: int, agent: Agent) -> dict[str, Any]:
+        """Return what the next request states.
+
+        Args:
+            executed: The number of the policy's actions that were executed before its observation.
+            agent: The policy; a `RemoteAgent` knows how often it has connected again.
+
+        Returns:
+            `step`: `executed`, the step for which the first row of the answer is; `rows`: (n, D) float32, the policy's
+            actions that were executed since the request before; `steps`: (n,) int64, their steps; `age_ms`: the age of
+            the observation from which the last one was computed, when it was executed; `safe`: the reason of the last
+            tick's safe action, "" if it had one of the policy's; and of the episode `safe_ticks`, `safe_spells` (runs
+            of such ticks), `late` (requests without an answer in time), and `reconnects`.
+        """
+        rows, self._rows = self._rows, deque(maxlen=_ROWS)
+        return {
+            "step": executed,
+            "steps": np.array([step for step, _ in rows], np.int64),
+            "rows": np.stack([row for _, row in rows]) if rows else np.zeros((0, 0), np.float32),
+            "age_ms": self._age_ms,
+            "safe": self._safe,
+            "safe_ticks": self._safe_ticks,
+            "safe_spells": self._spells,
+            "late": self._late,
+            "reconnects": getattr(agent, "reconnects", 0),
+        }
+
+    def _note_safe(self, reason: str) -> None:
+        self._spells += not self._safe
+        self._safe_ticks += 1
+        self._safe = reason

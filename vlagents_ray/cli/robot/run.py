@@ -1,0 +1,203 @@
+"""Episodes of an environment in the control loop of a robot."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from vlagents_ray.chunking.modes import Mode
+from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.chunking.takeover import Leader, Takeover
+from vlagents_ray.cli.console import out
+from vlagents_ray.cli.robot.terminal_view import TerminalView
+from vlagents_ray.client.agent import RemoteAgent
+from vlagents_ray.contract import Contract, require_match
+from vlagents_ray.envs.base import EvalEnv, make_env
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.interface import Agent, Obs
+from vlagents_ray.policies.wrapper import Wrapper, build_agent
+from vlagents_ray.robot import Guard, run_loop
+from vlagents_ray.robot.episode import Label
+from vlagents_ray.robot.record import Recorder
+from vlagents_ray.robot.teleoperation import AxesDevice, AxesLeader, Keyboard, SpaceMouse, TeleoperatedAgent
+from vlagents_ray.robot.teleoperation.environment import EnvRobot
+from vlagents_ray.robot.teleoperation.keyboard import HELP
+
+DEVICES = ("keyboard", "spacemouse")
+KEYS = "p pauses and continues; y success, n failure, x discard end the episode; q quits"
+_HZ = 10.0  # of environments that state no rate
+
+
+class EnvPolicy(Wrapper):
+    """A policy in an environment, whose actions stand in for those that its own contract does not state."""
+
+    def __init__(self, agent: Agent, env: Contract) -> None:
+        super().__init__(agent)
+        self._env = env
+        self._loaded = False
+
+    def initialize(self) -> None:
+        """Load the policy once, though each run of the control loop initializes its agent."""
+        if not self._loaded:
+            super().initialize()
+        self._loaded = True
+
+    @property
+    def contract(self) -> Contract:
+        """The policy's contract, or the environment's if that states no actions."""
+        own = self.agent.contract
+        return self._env if own is None or own.action.relative is None else own
+
+    def begin(self, obs: Obs, instruction: str | None) -> Obs:
+        return obs
+
+    def change_batch(self, obs: Any, sessions: Any) -> list[Obs | Exception]:
+        return list(obs)
+
+
+@dataclass
+class RobotRun:
+    """What `vlagents-ray robot` plays, and how; the fields are its options."""
+
+    env: str
+    env_options: dict[str, Any]
+    policy: str | None
+    settings: dict[str, Any]
+    teleop: str | None
+    record: Path | None
+    hz: float | None
+    mode: Mode
+    execute: int | None
+    max_step: float | None
+    step: float | None
+    ask_for_help: float | None
+    samples: int | None
+    verdict: Label | None = field(default=None, init=False)  # of the running episode, once a human has given it
+    over: bool = field(default=False, init=False)  # the human wants no further episode
+    _takeover: Takeover | None = field(default=None, init=False)
+    _view: TerminalView | None = field(default=None, init=False)
+    _said: str | None = field(default=None, init=False)  # the reason of the pause that was printed
+
+    def play(self, seeds: Iterable[int]) -> None:
+        """Play an episode for each seed, and print what became of it.
+
+        Raises:
+            ConfigError: The settings do not go together.
+            ContractMismatch: The policy does not fit the environment.
+        """
+        with contextlib.ExitStack() as stack:
+            env = stack.enter_context(make_env(self.env, **self.env_options))
+            hz = self.hz or env.contract.control_hz or _HZ
+            leader = self._leader(env.contract, stack)
+            agent = stack.enter_context(self._agent(env.contract, leader))
+            self._takeover = agent.takeover if isinstance(agent, ChunkPlayer) else None
+            recorder = None
+            if self.record is not None:
+                recorder = stack.enter_context(Recorder(self.record, hz, interventions=leader is not None))
+            if self.teleop == "keyboard":
+                out.print(f"{HELP}\n{KEYS}")
+            if self.teleop is not None and out.is_terminal:
+                self._view = TerminalView(_write)
+            for seed in seeds:
+                if self.over:
+                    break
+                self._play(env, agent, seed, hz, recorder)
+        if recorder is not None:  # closed, so everything is written
+            out.print(f"recorded: {recorder.episodes} episodes in {self.record}, {recorder.dropped} frames dropped")
+
+    def _play(self, env: EvalEnv, agent: Agent, seed: int, hz: float, recorder: Recorder | None) -> None:
+        self.verdict = None
+        robot = EnvRobot(env, seed, endless=self.teleop is not None)
+        self._say(f"seed {seed}: {env.instruction}")
+
+        def label() -> Label:
+            return self.verdict or ("success" if robot.success else "failure")
+
+        def ended() -> bool:
+            if recorder is not None and (recorder.interventions or self.over):
+                recorder.label(label())
+            self._say_why_paused()
+            if self._view is not None:
+                self._view.draw(robot.observe().cameras)
+            return robot.ended or self.verdict is not None
+
+        options = {} if self.policy is None else {"seed": seed, "env": self.env}
+        guard = Guard(env.contract, max_step=self.max_step) if self.policy is None else None
+        report = run_loop(
+            robot,
+            agent,
+            hz=hz,
+            instruction=env.instruction,
+            reset_options=options,
+            guard=guard,
+            recorder=recorder,
+            until=ended,
+        )
+        self._say(f"  {label()}: {robot.steps} steps, {report.interventions} of them a human's")
+
+    def _leader(self, contract: Contract, stack: contextlib.ExitStack) -> Leader | None:
+        if self.teleop is None:
+            return None
+        if self.teleop not in DEVICES:
+            raise ConfigError(f"--teleop: got {self.teleop!r}, want one of {list(DEVICES)}")
+        device: AxesDevice
+        if self.teleop == "keyboard":
+            verdicts = {"y": "success", "n": "failure", "x": "discard"}
+            keys = {key: lambda label=label: setattr(self, "verdict", label) for key, label in verdicts.items()}
+            device = stack.enter_context(Keyboard({**keys, "p": self._pause, "q": self._quit}))
+        else:
+            device = stack.enter_context(SpaceMouse())
+        return AxesLeader(contract, device, step=self.step)
+
+    def _agent(self, contract: Contract, leader: Leader | None) -> Agent:
+        if self.policy is None:
+            if leader is None:
+                raise ConfigError("robot: got neither a policy nor --teleop, want one of them, or both")
+            return TeleoperatedAgent(leader, contract)
+        remote = "://" in self.policy
+        if remote and self.settings:
+            raise ConfigError(f"--set: got {sorted(self.settings)}, but {self.policy} has its settings already")
+        inner = RemoteAgent(self.policy) if remote else build_agent(self.policy, self.settings)
+        policy = EnvPolicy(inner, contract)
+        policy.initialize()
+        require_match(inner.contract, contract)
+        return ChunkPlayer(
+            policy,
+            mode=self.mode,
+            execute=self.execute,
+            check=Guard(contract, max_step=self.max_step),
+            override=leader,
+            ask_for_help=self.ask_for_help,
+            samples=self.samples,
+        )
+
+    def _pause(self) -> None:
+        if self._takeover is None:
+            return
+        if self._takeover.reason is None:
+            self._takeover.pause()
+        else:
+            self._takeover.resume()
+
+    def _say_why_paused(self) -> None:
+        reason = None if self._takeover is None else self._takeover.reason
+        if reason not in (None, self._said):
+            out.bell()
+            self._say(f"  {reason}; p continues")
+        self._said = reason
+
+    def _say(self, text: str) -> None:
+        if self._view is not None:
+            self._view.leave()
+        out.print(text)
+
+    def _quit(self) -> None:
+        self.verdict, self.over = "discard", True
+
+
+def _write(text: str) -> None:
+    out.file.write(text)
+    out.file.flush()

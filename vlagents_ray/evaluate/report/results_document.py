@@ -1,0 +1,171 @@
+"""What a page in a browser shows of a folder of results: cells, learning curves, and failures with their videos."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate.artifacts.storage import inside, outcome
+from vlagents_ray.evaluate.report.progress import seconds_left
+from vlagents_ray.evaluate.results.database import FILE
+from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results, rate_of
+from vlagents_ray.evaluate.results.statistics import Rate
+
+STARTING, RUNNING = "starting", "running"
+_FAILURES = 24  # most failures in the document, the newest ones
+_TEXT = 300  # most characters of an error or an instruction
+_EVERY_S = 1.0  # least time between two readings of the results
+_SHARE = 0.04  # of a core, for reading them
+
+
+class ResultsDocument:
+    """Describes the results of an evaluation, or of those of a training, which any process may be writing.
+
+    `read` and `video` are called on one thread. Numbers come from the folder, by the code that makes the report: so
+    they include earlier runs and, in a training, earlier versions. Nothing is read while nobody calls `read`.
+    """
+
+    reason = ""
+    """The error that ended the evaluation."""
+
+    goes_on = False
+    """Whether further evaluations follow each other, as those of a training's checkpoints."""
+
+    def __init__(self, out: Path) -> None:
+        """Describe the results in the folder `out`, which may not be there yet."""
+        self._out = out
+        self._videos: list[str] = []  # paths of the videos by their number
+        self._numbers: dict[str, int] = {}  # the reverse
+        self._document: dict[str, Any] = {}
+        self._read_at, self._took_s = float("-inf"), 0.0
+
+    def read(self) -> dict[str, Any]:
+        """Return {"evaluation": the document}; the same object as before if nothing in it has changed.
+
+        It may take as long as reading the folder of results, for which it takes at most 4 % of a core.
+        """
+        since = time.monotonic() - self._read_at
+        if self.is_due(rested=since >= max(_EVERY_S, self._took_s / _SHARE)):
+            begun_s = time.thread_time()
+            self._document = {"evaluation": self._describe()}
+            self._took_s = time.thread_time() - begun_s
+            self._read_at = time.monotonic()
+        return self._document
+
+    def video(self, number: int) -> Path | None:
+        """Return the file of a video in the document; None if there is none, or it is a link out of the folder."""
+        if not 0 <= number < len(self._videos):
+            return None
+        try:
+            path = inside(self._out, self._videos[number])
+        except ConfigError:
+            return None
+        return path if path.is_file() else None
+
+    def is_due(self, *, rested: bool) -> bool:
+        """Return whether the results are to be read; `rested` is whether that keeps to the share of a core."""
+        return rested
+
+    def state(self, results: Results | None) -> str:
+        """Return how the evaluation stands: "starting", or as its last run says."""
+        return results.runs[-1].state if results is not None and results.runs else STARTING
+
+    def results(self) -> Results | None:
+        """Return the results as they are now; None if there are none yet."""
+        try:
+            return Results.load(self._out) if (self._out / FILE).is_file() else None
+        except ConfigError:  # the file is just being made
+            return None
+
+    def _describe(self) -> dict[str, Any]:
+        results = self.results()
+        state = self.state(results)
+        cells = () if results is None else results.cells
+        contenders = [] if results is None else results.contenders
+        left_s = _left_s(results) if results is not None and state == RUNNING else None
+        failed = [(cell, one) for cell in cells for one in cell.episodes if _failed(one)]
+        failed.sort(key=lambda found: found[1].finished, reverse=True)
+        return {
+            "name": self._out.name,
+            "state": state,
+            "reason": self.reason[:_TEXT],
+            "ends": None if left_s is None else time.time() + left_s,
+            "goes_on": self.goes_on,
+            "contenders": contenders,
+            "tasks": list(dict.fromkeys(cell.task for cell in cells)),
+            "done": sum(_done(cell) for cell in cells),
+            "planned": sum(_planned(cell) for cell in cells),
+            "retries": sum(attempt.retried for cell in cells for attempt in cell.attempts),
+            "cells": [_cell(cell) for cell in cells],
+            "curves": [] if results is None else _curves(results),
+            "failed": len(failed),
+            "failures": [self._failure(cell, one) for cell, one in failed[:_FAILURES]],
+        }
+
+    def _failure(self, cell: CellResults, one: Episode) -> dict[str, Any]:
+        result = one.result
+        return {
+            "key": str(result.key),
+            "policy": cell.contender,
+            "task": cell.task,
+            "episode": result.key.episode,
+            "seed": result.key.seed,
+            "outcome": outcome(result),
+            "error": (result.error or "")[:_TEXT],
+            "instruction": result.instruction[:_TEXT],
+            "steps": result.steps,
+            "finished": one.finished,
+            "videos": [self._number(video) for video in one.videos],
+        }
+
+    def _number(self, video: str) -> int:
+        if video not in self._numbers:
+            self._numbers[video] = len(self._videos)
+            self._videos.append(video)
+        return self._numbers[video]
+
+
+def _left_s(results: Results) -> float | None:
+    """Return how long the last run takes from now on, if episodes go on to take as long as those of it so far."""
+    run = results.runs[-1]
+    played = sum(one.run == run.run for cell in results.cells for one in cell.episodes)
+    left = sum(_planned(cell) - _done(cell) for cell in results.cells)
+    return seconds_left(left, played, time.time() - run.started)
+
+
+def _failed(one: Episode) -> bool:
+    return not one.beyond and not one.result.success_once
+
+
+def _done(cell: CellResults) -> int:
+    """Return the number of episodes with a result, those that infrastructure lost included."""
+    return sum(not one.beyond for one in cell.episodes)
+
+
+def _planned(cell: CellResults) -> int:
+    return cell.planned if cell.stopped_at is None else _done(cell)
+
+
+def _cell(cell: CellResults) -> dict[str, Any]:
+    counts = {"policy": cell.contender, "task": cell.task, "done": _done(cell), "planned": _planned(cell)}
+    stopped = {"stopped": cell.stopped_at is not None, "sequence": cell.stop is not None}
+    return counts | stopped | _rate(rate_of([cell], "success_once"))
+
+
+def _rate(rate: Rate) -> dict[str, Any]:
+    low, high = rate.interval
+    return {"successes": rate.successes, "episodes": rate.episodes, "rate": rate.rate, "low": low, "high": high}
+
+
+def _curves(results: Results) -> list[dict[str, Any]]:
+    """Return the learning curve of each policy that has several steps or versions: its success rate at each."""
+    points: dict[str, list[dict[str, Any]]] = {}
+    for contender in results.contenders:
+        cells = results.of(contender)
+        if cells[0].step is not None:
+            whole = all(_done(cell) == _planned(cell) for cell in cells)
+            point = {"step": cells[0].step, "whole": whole} | _rate(rate_of(cells, "success_once"))
+            points.setdefault(cells[0].policy, []).append(point)
+    return [{"policy": policy, "points": found} for policy, found in points.items()]

@@ -1,0 +1,318 @@
+"""Runs the trials of an evaluation on a robot, and writes the results when all of them have their verdicts."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import logging
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from vlagents_ray.errors import ConfigError, VLAgentsError
+from vlagents_ray.evaluate.artifacts.provenance import driver_code, save_diffs, versions
+from vlagents_ray.evaluate.artifacts.storage import storing
+from vlagents_ray.evaluate.episode.failures import Failure, explain
+from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult
+from vlagents_ray.evaluate.plan.cases import EvalCase, cells
+from vlagents_ray.evaluate.plan.config import EvalConfig
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey
+from vlagents_ray.evaluate.results.database import FILE as RESULTS
+from vlagents_ray.evaluate.results.stopping import Stopping
+from vlagents_ray.evaluate.results.store import Store, changed
+from vlagents_ray.evaluate.results.summary import Summary
+from vlagents_ray.evaluate.robot.operator import Operator, Verdict, VisibleTrial
+from vlagents_ray.evaluate.robot.pictures import save_start, start_pictures
+from vlagents_ray.evaluate.robot.schedule import Trial, schedule
+from vlagents_ray.evaluate.robot.trial import PlayedTrial, WatchedRobot, play, rehearse
+from vlagents_ray.evaluate.robot.trial_log import LoggedTrial, TrialLog, logged_plan
+from vlagents_ray.evaluate.run import conclude
+from vlagents_ray.evaluate.workers.agents import AgentFactory, agents
+from vlagents_ray.ray_tools.private import output_printer, set_output_printer
+from vlagents_ray.registry import require
+from vlagents_ray.robot.loop import Robot, import_class
+
+RECORDINGS = "recordings"
+_LOGGERS = ("vlagents_ray", "ray", "ray.serve", "websockets", "asyncio")  # their messages may name a policy
+
+
+class TrialsInterrupted(KeyboardInterrupt):
+    """The operator or a signal ended an evaluation on a robot; `resume` goes on with the next trial.
+
+    It says nothing of the results, as the trials to come would not be blind.
+    """
+
+
+def evaluate_on_robot(
+    config: EvalConfig,
+    operator: Operator,
+    *,
+    robot: Robot | None = None,
+    agent_factory: AgentFactory | None = None,
+) -> Summary:
+    """Play every trial of `config` that has no result yet, and write the results to `config.out`.
+
+    A trial's policy is drawn (`schedule`). Until the last verdict the folder, and what is printed and logged, do not
+    tell it: verdicts go to `trials.jsonl` (`TrialLog`), and results.db, summary.json and report.html are written at the
+    end, as those of a simulation are. With `config.stop`, a task ends once all its cells have stopped, since trials of
+    the others alone would name their policy.
+
+    Args:
+        config: The policies, with their URLs, and the plan, with `robot`.
+        operator: The person at the robot.
+        robot: The robot; by default one of the class `config.robot.arm`.
+        agent_factory: Called with a policy to make its agent for a trial, in place of a connection to its `url`.
+
+    Returns:
+        The summary of all results in `config.out`.
+
+    Raises:
+        ConfigError: The settings are invalid or contradict the log in `config.out`, or a policy changed between trials.
+        MissingDependency: Trials are to be recorded, and the extra "record" is not installed.
+        StorageFailed: The disk is full, or cannot be written to.
+        TrialsInterrupted: The operator ended the evaluation, or Ctrl-C did.
+        VLAgentsError: A policy cannot be reached, or fails, before the first trial.
+    """
+    planned = planned_cells(config)
+    if config.record != "none":
+        for module in ("av", "pyarrow"):
+            require(module)
+    factory = agent_factory or agents(config, None, "robot")
+    if robot is None:
+        robot = import_class("--robot", str(planned[0].on_robot[0].arm))()
+    watched = WatchedRobot(robot, operator)
+    with TrialLog(config, planned) as log:
+        trials = schedule(planned, log.key)
+        run = _RemainingTrials(config, operator, watched, factory, log, trials)
+        try:
+            with _quiet():
+                run.play()
+        except KeyboardInterrupt:
+            raise TrialsInterrupted(
+                f"interrupted after {len(log.finished)} of {len(trials)} trials; go on with --resume --out {config.out}"
+            ) from None
+    return _write_results(config, planned, log, "complete")
+
+
+def unblind(out: Path, key: str | None = None) -> Summary:
+    """Write the results of the trials that have a verdict, before all have one; trials after it are not blind.
+
+    Args:
+        out: The folder of an evaluation on a robot.
+        key: The plan's key; None: the one that was drawn for the folder.
+
+    Returns:
+        The summary of these results.
+
+    Raises:
+        ConfigError: The folder has no trials, or they are of another key.
+    """
+    config = logged_plan(out, key).model_copy(update={"out": out, "resume": True})
+    planned = planned_cells(config)
+    with TrialLog(config, planned) as log:
+        log.note_unblinded()
+    return _write_results(config, planned, log, "interrupted")
+
+
+def planned_cells(config: EvalConfig) -> list[EvalCase]:
+    """The cells of a plan on a robot.
+
+    Raises:
+        ConfigError: The plan has no robot, or settings that have no meaning on one.
+    """
+    if config.real_robot is None:
+        raise ConfigError("robot: got no robot, want `robot: {tasks: …}` in the plan and the class of one (--robot)")
+    if any(policy.pushed_weights is not None for policy in config.policies):
+        raise ConfigError("pushed_weights: got some with a robot, want checkpoints; leave them out")
+    if config.track:
+        raise ConfigError("track: got trackers with a robot, which would show the rates too early; leave them out")
+    return cells(config)
+
+
+class _RemainingTrials:
+    """The trials that are left, one after the other."""
+
+    def __init__(
+        self,
+        config: EvalConfig,
+        operator: Operator,
+        robot: WatchedRobot,
+        factory: AgentFactory,
+        log: TrialLog,
+        trials: Sequence[Trial],
+    ) -> None:
+        self._config = config
+        self._operator = operator
+        self._robot = robot
+        self._factory = factory
+        self._log = log
+        self._trials = trials
+        self._message = ""  # for the operator, of the trial before
+        self._stopping: dict[tuple[str, str], dict[str, Stopping]] = {}  # by task and cell
+        for trial in trials:
+            cell = trial.job.cell
+            if config.stop is not None:
+                found = self._stopping.setdefault(trial.task, {})
+                found.setdefault(cell.fingerprint, Stopping(config.stop, cell.suite.seeds, cell.planned))
+        for number, logged in log.finished.items():
+            self._count(trials[number - 1], result_of(trials[number - 1], logged))
+
+    def play(self) -> None:
+        """Play all trials that are left."""
+        left = [trial for trial in self._trials if trial.number not in self._log.finished and not self._is_over(trial)]
+        if not left:
+            return
+        obs = self._robot.observe()
+        policies = {trial.job.cell.contender: trial.job.cell for trial in left}
+        for _, cell in sorted(policies.items(), key=lambda one: one[0]):  # which tells nothing of the trials' order
+            rehearse(cell, self._factory, self._operator, obs)
+        for trial in left:
+            while not self._is_over(trial) and trial.number not in self._log.finished:
+                self._play(trial)
+
+    def _play(self, trial: Trial) -> None:
+        attempt = self._log.next_attempt(trial.number)
+        view = self._visible(trial, attempt)
+        if not self._operator.prepare(view, self._robot.observe):
+            raise KeyboardInterrupt
+        if all(self._trials[number - 1].place != trial.place for number in self._log.finished):
+            with storing(self._config.out):
+                save_start(self._config.out, trial.place, self._robot.observe())
+        self._log.begin(trial.number, attempt)
+        try:
+            played = play(trial, self._robot, self._factory, self._operator, self._recording(trial, attempt))
+        except VLAgentsError as error:
+            failure = explain(error)
+            why = failure.message if failure.code == "env_failed" else f"it could not be played ({failure.code})"
+            self._log.end(
+                trial.number,
+                attempt,
+                {"again": why, "cause": "worker" if failure.code == "env_failed" else "policy"},
+                dataclasses.asdict(failure),
+            )
+            return
+        self._require_same_policy(trial, played)
+        if played.result.status == "policy_error":
+            self._record(trial, attempt, played, Verdict("failure", note=played.ending), played.result)
+            self._message = f"trial {trial.number}: {played.ending}, so it counts as a failure"
+            return
+        self._message = ""
+        verdict = self._operator.judge(view, played.ending)
+        score = verdict.score(view.rubric)
+        if verdict.outcome == "repeat":
+            self._log.end(trial.number, attempt, {"again": verdict.note, "cause": "operator"}, {})
+            return
+        self._record(trial, attempt, played, verdict, played.judged(verdict, score))
+
+    def _record(self, trial: Trial, attempt: int, played: PlayedTrial, verdict: Verdict, result: EpisodeResult) -> None:
+        seen = {
+            "outcome": verdict.outcome,
+            "earned": sorted(set(verdict.earned)),
+            "note": verdict.note,
+            "score": result.episode_return,
+            "ending": played.ending,
+        }
+        sealed = {"result": dataclasses.asdict(result), "metadata": played.metadata}
+        self._log.end(trial.number, attempt, seen, sealed)
+        self._count(trial, result)
+
+    def _count(self, trial: Trial, result: EpisodeResult) -> None:
+        if self._config.stop is not None:
+            self._stopping[trial.task][trial.job.cell.fingerprint].add(result)
+
+    def _is_over(self, trial: Trial) -> bool:
+        stopping = self._stopping.get(trial.task)
+        return stopping is not None and all(one.at is not None for one in stopping.values())
+
+    def _visible(self, trial: Trial, attempt: int) -> VisibleTrial:
+        (robot, task), again = trial.job.cell.on_robot, self._log.why_again(trial.number)
+        return VisibleTrial(
+            number=trial.number,
+            total=len(self._trials),
+            task=" ".join(filter(None, trial.task)),
+            scene=trial.scene,
+            attempt=attempt,
+            instruction=task.instruction,
+            setup=task.setup,
+            seconds=task.max_steps / robot.hz,
+            rubric=task.rubric,
+            start=start_pictures(self._config.out, trial.place),
+            message=f"played again: {again}" if again else self._message,
+        )
+
+    def _recording(self, trial: Trial, attempt: int) -> Path | None:
+        if self._config.record == "none":
+            return None
+        return self._config.out / RECORDINGS / f"trial{trial.number:04d}-{attempt}"
+
+    def _require_same_policy(self, trial: Trial, played: PlayedTrial) -> None:
+        """Raise `ConfigError` if the policy is another than before; it names neither the policy nor its trials."""
+        cell = trial.job.cell
+        now = {name: getattr(played.result, name) for name in ("checkpoint", "weights")}
+        for number, logged in self._log.finished.items():
+            other = self._trials[number - 1].job.cell
+            if other.policy.name != cell.policy.name:
+                continue
+            what = changed(logged.sealed["metadata"], played.metadata, swept=cell.step is not None)
+            if what is None and other.contender == cell.contender:
+                before = logged.sealed["result"]
+                what = next((name for name in now if now[name] and before[name] and now[name] != before[name]), None)
+            if what is not None:
+                raise ConfigError(
+                    f"the {what} of a policy has changed since its earlier trials; serve all policies as before and go "
+                    "on with --resume, or choose another out folder"
+                )
+
+
+def result_of(trial: Trial, logged: LoggedTrial) -> EpisodeResult:
+    """Return the result of a finished trial."""
+    sealed = dict(logged.sealed["result"])
+    sealed["key"] = EpisodeKey(**sealed["key"])
+    if sealed["key"] != trial.job.key:
+        raise ConfigError(f"trial {trial.number}: its result is of another plan; choose another out folder")
+    return EpisodeResult(**sealed)
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep what this package, Ray and its processes log off the terminal: it may name the policy."""
+    loggers = {name: logging.getLogger(name) for name in _LOGGERS}
+    levels = {name: logger.level for name, logger in loggers.items()}
+    printer = output_printer()
+    set_output_printer(lambda *_, **__: None)
+    for logger in loggers.values():
+        logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        for name, logger in loggers.items():
+            logger.setLevel(levels[name])
+        set_output_printer(printer)
+
+
+def _write_results(config: EvalConfig, planned: Sequence[EvalCase], log: TrialLog, state: str) -> Summary:
+    """Write results.db as an evaluation in simulation does, from all that the log has; it replaces an earlier one."""
+    trials = schedule(planned, log.key)
+    with storing(config.out):
+        for name in (RESULTS, f"{RESULTS}-wal", f"{RESULTS}-shm"):
+            (config.out / name).unlink(missing_ok=True)
+    with Store(config.model_copy(update={"resume": True})) as store, storing(config.out):
+        store.begin_run(config, versions(), log.started)
+        save_diffs(config.out, driver_code().values())
+        for place in {cell.place: cell for cell in planned}.values():
+            store.note_env(place.place, EnvInfo({"robot": place.on_robot[0].arm}, {}))
+        for logged in log.attempts:
+            trial = trials[logged.trial - 1]
+            job = dataclasses.replace(trial.job, attempt=logged.attempt)
+            if not logged.finished:
+                store.record_attempt(job, _failure(logged), retried=True)
+                continue
+            if logged.sealed["metadata"]:
+                store.note_policy(trial.job.cell.policy.name, logged.sealed["metadata"])
+            store.record(result_of(trial, logged), logged.attempt, finished=logged.at)
+        return conclude(config, store, state)
+
+
+def _failure(logged: LoggedTrial) -> Failure:
+    if logged.seen["cause"] == "operator":
+        return Failure("operator", "trial_repeated", logged.seen["again"])
+    return Failure(**logged.sealed)

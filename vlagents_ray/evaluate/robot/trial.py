@@ -1,0 +1,237 @@
+"""One trial: a policy drives the robot until the task's time is over, the policy is done, or the operator stops it."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.errors import (
+    CheckpointFailed,
+    ConnectionLost,
+    DeadlineExceeded,
+    EnvFailed,
+    InvalidAction,
+    NoReplica,
+    OutcomeUnknown,
+    PolicyFailed,
+    PolicyUnavailable,
+)
+from vlagents_ray.evaluate.episode.episode import transport_of
+from vlagents_ray.evaluate.episode.failures import env_side, policy_side
+from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.episode.stats import EpisodeStats
+from vlagents_ray.evaluate.plan.cases import EvalCase
+from vlagents_ray.evaluate.plan.config import RobotConfig
+from vlagents_ray.evaluate.plan.jobs import EpisodeKey
+from vlagents_ray.evaluate.robot.operator import Operator, Verdict
+from vlagents_ray.evaluate.robot.schedule import Trial
+from vlagents_ray.evaluate.workers.agents import AgentFactory
+from vlagents_ray.interface import Act, Agent, Obs
+from vlagents_ray.robot import Guard, LoopReport, Robot, Watchdog, run_loop
+from vlagents_ray.robot.record import Recorder
+from vlagents_ray.robot.safety import measured_state
+
+_WAIT_S = 1.0  # deadline of a tick in the modes that wait for an answer
+_ENDINGS = {"policy_done": "the policy considers the task finished", "truncated": "the time is over"}
+_LOST = {one.code for one in (PolicyUnavailable, NoReplica, ConnectionLost, DeadlineExceeded, OutcomeUnknown)}
+_STOPPED = "stopped by the operator"
+
+
+@dataclass(frozen=True, slots=True)
+class PlayedTrial:
+    """A trial that was played, before its verdict."""
+
+    result: EpisodeResult  # without success
+    metadata: dict[str, Any]  # of the policy's server
+    ending: str  # in words that do not depend on the policy
+
+    def judged(self, verdict: Verdict, score: float) -> EpisodeResult:
+        """Return the result with the verdict: a partial success is none in the rates, its score is the return."""
+        success = verdict.outcome == "success"
+        return replace(
+            self.result,
+            success_once=success,
+            success_at_end=success,
+            first_success=self.result.steps if success else None,
+            episode_return=score,
+        )
+
+
+class WatchedRobot(Robot):
+    """A robot whose errors are `EnvFailed`, and whose observations the operator sees."""
+
+    def __init__(self, robot: Robot, operator: Operator) -> None:
+        self._robot = robot
+        self._operator = operator
+        self.simulated = getattr(robot, "simulated", False)
+        self.stats: EpisodeStats | None = None  # of the running trial
+
+    def observe(self) -> Obs:
+        """Read the sensors."""
+        with env_side("robot, observe"):
+            return self._robot.observe()
+
+    def apply(self, action: np.ndarray) -> None:
+        """Command an action, and count it."""
+        with env_side("robot, apply"):
+            self._robot.apply(action)
+        if self.stats is not None:
+            self.stats.steps += 1
+            self.stats.actions.update(action.astype("<f4", copy=False).tobytes())
+
+    def stop(self) -> None:
+        """Bring the robot to rest."""
+        with env_side("robot, stop"):
+            self._robot.stop()
+
+
+class _CountingPlayer(ChunkPlayer):
+    """A chunk player that records what the policy's answers say of themselves."""
+
+    def __init__(self, agent: Agent, stats: EpisodeStats, operator: Operator, **settings: Any) -> None:
+        super().__init__(agent, **settings)
+        self._stats = stats
+        self._operator = operator
+        self._chunk = -1
+
+    def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:
+        with policy_side("reset"):
+            info = super().reset(obs, instruction, **kwargs)
+        self._stats.began(info)
+        return info
+
+    def act(self, obs: Obs) -> Act:
+        self._operator.watch(obs)
+        with policy_side("act"):
+            act = super().act(obs)
+        number = act.info.get("chunk", self._chunk)
+        if number != self._chunk:
+            self._chunk = number
+            self._stats.acted(act, act.info.get("timing", {}).get("round_trip_ms", 0.0) / 1e3, None)
+        return act
+
+
+def play(
+    trial: Trial, robot: WatchedRobot, factory: AgentFactory, operator: Operator, recording: Path | None
+) -> PlayedTrial:
+    """Play one attempt at a trial. The robot is stopped however it ends.
+
+    Args:
+        trial: The trial.
+        robot: The robot.
+        factory: Makes the policy's agent.
+        operator: Watches, and may stop the trial.
+        recording: The folder of a new dataset with the attempt; None records nothing.
+
+    Returns:
+        The trial; with the status "policy_error" if the policy failed.
+
+    Raises:
+        VLAgentsError: The robot or the connection to the policy failed.
+    """
+    cell = trial.job.cell
+    settings, task = cell.on_robot
+    deadline_s = _deadline_s(settings)
+    stats = robot.stats = EpisodeStats(trial.job.key, instruction=task.instruction)
+    watchdog = Watchdog(
+        lambda _: robot.stop(), {"server": settings.silent_s, "loop": max(0.2, 5 / settings.hz) + deadline_s}
+    )
+    stopped = False
+
+    def until() -> bool:
+        nonlocal stopped
+        stopped = stopped or operator.stops()
+        return stopped or watchdog.stopped
+
+    with contextlib.ExitStack() as stack:
+        stack.callback(setattr, robot, "stats", None)
+        agent, player = stack.enter_context(_player(cell, factory, stats, operator))
+        recorder = None if recording is None else stack.enter_context(Recorder(recording, settings.hz))
+        failed, report = None, LoopReport(settings.hz)
+        try:
+            report = run_loop(
+                robot,
+                player,
+                hz=settings.hz,
+                seconds=task.max_steps / settings.hz,
+                instruction=task.instruction,
+                reset_options={**cell.policy_options, "env": cell.env, "seed": trial.job.key.seed},
+                watchdog=watchdog,
+                restart="manual",
+                recorder=recorder,
+                until=until,
+            )
+        except CheckpointFailed:
+            raise
+        except PolicyFailed as error:
+            failed = error
+        _require_alive(report)
+        stats.ending = "policy_done" if report.done else "terminated" if stopped else "truncated"
+        stats.ticks_held = report.safe_ticks
+        result = stats.result(transport_of(agent), failed)
+        ending = "the policy failed" if failed is not None else _ENDINGS.get(stats.ending, _STOPPED)
+        return PlayedTrial(replace(result, env_seconds=None), dict(getattr(agent, "metadata", {})), ending)
+
+
+def rehearse(cell: EvalCase, factory: AgentFactory, operator: Operator, obs: Obs) -> None:
+    """Let a policy answer once, without moving the robot.
+
+    A mistake in the settings shows before the first trial, and what a policy does at its first answer, such as
+    compiling, takes no time of a trial, by which the policy could be told.
+    """
+    _, task = cell.on_robot
+    unused = EpisodeStats(EpisodeKey(cell.env, 0, 0, cell.fingerprint))
+    with _player(cell, factory, unused, operator) as (_, player):
+        player.initialize()
+        with contextlib.suppress(InvalidAction):  # which is a failure of the policy in a trial
+            player.reset(obs, task.instruction, **cell.policy_options)
+            player.act(obs)
+
+
+@contextlib.contextmanager
+def _player(
+    cell: EvalCase, factory: AgentFactory, stats: EpisodeStats, operator: Operator
+) -> Iterator[tuple[Agent, ChunkPlayer]]:
+    """Yield a policy's agent and its player with the plan's settings; both are closed at the end."""
+    settings, _ = cell.on_robot
+    agent = factory(cell.policy)
+    with contextlib.ExitStack() as unplayed:
+        unplayed.callback(agent.close)
+        agent.initialize()
+        player = _CountingPlayer(
+            agent,
+            stats,
+            operator,
+            mode=settings.mode,
+            execute=cell.policy.execute,
+            deadline_s=_deadline_s(settings),
+            max_age_s=settings.max_age_s,
+            safe=settings.safe,
+            check=Guard(agent.contract, max_step=settings.max_step, measure=measured_state(settings.measure)),
+        )
+        unplayed.pop_all()  # the player closes it
+    with player:
+        yield agent, player
+
+
+def _deadline_s(settings: RobotConfig) -> float:
+    if settings.deadline_s is not None:
+        return settings.deadline_s
+    return 0.0 if settings.mode == "async" else _WAIT_S
+
+
+def _require_alive(report: LoopReport) -> None:
+    """Raise for a trial that the connection or the robot decided: infrastructure failures are not the policy's."""
+    for bark in report.barks:
+        if bark.startswith("server"):
+            raise PolicyUnavailable(f"the policy's server was silent: {bark}")
+        raise EnvFailed(f"robot: the control loop was held up: {bark}")
+    lost = sum(ticks for reason, ticks in report.safe.items() if reason.partition(":")[0] in _LOST)
+    if 2 * lost > report.jitter.get("ticks", 0):
+        raise PolicyUnavailable(f"the policy's server could not be reached in {lost} ticks: {sorted(report.safe)}")

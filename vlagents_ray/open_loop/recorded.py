@@ -1,0 +1,276 @@
+"""LeRobotDatasets as observations: those that a server recorded, and public ones (v3.0, v2.1 and v2.0)."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.contract import Contract
+from vlagents_ray.dataset_contract import GRIPPER, INFO, DatasetContract
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.images import jpeg_png
+from vlagents_ray.interface import CAPTURED, Obs
+from vlagents_ray.naming import did_you_mean
+from vlagents_ray.protocol.budget import Budget
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS
+from vlagents_ray.protocol.values import from_text
+from vlagents_ray.registry import require
+from vlagents_ray.robot.episode import ACTION, ENVIRONMENT, IMAGES, STATE
+from vlagents_ray.serve.recording.episodes import CHUNK, ROWS, SESSION, TRACE
+
+_PICTURES = ("video", "image")  # dtypes
+_JOINTS = "joints"  # part that `observation.state` is, if nothing else is known
+
+
+@dataclass(frozen=True, slots=True)
+class Names:
+    """How a policy names what a dataset without a contract of ours holds."""
+
+    cameras: Mapping[str, str] = field(default_factory=dict)  # policy's camera -> camera or feature of the dataset
+    state: Sequence[str] | None = None  # parts side by side in `observation.state`; "gripper" is `Obs.gripper`
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedStep:
+    """A frame of an episode."""
+
+    frame: int
+    obs: Obs
+    expected: np.ndarray  # (H, D): the answer that was recorded, or the actions from here on to the end of the episode
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedEpisode:
+    """An episode of a dataset."""
+
+    dataset: RecordedDataset
+    index: int
+    length: int
+    instruction: str
+    places: Mapping[str, Any]  # its row in `meta/episodes`
+
+
+@dataclass(frozen=True, slots=True)
+class RecordedSession:
+    """The episodes of one session in their order; of a public dataset, one episode."""
+
+    parts: tuple[RecordedEpisode, ...]
+    options: Mapping[str, Any]  # of the reset
+
+
+class RecordedDataset:
+    """A dataset that is read, not written."""
+
+    def __init__(self, root: Path) -> None:
+        """Open a dataset; raises `ConfigError` if there is none that can be read."""
+        self.root = root
+        self._pq: Any = require("pyarrow.parquet")
+        self._av: Any = require("av")
+        self.info: dict[str, Any] = json.loads((root / "meta/info.json").read_text())
+        self.version = str(self.info.get("codebase_version"))
+        if not self.version.startswith(("v3.", "v2.")):
+            raise ConfigError(f"{root}: got a LeRobotDataset {self.version}, want v3.0, v2.1 or v2.0; convert it")
+        self.features: dict[str, Any] = self.info["features"]
+        if ACTION not in self.features:
+            raise ConfigError(f"{root}: got features {sorted(self.features)}, want {ACTION!r} among them")
+        about = self.info.get(INFO)
+        self.contract = None if about is None else DatasetContract.from_json(about)
+        self.traced = TRACE in self.info and CHUNK in self.features
+
+    @property
+    def joints(self) -> list[str]:
+        """The names of the numbers of an action."""
+        names = self.features[ACTION].get("names")
+        if isinstance(names, Mapping):  # {"motors": [...]}
+            names = [name for group in names.values() for name in group]
+        [dim] = self.features[ACTION]["shape"]
+        return [str(name) for name in names] if names and len(names) == dim else [f"{ACTION}_{i}" for i in range(dim)]
+
+    def plays(self, chosen: Sequence[int] | None = None) -> list[RecordedSession]:
+        """Return the sessions of the dataset, of all its episodes or of those chosen; raises `ConfigError`."""
+        parts = self._parts()
+        if chosen is not None:
+            if missing := sorted(set(chosen) - {part.index for part in parts}):
+                raise ConfigError(f"{self.root}: has {len(parts)} episodes, got {missing} among those to replay")
+            parts = [part for part in parts if part.index in set(chosen)]
+        if not self.traced:
+            return [RecordedSession((part,), {}) for part in parts]
+        sessions: dict[int, list[tuple[RecordedEpisode, dict[str, list[Any]]]]] = {}
+        for part in parts:
+            columns = self._rows(part, [SESSION, "tick", "reset"])
+            sessions.setdefault(columns[SESSION][0], []).append((part, columns))
+        return [
+            RecordedSession(tuple(part for part, _ in found), _values(found[0][1]["reset"][0]))
+            for found in sessions.values()
+        ]
+
+    def gaps(self, part: RecordedEpisode) -> int:
+        """Return the number of acts that are missing within an episode that was traced."""
+        ticks = np.array(self._rows(part, ["tick"])["tick"]) if self.traced else np.zeros(0, np.int64)
+        return int((np.diff(ticks) - 1).clip(0).sum())
+
+    def steps(self, part: RecordedEpisode, names: Names, policy: Contract | None) -> Iterator[RecordedStep]:
+        """Yield the frames of an episode, as a policy with that contract names its inputs."""
+        pictures = [name for name, one in self.features.items() if one["dtype"] in _PICTURES]
+        images = [name for name in pictures if self.features[name]["dtype"] == "image"]
+        traced = [CHUNK, ROWS, "request", "captured_at"] if self.traced else []
+        numbers = [name for name in (ACTION, STATE, ENVIRONMENT) if name in self.features]
+        rows = self._rows(part, [*numbers, *images, *traced])
+        actions = np.array(rows[ACTION], np.float32).reshape(part.length, -1)
+        cameras = self._cameras(pictures, names)
+        states = self._states(names, policy)
+        videos = {name: self._video(part, name) for name in cameras if name not in images}
+        for i in range(part.length):
+            shown = {}
+            for name, camera in cameras.items():
+                image = next(videos[name]) if name in videos else _image(rows[name][i])
+                shown[camera] = self._cropped(image, camera)
+            state, gripper = _state_of({name: rows[name][i] for name in states}, states)
+            info = {}
+            expected = actions[i:]
+            if traced:
+                info = {CAPTURED: rows["captured_at"][i], **_values(rows["request"][i])}
+                expected = np.array(rows[CHUNK][i], np.float32).reshape(-1, actions.shape[1])[: rows[ROWS][i]]
+            yield RecordedStep(i, Obs(shown, gripper, state, info), expected)
+
+    def _parts(self) -> list[RecordedEpisode]:
+        if self.version.startswith("v2."):
+            lines = (self.root / "meta/episodes.jsonl").read_text().splitlines()
+            rows = [json.loads(line) for line in lines if line.strip()]
+        else:
+            files = sorted(self.root.glob("meta/episodes/*/*.parquet"))
+            named = [self._pq.read_schema(file).names for file in files]
+            columns = [[name for name in names if not name.startswith("stats/")] for names in named]
+            tables = [self._pq.read_table(file, columns=kept) for file, kept in zip(files, columns, strict=True)]
+            rows = [row for table in tables for row in table.to_pylist()]
+        rows.sort(key=lambda row: row["episode_index"])
+        return [RecordedEpisode(self, row["episode_index"], row["length"], _task(row), row) for row in rows]
+
+    def _rows(self, part: RecordedEpisode, columns: Sequence[str]) -> dict[str, list[Any]]:
+        file = self.root / self.info["data_path"].format(**self._place(part, "data"))
+        filters = [("episode_index", "=", part.index)]
+        rows: dict[str, list[Any]] = self._pq.read_table(file, columns=list(columns), filters=filters).to_pydict()
+        if any(len(values) != part.length for values in rows.values()):
+            raise ConfigError(f"{file}: has not the {part.length} frames of episode {part.index}; is it complete?")
+        return rows
+
+    def _place(self, part: RecordedEpisode, kind: str) -> dict[str, int]:
+        if self.version.startswith("v2."):
+            return {"episode_index": part.index, "episode_chunk": part.index // int(self.info["chunks_size"])}
+        return {name: part.places[f"{kind}/{name}"] for name in ("chunk_index", "file_index")}
+
+    def _video(self, part: RecordedEpisode, feature: str) -> Iterator[np.ndarray]:
+        """Yield the images of an episode, (H, W, 3) uint8 RGB."""
+        place = self._place(part, f"videos/{feature}")
+        file = self.root / self.info["video_path"].format(video_key=feature, **place)
+        start_s = float(part.places.get(f"videos/{feature}/from_timestamp") or 0)
+        with self._av.open(str(file)) as container:
+            [stream, *_] = container.streams.video
+            if start_s:
+                container.seek(int(start_s / stream.time_base), stream=stream)
+            for frame in container.decode(stream):
+                if frame.time >= start_s - 0.5 / self.info["fps"]:
+                    yield frame.to_ndarray(format="rgb24")
+        raise ConfigError(f"{file}: has fewer than the {part.length} frames of episode {part.index}")
+
+    def _cameras(self, pictures: Sequence[str], names: Names) -> dict[str, str]:
+        """Return the policy's name of each feature that holds pictures."""
+        known = {} if self.contract is None else self.contract.cameras
+        own = {feature: known.get(feature, feature.removeprefix(IMAGES)) for feature in pictures}
+        if not names.cameras:
+            return own
+        found = {camera: feature for feature, camera in own.items()} | {feature: feature for feature in pictures}
+        if unknown := [name for name in names.cameras.values() if name not in found]:
+            raise ConfigError(
+                f"--cameras: {self.root} has no {unknown[0]!r}, want some of {sorted(own.values())}"
+                f"{did_you_mean(unknown[0], found)}"
+            )
+        return {found[name]: camera for camera, name in names.cameras.items()}
+
+    def _states(self, names: Names, policy: Contract | None) -> dict[str, list[tuple[str, int]]]:
+        """Return the parts, and their widths, of each feature that is a state."""
+        widths = {name: int(self.features[name]["shape"][0]) for name in (STATE, ENVIRONMENT) if name in self.features}
+        about = self.contract
+        if about is not None and names.state is None:
+            specs = about.contract.state or {}
+            order = {STATE: about.state, ENVIRONMENT: about.environment}
+            return {name: [(part, _dim(specs, part)) for part in order[name]] for name in widths}
+        found: dict[str, list[tuple[str, int]]] = {}
+        if ENVIRONMENT in widths:
+            found[ENVIRONMENT] = [(ENVIRONMENT.rpartition(".")[2], widths[ENVIRONMENT])]
+        if STATE in widths:
+            found[STATE] = _parts_of(names.state, widths[STATE], policy)
+        return found
+
+    def _cropped(self, image: np.ndarray, camera: str) -> np.ndarray:
+        """Return the image without the row and the column that made the size of its video even."""
+        spec = None if self.contract is None else (self.contract.contract.cameras or {}).get(camera)
+        if spec is None or spec.height is None or spec.width is None:
+            return image
+        return np.ascontiguousarray(image[: spec.height, : spec.width])
+
+
+def find_datasets(folder: Path) -> list[Path]:
+    """Return the dataset that a folder is, or those in it."""
+    return [path.parents[1] for pattern in ("", "*/") for path in sorted(folder.glob(f"{pattern}meta/info.json"))]
+
+
+def _parts_of(chosen: Sequence[str] | None, width: int, policy: Contract | None) -> list[tuple[str, int]]:
+    """Divide a state of `width` numbers into parts: those chosen, or those that the policy wants, or the joints."""
+    specs = dict((policy and policy.state) or {})
+    usual = [*specs, *([GRIPPER] if policy is not None and policy.gripper else [])]
+    parts = list(chosen if chosen is not None else usual or [_JOINTS])
+    dims: dict[str, int | None] = {
+        part: 1 if part == GRIPPER else specs[part].dim if part in specs else None for part in parts
+    }
+    unknown = [part for part, dim in dims.items() if dim is None]
+    left = width - sum(dim or 0 for dim in dims.values())
+    if len(unknown) == 1:
+        dims[unknown[0]] = left
+    if left < (len(unknown) == 1) or len(unknown) > 1 or sum(dim or 0 for dim in dims.values()) != width:
+        raise ConfigError(
+            f"observation.state: got {width} numbers, want them divided into {parts} of the policy, of which the sizes "
+            f"are {dims}; name the parts in their order: --state joints,gripper"
+        )
+    return [(part, dim or 0) for part, dim in dims.items()]
+
+
+def _dim(specs: Mapping[str, Any], part: str) -> int:
+    return int(specs[part].dim or 0) if part in specs else 1
+
+
+def _state_of(
+    rows: Mapping[str, Any], states: Mapping[str, Sequence[tuple[str, int]]]
+) -> tuple[dict[str, np.ndarray], float | None]:
+    state: dict[str, np.ndarray] = {}
+    gripper = None
+    for name, parts in states.items():
+        values, place = np.atleast_1d(np.array(rows[name], np.float32)), 0
+        for part, dim in parts:
+            if part == GRIPPER and dim == 1:
+                gripper = float(values[place])
+            else:
+                state[part] = values[place : place + dim]
+            place += dim
+    return state, gripper
+
+
+def _image(value: Mapping[str, Any]) -> np.ndarray:
+    """Decode a picture that lies in the table."""
+    if not value.get("bytes"):
+        raise ConfigError(f"a picture is at {value.get('path')!r}, want its bytes in the table; LeRobot embeds them")
+    return jpeg_png.decode(value["bytes"], DEFAULT_LIMITS.pixels)
+
+
+def _task(row: Mapping[str, Any]) -> str:
+    return str(row["tasks"][0]) if row.get("tasks") else ""
+
+
+def _values(text: str) -> dict[str, Any]:
+    found: dict[str, Any] = from_text(text, Budget(DEFAULT_LIMITS)) if text else {}
+    return found

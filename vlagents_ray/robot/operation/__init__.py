@@ -1,0 +1,1 @@
+"""A control loop under the commands of people who watch it."""

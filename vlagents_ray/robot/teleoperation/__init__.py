@@ -1,0 +1,10 @@
+"""What a human moves a robot with: leaders for `ChunkPlayer(..., override=leader)`."""
+
+from vlagents_ray.chunking.takeover import Leader
+from vlagents_ray.robot.teleoperation.agent import TeleoperatedAgent
+from vlagents_ray.robot.teleoperation.axes import AxesDevice, AxesLeader
+from vlagents_ray.robot.teleoperation.keyboard import Keyboard
+from vlagents_ray.robot.teleoperation.relay import RelayedLeader
+from vlagents_ray.robot.teleoperation.spacemouse import SpaceMouse
+
+__all__ = ["AxesDevice", "AxesLeader", "Keyboard", "Leader", "RelayedLeader", "SpaceMouse", "TeleoperatedAgent"]

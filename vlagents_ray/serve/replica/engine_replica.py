@@ -1,0 +1,94 @@
+"""A Serve replica around an engine: the settings of its policy, loading, requests through a handle, and health."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+from vlagents_ray.contract import Contract
+from vlagents_ray.errors import PolicyFailed, VLAgentsError
+from vlagents_ray.protocol.frames import decode_requests
+from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.config.deployment import ServerArgs
+from vlagents_ray.serve.engine.dispatch import Dispatcher
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
+from vlagents_ray.serve.python_env.child_agent import make_agent, version_of
+from vlagents_ray.serve.sessions import SessionFinder
+
+logger = logging.getLogger(__name__)
+
+
+class EngineReplica:
+    """Loads the policy in its first `reconfigure`, so that Serve reports RUNNING only when the policy can act.
+
+    A policy that does not load therefore makes the start fail, with the reason in `serve status`.
+    """
+
+    def _open_engine(
+        self, args: ServerArgs, check: Callable[[Contract | None], None], finder: SessionFinder | None = None
+    ) -> None:
+        """Make the engine, without loading the policy; see `Engine` for the last two arguments."""
+        self._args = args
+        self._limits = args.limits.limits()
+        self._engine = Engine(
+            args.checkpoints.of(partial(make_agent, args), args.config),
+            max_batch_size=args.batch.max_size,
+            patience=args.batch.patience,
+            batch_sizes=args.batch.sizes or (),
+            session_limit=args.sessions.limit,
+            session_idle_s=args.sessions.idle_s,
+            version=version_of(args),
+            check=check,
+            limits=args.limits.call_limits(),
+            reply_bytes=self._limits.reply_bytes,
+            in_flight_bytes=self._limits.in_flight_bytes,
+            finder=finder,
+        )
+        self._configured = False
+
+    async def reconfigure(self, settings: dict[str, Any] | None, rank: Any) -> None:
+        """Apply the file's `user_config`; called by Serve before the replica is ready, and when the settings change.
+
+        An error of the first call makes the start of the replica fail. Later calls return at once and raise nothing, as
+        an error would end the replica: the metadata and the log show the result of the swap. `rank` is not used, but
+        Serve calls a method with this parameter also without a `user_config`.
+        """
+        config = {**self._args.config, **(settings or {})}
+        if self._configured:
+            logger.info("new settings, to be loaded beside the present ones: %s", config)
+        self._engine.models.configure(config)
+        if not self._configured:
+            self._configured = True
+            await self._start()
+
+    async def _start(self) -> None:
+        """Load the policy."""
+        try:
+            await asyncio.to_thread(self._engine.start)
+        except PolicyFailed as error:
+            if not isinstance(error.__cause__, VLAgentsError):
+                raise
+            logger.exception("the policy did not load")
+            # Errors of this package say what to do: `serve status` would show the tracebacks of both before it.
+            raise PolicyFailed(str(error)) from None
+
+    async def _ask(self, session_id: str, frame: Any, trace: RequestTrace) -> tuple[list[Request | Reply], list[Reply]]:
+        """Execute a frame of requests from inside the cluster; return the requests, and their replies."""
+        requests: list[Request | Reply] = []
+        sender = Dispatcher(self._engine, "handle", session_id, caller=NoKey.INSIDE, connected=False)
+        try:
+            admission = sender.admission(self._limits)  # the frame is in plasma
+            requests = await admission.decoded(partial(decode_requests, memoryview(frame)))
+            trace.decoded(requests)
+            return requests, await sender.ask(requests, admission)
+        except VLAgentsError as error:
+            return requests, [Reply(error=error)]
+
+    async def check_health(self) -> None:
+        """Raise if the policy died or hangs; Serve calls this once the policy has loaded, and replaces the replica."""
+        await asyncio.to_thread(self._engine.check_health)  # includes the policy's own check
