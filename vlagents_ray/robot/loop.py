@@ -270,6 +270,7 @@ def _drive(
                 interrupt()
                 report.count(stop)
                 operated.stood()
+                shown.add(obs, act, None, tick, pacer.since_tick_s(), stop)
                 continue
             if reason is not None:
                 report.count(reason)

@@ -125,6 +125,11 @@ def planned_cells(config: EvalConfig) -> list[EvalCase]:
         raise ConfigError("pushed_weights: got some with a robot, want checkpoints; leave them out")
     if config.track:
         raise ConfigError("track: got trackers with a robot, which would show the rates too early; leave them out")
+    if config.rerun or config.foxglove:
+        raise ConfigError(
+            "rerun, foxglove: got one of them with a robot, want neither, since the times and chunks that they show "
+            "tell the policies apart; `record` keeps the trials"
+        )
     return cells(config)
 
 
