@@ -277,6 +277,7 @@ def _drive(
                 interrupt()
                 report.count(stop)
                 operated.stood()
+                shown.add(obs, act, None, tick, pacer.since_tick_s(), stop)
                 continue
             if reason is not None:
                 report.count(reason, paused=takeover is not None and takeover.reason is not None)
