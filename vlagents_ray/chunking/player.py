@@ -12,11 +12,10 @@ import numpy as np
 
 from vlagents_ray.chunking.answer import LastAnswer
 from vlagents_ray.chunking.background import AsyncCaller, parts_of
-from vlagents_ray.chunking.buffer import DELAYS, ENSEMBLE, ENSEMBLE_M, ChunkBuffer, Merge, Step
+from vlagents_ray.chunking.buffer import DELAYS, ENSEMBLE, ENSEMBLE_M, ChunkBuffer, Merge, Mode, Step, require_settings
 from vlagents_ray.chunking.capture_clock import CaptureClock, stamped
 from vlagents_ray.chunking.execution import Execution
 from vlagents_ray.chunking.fallback import LATE, OLD, STALE, STOPPED, WAITING, Safe, SafeAction
-from vlagents_ray.chunking.modes import Mode, require_settings
 from vlagents_ray.chunking.motion import Check, Motion
 from vlagents_ray.chunking.takeover import RELEASED, Leader, Takeover
 from vlagents_ray.contract import ActionSpec, Contract
