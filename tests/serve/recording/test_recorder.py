@@ -235,6 +235,15 @@ def test_an_observation_that_cannot_be_kept_is_a_gap(tmp_path: Path) -> None:
     assert rows(only(tmp_path))["tick"] == [0, 2]
 
 
+def test_more_sessions_than_there_are_encoders_for_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(episodes, "_SESSIONS", 1)
+    with recorded(tmp_path) as server:
+        server.robot().play(2)
+        server.robot().play(3)
+        wait_for(lambda: server.recorder.lost == 3)
+    assert len(rows(only(tmp_path))["tick"]) == 2
+
+
 def test_requests_without_pictures_are_bounded_too(tmp_path: Path) -> None:
     with recorded(tmp_path) as server:
         robot = server.robot()

@@ -242,8 +242,11 @@ class SessionRecorder:
             elif op == "close":
                 self._first.pop(session, None)
                 self._writer.end(session)
-            elif asked.obs is not None and self._records(session) and session in self._writer:
-                self._writer.add(session, _frame(asked, reply, self._first[session] or 0))
+            elif asked.obs is not None and self._records(session):
+                if session in self._writer:
+                    self._writer.add(session, _frame(asked, reply, self._first[session] or 0))
+                else:  # too many sessions at once
+                    self.dropped += 1
         except (OSError, RecordingEnded):
             raise
         except UnknownSession:  # it has ended meanwhile, as has its episode
