@@ -117,6 +117,19 @@ def test_a_correction_of_a_second_is_recorded_from_its_first_tick_with_both_acti
     assert all(action.tolist() in guarded for action in arm.commanded)
 
 
+def test_pauses_are_counted_apart_from_ticks_that_the_policy_missed(clock: SimulatedTime) -> None:
+    arm = Arm()
+    with ChunkPlayer(Going(), override=ScriptedLeader(back)) as player:
+
+        def over() -> bool:
+            if len(arm.commanded) == 5:
+                player.takeover.pause()
+            return len(arm.commanded) == 40
+
+        report = run_loop(arm, player, hz=HZ, until=over)
+    assert (report.paused, report.safe, report.mostly_safe) == (35, {}, None)
+
+
 def test_a_silent_server_stops_no_robot_that_a_human_moves() -> None:
     """A silent policy gives safe actions; a human's count as signs of life of whoever moves the robot."""
     gate = threading.Event()

@@ -137,7 +137,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
             f"from a tick until its action is applied: p50 {report.work_p50_ms:.2f} ms, p99 {report.work_p99_ms:.2f} ms"
         )
         if leader is not None:
-            say(f"ticks at which a human moved the robot: {report.interventions}")
+            say(f"ticks at which a human moved the robot: {report.interventions}; ticks paused: {report.paused}")
         say(f"ticks without an action of the policy: {report.safe_ticks} of {report.jitter['ticks']:.0f}")
         for reason, ticks in sorted(report.safe.items(), key=lambda one: -one[1])[:5]:
             say(f"  {ticks} x {reason}")

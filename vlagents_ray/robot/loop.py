@@ -15,6 +15,7 @@ from typing import Any, Literal, Protocol, get_args
 
 import numpy as np
 
+from vlagents_ray.chunking.takeover import Takeover
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.errors import ConfigError, InvalidAction
 from vlagents_ray.interface import CAPTURED, INTERVENTION, SAFE, SILENT, WANTED, Agent, Obs
@@ -89,6 +90,7 @@ class LoopReport:
     safe: dict[str, int] = field(default_factory=dict)  # reason -> ticks with the safe action or without any
     barks: list[str] = field(default_factory=list)  # the watchdog's reasons to stop the robot
     interventions: int = 0  # ticks at which a human moved the robot
+    paused: int = 0  # ticks at which the robot was paused (see `vlagents_ray.chunking.takeover`); not among `safe`
     done: bool = False  # the policy considered its task finished
     means: list[str] = field(default_factory=list)  # the measures taken against jitter
     outcome: str = ""  # "success" or "failure", if it was marked on the live page
@@ -112,13 +114,17 @@ class LoopReport:
             "wait for its answer (deadline_s, --deadline-ms)"
         )
 
-    def count(self, reason: str) -> None:
+    def count(self, reason: str, *, paused: bool = False) -> None:
         """Count a tick without an action of the policy.
 
         Args:
             reason: The reason. After a hundred different ones, which may contain numbers, new ones are counted
                 together.
+            paused: Whether the robot was paused.
         """
+        if paused:
+            self.paused += 1
+            return
         if reason not in self.safe and len(self.safe) >= _REASONS:
             reason = "other reasons"
         self.safe[reason] = self.safe.get(reason, 0) + 1
@@ -188,7 +194,7 @@ def run_loop(
         raise ConfigError(f"restart: got {restart!r}, want one of {list(get_args(Restart))}")
     if seconds is not None and not seconds > 0:
         raise ConfigError(f"seconds: got {seconds}, want above 0, or None")
-    takeover = getattr(agent, "takeover", None)
+    takeover: Takeover | None = getattr(agent, "takeover", None)
     if takeover is not None and takeover.leader is not None and recorder is not None and not recorder.interventions:
         raise ConfigError(
             "recorder: got one without interventions for a player with override=; want Recorder(…, interventions=True)"
@@ -238,14 +244,11 @@ def _drive(
     last: np.ndarray | None = None
     guarded = getattr(agent, "check", None) is guard  # the agent has checked the action before `act` returns
     interrupt = getattr(agent, "interrupt", lambda: None)
+    takeover: Takeover | None = getattr(agent, "takeover", None)
     standing = True  # before the first action, and after a stop until the next one
     try:
         while not (until() or report.done):
-            if (
-                time.monotonic() - collected > _COLLECT_S
-            ):  # while idle, as automatic collection is off and failed requests leave cycles
-                gc.collect()
-                collected = time.monotonic()
+            collected = _collect_after(collected)
             tick = pacer.wait()
             if ticks is not None and tick >= ticks:
                 pacer.forget(ticks)
@@ -270,9 +273,10 @@ def _drive(
                 interrupt()
                 report.count(stop)
                 operated.stood()
+                shown.add(obs, act, None, tick, pacer.since_tick_s(), stop)
                 continue
             if reason is not None:
-                report.count(reason)
+                report.count(reason, paused=takeover is not None and takeover.reason is not None)
                 if standing:  # a robot at rest gets no command
                     continue
             action = act.action
@@ -292,6 +296,14 @@ def _drive(
         if work_s:
             report.work_p50_ms = float(np.median(work_s)) * 1e3
             report.work_p99_ms = float(np.quantile(work_s, 0.99)) * 1e3
+
+
+def _collect_after(collected: float) -> float:
+    """Free cycles, which failed requests leave, while automatic collection is off; return when that was done last."""
+    if time.monotonic() - collected <= _COLLECT_S:
+        return collected
+    gc.collect()
+    return time.monotonic()
 
 
 def _guard(agent: Agent, given: Guard | None) -> Guard:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from vlagents_ray.chunking.modes import Mode
+from vlagents_ray.chunking.buffer import Mode
 from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.chunking.takeover import Leader, Takeover
 from vlagents_ray.cli.console import out
@@ -136,7 +136,9 @@ class RobotRun:
             recorder=recorder,
             until=ended,
         )
-        self._say(f"  {label()}: {robot.steps} steps, {report.interventions} of them a human's")
+        self._say(
+            f"  {label()}: {robot.steps} steps, {report.interventions} of them a human's; {report.paused} ticks paused"
+        )
 
     def _leader(self, contract: Contract, stack: contextlib.ExitStack) -> Leader | None:
         if self.teleop is None:
