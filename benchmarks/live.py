@@ -1,9 +1,10 @@
 """What the live page costs: acts of robots with nobody, one and four viewers, side by side in one run.
 
-One cluster serves two applications, each with one replica of a policy that takes 5 ms: one as it is, and one whose
-dispatcher lacks the lines for the tap. Both serve the same robots, which are in processes of their own, as are the
-viewers: two robots of 50 Hz, and one that acts as fast as it is answered. The settings take turns within each round. A
-viewer shows the pictures of all sessions, and asks for a message as soon as it has one, as the page does.
+One cluster serves three applications, each with one replica of a policy that takes 5 ms: one as it is, one whose
+dispatcher lacks the lines for the tap, and one that holds the last 30 s of each session. All serve the same robots,
+which are in processes of their own, as are the viewers: two robots of 50 Hz, and one that acts as fast as it is
+answered. The settings take turns within each round. A viewer shows the pictures of all sessions, and asks for a message
+as soon as it has one, as the page does.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import json
 import re
 import statistics
 import sys
+import tempfile
 import textwrap
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -36,12 +38,14 @@ from vlagents_ray.policies.noop import Noop
 from vlagents_ray.serve.engine import dispatch
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
+from vlagents_ray.serve.live.tap import LEASE_S
 
-ABSENT, NOBODY = "tap absent", "nobody"
+ABSENT, NOBODY, RING = "tap absent", "nobody", "nobody, 30 s held"
 HZ, SATURATED_HZ = 50.0, 1e9
 _CHUNK = 8
 _CONFIG = {"base_ms": 5.0, "action_dim": 7, "chunk": _CHUNK}
 _WARM_S = 0.5
+_LEASE_ENDS_S = LEASE_S + 1.0  # after the last viewer has gone
 
 
 class Untapped(Noop):
@@ -104,20 +108,27 @@ def measure_live(
     tapped = deployment("noop", config=_CONFIG)
     untapped = deployment("benchmarks.live:Untapped", config=_CONFIG)
     untapped.applications[0].name, untapped.applications[0].route_prefix = "untapped", "/untapped"
-    both = tapped.model_copy(update={"applications": [*tapped.applications, *untapped.applications]})
     turns: dict[str, list[Turn]] = {}
     with contextlib.ExitStack() as stack:
-        server = stack.enter_context(running_server(both))
-        fleets = {name: Robots(stack, name, server.apps[name], transport) for name in ("noop", "untapped")}
+        holding = deployment(
+            "noop", config=_CONFIG, live={"folder": stack.enter_context(tempfile.TemporaryDirectory())}
+        )
+        holding.applications[0].name, holding.applications[0].route_prefix = "holding", "/holding"
+        apps = [one.applications[0] for one in (tapped, untapped, holding)]
+        server = stack.enter_context(running_server(tapped.model_copy(update={"applications": apps})))
+        fleets = {app.name: Robots(stack, app.name, server.apps[app.name], transport) for app in apps}
         watching = [
             stack.enter_context(_process(f"viewer {number}", {"watch": server.apps["noop"]}))
             for number in range(max(viewers, default=0))
         ]
         extensions = {str(one.read(START_S)) for one in watching}
-        settings = [(ABSENT, "untapped", 0), (NOBODY, "noop", 0), *((_name(n), "noop", n) for n in viewers)]
+        settings = [(ABSENT, "untapped", 0), (NOBODY, "noop", 0), (RING, "holding", 0)]
+        settings += [(_name(n), "noop", n) for n in viewers]
         for number in range(rounds):
             shift = number % len(settings)  # so that none is always first
             for name, app, looking in settings[shift:] + settings[:shift]:
+                if name == NOBODY:
+                    time.sleep(_LEASE_ENDS_S)
                 turns.setdefault(name, []).append(_turn(fleets[app], watching[:looking], seconds))
             progress(
                 f"round {number + 1}/{rounds}: "
@@ -144,7 +155,7 @@ def _base(name: str) -> str:
 def _turn(robots: Robots, watching: Sequence[LineProcess], seconds: float) -> Turn:
     for viewer in watching:
         viewer.send(json.dumps(seconds + 2 * _WARM_S))
-    time.sleep(_WARM_S if watching else 2 * _WARM_S + 2.0)  # the lease of the viewers before has ended
+    time.sleep(_WARM_S)
     paced, saturated = robots.act(seconds)
     seen = [viewer.read(seconds + START_S) for viewer in watching]
     messages, size = (sum(one[i] for one in seen) / (seconds + 2 * _WARM_S) for i in (0, 1))

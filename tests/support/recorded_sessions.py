@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import os
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -43,7 +44,10 @@ class Brightness(Agent):
             raise RuntimeError("as it was asked to")
         seen = np.array([obs.cameras["front"].astype(np.float64).mean(), obs.state["joints"][0]])
         noise = self._rng.normal(size=(obs.info.get("rows", self.rows), 2))
-        return Act((self.gain * seen + noise + obs.info.get("offset", 0)).astype(np.float32), info={"subtask": "reach"})
+        return Act(
+            (self.gain * seen + noise + obs.info.get("offset", 0)).astype(np.float32),
+            info={"subtask": "reach", "pid": os.getpid()},
+        )
 
 
 @dataclass(frozen=True)
@@ -59,9 +63,9 @@ class Recorded:
 class Robot:
     sender: Dispatcher
 
-    def ask(self, request: Request) -> Reply:
+    def ask(self, request: Request, part: Callable[[Reply], object] | None = None) -> Reply:
         replies: Future[list[Reply]] = Future()
-        self.sender.send([request], replies.set_result)
+        self.sender.send([request], replies.set_result, part=part)
         [reply] = replies.result(10)
         return reply
 

@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import signal
 import socket
+import subprocess
 import sys
+import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from eval_fakes import wait_for
 from viewer_files import read_mcap, read_rrd
 
 from vlagents_ray import ConfigError
 from vlagents_ray.errors import MissingDependency
 from vlagents_ray.images.jpeg_png import decode, encode_jpeg
+from vlagents_ray.serve.ports import free_port
 from vlagents_ray.viewers import ViewerFrame, open_viewers
 
 TICKS = 6
@@ -96,9 +102,7 @@ def test_an_mcap_file_has_the_schemas_and_times_that_foxglove_reads(tmp_path: Pa
 
 @pytest.mark.library("foxglove")
 def test_foxglove_may_connect_to_what_runs() -> None:
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
+    port = free_port()
     [viewer] = open_viewers(None, f"ws://127.0.0.1:{port}")
     with viewer, viewer.episode("ep0"):
         socket.create_connection(("127.0.0.1", port), 30).close()
@@ -129,3 +133,55 @@ def test_a_viewer_that_is_not_installed_names_its_extra(
     monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(MissingDependency, match=rf"pip install 'vlagents-ray\[{name}\]'"):
         open_viewers(**{f"{name}_target": str(tmp_path)})
+
+
+_VIEWER = """
+import sys, time, rerun
+shown = rerun.RecordingStream("viewer")
+shown.serve_grpc(grpc_port=int(sys.argv[1]))
+time.sleep(600)
+"""
+
+
+def listens(port: int) -> bool:
+    with socket.socket() as client:
+        return client.connect_ex(("127.0.0.1", port)) == 0
+
+
+@pytest.fixture
+def rerun_viewer() -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """What receives recordings live, as Rerun's viewer does: its address, and its process."""
+    port = free_port()
+    with subprocess.Popen([sys.executable, "-c", _VIEWER, str(port)]) as process:
+        try:
+            wait_for(lambda: listens(port))
+            yield f"rerun+http://127.0.0.1:{port}/proxy", process
+        finally:
+            process.kill()
+
+
+@pytest.mark.library("rerun")
+def test_a_viewer_of_rerun_gets_what_runs(rerun_viewer: tuple[str, subprocess.Popen[bytes]]) -> None:
+    address, _ = rerun_viewer
+    [viewer] = open_viewers(address)
+    with viewer, viewer.episode("ep0", "stack the cups"):
+        for tick in range(TICKS):
+            viewer.add(frame(tick))
+    assert (viewer.episodes, viewer.dropped, viewer.error) == (1, 0, None)  # its end says that all has arrived
+
+
+@pytest.mark.library("rerun")
+def test_a_viewer_of_rerun_that_stands_still_holds_up_nothing(
+    rerun_viewer: tuple[str, subprocess.Popen[bytes]],
+) -> None:
+    address, process = rerun_viewer
+    [viewer] = open_viewers(address)
+    with viewer.episode("ep0", "stack the cups"):
+        process.send_signal(signal.SIGSTOP)
+        for tick in range(TICKS):
+            viewer.add(frame(tick))
+    begun = time.monotonic()
+    viewer.close()
+    assert time.monotonic() - begun < 30
+    assert viewer.episodes == 0
+    assert viewer.error is not None

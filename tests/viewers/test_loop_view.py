@@ -13,8 +13,9 @@ from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.robot import run_loop
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.viewers import EpisodeViewer, ViewerFrame, open_viewers
+from vlagents_ray.viewers.loop_view import LoopView
 
-HZ, ROWS, TICKS = 100.0, 4, 10
+HZ, ROWS, CHUNKS = 100.0, 4, 3
 
 
 class Counting(Agent):
@@ -51,7 +52,8 @@ class Kept:
 def run(viewers: list[EpisodeViewer]) -> None:
     agent = Counting()
     player = ChunkPlayer(agent, mode="open_loop")
-    run_loop(SimulatedRobot(agent.contract), player, hz=HZ, seconds=TICKS / HZ, instruction="count", viewers=viewers)
+    robot = SimulatedRobot(agent.contract)
+    run_loop(robot, player, hz=HZ, instruction="count", viewers=viewers, until=lambda: agent.asked > CHUNKS)
 
 
 def test_each_tick_is_shown_with_what_was_planned_and_executed() -> None:
@@ -59,7 +61,7 @@ def test_each_tick_is_shown_with_what_was_planned_and_executed() -> None:
     with EpisodeViewer(target) as viewer:
         run([viewer])
     frames = target.frames
-    assert len(frames) > 2 * ROWS  # a busy machine may miss a tick
+    assert len(frames) == CHUNKS * ROWS + 1
     executed = [float(frame.executed[0]) for frame in frames]
     assert executed == list(range(len(frames)))
     assert [float(frame.planned[0]) for frame in frames] == executed
@@ -84,9 +86,31 @@ def test_an_action_without_a_plan_is_shown_too() -> None:
             def act(self, obs: Obs) -> Act:
                 return Act(np.zeros(2, np.float32))
 
-        run_loop(SimulatedRobot(one), Single(), hz=HZ, seconds=TICKS / HZ, viewers=[viewer])
+        run_loop(SimulatedRobot(one), Single(), hz=HZ, seconds=1, viewers=[viewer])
     assert {frame.planned is None for frame in target.frames} == {True}
     assert {tuple(frame.executed) for frame in target.frames} == {(0.0, 0.0)}
+
+
+def test_spells_without_the_policy_are_shown_with_their_reason_once() -> None:
+    target, wanted = Kept(), np.array([3, 4], np.float32)
+    acts = [
+        Act(np.zeros(2, np.float32), info={"safe": "waiting for an answer"}),
+        Act(np.zeros(2, np.float32), info={"safe": "waiting for an answer"}),
+        Act(np.ones(2, np.float32), info={"intervention": True, "policy_action": wanted}),
+        Act(np.ones(2, np.float32)),
+    ]
+    with EpisodeViewer(target) as viewer:
+        view = LoopView([viewer])
+        with view.episode("count"):
+            for tick, act in enumerate(acts):
+                stop = "no signal from the server" if tick == 3 else ""
+                view.add(Obs(), act, None if stop else act.action, tick, 0.0, stop)
+    shown = target.frames
+    assert [frame.note for frame in shown] == ["waiting for an answer", "", "", "no signal from the server"]
+    spells = [[frame.numbers[name] for name in ("safe", "intervention", "stopped")] for frame in shown]
+    assert spells == [[1, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]
+    assert [None if frame.planned is None else frame.planned.tolist() for frame in shown] == [None, None, [3, 4], None]
+    assert shown[3].executed is None
 
 
 @pytest.mark.library("rerun")

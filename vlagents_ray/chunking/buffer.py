@@ -12,13 +12,14 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from vlagents_ray.errors import ConfigError, PolicyFailed
 from vlagents_ray.interface import AGE, AGE_MS, DELAY, LEFTOVER, PLANNED, SILENT, Act
 
+Mode = Literal["open_loop", "ensemble", "async"]
 Merge = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """(D,) of the older chunks and (D,) of a newer one -> (D,), for one tick."""
 
@@ -192,3 +193,23 @@ class ChunkBuffer:
         else:
             action = np.asarray(functools.reduce(self._merge, rows), np.float32)
         return Step(action, newest, row)
+
+
+def require_settings(
+    mode: str,
+    execute: int | None,
+    horizon: int | None,
+    max_age_s: float | None,
+    merge: str | Merge,
+    real_time_chunking: bool,
+) -> None:
+    """Raise `ConfigError` if settings of a `ChunkPlayer` are out of range, or do not go together."""
+    if mode not in get_args(Mode):
+        raise ConfigError(f"mode: got {mode!r}, want one of {list(get_args(Mode))}")
+    for name, value in (("execute", execute), ("horizon", horizon)):
+        if value is not None and value < 1:
+            raise ConfigError(f"{name}: got {value}, want at least 1, or None")
+    if max_age_s is not None and not max_age_s > 0:
+        raise ConfigError(f"max_age_s: got {max_age_s}, want above 0, or None")
+    if mode != "async" and (merge != "newest" or real_time_chunking):
+        raise ConfigError(f"merge and real_time_chunking: got them with mode {mode!r}, want mode='async'")

@@ -1,7 +1,8 @@
-"""What a chunk player executed, stated in its requests for those who watch the server."""
+"""What a chunk player executed, stated in its requests while somebody watches the server: that makes them dearer."""
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from typing import Any
 
@@ -11,6 +12,8 @@ from vlagents_ray.errors import DeadlineExceeded, VLAgentsError
 from vlagents_ray.interface import AGE_MS, SAFE, Act, Agent
 
 PLAYED = "played"  # the entry of `Obs.info`
+WATCHED = "watched"  # the entry of `Act.info` with which a server says that somebody watches; it repeats that
+_WATCHED_S = 10.0  # time after which that is over unless it is said again
 _ROWS = 64  # most actions between two requests that are stated; older ones are left out
 
 
@@ -23,6 +26,12 @@ class Execution:
         self._age_ms: float | None = None
         self._safe = ""
         self._safe_ticks = self._spells = self._late = 0
+        self._watched_until = float("-inf")
+
+    def heard(self, answer: Act) -> None:
+        """Note whether somebody watches, as an answer of the policy says."""
+        if answer.info.pop(WATCHED, False):
+            self._watched_until = time.monotonic() + _WATCHED_S
 
     def note(self, act: Act, executed: int) -> Act:
         """Note the action of a tick, and return it.
@@ -59,14 +68,17 @@ class Execution:
             agent: The policy; a `RemoteAgent` knows how often it has connected again.
 
         Returns:
-            `step`: `executed`, the step for which the first row of the answer is; `rows`: (n, D) float32, the policy's
-            actions that were executed since the request before; `steps`: (n,) int64, their steps; `age_ms`: the age of
-            the observation from which the last one was computed, when it was executed; `safe`: the reason of the last
-            tick's safe action, "" if it had one of the policy's; and of the episode `safe_ticks`, `safe_spells` (runs
-            of such ticks), `late` (requests without an answer in time), and `reconnects`.
+            Nothing while nobody watches; else `PLAYED` with these entries. `step`: `executed`, the step for which the
+            first row of the answer is; `rows`: (n, D) float32, the policy's actions that were executed since the
+            request before; `steps`: (n,) int64, their steps; `age_ms`: the age of the observation from which the last
+            one was computed, when it was executed; `safe`: the reason of the last tick's safe action, "" if it had one
+            of the policy's; and of the episode `safe_ticks`, `safe_spells` (runs of such ticks), `late` (requests
+            without an answer in time), and `reconnects`.
         """
+        if time.monotonic() > self._watched_until:
+            return {}
         rows, self._rows = self._rows, deque(maxlen=_ROWS)
-        return {
+        played = {
             "step": executed,
             "steps": np.array([step for step, _ in rows], np.int64),
             "rows": np.stack([row for _, row in rows]) if rows else np.zeros((0, 0), np.float32),
@@ -77,6 +89,7 @@ class Execution:
             "late": self._late,
             "reconnects": getattr(agent, "reconnects", 0),
         }
+        return {PLAYED: played}
 
     def _note_safe(self, reason: str) -> None:
         self._spells += not self._safe

@@ -12,11 +12,10 @@ import numpy as np
 
 from vlagents_ray.chunking.answer import LastAnswer
 from vlagents_ray.chunking.background import AsyncCaller, parts_of
-from vlagents_ray.chunking.buffer import DELAYS, ENSEMBLE, ENSEMBLE_M, ChunkBuffer, Merge, Step
+from vlagents_ray.chunking.buffer import DELAYS, ENSEMBLE, ENSEMBLE_M, ChunkBuffer, Merge, Mode, Step, require_settings
 from vlagents_ray.chunking.capture_clock import CaptureClock, stamped
-from vlagents_ray.chunking.execution import PLAYED, Execution
+from vlagents_ray.chunking.execution import Execution
 from vlagents_ray.chunking.fallback import LATE, OLD, STALE, STOPPED, WAITING, Safe, SafeAction
-from vlagents_ray.chunking.modes import Mode, require_settings
 from vlagents_ray.chunking.motion import Check, Motion
 from vlagents_ray.chunking.takeover import RELEASED, Leader, Takeover
 from vlagents_ray.contract import ActionSpec, Contract
@@ -239,8 +238,7 @@ class ChunkPlayer(Agent):
 
     def _read_part(self, parts: Generator[Act, None, None], tick: int) -> None:
         self._answer.rest = None  # after an error nothing follows
-        act = next(parts)
-        self._take(act, tick)
+        self._take(act := next(parts), tick)
         self._answer.rest = parts if act.more else None
 
     def _is_old(self, seen_at: float) -> bool:
@@ -296,6 +294,7 @@ class ChunkPlayer(Agent):
 
     def _take(self, act: Act, now: int) -> None:
         answer = self._answer
+        self._execution.heard(act)
         try:
             rows = Act(check_action(act.action, self._contract)).rows()
         except InvalidAction:
@@ -312,7 +311,7 @@ class ChunkPlayer(Agent):
         self._trouble = WAITING if added or act.more else LATE
 
     def _extras(self) -> dict[str, Any]:
-        extras = self.takeover.extras() | {PLAYED: self._execution.report(self._plan.executed, self._agent)}
+        extras = self.takeover.extras() | self._execution.report(self._plan.executed, self._agent)
         if self._timeout_s is not None:
             extras[DEADLINE] = self._timeout_s * 1e3
         if self._real_time and self.takeover.state != "human":  # who executes other actions than those of the plan

@@ -38,7 +38,7 @@ class Mp4:
         self._av: Any = require("av")
         self._shape = shape
         height, width = shape[:2]
-        self._pad = (height % 2, width % 2)  # yuv420p halves both dimensions
+        self._pad = (0, 0) if lossless else (height % 2, width % 2)  # yuv420p halves both dimensions
         self._container = self._av.open(target if isinstance(target, io.BytesIO) else str(target), "w", format="mp4")
         options = {"preset": "ultrafast", "threads": "1", **({"qp": "0"} if lossless else {"crf": "23"})}
         if key_frames is not None:
@@ -51,7 +51,7 @@ class Mp4:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height and width of the video, both even: the last row or column of an odd image is repeated."""
+        """Height and width of the video; unless it is lossless, the last row or column of an odd image is repeated."""
         return self._shape[0] + self._pad[0], self._shape[1] + self._pad[1]
 
     def add(self, image: np.ndarray) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -67,7 +68,7 @@ def _page(result: OpenLoopResult, policy: str) -> str:
         .render(
             result=result.to_json(),
             policy=policy,
-            horizon=line_chart("Error by step of the horizon", "step of the chunk", errors),
+            horizon=line_chart("Error by step of the horizon", "step of the chunk", errors, 0.0),
             map=_map(result),
             joints=[
                 line_chart(name, "frame", [("recorded", drawn[:, 0, i]), ("policy", drawn[:, 1, i])])
@@ -77,10 +78,13 @@ def _page(result: OpenLoopResult, policy: str) -> str:
     )
 
 
-def line_chart(title: str, x_label: str, series: Sequence[tuple[str, Sequence[float] | np.ndarray]]) -> LineChart:
-    """Draw series of numbers at 0, 1, 2, … on common axes."""
+def line_chart(
+    title: str, x_label: str, series: Sequence[tuple[str, Sequence[float] | np.ndarray]], floor: float = math.inf
+) -> LineChart:
+    """Draw series of numbers at 0, 1, 2, … on common axes, of which the upright one begins at `floor` at the latest."""
     values = np.concatenate([np.asarray(numbers, float) for _, numbers in series]) if series else np.zeros(1)
     low, high = (float(values.min()), float(values.max())) if len(values) else (0.0, 1.0)
+    low = min(low, floor)
     if high - low < 1e-12:
         low, high = low - 0.5, high + 0.5
     last = max(1, max((len(numbers) for _, numbers in series), default=1) - 1)

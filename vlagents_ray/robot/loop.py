@@ -250,11 +250,7 @@ def _drive(
     standing = True  # before the first action, and after a stop until the next one
     try:
         while not (until() or report.done):
-            if (
-                time.monotonic() - collected > _COLLECT_S
-            ):  # while idle, as automatic collection is off and failed requests leave cycles
-                gc.collect()
-                collected = time.monotonic()
+            collected = _collect_after(collected)
             tick = pacer.wait()
             if ticks is not None and tick >= ticks:
                 pacer.forget(ticks)
@@ -279,6 +275,7 @@ def _drive(
                 interrupt()
                 report.count(stop)
                 operated.stood()
+                shown.add(obs, act, None, tick, pacer.since_tick_s(), stop)
                 continue
             if reason is not None:
                 report.count(reason, paused=takeover is not None and takeover.reason is not None)
@@ -301,6 +298,14 @@ def _drive(
         if work_s:
             report.work_p50_ms = float(np.median(work_s)) * 1e3
             report.work_p99_ms = float(np.quantile(work_s, 0.99)) * 1e3
+
+
+def _collect_after(collected: float) -> float:
+    """Free cycles, which failed requests leave, while automatic collection is off; return when that was done last."""
+    if time.monotonic() - collected <= _COLLECT_S:
+        return collected
+    gc.collect()
+    return time.monotonic()
 
 
 def _guard(agent: Agent, given: Guard | None) -> Guard:

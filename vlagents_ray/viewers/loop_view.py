@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from vlagents_ray.interface import PLANNED, SAFE, Act, Obs
+from vlagents_ray.interface import INTERVENTION, PLANNED, SAFE, WANTED, Act, Obs
 from vlagents_ray.viewers.frame import ViewerFrame, note_of, numbers_of
 from vlagents_ray.viewers.targets import dated_name
 from vlagents_ray.viewers.viewer import EpisodeViewer
@@ -31,30 +31,33 @@ class LoopView:
                 stack.enter_context(viewer.episode(name, instruction))
             yield
 
-    def add(self, obs: Obs, act: Act, executed: np.ndarray, tick: int, work_s: float) -> None:
+    def add(self, obs: Obs, act: Act, executed: np.ndarray | None, tick: int, work_s: float, stop: str = "") -> None:
         """Show a tick; never waits.
 
         Args:
             obs: The observation.
             act: What the agent answered.
-            executed: The action that was applied, (D,) float32.
+            executed: The action that was applied, (D,) float32; None if none was.
             tick: The tick of the control loop.
             work_s: The time from the tick until the action was applied, s.
+            stop: Why the robot is stopped, if it is.
         """
         if not any(viewer.has_room for viewer in self._viewers):
             for viewer in self._viewers:
                 viewer.dropped += 1
             return
-        rows, note = act.info.get(PLANNED), note_of(act.info)
+        info = act.info
+        rows, note = info.get(PLANNED), stop or note_of(info)
+        spells = {"safe": SAFE in info, "intervention": INTERVENTION in info, "stopped": bool(stop)}
         frame = ViewerFrame.of(
             obs,
             tick,
-            executed=np.array(executed),
-            planned=None if rows is None else rows[act.info["row"]],
+            executed=None if executed is None else np.array(executed),
+            planned=info.get(WANTED) if rows is None else rows[info["row"]],
             chunk=None if rows is self._chunk else rows,
-            numbers={**numbers_of(act.info), "work_ms": work_s * 1e3, "safe": float(SAFE in act.info)},
+            numbers={**numbers_of(info), "work_ms": work_s * 1e3, **{name: float(on) for name, on in spells.items()}},
             note=note if note != self._note else "",
         )
-        self._chunk, self._note = rows, note
+        self._chunk, self._note = self._chunk if rows is None else rows, note
         for viewer in self._viewers:
             viewer.add(frame)

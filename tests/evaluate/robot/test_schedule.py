@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given, settings
@@ -85,6 +86,21 @@ def test_tasks_are_those_of_the_plan_and_patterns_match_them(tmp_path: Path) -> 
         cells(plan(tmp_path, suite={"envs": ["kettle"]}))
     with pytest.raises(ConfigError, match="got no robot"):
         planned_cells(plan(tmp_path, robot={"arm": None}))
+    pushed = [{"name": "base", "url": "http://x", "pushed_weights": {"version": 3, "fingerprint": "ab"}}]
+    with pytest.raises(ConfigError, match="want checkpoints"):
+        planned_cells(plan(tmp_path, policies=pushed))
+
+
+@pytest.mark.parametrize("telling", [{"track": ["wandb"]}, {"rerun": "viewed"}, {"foxglove": "viewed"}])
+def test_what_would_show_rates_or_policies_before_the_end_is_refused(tmp_path: Path, telling: dict[str, Any]) -> None:
+    with pytest.raises(ConfigError, match=f"{next(iter(telling))}.*before the end"):
+        planned_cells(plan(tmp_path, **telling))
+
+
+@pytest.mark.parametrize("viewer", ["rerun", "foxglove"])
+def test_nothing_shows_the_times_by_which_policies_are_told_apart(tmp_path: Path, viewer: str) -> None:
+    with pytest.raises(ConfigError, match="tell the policies apart"):
+        planned_cells(plan(tmp_path).model_copy(update={viewer: str(tmp_path)}))
 
 
 def test_results_of_the_robot_are_not_those_of_its_simulation(tmp_path: Path) -> None:

@@ -44,6 +44,6 @@ def test_a_word_that_is_no_verdict_is_asked_again() -> None:
     typed = iter(["maybe", "p", "", "S", "well done"])
     trial = VisibleTrial(1, 2, "drawer", 1, 1, "open the drawer", "", 4.0, rubric={})
     said: list[str] = []
-    verdict = TerminalOperator(lambda _: next(typed), said.append).judge(trial, "the time is over")
+    verdict = TerminalOperator(lambda _: next(typed), said.append).judge(trial, "the trial is over")
     assert (verdict.outcome, verdict.note) == ("success", "well done")
     assert "want some of the rubric's" in said[-1], "a task without a rubric has no partial success"

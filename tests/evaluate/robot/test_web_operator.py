@@ -81,7 +81,7 @@ def test_a_whole_evaluation_over_the_page_shows_no_policy(tmp_path: Path, operat
             assert decode(person.get("start/front")).shape == (32, 32, 3)
         assert person.answer("ready", scene) == 200
         verdict = person.until("verdict")
-        assert verdict["ending"] == "the time is over"
+        assert verdict["ending"] == "the trial is over"
         assert person.answer("repeat", verdict) == 400, "it wants a reason"
         earned = ["the cup is on the plate"]
         assert person.answer("partial" if number < 3 else "success", verdict, earned=earned, note="slowly") == 200

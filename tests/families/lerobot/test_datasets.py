@@ -11,6 +11,7 @@ from flat_config import flat_config
 from in_process_evaluation import play
 from lerobot.datasets.dataset_tools import delete_episodes, merge_datasets
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from recorded_sessions import recorded, seen
 
 from vlagents_ray.dataset_contract import BYTES, STATISTICS, DatasetContract
 from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
@@ -58,6 +59,27 @@ def test_lerobots_tools_leave_out_episodes_and_merge_datasets_of_ours(tmp_path: 
     fewer = delete_episodes(datasets[0], [1], tmp_path / "fewer", "evaluation/fewer")
     assert fewer.num_episodes == 2
     assert fewer.meta.stats["observation.state.position"]["mean"].shape == (2,), "by which the parts are told"
+
+
+def test_lerobot_reads_and_merges_what_a_server_recorded(tmp_path: Path) -> None:
+    datasets, chunks = [], []
+    for number in range(2):
+        with recorded(tmp_path / f"traces{number}") as server:
+            chunks += [server.robot().play(5, seed=seed) for seed in (1, 2)]
+        [root] = (tmp_path / f"traces{number}").iterdir()
+        datasets.append(LeRobotDataset(f"traces/{number}", root=root))
+    dataset = datasets[0]
+    assert (dataset.num_episodes, dataset.num_frames) == (2, 10)
+    for i in range(5):
+        frame = dataset[i]
+        np.testing.assert_array_equal(frame["chunk"].numpy().reshape(4, 2), chunks[0][i])
+        assert int(frame["chunk_rows"]) == 4
+        assert frame["task"] == "stack the cups"
+        image = (255 * frame["observation.images.front"].numpy()).round().astype(np.uint8).transpose(1, 2, 0)
+        np.testing.assert_array_equal(image, seen(i).cameras["front"])
+    merged = merge_datasets(datasets, "traces/merged", tmp_path / "merged")
+    assert merged.num_episodes == 4
+    np.testing.assert_array_equal(merged[15]["chunk"].numpy().reshape(4, 2), chunks[3][0])
 
 
 def test_lerobot_reads_what_a_human_corrected(tmp_path: Path) -> None:

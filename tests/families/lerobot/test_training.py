@@ -20,6 +20,7 @@ import pytest
 import torch
 from flat_config import flat_config
 from in_process_evaluation import play
+from recorded_sessions import recorded
 from safetensors.torch import load_file, save_file
 from typer.testing import CliRunner
 from wrist_roll_env import ROLLER, Roller, Turner
@@ -132,6 +133,30 @@ def test_the_documented_commands_lead_from_recordings_to_a_policy_that_acts(rout
 
 def settings_of(words: list[str], option: str) -> dict[str, Any]:
     return parse_settings([value for name, value in pairwise(words) if name == option], option)
+
+
+def test_a_server_records_what_lerobot_trains_on_and_the_policy_is_replayed_on(tmp_path: Path) -> None:
+    with recorded(tmp_path / "traces") as server:
+        for seed in range(2):
+            server.robot().play(8, seed=seed)
+    [root] = (tmp_path / "traces").iterdir()
+    checkpoint = train(root, tmp_path / "act")
+    given = ["replay", str(root), "--policy", str(deployment(checkpoint, tmp_path)), "--out", str(tmp_path / "out")]
+    done = CliRunner().invoke(app, given)
+    assert done.exit_code == 0, done.output
+    result = json.loads((tmp_path / "out/open_loop.json").read_text())
+    assert (result["frames"], len(result["by_step"])) == (16, 4)
+    assert 0 < result["mae"] < np.inf
+
+
+def deployment(checkpoint: Path, folder: Path) -> Path:
+    """The file of a server of the checkpoint."""
+    config = {"checkpoint": str(checkpoint), "device": "cpu"}
+    args = {"policy": "lerobot", "config": config}
+    application = {"name": "act", "route_prefix": "/", "import_path": "vlagents_ray.serve.app:build", "args": args}
+    path = folder / "act.yaml"
+    path.write_text(json.dumps({"applications": [application]}))
+    return path
 
 
 def test_its_contract_is_the_envs_with_the_meaning_of_its_actions(policy: LeRobot) -> None:

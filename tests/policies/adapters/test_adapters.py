@@ -210,6 +210,7 @@ def broken(values: dict[str, np.ndarray], what: str) -> dict[str, np.ndarray]:
         "half": {"base_model.model.head.1.lora_A.weight": np.ones((2, 4), np.float32)},
         "shape": {first: np.ones((2, 5), np.float32)},
         "nan": {first: np.full((2, 4), np.nan, np.float32)},
+        "whole numbers": {first: np.ones((2, 4), np.int8)},
         "no linear": {"base_model.model.head.1.lora_A.weight": np.ones((2, 4), np.float32)}
         | {"base_model.model.head.1.lora_B.weight": np.ones((8, 2), np.float32)},
         "attention": {"base_model.model.attention.out_proj.lora_A.weight": np.ones((2, 8), np.float32)}
@@ -227,6 +228,7 @@ def broken(values: dict[str, np.ndarray], what: str) -> dict[str, np.ndarray]:
         ("half", r"got \['base_model.model.head.1.lora_B.weight'\], want pairs"),
         ("shape", r"see: got A \(2, 5\) and B \(8, 2\), want them for weights \(8, 4\)"),
         ("nan", "see: got NaN or infinite values"),
+        ("whole numbers", "see: got A int8 and B float32, want real numbers"),
         ("no linear", "got adapters of {'head.1': 'Tanh'}, want those of linear layers and"),
         ("attention", "got adapters of {'attention.out_proj': 'NonDynamicallyQuantizableLinear'}"),
         ("changed", r"got \['base_model.model.see.base_layer.weight'\], want pairs .* and no changes of the base"),

@@ -25,6 +25,7 @@ from vlagents_ray.errors import InvalidInput, Overloaded, UnknownSession
 from vlagents_ray.interface import Act
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.protocol.messages import Reply, Request
+from vlagents_ray.robot.__main__ import main
 from vlagents_ray.robot.loop import LoopReport, run_loop
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.live import endpoint
@@ -175,7 +176,7 @@ def robot(server: LiveServer, *, obeys: bool = True) -> Iterator[tuple[Arm, str,
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[LiveServer]:
-    with live_server(Noop.from_config({"action_dim": 2, "chunk": 8})) as one:
+    with live_server(Noop.from_config({"action_dim": 7, "chunk": 8})) as one:
         yield one
 
 
@@ -211,6 +212,22 @@ def test_another_instruction_ends_the_episode(server: LiveServer) -> None:
         post(server, {"session": session, "do": "instruct", "text": "stack the cubes"})
         wait_for(lambda: reports, 30)
         assert reports[0].next_instruction == "stack the cubes"
+
+
+def test_the_robots_command_begins_another_episode(server: LiveServer, capsys: pytest.CaptureFixture[str]) -> None:
+    options = ["--hz", "50", "--seconds", "30", "--baseline", "0", "--instruction", "fold", "--operate"]
+    status: list[int] = []
+    thread = threading.Thread(target=lambda: status.append(main([server.url, *options])))
+    thread.start()
+    for do, text, instruction in (("instruct", "stack the cubes", "fold"), ("failure", "", "stack the cubes")):
+        wait_for(lambda now=instruction: [one.instruction for one in server.engine.sessions.all()] == [now], 30)
+        [session] = server.engine.sessions.ids()
+        assert post(server, {"session": session, "do": do, "text": text})[0] == 200
+    thread.join(30)
+    said = capsys.readouterr().out
+    assert status in ([0], [1])  # safe actions while it connected
+    assert "the live page asks for another episode: 'stack the cubes'" in said
+    assert "marked as a failure on the live page" in said
 
 
 def test_a_robot_that_has_not_opted_in_goes_on(server: LiveServer) -> None:

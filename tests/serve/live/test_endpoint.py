@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import threading
 import urllib.error
 import urllib.request
@@ -131,6 +132,13 @@ def test_the_page_holds_no_data_and_may_load_nothing(server: LiveServer) -> None
     assert "unsafe" not in policy
     assert b"http:" not in text.replace(b"http://www.w3.org/2000/svg", b"")
     assert b"https:" not in text.replace(b'"https:"', b"")
+
+
+def test_the_scripts_of_the_page_share_no_name_since_they_share_one_scope() -> None:
+    html, _ = endpoint.live_page()
+    names = re.findall(r"^(?:const|let|class|(?:async )?function) (\w+)", html, re.MULTILINE)
+    assert {"showEvaluation", "showFleet"} < set(names)
+    assert {name for name in names if names.count(name) > 1} == set()
 
 
 @pytest.mark.parametrize("message", [b"", b"[]", b'{"shown": [1]}', b'{"shown": 3}', b"{", b"[" * 10_000])

@@ -52,7 +52,8 @@ def served(read: Callable[[], dict[str, Any]], videos: Any = None, keys: Keys | 
 
 
 def show(page: Page, url: str, *, width: int = 1400, scheme: str = "light") -> None:
-    page.said.clear()
+    page.open(Address("about:blank"), width=width, scheme=scheme)  # type: ignore[arg-type]
+    page.said.clear()  # of the page before, whose server has ended
     page.asked.clear()
     page.open(Address(url), width=width, scheme=scheme)  # type: ignore[arg-type]
 

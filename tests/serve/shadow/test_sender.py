@@ -210,6 +210,21 @@ def test_an_episode_that_the_candidate_has_lost_is_followed_again_from_its_next_
     assert [one.obs and int(one.obs.cameras["front"][0, 0, 0]) for one in followed.candidate.asked()] == [1, 3]
 
 
+def test_a_reset_that_waits_behind_a_lost_episode_is_sent(followed: Followed) -> None:
+    followed.reset()
+    wait_for(lambda: len(followed.candidate.turns) == 1)
+    followed.candidate.free.clear()
+    followed.candidate.failure = PolicyUnavailable("gone")
+    for value in range(2):
+        followed.act(value)
+    followed.reset()
+    wait_for(lambda: len(followed.candidate.turns) == 2)
+    wait_for(lambda: len(followed.sender._waiting) == 2)
+    followed.candidate.free.set()
+    wait_for(lambda: len(followed.candidate.asked("reset")) == 2)
+    assert followed.sender.dropped == 2
+
+
 def test_a_session_that_the_candidate_does_not_know_is_dropped_alone(followed: Followed) -> None:
     for session in ("a", "b"):
         followed.reset(session)

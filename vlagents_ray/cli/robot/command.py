@@ -7,7 +7,7 @@ from typing import Annotated, cast, get_args
 
 import typer
 
-from vlagents_ray.chunking.modes import Mode
+from vlagents_ray.chunking.buffer import Mode
 from vlagents_ray.cli.console import errors
 from vlagents_ray.cli.options import Set, parse_settings
 from vlagents_ray.errors import ConfigError

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from vlagents_ray.chunking.modes import Mode
+from vlagents_ray.chunking.buffer import Mode
 from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.chunking.takeover import Leader, Takeover
 from vlagents_ray.cli.console import out

@@ -8,7 +8,7 @@ import logging
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from vlagents_ray.errors import ConfigError, VLAgentsError
+from vlagents_ray.errors import ConfigError, VLAgentsError, from_code
 from vlagents_ray.evaluate.artifacts.provenance import driver_code, save_diffs, versions
 from vlagents_ray.evaluate.artifacts.storage import storing
 from vlagents_ray.evaluate.episode.failures import Failure, explain
@@ -123,8 +123,8 @@ def planned_cells(config: EvalConfig) -> list[EvalCase]:
         raise ConfigError("robot: got no robot, want `robot: {tasks: …}` in the plan and the class of one (--robot)")
     if any(policy.pushed_weights is not None for policy in config.policies):
         raise ConfigError("pushed_weights: got some with a robot, want checkpoints; leave them out")
-    if config.track:
-        raise ConfigError("track: got trackers with a robot, which would show the rates too early; leave them out")
+    if telling := [name for name in ("track", "rerun", "foxglove") if getattr(config, name)]:
+        raise ConfigError(f"{telling}: got them with a robot, want none: they show rates or policies before the end")
     return cells(config)
 
 
@@ -164,7 +164,10 @@ class _RemainingTrials:
         obs = self._robot.observe()
         policies = {trial.job.cell.contender: trial.job.cell for trial in left}
         for _, cell in sorted(policies.items(), key=lambda one: one[0]):  # which tells nothing of the trials' order
-            rehearse(cell, self._factory, self._operator, obs)
+            try:
+                rehearse(cell, self._factory, self._operator, obs)
+            except VLAgentsError as error:
+                raise from_code(error.code, f"policy {cell.contender!r}: {error}") from error
         for trial in left:
             while not self._is_over(trial) and trial.number not in self._log.finished:
                 self._play(trial)

@@ -38,9 +38,7 @@ from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import measured_state
 
 _WAIT_S = 1.0  # deadline of a tick in the modes that wait for an answer
-_ENDINGS = {"policy_done": "the policy considers the task finished", "truncated": "the time is over"}
 _LOST = {one.code for one in (PolicyUnavailable, NoReplica, ConnectionLost, DeadlineExceeded, OutcomeUnknown)}
-_STOPPED = "stopped by the operator"
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,7 +173,9 @@ def play(
         stats.ending = "policy_done" if report.done else "terminated" if stopped else "truncated"
         stats.ticks_held = report.safe_ticks
         result = stats.result(transport_of(agent), failed)
-        ending = "the policy failed" if failed is not None else _ENDINGS.get(stats.ending, _STOPPED)
+        # Not whether the policy considered the task finished: only some policies ever do.
+        over = "stopped by the operator" if stopped else "the trial is over"
+        ending = over if failed is None else "the policy failed"
         return PlayedTrial(replace(result, env_seconds=None), dict(getattr(agent, "metadata", {})), ending)
 
 

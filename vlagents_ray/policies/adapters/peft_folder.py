@@ -153,8 +153,14 @@ def _layer(
 ) -> tuple[Any, Any]:
     from torch import float32, isfinite
 
+    raw = [saved[f"{_PREFIX}{name}{end}"] for end in (_DOWN, _UP)]
+    if not all(one.dtype.kind in "fV" for one in raw):  # V: bfloat16, which numpy does not have
+        raise ConfigError(
+            f"{folder / WEIGHTS}: {name}: got A {raw[0].dtype} and B {raw[1].dtype}, want real numbers; save the "
+            f"adapter without quantization"
+        )
     # scaled before they are rounded to the type of the weights
-    down, up = (converted(saved[f"{_PREFIX}{name}{end}"], weight.new_empty(0, dtype=float32)) for end in (_DOWN, _UP))
+    down, up = (converted(one, weight.new_empty(0, dtype=float32)) for one in raw)
     (outputs, *inputs), rank = weight.shape, down.shape[0] if down.ndim else 0
     wanted = (rank, *inputs), (outputs, rank, *(1 for _ in inputs[1:]))
     if (tuple(down.shape), tuple(up.shape)) != wanted or not rank:

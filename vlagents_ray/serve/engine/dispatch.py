@@ -19,7 +19,7 @@ from vlagents_ray.protocol.messages import Limits, Reply, Request
 from vlagents_ray.serve.access.api_keys import Caller, Identity, NoKey, throttled_s
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.arrival import count_wait
-from vlagents_ray.serve.engine.responses import Done, ReplyCollector
+from vlagents_ray.serve.engine.responses import Done, ReplyCollector, whole_answers
 from vlagents_ray.serve.queue.batch_queue import PendingRequest
 
 if TYPE_CHECKING:
@@ -113,7 +113,12 @@ class Dispatcher:
         """
         if (watcher := self._engine.watchers.one) is not None:
             sessions = ["" if isinstance(item, Reply) else self._session(item) for item in items]
-            done = watcher.note(sessions, items, (admission and admission.files) or {}, done)
+            note = partial(watcher.note, sessions, items, (admission and admission.files) or {})
+            [first, *others] = items
+            if part is not None and not others and isinstance(first, Request) and first.parts:
+                done, part = whole_answers(note, done, part)
+            else:
+                done = note(done)
         if admission is not None and admission.holds:
             done = partial(_release, admission, done)
         collector = ReplyCollector(items, done, self._asks_to_reconnect, self._engine.withdraw)

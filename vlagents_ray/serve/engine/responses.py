@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from types import MappingProxyType
 from typing import Any, Protocol
 
@@ -31,6 +32,7 @@ from vlagents_ray.validation import check_action
 logger = logging.getLogger(__name__)
 
 Done = Callable[[list[Reply]], None]
+Part = Callable[[Reply], object]
 
 
 class Watcher(Protocol):
@@ -75,6 +77,37 @@ class Watchers:
     def _set(self, watchers: tuple[Watcher, ...]) -> None:
         self._all = watchers
         self.one = watchers[0] if len(watchers) == 1 else self if watchers else None
+
+
+def whole_answers(note: Callable[[Done], Done], done: Done, part: Part) -> tuple[Done, Part]:
+    """Let watchers see the answer to a lone act as a whole, which its sender gets in parts.
+
+    Args:
+        note: `Watcher.note` of the act.
+        done: Sends the last part.
+        part: Sends a part before it.
+
+    Returns:
+        What to call in place of `done` and `part`.
+    """
+    earlier: list[np.ndarray] = []  # (h, D) each
+    last: list[Reply] = []
+    watched = note(lambda _: done(last))
+
+    def send_part(reply: Reply) -> object:
+        if reply.act is not None:
+            earlier.append(reply.act.rows())
+        return part(reply)
+
+    def answer(replies: list[Reply]) -> None:
+        last.extend(replies)
+        [reply] = replies
+        if earlier and reply.act is not None:
+            whole = np.concatenate([*earlier, reply.act.rows()])
+            reply = replace(reply, act=replace(reply.act, action=whole))
+        watched([reply])
+
+    return answer, send_part
 
 
 def build_reply(

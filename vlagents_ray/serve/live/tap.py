@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from vlagents_ray.chunking.execution import PLAYED
+from vlagents_ray.chunking.execution import PLAYED, WATCHED
 from vlagents_ray.images.codecs import JPEG, DecodedFiles
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.responses import Done
@@ -32,6 +32,7 @@ VALUES = 64  # most numbers of one part of a state, or of one action
 ROWS = 128  # most actions of a chunk, or executed before a request
 _SAID = ("step", "age_ms", "safe", "safe_ticks", "safe_spells", "late", "reconnects")
 _ENCODING = threading.Lock()
+_TELL_S = 2.0  # interval at which a session is told that it is watched
 _KEPT_S = 1.0  # time for which the pictures of an observation are kept if nobody reads them
 
 
@@ -113,6 +114,7 @@ class LiveTap:
         self._numbers = itertools.count(1)
         self._answers: deque[Answer] = deque(maxlen=_ANSWERS)
         self._seen: dict[str, Seen] = {}
+        self._told: dict[str, float] = {}  # when a session was told last that it is watched
 
     @property
     def watched(self) -> bool:
@@ -138,6 +140,7 @@ class LiveTap:
             self._show(None)
             self._answers.clear()
             self._seen.clear()
+            self._told.clear()
 
     def note(
         self,
@@ -167,8 +170,9 @@ class LiveTap:
                 self._commands.note(session, item)
 
         def answer(replies: list[Reply]) -> None:
-            if self._commands is not None:
-                for session, reply in zip(sessions, replies, strict=True):
+            for session, reply in zip(sessions, replies, strict=True):
+                self._tell(session, reply)
+                if self._commands is not None:
                     self._commands.send(session, reply)
             done(replies)
             for (session, op, rank, played, seen), reply in zip(kinds, replies, strict=True):
@@ -189,8 +193,16 @@ class LiveTap:
 
     def forget_others(self, sessions: Collection[str]) -> None:
         """Drop the observations of all sessions but these, since those have ended."""
-        for session in self._seen.keys() - set(sessions):
-            self._seen.pop(session, None)
+        for held in (self._seen, self._told):
+            for session in held.keys() - set(sessions):
+                held.pop(session, None)
+
+    def _tell(self, session: str, reply: Reply) -> None:
+        """Say from time to time that somebody looks, so that a chunk player states what it executed."""
+        now = self._clock()
+        if reply.act is not None and now - self._told.get(session, float("-inf")) > _TELL_S:
+            self._told[session] = now
+            reply.act.info[WATCHED] = True
 
     def _keep(self, session: str, request: Request, files: DecodedFiles) -> Seen | None:
         """Keep a request's observation, unless one was kept just before."""

@@ -145,7 +145,7 @@ class SessionRecorder:
         if item.op != "act" or item.obs is None:
             return _Asked(self, session, item, None, 0)
         size = sum(image.nbytes for image in item.obs.cameras.values())
-        if item.parts or not self._hold(size):  # of an answer in parts, only the last one is seen here
+        if not self._hold(size):
             self.dropped += 1
             return None
         return _Asked(self, session, item, item.obs, size)

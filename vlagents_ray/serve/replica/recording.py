@@ -49,9 +49,10 @@ def open_recorder(
         found = engine.sessions.get(session)
         return found.instruction, found.first
 
+    name = re.sub(r"[^A-Za-z0-9]+", "-", replica.removeprefix("SERVE_REPLICA::"))
     writer = EpisodeWriter(
         folder,
-        f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}-{re.sub('[^A-Za-z0-9]+', '_', replica)}",
+        f"{time.strftime('%Y%m%d-%H%M%S', time.gmtime())}-{name}",
         args.fps,
         lossless=args.pictures == "exact",
         most_bytes=args.most_gb * _GB,

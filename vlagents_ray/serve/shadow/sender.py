@@ -265,7 +265,8 @@ class ShadowSender:
                 self._held -= 1
                 entry.episode.waiting -= 1
                 self._drop(entry.episode)
-            elif entry.session in seen or (self._asked and size + len(entry.frame) > _CALL_BYTES):
+                continue
+            if entry.session in seen or (self._asked and size + len(entry.frame) > _CALL_BYTES):
                 left.append(entry)
             else:
                 size += len(entry.frame)

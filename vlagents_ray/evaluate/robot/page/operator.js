@@ -5,6 +5,11 @@ let state = null;
 let shown = "";
 
 async function look() {
+  if (!document.hidden) await refresh();  // when nobody looks, the server stops a running trial
+  setTimeout(look, 300);
+}
+
+async function refresh() {
   try {
     const answer = await fetch("now/state");
     if (!answer.ok) throw new Error(String(answer.status));
@@ -15,7 +20,6 @@ async function look() {
     $("phase").textContent = "No connection: the evaluation has ended, or was interrupted";
     for (const part of document.querySelectorAll("[data-phase]")) part.hidden = true;
   }
-  setTimeout(look, 300);
 }
 
 function show(found) {
@@ -87,12 +91,12 @@ function camera(name) {
   caption.textContent = name;
   frame.append(live, over);
   figure.append(frame, caption);
-  const refresh = () => {
+  const renew = () => {
     if (figure.isConnected) live.src = `now/camera/${encodeURIComponent(name)}?${Date.now()}`;
   };
-  live.onload = () => setTimeout(refresh, 100);
-  live.onerror = () => setTimeout(refresh, 1000);
-  setTimeout(refresh);
+  live.onload = () => setTimeout(renew, 100);
+  live.onerror = () => setTimeout(renew, 1000);
+  setTimeout(renew);
   return figure;
 }
 

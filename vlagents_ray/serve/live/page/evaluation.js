@@ -13,7 +13,7 @@ const STATES = {
   stopped: "Stopped by an error",
 };
 const UNDER_WAY = ["starting", "running", "waiting"];
-const OUTCOMES = { failure: "not solved", policy_error: "error of the policy", infra_failed: "lost to infrastructure" };
+const FAILURE_NAMES = { failure: "not solved", policy_error: "error of the policy", infra_failed: "lost to infrastructure" };
 
 const failures = new Map(); // the cards of the failed episodes, by their key
 let evaluation = null; // what was said last
@@ -21,7 +21,7 @@ let evaluation = null; // what was said last
 const percent = (share) => `${Math.round(100 * share)} %`;
 const interval = (one) => `${Math.round(100 * one.low)} to ${percent(one.high)}`;
 
-function svgElement(tag, attributes) {
+function svgNode(tag, attributes) {
   const made = document.createElementNS(SVG, tag);
   for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
   return made;
@@ -81,11 +81,11 @@ function cellOf(cell) {
 }
 
 function intervalBar(cell) {
-  const svg = svgElement("svg", { viewBox: "0 0 100 10", preserveAspectRatio: "none", "aria-hidden": "true", class: "interval" });
-  svg.append(svgElement("rect", { x: 0, y: 4, width: 100, height: 2, class: "axis" }));
+  const svg = svgNode("svg", { viewBox: "0 0 100 10", preserveAspectRatio: "none", "aria-hidden": "true", class: "interval" });
+  svg.append(svgNode("rect", { x: 0, y: 4, width: 100, height: 2, class: "axis" }));
   if (cell) {
-    svg.append(svgElement("rect", { x: 100 * cell.low, y: 2, width: Math.max(0.5, 100 * (cell.high - cell.low)), height: 6, class: "range" }));
-    svg.append(svgElement("path", { d: `M${100 * cell.rate} 0V10`, class: "rate" }));
+    svg.append(svgNode("rect", { x: 100 * cell.low, y: 2, width: Math.max(0.5, 100 * (cell.high - cell.low)), height: 6, class: "range" }));
+    svg.append(svgNode("path", { d: `M${100 * cell.rate} 0V10`, class: "rate" }));
   }
   return svg;
 }
@@ -99,15 +99,15 @@ function showCurves(curves) {
   const first = Math.min(...steps), last = Math.max(...steps);
   const x = (step) => (first === last ? 50 : 2 + (96 * (step - first)) / (last - first));
   const y = (share) => 100 - 100 * share;
-  const drawn = [0, 0.5, 1].map((share) => svgElement("path", { d: `M0 ${y(share)}H100`, class: "grid" }));
+  const drawn = [0, 0.5, 1].map((share) => svgNode("path", { d: `M0 ${y(share)}H100`, class: "grid" }));
   const told = [];
   curves.forEach((curve, i) => {
     const known = curve.points.filter((point) => point.rate !== null);
     const colour = `var(${COLOURS[i % COLOURS.length]})`;
-    const lines = [svgElement("polyline", { points: known.map((point) => `${x(point.step)},${y(point.rate)}`).join(" ") })];
+    const lines = [svgNode("polyline", { points: known.map((point) => `${x(point.step)},${y(point.rate)}`).join(" ") })];
     for (const point of known) {
-      lines.push(svgElement("path", { d: `M${x(point.step)} ${y(point.low)}V${y(point.high)}`, class: "bar" }));
-      lines.push(svgElement("path", { d: `M${x(point.step)} ${y(point.rate)}h0`, class: point.whole ? "dot" : "dot begun" }));
+      lines.push(svgNode("path", { d: `M${x(point.step)} ${y(point.low)}V${y(point.high)}`, class: "bar" }));
+      lines.push(svgNode("path", { d: `M${x(point.step)} ${y(point.rate)}h0`, class: point.whole ? "dot" : "dot begun" }));
     }
     for (const line of lines) line.style.stroke = colour;
     drawn.push(...lines);
@@ -145,7 +145,7 @@ function failureCard(one) {
   const title = element("h3", { id: `failure-${one.key}` }, name);
   const about = [one.policy, `seed ${one.seed}`, `${one.steps} steps`, new Date(1000 * one.finished).toLocaleTimeString()];
   const card = element("article", {},
-    element("div", {}, title, element("span", { className: "badge" }, OUTCOMES[one.outcome] || one.outcome)),
+    element("div", {}, title, element("span", { className: "badge" }, FAILURE_NAMES[one.outcome] || one.outcome)),
     ...one.videos.map((number) => videoOf(number, name)),
     element("p", { className: "instruction" }, one.instruction ? `“${one.instruction}”` : ""),
     element("p", { className: "bad" }, one.error),
