@@ -453,6 +453,7 @@ def over_handle(visitor: Visitor, _when: str) -> str:
 
     visitor.become()
     replica: Any = SimpleNamespace(_engine=visitor.replica.engine, _limits=LIMITS)
+    replica._ask = partial(PolicyReplica._ask, replica)
     frame = encode_request(Request("reset", Obs(), visitor.mark))
     [reply] = decode_replies(asyncio.run(PolicyReplica.call(replica, visitor.name, frame)))
     return "done" if reply.error is None else str(reply.error.status)
