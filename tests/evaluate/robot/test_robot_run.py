@@ -178,7 +178,7 @@ def test_a_repeated_trial_is_counted_with_its_reason_and_played_by_the_same_poli
 
 def test_an_arm_that_fails_is_stopped_and_its_trial_played_again_by_the_same_policy(tmp_path: Path) -> None:
     arm, policies = Arm(fails_at=7), Policies()
-    config = plan(tmp_path / "out", suite={"episodes": 1})
+    config = plan(tmp_path / "out", suite={"episodes": 1}, robot={"hz": 50})
     person = ScriptedPerson(judged("s"))
     summary = evaluate_on_robot(config, person, robot=arm, agent_factory=policies)
     order = names_by_trial(config)
@@ -208,7 +208,9 @@ def test_a_lost_connection_is_told_without_the_policy_and_is_no_failure_of_it(
                 raise ConnectionLost(f"{URLS[self.name]} went away")
 
     policies = Policies(Losing)
-    config = plan(tmp_path / "out", suite={"episodes": 1, "envs": ["drawer"]}, robot={"tasks": tasks(max_steps=12)})
+    config = plan(
+        tmp_path / "out", suite={"episodes": 1, "envs": ["drawer"]}, robot={"tasks": tasks(max_steps=12), "hz": 50}
+    )
     person = ScriptedPerson(judged("f"))
     summary = evaluate_on_robot(config, person, agent_factory=policies)
     [told] = [line for line in person.printed if "played again" in line]
