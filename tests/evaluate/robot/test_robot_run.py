@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -177,7 +178,7 @@ def test_a_repeated_trial_is_counted_with_its_reason_and_played_by_the_same_poli
 
 def test_an_arm_that_fails_is_stopped_and_its_trial_played_again_by_the_same_policy(tmp_path: Path) -> None:
     arm, policies = Arm(fails_at=7), Policies()
-    config = plan(tmp_path / "out", suite={"episodes": 1})
+    config = plan(tmp_path / "out", suite={"episodes": 1}, robot={"hz": 50})
     person = ScriptedPerson(judged("s"))
     summary = evaluate_on_robot(config, person, robot=arm, agent_factory=policies)
     order = names_by_trial(config)
@@ -207,7 +208,9 @@ def test_a_lost_connection_is_told_without_the_policy_and_is_no_failure_of_it(
                 raise ConnectionLost(f"{URLS[self.name]} went away")
 
     policies = Policies(Losing)
-    config = plan(tmp_path / "out", suite={"episodes": 1, "envs": ["drawer"]}, robot={"tasks": tasks(max_steps=12)})
+    config = plan(
+        tmp_path / "out", suite={"episodes": 1, "envs": ["drawer"]}, robot={"tasks": tasks(max_steps=12), "hz": 50}
+    )
     person = ScriptedPerson(judged("f"))
     summary = evaluate_on_robot(config, person, agent_factory=policies)
     [told] = [line for line in person.printed if "played again" in line]
@@ -389,11 +392,18 @@ def test_the_first_start_of_a_scene_is_what_later_trials_of_it_are_set_to(tmp_pa
     overlay = start.parent.with_name("overlay-front.jpg")
     assert [line.strip() for line in person.printed if "scene" in line and "start picture" in line and "yet" in line]
     assert any(str(start) in line for line in person.printed)
-    assert str(overlay) in person.printed[-6] or any(line.strip() == str(overlay) for line in person.printed)
+    assert any(line.strip() == str(overlay) for line in person.printed)
     assert decode(start.read_bytes()).shape == decode(overlay.read_bytes()).shape == (32, 32, 3)
 
 
 def test_a_first_trial_that_is_repeated_takes_the_start_pictures_again(tmp_path: Path) -> None:
+    class Flashing(Arm):
+        seen = 0
+
+        def observe(self) -> Obs:
+            self.seen += 1
+            return replace(super().observe(), cameras={"front": np.full((8, 8, 3), 5 * self.seen % 256, np.uint8)})
+
     pictures: list[bytes] = []
 
     def keep() -> None:
@@ -401,7 +411,7 @@ def test_a_first_trial_that_is_repeated_takes_the_start_pictures_again(tmp_path:
 
     lines = ["", "r", "the cup stood on another mark", "", "s", "", "", "s", ""]
     config = plan(tmp_path / "out", suite={"episodes": 1, "envs": ["drawer"]})
-    evaluate_on_robot(config, ScriptedPerson(typed(lines), keep), agent_factory=Policies())
+    evaluate_on_robot(config, ScriptedPerson(typed(lines), keep), robot=Flashing(), agent_factory=Policies())
     assert len(pictures) == 8, "at every question but the first"
     assert list(dict.fromkeys(pictures)) == [pictures[0], pictures[3]]
     assert pictures[3:] == [pictures[3]] * 5, "the second policy is not asked for another start"

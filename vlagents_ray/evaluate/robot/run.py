@@ -124,7 +124,7 @@ def planned_cells(config: EvalConfig) -> list[EvalCase]:
     if any(policy.pushed_weights is not None for policy in config.policies):
         raise ConfigError("pushed_weights: got some with a robot, want checkpoints; leave them out")
     if telling := [name for name in ("track", "rerun", "foxglove") if getattr(config, name)]:
-        raise ConfigError(f"{telling}: got them with a robot, want none: they show rates or policies before the end")
+        raise ConfigError(f"{telling}: got them with a robot, want none: rates and times tell policies before the end")
     return cells(config)
 
 
