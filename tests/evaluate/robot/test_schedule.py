@@ -97,12 +97,6 @@ def test_what_would_show_rates_or_policies_before_the_end_is_refused(tmp_path: P
         planned_cells(plan(tmp_path, **telling))
 
 
-@pytest.mark.parametrize("viewer", ["rerun", "foxglove"])
-def test_nothing_shows_the_times_by_which_policies_are_told_apart(tmp_path: Path, viewer: str) -> None:
-    with pytest.raises(ConfigError, match="tell the policies apart"):
-        planned_cells(plan(tmp_path).model_copy(update={viewer: str(tmp_path)}))
-
-
 def test_results_of_the_robot_are_not_those_of_its_simulation(tmp_path: Path) -> None:
     tasks = {"tabletop": {"instruction": "push"}}
     real, simulated = (
