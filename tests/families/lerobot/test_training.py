@@ -141,12 +141,25 @@ def test_a_server_records_what_lerobot_trains_on_and_the_policy_is_replayed_on(t
             server.robot().play(8, seed=seed)
     [root] = (tmp_path / "traces").iterdir()
     checkpoint = train(root, tmp_path / "act")
-    given = ["replay", str(root), "--policy", str(deployment(checkpoint, tmp_path)), "--out", str(tmp_path / "out")]
+    other = replayed(root, checkpoint, tmp_path / "other")
+    assert (other["frames"], len(other["by_step"])) == (16, 4)
+    assert 0 < other["mae"] < np.inf
+    with recorded(tmp_path / "own", LeRobot.from_config({"checkpoint": str(checkpoint), "device": "cpu"})) as server:
+        for seed in range(2):
+            server.robot().play(4, seed=seed)
+    same = replayed(tmp_path / "own", checkpoint, tmp_path / "same")
+    assert (same["frames"], same["max"]) == (8, 0.0)
+
+
+def replayed(dataset: Path, checkpoint: Path, out: Path) -> dict[str, Any]:
+    """What the command writes about the checkpoint, one session at a time."""
+    out.mkdir()
+    file = deployment(checkpoint, out)
+    given = ["replay", str(dataset), "--policy", str(file), "--out", str(out), "--at-once", "1"]
     done = CliRunner().invoke(app, given)
     assert done.exit_code == 0, done.output
-    result = json.loads((tmp_path / "out/open_loop.json").read_text())
-    assert (result["frames"], len(result["by_step"])) == (16, 4)
-    assert 0 < result["mae"] < np.inf
+    found: dict[str, Any] = json.loads((out / "open_loop.json").read_text())
+    return found
 
 
 def deployment(checkpoint: Path, folder: Path) -> Path:
