@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
-import numpy as np
-import pytest
+from pathlib import Path
 
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from scripted_leader import ScriptedLeader
+
+from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.client.commands import COMMAND, CommandInbox
+from vlagents_ray.contract import ActionSpec, Contract
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.robot.loop import LoopReport, run_loop
 from vlagents_ray.robot.operation.operated_loop import OperatedLoop
+from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import Watchdog
 
 
@@ -135,3 +142,44 @@ def test_a_loop_without_commands_is_as_before() -> None:
     report = run_loop(arm, Commanding(CommandInbox(), {3: "stop"}), hz=200, until=lambda: len(applied(arm)) > 8)
     assert report.safe == {}
     assert len(applied(arm)) == 9
+
+
+def test_a_human_takes_over_in_a_pause_from_the_page_and_the_mark_labels_the_episode(tmp_path: Path) -> None:
+    class Standing(Commanding):
+        contract = Contract(action=ActionSpec(dim=2, delta=False))
+
+    arm, inbox = Arm(simulated=False), CommandInbox()
+    states: list[str] = []
+    leader = ScriptedLeader(np.ones(2, np.float32), lambda: 8 <= arm.ticks < 12)
+    agent = Standing(inbox, {3: "pause", 15: "pause", 18: "resume", 25: "success"})
+    player = ChunkPlayer(agent, override=leader)
+
+    def state() -> bool:
+        states.append(player.takeover.state)
+        return False
+
+    with player, Recorder(tmp_path, 200, interventions=True) as recorder:
+        report = run_loop(arm, player, hz=200.0, seconds=60.0, commands=inbox, recorder=recorder, until=state)
+    changes = [state for state, before in zip(states[1:], states, strict=False) if state != before]
+    assert changes == ["paused", "human", "autonomous", "paused", "autonomous"]
+    assert (report.interventions, report.outcome) == (4, "success")
+    assert report.paused >= 5
+    assert (1, "stop") not in arm.did[:-1], "the safe action holds it"
+    [about] = pq.read_table(next(tmp_path.glob("meta/episodes/*/*.parquet"))).to_pylist()
+    assert about["label"] == "success"
+
+
+def test_the_page_lets_a_policy_go_on_that_asked_for_help() -> None:
+    class Doubting(Commanding):
+        contract = Contract(action=ActionSpec(dim=2, delta=True))
+
+        def act(self, obs: Obs) -> Act:
+            act = super().act(obs)
+            act.info["uncertainty"] = 1.0
+            return act
+
+    arm, inbox = Arm(simulated=False), CommandInbox()
+    with ChunkPlayer(Doubting(inbox, {6: "resume", 12: "success"}), ask_for_help=0.5) as player:
+        report = run_loop(arm, player, hz=200.0, seconds=60.0, commands=inbox)
+    assert report.outcome == "success"
+    assert 5 <= report.paused <= 7

@@ -252,7 +252,7 @@ class ChunkPlayer(Agent):
 
     def _wants(self, tick: int, obs: Obs) -> bool:
         """Whether a request with this tick's observation is due."""
-        if self.takeover.state == "paused" or self._is_old(self._captured(obs)):
+        if self._is_old(self._captured(obs)):
             return False
         step = self._next()
         if step is None or step.chunk.done:
@@ -319,10 +319,9 @@ class ChunkPlayer(Agent):
         return extras
 
     def _chosen(self, obs: Obs, tick: int) -> Act:
-        step = self._next()
+        step = None if self.takeover.state == "paused" else self._next()
         reason = STALE if self._is_old(self._captured(obs)) else self._trouble
         if step is not None and self.takeover.needs_help(step.chunk.info):
-            self._begin_again(RELEASED)
             step = None
         if step is not None:
             try:
@@ -337,6 +336,7 @@ class ChunkPlayer(Agent):
                 if not self._motion.can_hold:
                     raise
         action, reason = self._motion.hold(obs, self.takeover.reason or reason)
+        self.takeover.note_held(action)
         return Act(action, info={SAFE: reason, SILENT: self._silent_s()})
 
     def _begin_again(self, reason: str) -> None:

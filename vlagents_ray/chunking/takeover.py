@@ -115,7 +115,8 @@ class Takeover:
         """Decide at the beginning of a tick who moves the robot; the player calls this.
 
         Returns:
-            Whether what the policy has planned is void, since somebody else moved the robot, or nobody does now.
+            Whether what the policy has planned is void, since a human moved the robot, or nobody does. In a pause the
+            policy is asked on, and none of its answers is executed.
         """
         self._noted = False
         before, engaged = self._state, False
@@ -127,10 +128,9 @@ class Takeover:
             if engaged and before != "human":
                 self._pause = None
         self._state = "human" if engaged else "autonomous" if self._pause is None else "paused"
-        if self._state in (before, "human"):
-            return False
-        self._helped = True
-        return True
+        void = self._state == "paused" or self._state == "autonomous" != before
+        self._helped |= void
+        return void
 
     def act(self, obs: Obs, planned: Step | None, motion: Motion) -> Act:
         """Return the action of the human who has the robot, or the safe one where that is refused.
@@ -161,6 +161,11 @@ class Takeover:
         """Note an action, (D,), that the robot executed in place of the policy's; the next request says so."""
         self._executed.append(action)
         self._noted = True
+
+    def note_held(self, action: np.ndarray) -> None:
+        """Note an action, (D,), that holds the robot; in a pause, the policy's is not to be expected any more."""
+        if self._state == "paused":
+            self.note_executed(action)
 
     def note_stopped(self) -> None:
         """Note that the robot was stopped, and did not execute the action noted at this tick."""

@@ -18,6 +18,7 @@ from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
 from vlagents_ray.images.codecs import decode_files
 from vlagents_ray.protocol.arrays import Buffer, is_plain, read_array
 from vlagents_ray.protocol.budget import Budget
+from vlagents_ray.protocol.frame_layout import parse_json
 
 
 class ValueWriter:
@@ -192,9 +193,9 @@ def to_text(value: Any) -> str:
 
 def from_text(text: str, budget: Budget) -> Any:
     """Return the value of which `to_text` made the text; raises `MalformedMessage` if there is none."""
+    document = parse_json(text, "value:")
     try:
-        document = json.loads(text)
-        blobs = [base64.b64decode(blob) for blob in document.get("blobs", ())]
+        blobs = [base64.b64decode(blob, validate=True) for blob in document.get("blobs", ())]
         return ValueReader(blobs, budget).value(document["value"])
     except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise MalformedMessage(f"value: {type(error).__name__}: {error}") from error

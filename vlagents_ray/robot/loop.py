@@ -213,9 +213,11 @@ def run_loop(
             report.means = stack.enter_context(undisturbed(real_time=real_time))
             if watchdog is not None:
                 stack.enter_context(watchdog)
-            operated = OperatedLoop(commands, watchdog, manual=restart == "manual")
+            operated = OperatedLoop(commands, watchdog, manual=restart == "manual", takeover=takeover)
             pacer = Pacer(hz, spin_s)
             _drive(robot, agent, guard, watchdog, recorder, shown, report, pacer, seconds, until, operated)
+            if report.outcome and recorder is not None and recorder.interventions:
+                recorder.label("success" if report.outcome == "success" else "failure")
         finally:
             robot.stop()  # before the watchdog and the recorder end
     if watchdog is not None:

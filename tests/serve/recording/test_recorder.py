@@ -6,9 +6,12 @@ import errno
 import json
 import shutil
 import stat
+import threading
 from collections.abc import Generator
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import av
 import numpy as np
@@ -192,6 +195,64 @@ def test_a_share_of_the_episodes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         server.robot().play(3, instruction="kept")
     tasks = pq.read_table(only(tmp_path) / "meta/tasks.parquet").to_pydict()
     assert tasks["__index_level_0__"] == ["kept"]
+
+
+def test_a_session_that_ends_while_its_acts_wait_is_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on = threading.Event()
+    add = episodes.EpisodeWriter.add
+
+    def slow(*args: Any) -> None:
+        go_on.wait(10)
+        add(*args)
+
+    monkeypatch.setattr(episodes.EpisodeWriter, "add", slow)
+    monkeypatch.setattr(recorder, "_LOOK_S", 0.0)
+    with recorded(tmp_path) as server:
+        robot = server.robot()
+        robot.play(5)
+        robot.sender.release(for_good=True)
+        wait_for(lambda: not server.engine.sessions.ids())
+        go_on.set()
+        wait_for(lambda: server.recorder.saved == 5)
+        assert server.recorder.lost == 0
+
+
+def test_a_time_that_is_no_number_is_that_of_the_arrival(tmp_path: Path) -> None:
+    with recorded(tmp_path) as server:
+        robot = server.robot()
+        robot.play(1)
+        robot.act(replace(seen(1), info={"captured_at": "noon"}))
+    frames = rows(only(tmp_path))
+    assert frames["captured_at"][1] == frames["received_at"][1]
+
+
+def test_an_observation_that_cannot_be_kept_is_a_gap(tmp_path: Path) -> None:
+    with recorded(tmp_path) as server:
+        robot = server.robot()
+        robot.play(1)
+        robot.act(replace(seen(1), info={"object": object()}))  # as only a caller in this process may send it
+        robot.act(seen(2))
+    assert rows(only(tmp_path))["tick"] == [0, 2]
+
+
+def test_more_sessions_than_there_are_encoders_for_are_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(episodes, "_SESSIONS", 1)
+    with recorded(tmp_path) as server:
+        server.robot().play(2)
+        server.robot().play(3)
+        wait_for(lambda: server.recorder.lost == 3)
+    assert len(rows(only(tmp_path))["tick"]) == 2
+
+
+def test_requests_without_pictures_are_bounded_too(tmp_path: Path) -> None:
+    with recorded(tmp_path) as server:
+        robot = server.robot()
+        robot.play(1)
+        wait_for(lambda: server.recorder._held == 0)
+        server.recorder._held_bytes = 2 * recorder._OTHER_BYTES
+        request = Request("act", Obs(state={"joints": np.zeros(2, np.float32)}))
+        waiting = [server.recorder._asked("a", request) for _ in range(3)]
+        assert [one is not None for one in waiting] == [True, True, False]
 
 
 def test_what_does_not_fit_into_memory_is_dropped_and_counted(tmp_path: Path) -> None:

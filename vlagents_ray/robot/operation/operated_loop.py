@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from vlagents_ray.chunking.takeover import Takeover
 from vlagents_ray.client.commands import CommandInbox
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.robot.safety import Watchdog
+
+PAUSED = "paused from the live page"
 
 
 class OperatedLoop:
@@ -12,16 +15,25 @@ class OperatedLoop:
 
     A paused robot stands still, and goes on with `resume`. A stopped one is started again by a person who sees it, as
     after a stop by the watchdog; without a watchdog the loop ends. Where motion restarts by itself (a simulated robot),
-    it holds until `resume`.
+    it holds until `resume`. A player that a human can take over from is paused itself, so that he can also do it in a
+    pause.
     """
 
-    def __init__(self, commands: CommandInbox | None, watchdog: Watchdog | None, *, manual: bool) -> None:
+    def __init__(
+        self,
+        commands: CommandInbox | None,
+        watchdog: Watchdog | None,
+        *,
+        manual: bool,
+        takeover: Takeover | None = None,
+    ) -> None:
         """Begin with a robot that moves.
 
         Args:
             commands: The commands; None if the loop obeys none.
             watchdog: The loop's watchdog.
             manual: Whether a person restarts motion after a stop.
+            takeover: That of the chunk player; None if there is none.
         """
         self.outcome = ""  # "success" or "failure", if it was marked
         self.next_instruction: str | None = None
@@ -29,6 +41,7 @@ class OperatedLoop:
         self._commands = commands
         self._watchdog = watchdog
         self._manual = manual
+        self._takeover = takeover if takeover is not None and takeover.used else None
         self._holds: str | None = None
 
     def holds(self) -> str | None:
@@ -44,13 +57,18 @@ class OperatedLoop:
 
     def pause(self) -> None:
         """Hold the robot still until `resume`."""
-        self._holds = self._holds or "paused from the live page"
+        if self._takeover is not None:
+            self._takeover.pause(PAUSED)
+        else:
+            self._holds = self._holds or PAUSED
 
     def resume(self) -> None:
         """Let the policy go on; raises `ConfigError` if the robot was stopped, and a person has to start it."""
         if self._watchdog is not None and self._watchdog.stopped and self._manual:
             raise ConfigError("resume: the robot is stopped; start it where it stands")
         self._holds = None
+        if self._takeover is not None:
+            self._takeover.resume()
 
     def stop(self, by: str) -> None:
         """Stop the robot."""

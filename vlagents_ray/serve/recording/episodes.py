@@ -6,7 +6,7 @@ import logging
 import os
 import shutil
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -154,11 +154,6 @@ class EpisodeWriter:
         """End the session's episode, which is then part of its dataset."""
         if (running := self._running.pop(session, None)) is not None:
             self._save(running)
-
-    def end_others(self, held: Collection[str]) -> None:
-        """End the episodes of all sessions but these."""
-        for session in self._running.keys() - set(held):
-            self.end(session)
 
     def drop(self, session: str) -> None:
         """Drop the session's running episode, which cannot be written."""

@@ -17,7 +17,7 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-from vlagents_ray.errors import PolicyFailed
+from vlagents_ray.errors import PolicyFailed, UnknownSession
 from vlagents_ray.images.codecs import DecodedFiles
 from vlagents_ray.interface import CAPTURED, POLICY, Obs, copied
 from vlagents_ray.protocol.messages import Reply, Request
@@ -30,6 +30,8 @@ logger = logging.getLogger(__name__)
 
 NO_VERSION = -1  # of an answer whose policy names no version of its weights
 _HELD_BYTES = 256 * 2**20  # most bytes of observations that wait to be written
+_OTHER_BYTES = 16 * 2**10  # counted for an act beside its pictures
+_CLOSING_S = 30.0  # time that the threads get to write what waits
 _NICE = 5  # the threads run after the policy's
 _LOOK_S = 1.0  # time after which ended sessions are looked up
 
@@ -50,20 +52,29 @@ class _Asked:
     def own(self) -> None:
         """Copy what may lie in the client's memory."""
         self.options = to_text(self.options) if self.op == "reset" else ""
-        if (obs := self.obs) is None:
-            return
-        info = {key: value for key, value in obs.info.items() if key != CAPTURED}
-        self.info = to_text(info) if info else ""
-        captured = {CAPTURED: float(obs.info.get(CAPTURED) or self.at)}
-        self.obs = copied(replace(obs, info=captured, prepared=None))
+        if (obs := self.obs) is not None:
+            info = dict(obs.info)
+            captured = info.pop(CAPTURED, None)
+            self.info = to_text(info) if info else ""
+            captured_at = float(captured) if isinstance(captured, (int, float)) else self.at
+            self.obs = copied(replace(obs, info={CAPTURED: captured_at}, prepared=None))
+        texts = len(self.options) + len(self.info)
+        self.size += texts
+        self._recorder._held_more(texts)
 
     def __del__(self) -> None:
-        self._recorder._hold(-self.size)
+        self._recorder._held_more(-self.size)
 
 
 class _Answered(NamedTuple):
     asked: list[_Asked | None]
     replies: list[Reply]
+
+
+class _Held(NamedTuple):
+    """The sessions that the replica has, after all that was put into the queue before."""
+
+    sessions: frozenset[str]
 
 
 class SessionRecorder:
@@ -85,7 +96,7 @@ class SessionRecorder:
             sessions: Returns the ids of the replica's sessions.
             find: Returns the instruction and the first step of a session; raises `VLAgentsError` if it has gone.
             share: The share of the episodes that are recorded, drawn at each reset.
-            held_bytes: The most bytes of observations that wait.
+            held_bytes: The most bytes of requests that wait.
         """
         self.dropped = 0  # acts for which there was no memory, or which came in an episode that could not be written
         self.ended: str | None = None  # why nothing more is recorded
@@ -97,9 +108,10 @@ class SessionRecorder:
         self._held = 0
         self._lock = threading.RLock()  # of `_held`, which the garbage collector may lower at any time
         self._looked = float("-inf")  # time at which ended sessions were looked up, s
+        self._missing: set[str] = set()  # sessions in `_first` that were not here when they were looked up
         self._first: dict[str, int | None] = {}  # step at the reset of each session; None if it is not recorded
-        self._inbox: queue.SimpleQueue[list[_Asked | None] | _Answered | None] = queue.SimpleQueue()
-        self._ready: queue.SimpleQueue[tuple[_Asked, Reply] | None] = queue.SimpleQueue()
+        self._inbox: queue.SimpleQueue[list[_Asked | None] | _Answered | _Held | None] = queue.SimpleQueue()
+        self._ready: queue.SimpleQueue[tuple[_Asked, Reply] | _Held | None] = queue.SimpleQueue()
         self._threads = [
             threading.Thread(target=run, name=name, daemon=True)
             for run, name in ((self._copy, "record-copy"), (self._write, "record-write"))
@@ -133,10 +145,11 @@ class SessionRecorder:
         return answer
 
     def close(self) -> None:
-        """Write what waits, and complete all episodes."""
+        """Write what waits, and complete all episodes, as far as the disk is fast enough."""
         self._inbox.put(None)
+        until = time.monotonic() + _CLOSING_S
         for thread in self._threads:
-            thread.join()
+            thread.join(max(0.0, until - time.monotonic()))
 
     def _asked(self, session: str, item: Request | Reply) -> _Asked | None:
         """Return what is to be recorded of a request; None if there is nothing, or no memory for it."""
@@ -144,7 +157,7 @@ class SessionRecorder:
             return None
         if item.op != "act" or item.obs is None:
             return _Asked(self, session, item, None, 0)
-        size = sum(image.nbytes for image in item.obs.cameras.values())
+        size = _OTHER_BYTES + sum(image.nbytes for image in item.obs.cameras.values())
         if not self._hold(size):
             self.dropped += 1
             return None
@@ -152,10 +165,14 @@ class SessionRecorder:
 
     def _hold(self, size: int) -> bool:
         with self._lock:
-            if size > 0 and self._held + size > self._held_bytes:
+            if self._held + size > self._held_bytes:
                 return False
             self._held += size
             return True
+
+    def _held_more(self, size: int) -> None:
+        with self._lock:
+            self._held += size
 
     def _copy(self) -> None:
         """Copy each request as it comes, and pass it on with its answer."""
@@ -164,20 +181,23 @@ class SessionRecorder:
             pass
         self._ready.put(None)
 
-    def _copy_next(self, item: list[_Asked | None] | _Answered | None) -> bool:
+    def _copy_next(self, item: list[_Asked | None] | _Answered | _Held | None) -> bool:
         if item is None:
             return False
-        try:
-            if isinstance(item, _Answered):
-                for asked, reply in zip(item.asked, item.replies, strict=True):
-                    if asked is not None and reply.error is None:
-                        self._ready.put((asked, reply))
-            else:
-                for asked in filter(None, item):
+        if isinstance(item, _Held):
+            self._ready.put(item)
+        elif isinstance(item, _Answered):
+            for asked, reply in zip(item.asked, item.replies, strict=True):
+                if asked is not None and reply.error is None:
+                    self._ready.put((asked, reply))
+        else:
+            for asked in filter(None, item):
+                try:
                     asked.own()
-        except Exception:
-            logger.exception("recording: a message is left out")
-            self.dropped += 1
+                except Exception as error:  # noqa: BLE001 - of this request alone
+                    logger.warning("recording: an act of session %s is left out: %s", asked.session, error)
+                    self.dropped += 1
+                    asked.obs, asked.options = None, ""
         return True
 
     def _write(self) -> None:
@@ -189,21 +209,23 @@ class SessionRecorder:
 
     def _write_next(self) -> bool:
         """Write the next act, and return whether others follow."""
-        answered: tuple[_Asked, Reply] | None = None
+        item: tuple[_Asked, Reply] | _Held | None = None
         try:
-            answered = self._ready.get(timeout=_LOOK_S)
-            if answered is None:
+            item = self._ready.get(timeout=_LOOK_S)
+            if item is None:
                 return False
         except queue.Empty:
             pass
-        if self.ended is not None:
+        if time.monotonic() - self._looked > _LOOK_S:
+            self._looked = time.monotonic()
+            self._inbox.put(_Held(frozenset(self._sessions())))
+        if self.ended is not None or item is None:
             return True
         try:
-            if answered is not None:
-                self._handle(*answered)
-            if time.monotonic() - self._looked > _LOOK_S:
-                self._looked = time.monotonic()
-                self._end_others()
+            if isinstance(item, _Held):
+                self._end_others(item.sessions)
+            else:
+                self._handle(*item)
         except (OSError, RecordingEnded) as error:
             self._end(error)
         return True
@@ -220,10 +242,15 @@ class SessionRecorder:
             elif op == "close":
                 self._first.pop(session, None)
                 self._writer.end(session)
-            elif self._records(session) and session in self._writer:
-                self._writer.add(session, _frame(asked, reply, self._first[session] or 0))
+            elif asked.obs is not None and self._records(session):
+                if session in self._writer:
+                    self._writer.add(session, _frame(asked, reply, self._first[session] or 0))
+                else:  # too many sessions at once
+                    self.dropped += 1
         except (OSError, RecordingEnded):
             raise
+        except UnknownSession:  # it has ended meanwhile, as has its episode
+            self.dropped += 1
         except Exception as error:  # noqa: BLE001 - one session's episode
             logger.warning("recording: the episode of session %s is lost: %s", session, error)
             self._first[session] = None
@@ -239,12 +266,13 @@ class SessionRecorder:
                 self._writer.begin(session, instruction, "")
         return self._first[session] is not None
 
-    def _end_others(self) -> None:
-        """End the episodes of sessions that are no longer here."""
-        held = set(self._sessions())
-        self._writer.end_others(held)
-        for session in self._first.keys() - held:
+    def _end_others(self, held: Collection[str]) -> None:
+        """End the episodes of sessions that are no longer here; new ones may be missing once."""
+        missing = self._first.keys() - held
+        for session in missing & self._missing:
             del self._first[session]
+            self._writer.end(session)
+        self._missing = missing
 
     def _end(self, error: Exception) -> None:
         """End the recording, but no session."""
