@@ -4,7 +4,7 @@ One cluster serves three applications, each with one replica of a policy that ta
 dispatcher lacks the lines for the tap, and one that holds the last 30 s of each session. All serve the same robots,
 which are in processes of their own, as are the viewers: two robots of 50 Hz, and one that acts as fast as it is
 answered. The settings take turns within each round. A viewer shows the pictures of all sessions, and asks for a message
-as soon as it has one, as the page does.
+as soon as it has one, as the page does. On a busy machine the CPU time of the replica says more than acts a second.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import inspect
 import json
+import os
 import re
 import statistics
 import sys
@@ -20,6 +21,7 @@ import textwrap
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
@@ -34,6 +36,7 @@ from vlagents_ray.cli.console import errors, out, progress, save, table
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.errors import ConfigError
+from vlagents_ray.interface import Obs
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.serve.engine import dispatch
 from vlagents_ray.serve.launch.deployment_file import deployment
@@ -48,7 +51,15 @@ _WARM_S = 0.5
 _LEASE_ENDS_S = LEASE_S + 1.0  # after the last viewer has gone
 
 
-class Untapped(Noop):
+class Measured(Noop):
+    """`noop` that says in which process it acts."""
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        """Return the id of the replica's process."""
+        return super().reset(obs, instruction, **kwargs) | {"pid": os.getpid()}
+
+
+class Untapped(Measured):
     """`noop` in a replica whose dispatcher was compiled without the lines for the live page."""
 
     def initialize(self) -> None:
@@ -73,6 +84,7 @@ class Turn(NamedTuple):
     """What the robots measured in one turn of one setting."""
 
     acts_per_s: float  # of the saturated robot
+    cpu_ms: float  # of the replica's process, for each act of any robot
     saturated_ms: list[float]
     paced_ms: list[float]  # of those of 50 Hz
     messages_per_s: float  # of all viewers
@@ -87,8 +99,7 @@ class Robots:
             stack.enter_context(_process(f"{kind} of {name}", {"url": url, "hz": hz, "transport": transport}))
             for kind, hz in (("robots", [HZ, HZ]), ("saturated robot", [SATURATED_HZ]))
         ]
-        for process in self._processes:
-            process.read(START_S)
+        [self.replica] = {process.read(START_S) for process in self._processes}  # the id of its process
 
     def act(self, seconds: float) -> list[list[float]]:
         """Let all act; returns the milliseconds of each act, of the paced and of the saturated ones."""
@@ -105,25 +116,26 @@ def measure_live(
     progress: Callable[[str], None] = lambda _: None,
 ) -> dict[str, Any]:
     """Measure each setting once in each round, for so many seconds; returns plain JSON values."""
-    tapped = deployment("noop", config=_CONFIG)
-    untapped = deployment("benchmarks.live:Untapped", config=_CONFIG)
-    untapped.applications[0].name, untapped.applications[0].route_prefix = "untapped", "/untapped"
     turns: dict[str, list[Turn]] = {}
     with contextlib.ExitStack() as stack:
-        holding = deployment(
-            "noop", config=_CONFIG, live={"folder": stack.enter_context(tempfile.TemporaryDirectory())}
-        )
-        holding.applications[0].name, holding.applications[0].route_prefix = "holding", "/holding"
-        apps = [one.applications[0] for one in (tapped, untapped, holding)]
-        server = stack.enter_context(running_server(tapped.model_copy(update={"applications": apps})))
+        folder = stack.enter_context(tempfile.TemporaryDirectory())
+        made = {
+            "tapped": deployment("benchmarks.live:Measured", config=_CONFIG),
+            "untapped": deployment("benchmarks.live:Untapped", config=_CONFIG),
+            "holding": deployment("benchmarks.live:Measured", config=_CONFIG, live={"folder": folder}),
+        }
+        apps = [one.applications[0] for one in made.values()]
+        for name, app in zip(made, apps, strict=True):
+            app.name, app.route_prefix = name, f"/{name}"
+        server = stack.enter_context(running_server(made["tapped"].model_copy(update={"applications": apps})))
         fleets = {app.name: Robots(stack, app.name, server.apps[app.name], transport) for app in apps}
         watching = [
-            stack.enter_context(_process(f"viewer {number}", {"watch": server.apps["noop"]}))
+            stack.enter_context(_process(f"viewer {number}", {"watch": server.apps["tapped"]}))
             for number in range(max(viewers, default=0))
         ]
         extensions = {str(one.read(START_S)) for one in watching}
-        settings = [(ABSENT, "untapped", 0), (NOBODY, "noop", 0), (RING, "holding", 0)]
-        settings += [(_name(n), "noop", n) for n in viewers]
+        settings = [(ABSENT, "untapped", 0), (NOBODY, "tapped", 0), (RING, "holding", 0)]
+        settings += [(_name(n), "tapped", n) for n in viewers]
         for number in range(rounds):
             shift = number % len(settings)  # so that none is always first
             for name, app, looking in settings[shift:] + settings[:shift]:
@@ -156,16 +168,25 @@ def _turn(robots: Robots, watching: Sequence[LineProcess], seconds: float) -> Tu
     for viewer in watching:
         viewer.send(json.dumps(seconds + 2 * _WARM_S))
     time.sleep(_WARM_S)
+    before = _cpu_ms(robots.replica)
     paced, saturated = robots.act(seconds)
+    cpu_ms = (_cpu_ms(robots.replica) - before) / (len(paced) + len(saturated))
     seen = [viewer.read(seconds + START_S) for viewer in watching]
     messages, size = (sum(one[i] for one in seen) / (seconds + 2 * _WARM_S) for i in (0, 1))
-    return Turn(len(saturated) / seconds, saturated, paced, messages, size / 1e6)
+    return Turn(len(saturated) / seconds, cpu_ms, saturated, paced, messages, size / 1e6)
+
+
+def _cpu_ms(pid: int) -> float:
+    """Return the CPU time of a process so far, ms."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) * 1e3 / os.sysconf("SC_CLK_TCK")
 
 
 def _figures(turns: list[Turn], base: list[Turn]) -> dict[str, Any]:
     ratios = [mine.acts_per_s / theirs.acts_per_s for mine, theirs in zip(turns, base, strict=True)]
     found = {
         "acts_per_s": statistics.median(turn.acts_per_s for turn in turns),
+        "cpu_ms_per_act": statistics.median(turn.cpu_ms for turn in turns),
         "ratios": ratios,
         "median_ratio": statistics.median(ratios),
         "messages_per_s": statistics.median(turn.messages_per_s for turn in turns),
@@ -197,11 +218,10 @@ def child(settings: dict[str, Any]) -> None:
 
 def _robots(
     stack: contextlib.ExitStack, url: str, hz: Sequence[float], transport: TransportName
-) -> tuple[Callable[[float], list[float]], str]:
+) -> tuple[Callable[[float], list[float]], int]:
     agents = [stack.enter_context(RemoteAgent(url, transport=transport, codec="jpeg")) for _ in hz]
     pool = stack.enter_context(ThreadPoolExecutor(len(hz)))
-    for agent in agents:
-        agent.reset(observation(), "measure")
+    replica, *_ = [agent.reset(observation(), "measure")["pid"] for agent in agents]
 
     def play(agent: RemoteAgent, hz: float, seconds: float) -> list[float]:
         taken: list[float] = []
@@ -217,7 +237,7 @@ def _robots(
         played = [pool.submit(play, agent, each, seconds) for agent, each in zip(agents, hz, strict=True)]
         return [ms for one in played for ms in one.result()]
 
-    return act, agents[0].transport
+    return act, replica
 
 
 def _viewer(_: contextlib.ExitStack, watch: str) -> tuple[Callable[[float], tuple[int, int]], str]:
@@ -257,6 +277,7 @@ def main(
             name,
             f"{one['acts_per_s']:.1f}",
             f"{one['median_ratio']:.3f} ({min(one['ratios']):.3f} to {max(one['ratios']):.3f})",
+            f"{one['cpu_ms_per_act']:.2f}",
             f"{one['paced_ms_p50']:.1f} / {one['paced_ms_p99']:.1f}",
             f"{one['saturated_ms_p50']:.1f} / {one['saturated_ms_p99']:.1f}",
             f"{one['messages_per_s']:.1f}",
@@ -264,7 +285,8 @@ def main(
         ]
         for name, one in found["settings"].items()
     ]
-    shown = table("who looks", "acts/s", "ratio", "50 Hz p50/p99 ms", "saturated p50/p99 ms", "messages/s", "MB/s")
+    columns = ("acts/s", "ratio", "CPU ms/act", "50 Hz p50/p99 ms", "saturated p50/p99 ms", "messages/s", "MB/s")
+    shown = table("who looks", *columns)
     for row in rows:
         shown.add_row(*row)
     out.print(shown)
