@@ -20,9 +20,10 @@ from vlagents_ray.serve.replica.app import build
 from vlagents_ray.serve.replica.replica import PolicyReplica
 
 
-def replica(start: Any) -> Any:
-    """What starting touches of a replica."""
-    return SimpleNamespace(
+def replica(start: Any) -> PolicyReplica:
+    """A replica with what starting touches."""
+    one = object.__new__(PolicyReplica)
+    vars(one).update(
         _args=ServerArgs(policy="noop"),
         _configured=False,
         _gateway=None,
@@ -31,6 +32,7 @@ def replica(start: Any) -> Any:
         _follow_others=lambda: asyncio.sleep(0),
         _watch_shutdown=lambda: asyncio.sleep(0),
     )
+    return one
 
 
 def test_a_replica_runs_when_its_policy_has_loaded() -> None:
@@ -38,8 +40,7 @@ def test_a_replica_runs_when_its_policy_has_loaded() -> None:
 
     async def start() -> list[bool]:
         one = replica(lambda: loaded.wait(60))
-        one._start = lambda: PolicyReplica._start(one)
-        running = asyncio.ensure_future(PolicyReplica.reconfigure(one, {}, None))
+        running = asyncio.ensure_future(one.reconfigure({}, None))
         await asyncio.wait({running}, timeout=0.3)
         before = running.done()
         loaded.set()
@@ -55,9 +56,7 @@ def test_a_policy_that_does_not_load_is_a_failed_start() -> None:
         raise PolicyFailed("the policy did not load: no checkpoint here")
 
     async def start() -> None:
-        one = replica(fail)
-        one._start = lambda: PolicyReplica._start(one)
-        await PolicyReplica.reconfigure(one, {}, None)
+        await replica(fail).reconfigure({}, None)
 
     with pytest.raises(PolicyFailed, match="no checkpoint here"):
         asyncio.run(start())
@@ -74,7 +73,7 @@ def test_only_the_traceback_of_a_policys_own_bug_is_shown(
 
     one = replica(fail)
     with pytest.raises(PolicyFailed, match="the policy did not load: no jax") as failed:
-        asyncio.run(PolicyReplica._start(one))
+        asyncio.run(one._start())
     lines = traceback.format_exception(failed.value)
     assert ("direct cause" in "".join(lines)) == shown
     assert ("in fail" in "".join(lines)) == shown
