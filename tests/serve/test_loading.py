@@ -20,9 +20,16 @@ from vlagents_ray.serve.replica.app import build
 from vlagents_ray.serve.replica.replica import PolicyReplica
 
 
-def replica(start: Any) -> PolicyReplica:
+class Bare(PolicyReplica):
+    """A replica that Serve has not made, and that has nothing to close."""
+
+    def __del__(self) -> None:  # type: ignore[override]
+        pass
+
+
+def replica(start: Any) -> Bare:
     """A replica with what starting touches."""
-    one = object.__new__(PolicyReplica)
+    one = object.__new__(Bare)
     vars(one).update(
         _args=ServerArgs(policy="noop"),
         _configured=False,
