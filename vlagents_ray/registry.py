@@ -86,6 +86,7 @@ _EXTRAS = {
     "gym_pusht": "pusht",
     "gymnasium_robotics": "robotics",
     "mujoco": "robotics",
+    "opentelemetry": "otel",
     "wandb": "wandb",
     "trackio": "trackio",
     "tensorboard": "tensorboard",
@@ -97,6 +98,7 @@ _EXTRAS = {
 _POLICY_REQUIREMENTS = {
     "torch": ("diffusion_policy", "hf", "lerobot", "openpi", "openvla"),
     "transformers": ("hf", "lerobot", "octo", "openpi", "openvla"),
+    "torchvision": ("diffusion_policy", "hf", "openvla"),
     "tokenizers": ("hf", "lerobot", "octo", "openpi", "openvla"),
     "huggingface_hub": ("diffusion_policy", "hf", "lerobot", "octo", "openpi", "openvla"),
     "safetensors": ("hf", "lerobot", "openpi", "openvla"),
