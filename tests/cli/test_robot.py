@@ -109,7 +109,7 @@ def test_a_human_corrects_a_policy(tmp_path: Path) -> None:
 def test_cameras_are_drawn_two_pixels_a_character_and_redrawn_in_place(monkeypatch: pytest.MonkeyPatch) -> None:
     clock, written = Clock(), []
     monkeypatch.setattr("vlagents_ray.cli.robot.terminal_view.time.monotonic", clock)
-    monkeypatch.setattr("shutil.get_terminal_size", lambda: os.terminal_size((80, 10)))
+    monkeypatch.setattr("shutil.get_terminal_size", lambda **_: os.terminal_size((80, 10)))
     view = TerminalView(written.append)
     image = np.zeros((16, 16, 3), np.uint8)
     image[:8, :, 0] = 255
