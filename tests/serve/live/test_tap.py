@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from manual_clock import Clock
 
+from vlagents_ray.chunking.execution import WATCHED
 from vlagents_ray.images.codecs import DecodedFiles
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.protocol.messages import Reply, Request
@@ -69,6 +70,20 @@ def test_answers_are_sent_first_and_kept_in_order(watched: Watched) -> None:
     first, second = watched.tap.answers(0)
     assert (first.session, first.op, second.session, second.op) == ("a", "act", "b", "reset")
     assert watched.tap.answers(first.number) == [second]
+
+
+def test_players_are_told_of_viewers_and_of_nothing_else_that_reads(watched: Watched) -> None:
+    """What they then state with each request costs half a millisecond over shared memory."""
+    watched.tap.renew()
+    watched.ask("a", Obs())
+    watched.tap.renew(viewer=True)
+    watched.ask("a", Obs())
+    watched.ask("a", Obs())
+    watched.clock.now += LEASE_S
+    watched.tap.renew()
+    watched.ask("a", Obs())
+    told = [reply.act is not None and WATCHED in reply.act.info for [reply] in watched.replies]
+    assert told == [False, True, False, False]
 
 
 def test_unreadable_requests_are_kept_as_errors(watched: Watched) -> None:

@@ -85,7 +85,7 @@ class ReplicaView:
         It may take milliseconds, so it does not belong on an event loop or the policy's thread.
         """
         engine, tap = self._engine, self.tap
-        tap.renew()
+        tap.renew(viewer=True)
         answers = tap.answers(since)
         snapshot = Snapshot(answers[-1].number if answers else since, {})
         last = {one.session: one for one in answers if one.op in _SHOWN_OPS}

@@ -110,6 +110,7 @@ class LiveTap:
         self._commands = commands
         self._clock = clock
         self._until = float("-inf")  # end of the lease, s
+        self._viewed_until = float("-inf")  # end of that of the last viewer
         self._shown = False
         self._numbers = itertools.count(1)
         self._answers: deque[Answer] = deque(maxlen=_ANSWERS)
@@ -118,12 +119,20 @@ class LiveTap:
 
     @property
     def watched(self) -> bool:
-        """Whether a viewer looks."""
+        """Whether anything reads."""
         return self._clock() < self._until
 
-    def renew(self, lease_s: float = LEASE_S) -> None:
-        """Keep what happens for `lease_s` more."""
-        self._until = max(self._until, self._clock() + lease_s)
+    def renew(self, lease_s: float = LEASE_S, *, viewer: bool = False) -> None:
+        """Keep what happens for `lease_s` more.
+
+        Args:
+            lease_s: The time, s.
+            viewer: Whether a person looks, who is to see what the players execute; a recording does without.
+        """
+        until = self._clock() + lease_s
+        self._until = max(self._until, until)
+        if viewer:
+            self._viewed_until = until
         if not self._shown:
             self._shown = True
             self._show(self)
@@ -198,9 +207,13 @@ class LiveTap:
                 held.pop(session, None)
 
     def _tell(self, session: str, reply: Reply) -> None:
-        """Say from time to time that somebody looks, so that a chunk player states what it executed."""
+        """Say from time to time that a viewer looks, so that a chunk player states what it executed."""
         now = self._clock()
-        if reply.act is not None and now - self._told.get(session, float("-inf")) > _TELL_S:
+        if (
+            now < self._viewed_until
+            and reply.act is not None
+            and now - self._told.get(session, float("-inf")) > _TELL_S
+        ):
             self._told[session] = now
             reply.act.info[WATCHED] = True
 
