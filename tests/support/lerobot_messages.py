@@ -97,12 +97,10 @@ def setup(**changes: Any) -> RemotePolicyConfig:
     return RemotePolicyConfig(stated.pop("policy_type", "act"), stated.pop("checkpoint", "me/act"), **stated)
 
 
-def seen(
-    timestep: int, pixel: int = 0, shoulder: float = 0.5, task: str = "abc", must_go: bool = False
-) -> TimedObservation:
+def robot_saw(timestep: int, pixel: int = 0, task: str = "abc", must_go: bool = False, **more: Any) -> TimedObservation:
     """An observation of a robot with `FEATURES`."""
-    values = {"shoulder.pos": shoulder, "gripper.pos": 0.25, "front": np.full((8, 8, 3), pixel, np.uint8), "task": task}
-    return TimedObservation(1000.0 + timestep, timestep, values, must_go)
+    values = {"shoulder.pos": 0.5, "gripper.pos": 0.25, "front": np.full((8, 8, 3), pixel, np.uint8), "task": task}
+    return TimedObservation(1000.0 + timestep, timestep, values | more, must_go)
 
 
 def field_of(number: int, value: int | bytes) -> bytes:

@@ -21,7 +21,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from lerobot_messages import HELPERS, TimedObservation, pickled, seen, setup
+from lerobot_messages import HELPERS, TimedObservation, pickled, robot_saw, setup
 from many import many
 
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
@@ -245,7 +245,7 @@ def test_what_is_no_number_text_or_array_of_numbers_is_refused(value: Any, says:
 
 def test_a_class_of_a_listed_module_is_not_listed() -> None:
     with pytest.raises(MalformedMessage, match=r"names 'lerobot\.async_inference\.helpers' 'FPSTracker'"):
-        read(pickled(seen(1)).replace(b"\x10TimedObservation", b"\x0aFPSTracker"))
+        read(pickled(robot_saw(1)).replace(b"\x10TimedObservation", b"\x0aFPSTracker"))
     with pytest.raises(MalformedMessage, match="got a RemotePolicyConfig, want a TimedObservation"):
         read(pickled(setup()))
 
@@ -323,7 +323,7 @@ def test_programs_that_no_client_sends_are_refused(program: bytes, says: str) ->
 @pytest.mark.parametrize("head", [b"", b"\x80", b"\x80\x02", b"\x80\x03", b"\x80\x06", b"(dp0\n"])
 def test_other_protocols_are_refused(head: bytes) -> None:
     with pytest.raises(MalformedMessage, match=r"protocol 4 or 5|ends too early"):
-        read(head + pickled(seen(1))[2:] * bool(head[1:2]))
+        read(head + pickled(robot_saw(1))[2:] * bool(head[1:2]))
 
 
 def test_the_watch_sees_what_pickle_would_do() -> None:
@@ -338,7 +338,7 @@ def test_the_watch_sees_what_pickle_would_do() -> None:
 def mutations() -> Callable[[random.Random], bytes]:
     """Draw a pickle that was changed in a few places, with parts of other programs among its own."""
     seeds = [base64.b64decode(text) for text in (SETUP, *OBSERVATIONS.values())]
-    seeds += [pickled(message, protocol) for message in (seen(3), setup()) for protocol in (4, 5)]
+    seeds += [pickled(message, protocol) for message in (robot_saw(3), setup()) for protocol in (4, 5)]
     seeds.append(pickled({"x": [Command(), (1, 2.0), {"y": None}]}))
     opcodes = [opcode.code.encode("latin-1") for opcode in pickletools.opcodes]
     words = [
@@ -392,7 +392,7 @@ def test_mutated_pickles_execute_nothing_and_cost_little() -> None:
 
 @given(st.binary(max_size=200), st.integers(0, 10**6))
 def test_garbage_is_refused(garbage: bytes, place: int) -> None:
-    data = pickled(seen(3))
+    data = pickled(robot_saw(3))
     at = place % len(data)
     for changed in (garbage, b"\x80\x04" + garbage, data[:at] + garbage, data[:at] + garbage + data[at:]):
         attempt(changed)

@@ -80,8 +80,8 @@ def read_instructions(data: bytes, limits: Limits) -> PolicyInstructions:
             state = _names(feature)
         elif not (name.startswith(IMAGES) and kind in ("image", "video")):
             raise InvalidObservation(
-                f"lerobot_features: got {name[:_SHOWN]!r} of {str(kind)[:_SHOWN]!r}, want {STATE!r} of float32, and images "
-                f"{IMAGES + 'NAME'!r}"
+                f"lerobot_features: got {name[:_SHOWN]!r} of {str(kind)[:_SHOWN]!r}, want {STATE!r} of float32, and "
+                f"images {IMAGES + 'NAME'!r}"
             )
     cameras = tuple(name.removeprefix(IMAGES) for name in features if name != STATE)
     if len(cameras) > limits.cameras or len(state) > limits.state_values:
@@ -143,7 +143,7 @@ def frame(observation: RobotObservation, robot: PolicyInstructions) -> dict[str,
             if not is_number(value):
                 raise InvalidObservation(f"{name[:_SHOWN]!r}: got {type(value).__name__}, want a number")
             numbers.append(value)
-        with np.errstate(over="ignore"):  # becomes infinite, which is refused later
+        with np.errstate(over="ignore"):  # becomes infinite, as at LeRobot's own server
             found[STATE] = np.array(numbers, np.float64).astype(np.float32)
     for name in robot.cameras:
         if name not in values:

@@ -47,7 +47,7 @@ class LeRobotConnection:
         self._session = GatewaySessions(context.connect, context.contract)
         self._session.show(NoKey.OPEN, None)  # the protocol has no key, and the deployment accepted that
         self._robot: PolicyInstructions | None = None
-        self._acted = -1  # time step of the last observation that was acted on
+        self._acted = -1  # time step of the last observation that the policy got
         self._waiting: _Waiting | None = None
         self._arrival = threading.Condition()
         self._acting = threading.Lock()
@@ -93,7 +93,7 @@ class LeRobotConnection:
     def observe(self, data: bytes, admission: MessageAdmission) -> None:
         """Take an observation in place of an earlier one that the policy did not get yet.
 
-        One of a time step that was acted on already is left out, unless the client must have actions.
+        One of a time step that the policy got already is left out, unless the client has no action left.
 
         Args:
             data: The pickle.
@@ -150,11 +150,14 @@ class LeRobotConnection:
         robot, contract, seen = self._robot, self._context.contract, waiting.seen
         if robot is None:
             raise NotReset("SendPolicyInstructions: got none since Ready; start the client again")
+        before, self._acted = self._acted, max(self._acted, seen.timestep)
         try:
             act = self._session.act(waiting.obs, waiting.instruction)
+        except BaseException:
+            self._acted = before  # the client's next observation of this time step is not left out
+            raise
         finally:
             waiting.admission.release()
         rows: np.ndarray = self._mapping.rows(act.action, None if contract is None else contract.action)
-        self._acted = max(self._acted, seen.timestep)
         hz = (contract and contract.control_hz) or _HZ
         return codec.write_chunk(rows[: robot.actions_per_chunk], seen.timestamp, seen.timestep, 1 / hz)

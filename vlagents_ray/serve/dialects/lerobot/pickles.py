@@ -54,7 +54,7 @@ Call = Callable[[tuple[Any, ...]], "Reduced | int | float"]
 """Returns what a call in a pickle stands for, given its arguments; raises `MalformedMessage` for others."""
 
 
-class _Entry(NamedTuple):
+class _StackValue(NamedTuple):
     """A value on the stack."""
 
     value: Any
@@ -77,10 +77,10 @@ def read_pickle(
         MalformedMessage: The bytes are no pickle, or have another opcode, name or shape than those listed here.
         MessageTooLarge: The pickle exceeds a limit.
     """
-    return _PickleReader(data, limits, records, calls).whole()
+    return _StackMachine(data, limits, records, calls).whole()
 
 
-class _PickleReader:
+class _StackMachine:
     """A stack machine without calls."""
 
     def __init__(
@@ -92,9 +92,9 @@ class _PickleReader:
         self._records = records
         self._calls = calls
         self._items = 0
-        self._stack: list[_Entry] = []
-        self._below: list[list[_Entry]] = []  # the stacks below each open mark
-        self._memo: list[_Entry] = []
+        self._stack: list[_StackValue] = []
+        self._below: list[list[_StackValue]] = []  # the stacks below each open mark
+        self._memo: list[_StackValue] = []
 
     def whole(self) -> Record:
         """Read the pickle to its end."""
@@ -130,7 +130,7 @@ class _PickleReader:
         """Put a value onto the stack."""
         if depth > self._limits.depth:
             raise MessageTooLarge(f"pickle: more than {self._limits.depth} levels of nesting")
-        self._stack.append(_Entry(value, depth, items))
+        self._stack.append(_StackValue(value, depth, items))
 
     def pop(self) -> Any:
         """Take the value at the top of the stack."""
@@ -172,7 +172,7 @@ class _PickleReader:
         self._count(entry.items)
         self._stack.append(entry)
 
-    def tuple_of(self, entries: Sequence[_Entry]) -> None:
+    def tuple_of(self, entries: Sequence[_StackValue]) -> None:
         """Make a tuple of values."""
         self.push(
             tuple(_finished(entry.value) for entry in entries),
@@ -180,11 +180,11 @@ class _PickleReader:
             1 + sum(entry.items for entry in entries),
         )
 
-    def extend(self, entries: Sequence[_Entry]) -> None:
+    def extend(self, entries: Sequence[_StackValue]) -> None:
         """Append values to the list below them."""
         self._into(list, entries).extend(_finished(entry.value) for entry in entries)
 
-    def update(self, entries: Sequence[_Entry]) -> None:
+    def update(self, entries: Sequence[_StackValue]) -> None:
         """Put keys and values into the dict below them."""
         keys = [entry.value for entry in entries[::2]]
         if len(entries) % 2 or not all(type(key) is str for key in keys):
@@ -192,7 +192,7 @@ class _PickleReader:
         values = [_finished(entry.value) for entry in entries[1::2]]
         self._into(dict, entries).update(zip(keys, values, strict=True))
 
-    def last(self, number: int | None) -> list[_Entry]:
+    def last(self, number: int | None) -> list[_StackValue]:
         """Take the last values, or all since the mark, from the stack."""
         if number is not None:
             return [self._entry() for _ in range(number)][::-1]
@@ -239,7 +239,7 @@ class _PickleReader:
                 got = [str(key)[:_SHOWN] for key in state.value][: 2 * len(fields)]
                 raise MalformedMessage(f"pickle: {target.name.name}: got the fields {got}, want {list(fields)}")
             target.fields = state.value
-            self._stack[-1] = _Entry(target, state.depth + 1)
+            self._stack[-1] = _StackValue(target, state.depth + 1)
         elif isinstance(target, Reduced) and target.value is None and target.read_state is not None:
             target.value = target.read_state(state.value)
         else:
@@ -250,17 +250,17 @@ class _PickleReader:
         if self._items > self._limits.items:
             raise MessageTooLarge(f"pickle: more than {self._limits.items} values in a message")
 
-    def _top(self) -> _Entry:
+    def _top(self) -> _StackValue:
         if not self._stack:
             raise MalformedMessage("pickle: an opcode without its value")
         return self._stack[-1]
 
-    def _entry(self) -> _Entry:
+    def _entry(self) -> _StackValue:
         entry = self._top()
         self._stack.pop()
         return entry
 
-    def _into(self, kind: type, entries: Sequence[_Entry]) -> Any:
+    def _into(self, kind: type, entries: Sequence[_StackValue]) -> Any:
         """Return the container below `entries`, which will contain them."""
         container = self._entry()
         if type(container.value) is not kind:
@@ -270,7 +270,7 @@ class _PickleReader:
         return container.value
 
 
-def _above(entries: Sequence[_Entry]) -> int:
+def _above(entries: Sequence[_StackValue]) -> int:
     return 1 + max((entry.depth for entry in entries), default=0)
 
 
@@ -296,33 +296,33 @@ _U1, _U2, _U4, _U8 = (struct.Struct(f"<{kind}") for kind in "BHIQ")
 _I4, _F8 = struct.Struct("<i"), struct.Struct(">d")
 
 
-def _number(form: struct.Struct, then: Callable[[_PickleReader, Any], None]) -> Callable[[_PickleReader], None]:
+def _number(form: struct.Struct, then: Callable[[_StackMachine, Any], None]) -> Callable[[_StackMachine], None]:
     return lambda reader: then(reader, form.unpack(reader.take(form.size))[0])
 
 
-def _bytes(reader: _PickleReader, length: int) -> None:
+def _bytes(reader: _StackMachine, length: int) -> None:
     reader.push(reader.take(length))
 
 
-def _fixed(value: Any) -> Callable[[_PickleReader], None]:
+def _fixed(value: Any) -> Callable[[_StackMachine], None]:
     return lambda reader: reader.push(value)
 
 
-_OPCODES: dict[int, Callable[[_PickleReader], None]] = {
+_OPCODES: dict[int, Callable[[_StackMachine], None]] = {
     ord("N"): _fixed(None),
     0x88: _fixed(True),
     0x89: _fixed(False),
-    ord("K"): _number(_U1, _PickleReader.push),
-    ord("M"): _number(_U2, _PickleReader.push),
-    ord("J"): _number(_I4, _PickleReader.push),
-    0x8A: _PickleReader.integer,
-    ord("G"): _number(_F8, _PickleReader.push),
-    0x8C: _number(_U1, _PickleReader.text),
-    ord("X"): _number(_U4, _PickleReader.text),
+    ord("K"): _number(_U1, _StackMachine.push),
+    ord("M"): _number(_U2, _StackMachine.push),
+    ord("J"): _number(_I4, _StackMachine.push),
+    0x8A: _StackMachine.integer,
+    ord("G"): _number(_F8, _StackMachine.push),
+    0x8C: _number(_U1, _StackMachine.text),
+    ord("X"): _number(_U4, _StackMachine.text),
     ord("C"): _number(_U1, _bytes),
     ord("B"): _number(_U4, _bytes),
     0x96: _number(_U8, _bytes),  # a bytearray
-    ord("("): _PickleReader.mark,
+    ord("("): _StackMachine.mark,
     ord(")"): _fixed(()),
     0x85: lambda reader: reader.tuple_of(reader.last(1)),
     0x86: lambda reader: reader.tuple_of(reader.last(2)),
@@ -334,12 +334,12 @@ _OPCODES: dict[int, Callable[[_PickleReader], None]] = {
     ord("}"): lambda reader: reader.push({}, 1),
     ord("s"): lambda reader: reader.update(reader.last(2)),
     ord("u"): lambda reader: reader.update(reader.last(None)),
-    0x94: _PickleReader.remember,
-    ord("h"): _number(_U1, _PickleReader.recall),
-    ord("j"): _number(_U4, _PickleReader.recall),
-    0x93: _PickleReader.name,
-    ord("R"): _PickleReader.reduce,
-    0x81: _PickleReader.new,
-    ord("b"): _PickleReader.build,
+    0x94: _StackMachine.remember,
+    ord("h"): _number(_U1, _StackMachine.recall),
+    ord("j"): _number(_U4, _StackMachine.recall),
+    0x93: _StackMachine.name,
+    ord("R"): _StackMachine.reduce,
+    0x81: _StackMachine.new,
+    ord("b"): _StackMachine.build,
     0x95: lambda reader: reader.skip(_U8.size),  # a frame, whose length is of no use here
 }
