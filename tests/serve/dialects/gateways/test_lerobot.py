@@ -14,7 +14,8 @@ from lerobot_messages import BEGIN, END, FEATURES, MIDDLE, AsyncClient, field_of
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.dialects.lerobot import handler
+from vlagents_ray.serve.dialects.gateway_sessions import GatewaySessions
+from vlagents_ray.serve.dialects.lerobot import codec, handler
 
 
 def sessions(replicas: Replicas) -> int:
@@ -259,6 +260,33 @@ def test_no_other_process_shares_the_port(open_lerobot) -> None:
     server = grpc.server(None, options=[("grpc.so_reuseport", 1)])
     with pytest.raises(RuntimeError, match="bind"):
         server.add_insecure_port(f"127.0.0.1:{port}")
+
+
+def test_an_endpoint_for_ipv4_has_no_clients_over_ipv6(open_lerobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the host 0.0.0.0, gRPC also listens on all addresses of IPv6."""
+    port, peer = open_lerobot(), grpc._server._Context.peer
+    monkeypatch.setattr(grpc._server._Context, "peer", lambda self: peer(self).replace("ipv4:", "ipv6:"))
+    with AsyncClient(port) as robot, pytest.raises(grpc.RpcError, match="is for IPv4") as error:
+        robot.begin()
+    assert status_of(error)[0] == "PERMISSION_DENIED"
+
+
+def test_what_is_no_error_of_ours_is_logged_and_not_shown(open_lerobot, caplog, monkeypatch) -> None:
+    monkeypatch.setattr(codec, "frame", lambda *_: 1 / 0)
+    with AsyncClient(open_lerobot()).begin() as robot, pytest.raises(grpc.RpcError) as error:
+        robot.send(robot_saw(0))
+    status, details = status_of(error)
+    assert (status, "ZeroDivisionError" in caplog.text, "division" in details) == ("INTERNAL", True, False)
+
+
+def test_a_time_step_whose_action_failed_may_come_again(open_lerobot, monkeypatch: pytest.MonkeyPatch) -> None:
+    act = GatewaySessions.act
+    monkeypatch.setattr(GatewaySessions, "act", lambda *_: 1 / 0)
+    with AsyncClient(open_lerobot()).begin() as robot:
+        with pytest.raises(grpc.RpcError, match="internal error"):
+            robot.act(robot_saw(3))
+        monkeypatch.setattr(GatewaySessions, "act", act)
+        assert robot.act(robot_saw(3, pixel=5))
 
 
 def test_with_keys_on_the_deployment_must_accept_clients_without_one(open_lerobot) -> None:

@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 
 from pydantic import Field
 
-from vlagents_ray.errors import MalformedMessage, MessageTooLarge, NotReset, PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import Forbidden, MalformedMessage, MessageTooLarge, NotReset, PolicyUnavailable, VLAgentsError
 from vlagents_ray.registry import require
 from vlagents_ray.serve.config.dialects import KeylessPortConfig, MappingSetting
 from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
@@ -33,9 +33,11 @@ _TICK_S = 0.5
 _END_S = 3.0
 _REQUESTS = 4  # maximum number of requests of one client at a time; LeRobot's has two
 _HEARTBEAT_MS = 10_000
+_DETAILS = 500  # maximum number of characters of an error, which gRPC sends in a header of 8 KiB at most
 # HTTP status -> name of gRPC's; the client sends a request again by itself if it is UNAVAILABLE or DEADLINE_EXCEEDED
 _STATUS = {
     400: "INVALID_ARGUMENT",
+    403: "PERMISSION_DENIED",
     404: "NOT_FOUND",
     409: "FAILED_PRECONDITION",
     413: "RESOURCE_EXHAUSTED",
@@ -84,11 +86,13 @@ class LeRobotDialect(PortDialect):
         self._clients: GatewayClients[str, LeRobotConnection] = GatewayClients(context)
         self._uploads: dict[Any, float] = {}  # gRPC's context of each observation that is being received -> its start
         self._server: Any = None
+        self._ipv4 = True
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="lerobot", daemon=True)
 
     def serve(self, listener: socket.socket) -> None:
         grpc = require("grpc")
+        self._ipv4 = listener.family == socket.AF_INET
         host, port = listener.getsockname()[:2]
         most = _REQUESTS * self.context.sessions
         self._server = grpc.server(
@@ -121,6 +125,7 @@ class LeRobotDialect(PortDialect):
         self._clients.end_all()
         if self._server is not None:
             self._server.stop(None).wait(_END_S)
+        if self._thread.is_alive():
             self._thread.join(_END_S)
 
     def _methods(self, grpc: Any) -> dict[str, Any]:
@@ -145,12 +150,14 @@ class LeRobotDialect(PortDialect):
             name = uuid.uuid4().hex
             logger.exception("lerobot: request %s failed", name)
             status, text = "INTERNAL", f"internal error; the server's log has the details under {name}"
-        context.abort(getattr(grpc.StatusCode, status), text)
+        context.abort(getattr(grpc.StatusCode, status), text[:_DETAILS])
         raise AssertionError  # abort raises
 
     def _ready(self, _: bytes, context: Any) -> bytes:
         if self._closing.is_set():
             raise PolicyUnavailable("the server is stopping; connect again")
+        if self._ipv4 and context.peer().startswith("ipv6:"):  # gRPC listens there, too, if the host is 0.0.0.0
+            raise Forbidden("this server is for IPv4; connect to such an address, or set dialects.lerobot.host to '::'")
         make = partial(LeRobotConnection, self.context, self.mapping, self.config.checkpoint)
         self._clients.add(context.peer(), make)
         return protobuf.EMPTY
@@ -162,7 +169,8 @@ class LeRobotDialect(PortDialect):
 
     def _observe(self, parts: Iterator[bytes], context: Any) -> bytes:
         with self._client(context) as client:
-            admission = MessageAdmission(self.context.admission, self.context.limits, None, inline=False)
+            robot = self.config.rank == "robot"
+            admission = MessageAdmission(self.context.admission, self.context.limits, None, robot=robot, inline=False)
             self._uploads[context] = time.monotonic()
             try:
                 data = _joined(parts, admission)
