@@ -105,9 +105,10 @@ def test_a_mapping_gives_the_policys_names(open_lerobot) -> None:
         ({"actions_per_chunk": 0}, "an integer of 1 or more"),
         ({"lerobot_features": {"observation.state": {"dtype": "string"}}}, "want 'observation.state' of float32"),
         ({"lerobot_features": {"observation.state": {"dtype": "float32", "names": None}}}, "want `names`"),
-        ({"lerobot_features": []}, "got list, want a dict"),
+        ({"lerobot_features": {"observation.state": None}}, "got NoneType, want a dict"),
+        ({"lerobot_features": []}, "got list, dict, want dicts"),
         ({"lerobot_features": {f"observation.images.{n}": {"dtype": "image"} for n in range(17)}}, "17 cameras"),
-        ({"policy_type": 3}, "policy_type: got int, want text"),
+        ({"policy_type": 3}, "policy_type: got 3, want text"),
         ({"policy_type": print}, "names 'builtins' 'print'"),
     ],
 )

@@ -21,13 +21,14 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from lerobot_messages import HELPERS, TimedObservation, pickled, robot_saw, setup
+from lerobot_messages import FEATURES, HELPERS, TimedObservation, pickled, robot_saw, setup
 from many import many
 
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
 from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.serve.dialects.lerobot import codec
+from vlagents_ray.serve.mapping.presets import read_mapping
 
 LIMITS = Limits(body_bytes=2**20)
 MUTATED = int(os.environ.get("VLAGENTS_RAY_FUZZ", many(5000)))
@@ -114,6 +115,9 @@ class Watch:
 WATCH = Watch()  # a hook cannot be removed
 
 
+MAPPING = read_mapping("lerobot")
+
+
 def attempt(data: bytes) -> str:
     """Read what may be either of the messages, as the dialect does; returns the error's code, or "read"."""
     said = []
@@ -122,7 +126,7 @@ def attempt(data: bytes) -> str:
             with WATCH.watching():
                 found = reader(data)
                 if isinstance(found, codec.RobotObservation):
-                    codec.frame(found, ROBOT)
+                    MAPPING.obs(codec.frame(found, ROBOT), LIMITS)
             said.append("read")
         except InvalidInput as error:
             said.append(error.code)
@@ -241,6 +245,27 @@ class Text(str):
 def test_what_is_no_number_text_or_array_of_numbers_is_refused(value: Any, says: str) -> None:
     with pytest.raises(InvalidInput, match=says), WATCH.watching():
         value_of(value)
+
+
+ODD = [
+    None, True, -1, 1.5, float("nan"), "text", b"bytes", (), (1, "a"), [], ["a"] * 9, {}, {"a": 1}, np.zeros((2, 3)),
+    np.zeros(1), np.float32(1), np.ndarray, np.dtype("f4"), robot_saw(0),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("odd", ODD, ids=lambda odd: type(odd).__name__)
+def test_any_value_at_any_place_is_read_or_refused(odd: Any) -> None:
+    """Where a text, a number or a dict is expected, an array or a class has no truth value and no equal."""
+    for field in vars(setup()):
+        attempt(pickled(setup(**{"checkpoint" if field == "pretrained_name_or_path" else field: odd})))
+    for name, feature in FEATURES.items():
+        attempt(pickled(setup(lerobot_features={**FEATURES, name: odd})))
+        for key in feature:
+            attempt(pickled(setup(lerobot_features={**FEATURES, name: {**feature, key: odd}})))
+    for field in vars(robot_saw(0)):
+        attempt(pickled(TimedObservation(**vars(robot_saw(0)) | {field: odd})))
+    for name in ("front", "shoulder.pos", "task"):
+        attempt(pickled(robot_saw(0, **{name: odd})))
 
 
 def test_a_class_of_a_listed_module_is_not_listed() -> None:

@@ -66,21 +66,23 @@ def read_instructions(data: bytes, limits: Limits) -> PolicyInstructions:
     """
     stated = _fields(data, limits, _SETUP)
     policy_type, checkpoint = (_text(stated, name) for name in ("policy_type", "pretrained_name_or_path"))
-    rows, features = stated["actions_per_chunk"], stated["lerobot_features"]
+    rows, features, renames = (stated[name] for name in ("actions_per_chunk", "lerobot_features", "rename_map"))
     if type(rows) is not int or rows < 1:
-        raise MalformedMessage(f"actions_per_chunk: got {str(rows)[:_SHOWN]}, want an integer of 1 or more")
-    if not isinstance(features, dict):
-        raise MalformedMessage(f"lerobot_features: got {type(features).__name__}, want a dict")
-    if stated["rename_map"]:
+        raise MalformedMessage(f"actions_per_chunk: got {_shown(rows)}, want an integer of 1 or more")
+    if not (isinstance(features, dict) and isinstance(renames, dict)):
+        raise MalformedMessage(f"lerobot_features, rename_map: got {_shown(features)}, {_shown(renames)}, want dicts")
+    if renames:
         raise InvalidObservation("rename_map: got names, want none; rename them in dialects.lerobot.mapping")
     state: tuple[str, ...] = ()
     for name, feature in features.items():
-        kind = feature.get("dtype") if isinstance(feature, dict) else None
+        if not isinstance(feature, dict):
+            raise MalformedMessage(f"lerobot_features: {name[:_SHOWN]!r}: got {_shown(feature)}, want a dict")
+        kind = _text(feature, "dtype")
         if name == STATE and kind == "float32":
             state = _names(feature)
         elif not (name.startswith(IMAGES) and kind in ("image", "video")):
             raise InvalidObservation(
-                f"lerobot_features: got {name[:_SHOWN]!r} of {str(kind)[:_SHOWN]!r}, want {STATE!r} of float32, and "
+                f"lerobot_features: got {name[:_SHOWN]!r} of {kind[:_SHOWN]!r}, want {STATE!r} of float32, and "
                 f"images {IMAGES + 'NAME'!r}"
             )
     cameras = tuple(name.removeprefix(IMAGES) for name in features if name != STATE)
@@ -102,19 +104,19 @@ def read_observation(data: bytes, budget: Budget) -> RobotObservation:
     stated = _fields(data, budget.limits, _OBSERVATION)
     timestamp, timestep, values, must_go = (stated[name] for name in _RECORDS[_OBSERVATION])
     if not is_number(timestamp) or not math.isfinite(timestamp):
-        raise MalformedMessage(f"timestamp: got {str(timestamp)[:_SHOWN]}, want a finite number")
+        raise MalformedMessage(f"timestamp: got {_shown(timestamp)}, want a finite number")
     if type(timestep) is not int or not 0 <= timestep < _STEPS:
-        raise MalformedMessage(f"timestep: got {str(timestep)[:_SHOWN]}, want an integer in [0, 2**31)")
+        raise MalformedMessage(f"timestep: got {_shown(timestep)}, want an integer in [0, 2**31)")
     if type(must_go) is not bool:
-        raise MalformedMessage(f"must_go: got {type(must_go).__name__}, want a bool")
+        raise MalformedMessage(f"must_go: got {_shown(must_go)}, want a bool")
     if not isinstance(values, dict):
-        raise MalformedMessage(f"observation: got {type(values).__name__}, want a dict")
+        raise MalformedMessage(f"observation: got {_shown(values)}, want a dict")
     for name, value in values.items():
         if isinstance(value, np.ndarray):
             budget.count(value.nbytes)
         elif not (isinstance(value, (str, bool)) or is_number(value)):
             raise MalformedMessage(
-                f"observation: {name[:_SHOWN]!r}: got {type(value).__name__}, want a number, text or numpy array"
+                f"observation: {name[:_SHOWN]!r}: got {_shown(value)}, want a number, text or numpy array"
             )
     return RobotObservation(float(timestamp), timestep, values, must_go)
 
@@ -141,7 +143,7 @@ def frame(observation: RobotObservation, robot: PolicyInstructions) -> dict[str,
             if isinstance(value, np.ndarray) and value.size == 1:
                 value = value.item()
             if not is_number(value):
-                raise InvalidObservation(f"{name[:_SHOWN]!r}: got {type(value).__name__}, want a number")
+                raise InvalidObservation(f"{name[:_SHOWN]!r}: got {_shown(value)}, want a number")
             numbers.append(value)
         with np.errstate(over="ignore"):  # becomes infinite, as at LeRobot's own server
             found[STATE] = np.array(numbers, np.float64).astype(np.float32)
@@ -198,10 +200,15 @@ def _fields(data: bytes, limits: Limits, wanted: Name) -> dict[str, Any]:
 
 
 def _text(stated: Mapping[str, Any], name: str) -> str:
-    value = stated[name]
+    value = stated.get(name)
     if not isinstance(value, str):
-        raise MalformedMessage(f"{name}: got {type(value).__name__}, want text")
+        raise MalformedMessage(f"{name}: got {_shown(value)}, want text")
     return value
+
+
+def _shown(value: object) -> str:
+    """Return a client's value as an error shows it: a number, or the type of anything else, whatever its size."""
+    return repr(value) if is_number(value) else type(value).__name__
 
 
 def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:

@@ -137,6 +137,8 @@ class LeRobotConnection:
         if self._acting.acquire(blocking=False):
             try:
                 self._session.close()
+            except Exception:
+                logger.exception("lerobot: a session did not end")
             finally:
                 self._acting.release()
 
