@@ -120,7 +120,7 @@ class RobotRun:
         def ended() -> bool:
             if recorder is not None and (recorder.interventions or self.over):
                 recorder.label(label())
-            self._say_who_moves()
+            self._say_who_moves(begun=robot.steps > 0)
             if self._view is not None:
                 self._view.draw(robot.observe().cameras)
             return robot.ended or self.verdict is not None
@@ -185,10 +185,10 @@ class RobotRun:
         else:
             self._takeover.resume()
 
-    def _say_who_moves(self) -> None:
-        if self._takeover is None:
+    def _say_who_moves(self, begun: bool) -> None:
+        reason = None if self._takeover is None else self._takeover.reason
+        if self._takeover is None or not (begun or reason):
             return
-        reason = self._takeover.reason
         now = f"{reason}; p continues" if reason is not None else _MOVES[self._takeover.state]
         if now != self._said:
             if reason is not None:

@@ -72,7 +72,7 @@ class Summary:
 
     @property
     def state(self) -> str:
-        """How the last run ended, as in `Run.state`."""
+        """The state of the last run, as in `Run.state`."""
         return self.results.runs[-1].state
 
     @property
