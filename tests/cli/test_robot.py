@@ -21,6 +21,7 @@ from vlagents_ray.cli.main import app
 from vlagents_ray.cli.robot.terminal_view import TerminalView, blocks
 from vlagents_ray.policies.scripted import Scripted
 
+REPEATS = 20  # the loop has ten ticks in that time
 QUICK = ["--env", "tabletop/lift", "--env-set", "width=32", "--env-set", "height=32"]
 
 
@@ -69,8 +70,9 @@ def test_a_human_drives_a_simulation_and_labels_its_episodes(tmp_path: Path) -> 
     def keys(press: Callable[[str], None], wait: Callable[[str], None]) -> None:
         for verdict in ("y", "x", "n"):
             wait("seed")
-            press("w")
-            time.sleep(0.5)
+            for _ in range(REPEATS):  # as a terminal does while the key is down
+                press("w")
+                time.sleep(0.05)
             press(verdict)
         wait("seed")
         press("q")
@@ -86,11 +88,11 @@ def test_a_human_drives_a_simulation_and_labels_its_episodes(tmp_path: Path) -> 
 
 def test_a_human_corrects_a_policy(tmp_path: Path) -> None:
     def keys(press: Callable[[str], None], wait: Callable[[str], None]) -> None:
-        wait("seed")
-        time.sleep(0.3)
+        wait("the policy moves the robot")
         press("s")
-        time.sleep(0.5)
+        wait("you move the robot")
         press("\n")  # gives back
+        wait("the policy moves the robot")
         wait("seed")
         press("q")
 

@@ -51,7 +51,7 @@ def exported() -> dict[str, Series]:
             patch.setattr(metrics, kind, declared(kind))
         engine = Engine(Agent())
         metrics.Exporter(engine, dict.fromkeys(TAGS, "x"))
-        metrics.ShadowExporter(Comparer(None, "x"), dict.fromkeys(TAGS, "x"))
+        metrics.ShadowExporter(Comparer(), dict.fromkeys(TAGS, "x"))
         engine.close()
     return series
 

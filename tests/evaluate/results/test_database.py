@@ -6,6 +6,7 @@ import os
 import sqlite3
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -20,7 +21,7 @@ from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.merge import merge
 from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.jobs import plan
-from vlagents_ray.evaluate.results import database
+from vlagents_ray.evaluate.results import database, lock
 from vlagents_ray.evaluate.results.store import Store
 
 Config = Callable[..., EvalConfig]
@@ -135,7 +136,41 @@ def test_a_reader_cannot_write(config: Config) -> None:
 
 def test_what_a_killed_evaluation_left_is_read(config: Config) -> None:
     kill_in(config())
-    assert episodes(Results.load(config().out)) == 1
+    found = Results.load(config().out)
+    assert episodes(found) == 1
+    assert [run.state for run in found.runs] == ["killed"]
+
+
+def test_only_the_run_that_holds_the_lock_is_running(config: Config) -> None:
+    kill_in(config())
+    with Store(config(resume=True)) as store:
+        store.begin_run(config(), {})
+        assert [run.state for run in Results.load(config().out).runs] == ["killed", "running"]
+        store.end_run("complete")
+    assert [run.state for run in Results.load(config().out).runs] == ["killed", "complete"]
+
+
+def test_readers_that_look_at_the_lock_stop_no_evaluation(config: Config) -> None:
+    begun(config()).close()
+    looked = threading.Event()
+    over = threading.Event()
+
+    def look() -> None:
+        while not over.is_set():
+            lock.is_held(config().out)
+            looked.set()
+
+    readers = [threading.Thread(target=look) for _ in range(4)]
+    for reader in readers:
+        reader.start()
+    assert looked.wait(10)
+    try:
+        for _ in range(20):
+            Store(config(resume=True)).close()
+    finally:
+        over.set()
+        for reader in readers:
+            reader.join()
 
 
 @pytest.mark.parametrize("damage", [b"not a database", b"SQLite format 3\0" + bytes(4000)])

@@ -58,15 +58,15 @@ def test_the_candidate_may_be_a_name_or_settings(policy: str | dict[str, Any]) -
 
 
 def test_the_candidate_is_a_deployment_of_one_replica_behind_the_policy(candidate: str) -> None:
-    built = build({"policy": "noop", "replicas": 2, "shadow": {"policy": candidate, "record": "seen"}})
+    built = build({"policy": "noop", "replicas": 2, "shadow": {"policy": candidate, "record": "seen", "record_mb": 5}})
     policy = built._bound_deployment
     shadow = policy.init_kwargs["candidate"]._bound_deployment
     assert shadow.name == SHADOW
     assert shadow.num_replicas == 1
     assert shadow.ray_actor_options["num_gpus"] == 0.5
-    settings, record = shadow.init_args
+    settings, record, record_mb = shadow.init_args
     assert settings["config"] == {"chunk": 4}
-    assert record == str(Path("seen").absolute())
+    assert (record, record_mb) == (str(Path("seen").absolute()), 5)
     assert policy.init_args[0]["shadow"]["policy"] == "noop", "the live policy does not restart for its settings"
     assert build({"policy": "noop"})._bound_deployment.init_kwargs == {}
 

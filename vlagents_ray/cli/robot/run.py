@@ -29,6 +29,7 @@ from vlagents_ray.robot.teleoperation.keyboard import HELP
 DEVICES = ("keyboard", "spacemouse")
 KEYS = "p pauses and continues; y success, n failure, x discard end the episode; q quits"
 _HZ = 10.0  # of environments that state no rate
+_MOVES = {"autonomous": "the policy moves the robot", "human": "you move the robot", "paused": "nobody moves the robot"}
 
 
 class EnvPolicy(Wrapper):
@@ -79,7 +80,7 @@ class RobotRun:
     over: bool = field(default=False, init=False)  # the human wants no further episode
     _takeover: Takeover | None = field(default=None, init=False)
     _view: TerminalView | None = field(default=None, init=False)
-    _said: str | None = field(default=None, init=False)  # the reason of the pause that was printed
+    _said: str | None = field(default=None, init=False)  # who moves the robot, or why nobody does, as printed
 
     def play(self, seeds: Iterable[int]) -> None:
         """Play an episode for each seed, and print what became of it.
@@ -119,7 +120,7 @@ class RobotRun:
         def ended() -> bool:
             if recorder is not None and (recorder.interventions or self.over):
                 recorder.label(label())
-            self._say_why_paused()
+            self._say_who_moves(begun=robot.steps > 0)
             if self._view is not None:
                 self._view.draw(robot.observe().cameras)
             return robot.ended or self.verdict is not None
@@ -184,12 +185,16 @@ class RobotRun:
         else:
             self._takeover.resume()
 
-    def _say_why_paused(self) -> None:
+    def _say_who_moves(self, begun: bool) -> None:
         reason = None if self._takeover is None else self._takeover.reason
-        if reason not in (None, self._said):
-            out.bell()
-            self._say(f"  {reason}; p continues")
-        self._said = reason
+        if self._takeover is None or not (begun or reason):
+            return
+        now = f"{reason}; p continues" if reason is not None else _MOVES[self._takeover.state]
+        if now != self._said:
+            if reason is not None:
+                out.bell()
+            self._say(f"  {now}")
+        self._said = now
 
     def _say(self, text: str) -> None:
         if self._view is not None:

@@ -10,7 +10,8 @@ from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import EvalCase
 from vlagents_ray.evaluate.plan.jobs import Job
 from vlagents_ray.evaluate.report.progress import Progress, SilentProgress
-from vlagents_ray.evaluate.report.results_document import RUNNING, STARTING, ResultsDocument
+from vlagents_ray.evaluate.report.results_document import STARTING, ResultsDocument
+from vlagents_ray.evaluate.results.database import RUNNING
 from vlagents_ray.evaluate.results.reader import Results
 from vlagents_ray.evaluate.results.statistics import Rate
 

@@ -9,11 +9,11 @@ from typing import Any
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.storage import inside, outcome
 from vlagents_ray.evaluate.report.progress import seconds_left
-from vlagents_ray.evaluate.results.database import FILE
+from vlagents_ray.evaluate.results.database import FILE, RUNNING
 from vlagents_ray.evaluate.results.reader import CellResults, Episode, Results, rate_of
 from vlagents_ray.evaluate.results.statistics import Rate
 
-STARTING, RUNNING = "starting", "running"
+STARTING = "starting"
 _FAILURES = 24  # most failures in the document, the newest ones
 _TEXT = 300  # most characters of an error or an instruction
 _EVERY_S = 1.0  # least time between two readings of the results

@@ -8,6 +8,7 @@ from rich.table import Table
 
 from vlagents_ray.evaluate.report.html import FILE as REPORT
 from vlagents_ray.evaluate.results.comparison import Comparison, clock_gaps
+from vlagents_ray.evaluate.results.database import RUNNING
 from vlagents_ray.evaluate.results.summary import Group, Summary, pushed_of
 
 
@@ -67,7 +68,9 @@ def print_summary(console: Console, summary: Summary) -> None:
             "cells that stopped after different numbers of episodes have no rate in common: quote each by itself"
         )
     lines += [_gap(one) for one in clock_gaps(summary.results)]
-    if summary.state != "complete":
+    if summary.state == RUNNING:
+        lines.append("still running")
+    elif summary.state != "complete":
         lines.append(f"{summary.state}: go on with --resume")
     lines.append(f"results: {summary.out}")
     if (summary.out / REPORT).is_file():

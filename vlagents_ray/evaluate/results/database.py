@@ -20,6 +20,7 @@ from typing import Any
 from vlagents_ray.errors import ConfigError
 
 FILE = "results.db"
+RUNNING = "running"  # the state of a run that has not ended, or was killed
 VERSION = 3
 
 SCHEMA = """

@@ -17,9 +17,13 @@ from vlagents_ray.evaluate.episode.records import EpisodeResult
 from vlagents_ray.evaluate.plan.cases import contender
 from vlagents_ray.evaluate.plan.config import StopConfig
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
-from vlagents_ray.evaluate.results.database import FILE, read_only, require_readable
+from vlagents_ray.evaluate.results import lock
+from vlagents_ray.evaluate.results.database import FILE, RUNNING, read_only, require_readable
 from vlagents_ray.evaluate.results.statistics import Rate
 from vlagents_ray.evaluate.results.stopping import Stopping, pooled
+
+KILLED = "killed"
+"""The state of a run that ended without saying so."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +81,8 @@ class Run:
 
     run: int
     started: float  # seconds since 1970
-    ended: float | None  # None: it was killed
-    state: str  # "complete", "interrupted", "out of time", "stopped" by an error, or "running"
+    ended: float | None  # None: it runs, or was killed
+    state: str  # "complete", "interrupted", "out of time", "stopped" by an error, "running", or "killed"
     config: dict[str, Any]
     versions: dict[str, Any]
 
@@ -148,6 +152,7 @@ class Results:
             ConfigError: The folder holds no results, or they are of another version, or cannot be read.
         """
         out = Path(out)
+        written = lock.is_held(out)
         with reading(out) as db:
             episodes: dict[str, list[Episode]] = {}
             for row in table(db, "episodes", "seed"):
@@ -155,13 +160,18 @@ class Results:
             attempts: dict[str, list[Attempt]] = {}
             for row in table(db, "attempts"):
                 attempts.setdefault(row["cell"], []).append(Attempt(**row | {"retried": bool(row["retried"])}))
+            runs = [_run(row) for row in table(db, "runs")]
+            written = written or lock.is_held(out)  # it may have begun meanwhile
             return cls(
                 out,
                 tuple(
                     _cell(row, tuple(episodes.get(row["cell"], ())), tuple(attempts.get(row["cell"], ())))
                     for row in table(db, "cells")
                 ),
-                tuple(_run(row) for row in table(db, "runs")),
+                tuple(
+                    replace(run, state=KILLED) if run.state == RUNNING and not (written and run is runs[-1]) else run
+                    for run in runs
+                ),
                 {row["name"]: json.loads(row["metadata"]) for row in table(db, "policies")},
                 tuple(Worker(**row) for row in table(db, "workers")),
             )

@@ -6,15 +6,12 @@ that is killed and resumed has each episode exactly once. Read it with `vlagents
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import json
 import os
 import sqlite3
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 from vlagents_ray.errors import ConfigError, WeightsLost
@@ -24,10 +21,9 @@ from vlagents_ray.evaluate.episode.records import EnvInfo, EpisodeResult, Worker
 from vlagents_ray.evaluate.plan.cases import EvalCase, cells
 from vlagents_ray.evaluate.plan.config import EvalConfig, canonical
 from vlagents_ray.evaluate.plan.jobs import Job
-from vlagents_ray.evaluate.results import database
-from vlagents_ray.evaluate.results.database import SCHEMA, VERSION, complete, insert, require_readable
+from vlagents_ray.evaluate.results import database, lock
+from vlagents_ray.evaluate.results.database import RUNNING, SCHEMA, VERSION, complete, insert, require_readable
 
-LOCK = "results.lock"
 IDENTITY = ("policy", "checkpoint", "weights")  # of a policy's metadata; must not change between runs
 
 
@@ -62,7 +58,7 @@ class Store:
         self._out = config.out
         with storing(config.out):
             self._out.mkdir(parents=True, exist_ok=True)
-            self._lock = _lock(self._out)
+            self._lock = lock.acquire(self._out)
         self._run = 0
         self._weights: dict[str, str | None] = {}  # by the cell that they played; read when first needed
         self._made: set[str] = set()  # places whose env is known to be that of earlier runs
@@ -89,7 +85,7 @@ class Store:
         with self._db:
             row = (
                 time.time() if started is None else started,
-                "running",
+                RUNNING,
                 config.model_dump_json(),
                 canonical(versions),
             )
@@ -306,24 +302,3 @@ def _differences(db: sqlite3.Connection, cell: EvalCase) -> list[str]:
         differing.append(("seeds", seeds, cell.suite.seeds))
     where = " ".join(filter(None, cell.name))
     return [f"{where}: {name}: the results have {old!r}, now it is {new!r}" for name, old, new in differing]
-
-
-def _lock(out: Path) -> int:
-    """Open a file with a lock on `out`, which the system releases when this process ends."""
-    file = os.open(out / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        os.close(file)
-        raise ConfigError(
-            f"{out}: another evaluation is writing there; wait for it, or choose another folder"
-        ) from error
-    except OSError as error:
-        os.close(file)
-        if error.errno not in (errno.ENOSYS, errno.EOPNOTSUPP, errno.ENOLCK):
-            raise
-        raise ConfigError(
-            f"{out}: its file system knows no locks ({error.strerror}), so that two evaluations could write to one "
-            f"folder; choose another one with --out (Lustre: have it mounted with `-o flock`)"
-        ) from error
-    return file

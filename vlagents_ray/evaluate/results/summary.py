@@ -72,7 +72,7 @@ class Summary:
 
     @property
     def state(self) -> str:
-        """The way in which the last run ended: "complete", "interrupted", "out of time", or "stopped" by an error."""
+        """The state of the last run, as in `Run.state`."""
         return self.results.runs[-1].state
 
     @property

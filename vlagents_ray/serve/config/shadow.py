@@ -27,6 +27,7 @@ class ShadowArgs(BaseModel):
         description="folder on the candidate's node, where each comparison becomes a line of JSON; a relative path is "
         "one from the working directory",
     )
+    record_mb: int = Field(default=1000, ge=1, description="most MB of these files; the oldest ones are deleted")
 
     @field_validator("record")
     @classmethod

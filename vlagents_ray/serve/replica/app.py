@@ -11,6 +11,7 @@ from ray.serve import Application
 
 from vlagents_ray.serve.config.deployment import GATEWAY, POLICY, SHADOW, ServerArgs, candidate_of
 from vlagents_ray.serve.config.dialects import DialectArgs
+from vlagents_ray.serve.config.shadow import ShadowArgs
 from vlagents_ray.serve.dialects.gateway import Gateway
 from vlagents_ray.serve.python_env.probe import with_process
 from vlagents_ray.serve.replica.candidate import CandidateReplica
@@ -61,7 +62,7 @@ def build(args: ServerArgs) -> Application:
     if args.shadow is not None:
         candidate = candidate_of(args.shadow)
         settings["shadow"]["policy"] = candidate.policy
-        parts["candidate"] = _shadow(candidate, args.shadow.record)
+        parts["candidate"] = _shadow(candidate, args.shadow)
     return policy.bind(settings, **parts)
 
 
@@ -86,7 +87,7 @@ def _options(args: ServerArgs, name: str) -> dict[str, Any]:
     }
 
 
-def _shadow(candidate: ServerArgs, record: str | None) -> Application:
+def _shadow(candidate: ServerArgs, shadow: ShadowArgs) -> Application:
     """Build the deployment of the candidate: one replica, which only the live policy's replicas call."""
     args = candidate.model_copy(update={"environment": with_process(candidate.environment), "dialects": DialectArgs()})
     options = {
@@ -96,7 +97,7 @@ def _shadow(candidate: ServerArgs, record: str | None) -> Application:
         "graceful_shutdown_wait_loop_s": 0.1,  # the live policy does not wait for a comparison
     }
     settings = args.model_dump(mode="json", exclude=_OUTSIDE)
-    return serve.deployment(**options)(CandidateReplica).bind(settings, record)
+    return serve.deployment(**options)(CandidateReplica).bind(settings, shadow.record, shadow.record_mb)
 
 
 def _gateway(args: ServerArgs) -> Application:

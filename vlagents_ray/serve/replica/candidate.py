@@ -20,18 +20,31 @@ from vlagents_ray.serve.replica.engine_replica import EngineReplica
 from vlagents_ray.serve.replica.metrics import ShadowExporter, tags_of
 from vlagents_ray.serve.shadow.comparer import Comparer
 from vlagents_ray.serve.shadow.comparison import require_comparable
+from vlagents_ray.serve.shadow.comparison_log import ComparisonLog
 
 
 class CandidateReplica(EngineReplica):
     """Acts on what a live policy has acted on, and compares. It loads once the live policy can act."""
 
-    async def __init__(self, args: dict[str, Any], record: str | None) -> None:  # type: ignore[misc]  # Serve awaits it
-        """Create the replica of the candidate with the settings `args`; `record` is the folder of the comparisons."""
+    async def __init__(  # type: ignore[misc]  # Serve awaits it
+        self, args: dict[str, Any], record: str | None, record_mb: int
+    ) -> None:
+        """Create the replica of the candidate.
+
+        Args:
+            args: Its settings.
+            record: The folder of the comparisons; None records none.
+            record_mb: Most MB of them.
+        """
         self._live: Contract | None = None
         self._open_engine(ServerArgs(**args), self._check)
         context = serve.get_replica_context()
-        folder = None if record is None else Path(record)
-        self._comparer = await asyncio.to_thread(Comparer, folder, f"{context.app_name}-{context.replica_tag}")
+        log = None
+        if record is not None:
+            log = await asyncio.to_thread(
+                ComparisonLog, Path(record), context.app_name, context.replica_tag, record_mb * 10**6
+            )
+        self._comparer = Comparer(log)
         self._metrics = ShadowExporter(self._comparer, tags_of(self._args.policy))
 
     def _check(self, contract: Contract | None) -> None:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +17,7 @@ from vlagents_ray.interface import POLICY, Act
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.metrics_buffer import Sample
 from vlagents_ray.serve.shadow.comparison import ActionDifference, action_difference
+from vlagents_ray.serve.shadow.comparison_log import ComparisonLog
 
 logger = logging.getLogger(__name__)
 
@@ -36,20 +35,9 @@ class Compared:
 class Comparer:
     """Compares the candidate's replies with those of the live policy. Thread-safe."""
 
-    def __init__(self, folder: Path | None, name: str) -> None:
-        """Create a comparer.
-
-        Args:
-            folder: Where each comparison is recorded, as a line of JSON in a file; None records nothing.
-            name: The name of that file, without its suffix.
-
-        Raises:
-            OSError: The folder cannot be made.
-        """
-        self._file: Path | None = None
-        if folder is not None:
-            folder.mkdir(parents=True, exist_ok=True)
-            self._file = folder / f"{name}.jsonl"
+    def __init__(self, log: ComparisonLog | None = None) -> None:
+        """Create a comparer that records each comparison in `log`; None records nothing."""
+        self._log = log
         self._lock = threading.Lock()
         self._compared = Compared()
 
@@ -89,7 +77,8 @@ class Comparer:
                 }
                 line["difference"] = self._compare(request, ours, theirs)
             lines.append(line)
-        self._record(lines)
+        if self._log is not None:
+            self._log.write(lines)
         return lost
 
     def collect(self) -> Compared:
@@ -123,16 +112,6 @@ class Comparer:
             "first_row": found.first_row.tolist(),
             "cosine": found.cosine,
         }
-
-    def _record(self, lines: Iterable[dict[str, Any]]) -> None:
-        if self._file is None:
-            return
-        try:
-            with self._file.open("a") as file:
-                file.writelines(json.dumps(line) + "\n" for line in lines)
-        except OSError:
-            logger.exception("shadow: %s is not written any more", self._file)
-            self._file = None
 
 
 def _described(reply: Reply) -> dict[str, Any]:

@@ -10,6 +10,7 @@ const STATES = {
   complete: "Complete",
   interrupted: "Interrupted: --resume goes on",
   "out of time": "Out of time: --resume goes on",
+  killed: "Killed: --resume goes on",
   stopped: "Stopped by an error",
 };
 const UNDER_WAY = ["starting", "running", "waiting"];
@@ -39,7 +40,7 @@ function showEvaluation(said, now) {
   document.title = `${said.planned ? Math.floor((100 * said.done) / said.planned) : 0} %, ${said.name}, live`;
   const state = STATES[said.state] + (said.reason ? `: ${said.reason}` : "");
   if (byId("evaluation-state").textContent !== state) byId("evaluation-state").textContent = state; // it is read aloud
-  byId("evaluation-state").className = said.state === "stopped" ? "bad" : "";
+  byId("evaluation-state").className = ["killed", "stopped"].includes(said.state) ? "bad" : "";
   byId("retries").textContent = said.retries ? `Attempts that infrastructure failed, and that were repeated: ${said.retries}` : "";
   showCells(said);
   showCurves(said.curves);
