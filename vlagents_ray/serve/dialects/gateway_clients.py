@@ -78,14 +78,11 @@ class GatewayClients(Generic[K, C]):
             ended = [self._clients.pop(key) for key in removed]
         _end(ended)
 
-    def all(self) -> list[C]:
-        """Return all clients."""
-        with self._lock:
-            return list(self._clients.values())
-
     def end_all(self) -> list[C]:
         """End the sessions of all clients, and return the clients."""
-        return _end(self.all())
+        with self._lock:
+            clients = list(self._clients.values())
+        return _end(clients)
 
     def _is_gone(self, client: C, now: float) -> bool:
         patience_s = self._context.idle_s if client.begun else min(_QUIET_S, self._context.idle_s)

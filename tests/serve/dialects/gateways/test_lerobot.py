@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import random
+import socket
 import threading
 from collections.abc import Iterator
 
@@ -11,6 +14,7 @@ import pytest
 from eval_fakes import wait_for
 from in_process_replicas import Replicas
 from lerobot_messages import BEGIN, END, FEATURES, MIDDLE, AsyncClient, field_of, parts_of, pickled, robot_saw, setup
+from many import many
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.access.api_keys import NoKey
@@ -288,6 +292,20 @@ def test_a_time_step_whose_action_failed_may_come_again(open_lerobot, monkeypatc
             robot.act(robot_saw(3))
         monkeypatch.setattr(GatewaySessions, "act", act)
         assert robot.act(robot_saw(3, pixel=5))
+
+
+def test_garbage_instead_of_grpc_holds_up_nobody(open_lerobot) -> None:
+    port, choose = open_lerobot(), random.Random(1)
+    preface = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n"
+    with AsyncClient(port).begin() as robot:
+        robot.act(robot_saw(0))
+        for number in range(many(300)):
+            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=10) as connection:
+                connection.sendall(preface * (number % 3 > 0))
+                if number % 3 == 2:  # a frame of any kind
+                    connection.sendall(b"\0\0" + bytes([9, choose.randrange(11)]) + choose.randbytes(5))
+                connection.sendall(choose.randbytes(choose.randrange(200)))
+        assert rows(robot.act(robot_saw(1, pixel=4)))[0] == [4, 0.5, -1, 3, 2]
 
 
 def test_with_keys_on_the_deployment_must_accept_clients_without_one(open_lerobot) -> None:

@@ -87,7 +87,7 @@ class LeRobotConnection:
                 f"pretrained_name_or_path: got {robot.checkpoint[:80]!r}, this server acts for {self._checkpoint!r}; "
                 "start the client with that"
             )
-        logger.info("lerobot: a client of %s %s begins", robot.policy_type[:80], robot.checkpoint[:80])
+        logger.info("lerobot: a client of %r %r begins", robot.policy_type[:80], robot.checkpoint[:80])
         self._robot = robot
 
     def observe(self, data: bytes, admission: MessageAdmission) -> None:
