@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
 
 from vlagents_ray.chunking.buffer import Step
 from vlagents_ray.chunking.motion import Motion
-from vlagents_ray.errors import ConfigError, InvalidAction
+from vlagents_ray.errors import ConfigError, InvalidAction, VLAgentsError
 from vlagents_ray.interface import (
     DISTRIBUTION,
     EXECUTED,
@@ -52,12 +52,29 @@ class Leader(Protocol):
         ...
 
 
+@runtime_checkable
+class DistantLeader(Leader, Protocol):
+    """The interface of a leader with which a human may be far from the robot: whoever stands at it goes first."""
+
+    @property
+    def distant(self) -> bool:
+        """Whether the human who is engaged is far away."""
+        ...
+
+    def dismiss(self, why: str) -> None:
+        """Let a human who is far away have to take over again; `why` is told to him."""
+        ...
+
+
 class Takeover:
     """The state of a chunk player: autonomous → paused → human → autonomous, decided once a tick.
 
     A leader that is engaged has the robot, whatever the state was. When it lets go, the policy continues, or the robot
     is paused if `pause` was called meanwhile. `pause` and `resume` may be called from any thread; they take effect at
     the next tick.
+
+    A human who is far away (`DistantLeader`) goes last: any pause ends his hold of the robot at once, and he takes over
+    neither in a pause by somebody at the robot nor while the robot is stopped.
 
     Args:
         leader: What a human moves the robot with; None if there is nothing.
@@ -79,6 +96,7 @@ class Takeover:
         self._samples = samples
         self._executed: deque[np.ndarray] = deque(maxlen=_EXECUTED)  # in place of the policy's, since the last request
         self._pause: str | None = None  # the reason of a pause that lasts
+        self._paused_here = False  # whether somebody at the robot paused it
         self._noted = False  # an action was noted at this tick
         self._judged: Mapping[str, Any] | None = None  # the info of the last chunk whose uncertainty was looked at
         self._helped = False  # since the last certain chunk, a human has looked at the scene
@@ -98,12 +116,27 @@ class Takeover:
         """Whether a leader or a threshold is set."""
         return self.leader is not None or self._threshold is not None
 
-    def pause(self, reason: str = PAUSED) -> None:
-        """Let the robot hold still from the next tick on, until `resume` or a human."""
+    def pause(self, reason: str = PAUSED, *, here: bool = True) -> None:
+        """Let the robot hold still from the next tick on, until `resume` or a human.
+
+        Args:
+            reason: Why, for `reason`.
+            here: Whether somebody at the robot asks for it; then nobody who is far away ends it.
+        """
+        self._paused_here = here or (self._paused_here and self._pause is not None)
         self._pause = reason
 
-    def resume(self) -> None:
-        """Let the policy continue from the next tick on, with a new answer."""
+    def resume(self, *, here: bool = True) -> None:
+        """Let the policy continue from the next tick on, with a new answer.
+
+        Args:
+            here: Whether somebody at the robot asks for it.
+
+        Raises:
+            ConfigError: Somebody at the robot paused it, and somebody else is to end that.
+        """
+        if not here and self._pause is not None and self._paused_here:
+            raise ConfigError("resume: somebody at the robot has paused it; resume it there")
         self._pause = None
 
     def begin(self) -> None:
@@ -124,8 +157,12 @@ class Takeover:
             try:
                 engaged = self.leader.engaged()
             except Exception as error:  # noqa: BLE001 - a broken device must not end the loop
-                self.pause(f"the leader failed: {error!r}")
-            if engaged and before != "human":
+                self.pause(
+                    str(error) if isinstance(error, VLAgentsError) else f"the leader failed: {error!r}", here=False
+                )
+            if engaged and self._pause is not None and self._is_outranked(before):
+                engaged = False
+            elif engaged and before != "human":
                 self._pause = None
         self._state = "human" if engaged else "autonomous" if self._pause is None else "paused"
         void = self._state == "paused" or self._state == "autonomous" != before
@@ -172,6 +209,8 @@ class Takeover:
         if self._noted:
             self._executed.pop()
             self._noted = False
+        if isinstance(self.leader, DistantLeader) and self.leader.distant:
+            self.leader.dismiss("the robot was stopped")
 
     def extras(self) -> dict[str, Any]:
         """Return what the next request says in its `Obs.info`: the samples wanted, and what was executed since."""
@@ -180,6 +219,15 @@ class Takeover:
             extras[EXECUTED] = np.stack(self._executed)
             self._executed.clear()
         return extras
+
+    def _is_outranked(self, before: TakeoverState) -> bool:
+        """Whether the human who is engaged is far away, and the pause ends his hold of the robot, or forbids one."""
+        if not (isinstance(self.leader, DistantLeader) and self.leader.distant):
+            return False
+        outranked = self._paused_here or before == "human"
+        if outranked:
+            self.leader.dismiss(self._pause or PAUSED)
+        return outranked
 
     def _led(self, obs: Obs) -> np.ndarray:
         if self.leader is None:
@@ -215,8 +263,13 @@ class Takeover:
             return False
         if self._helped:
             return False
-        self.pause(f"asks for help: its uncertainty is {value:.3g}, above {self._threshold:.3g}")
+        self.pause(f"asks for help: its uncertainty is {value:.3g}, above {self._threshold:.3g}", here=False)
         return True
+
+
+def _reason(error: Exception) -> str:
+    """Return why a leader that raised an error pauses the robot; this package's errors say it themselves."""
+    return str(error) if isinstance(error, VLAgentsError) else f"the leader failed: {error!r}"
 
 
 def uncertainty(info: Mapping[str, Any]) -> float | None:

@@ -30,12 +30,7 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.images.codecs import RAW, ImageCodec
 from vlagents_ray.interface import DEADLINE, Act, Agent, Obs, Parts, copied
-from vlagents_ray.protocol.messages import (
-    RANKS,
-    RankName,
-    Reply,
-    Request,
-)
+from vlagents_ray.protocol.messages import RANKS, RankName, Reply, Request
 from vlagents_ray.tracing import tracer
 
 if TYPE_CHECKING:
@@ -98,15 +93,13 @@ class RemoteAgent(Agent):
         if rank not in RANKS:
             raise ConfigError(f"rank: got {rank!r}, want one of {list(RANKS)}")
         choice = CodecChoice(codec)
-        new_transport = partial(select_transport, url, transport, choice, Credentials(api_key, ca, certificate))
+        self.credentials = Credentials(api_key, ca, certificate)
+        new_transport = partial(select_transport, url, transport, choice, self.credentials)
         renew = new_transport if resume else None
-        self._attach(
-            Connection(url, new_transport(), choice, timeout_s, connect_timeout_s, renew), rank, resume, commands
-        )
+        connection = Connection(url, new_transport(), choice, timeout_s, connect_timeout_s, renew)
+        self._attach(connection, rank, resume, commands)
 
-    def _attach(
-        self, connection: Connection, rank: RankName, resume: bool, commands: CommandInbox | None = None
-    ) -> None:
+    def _attach(self, connection: Connection, rank: RankName, resume: bool, commands: CommandInbox | None) -> None:
         self._connection = connection
         self._commands = commands
         self._rank: RankName = rank
@@ -120,7 +113,8 @@ class RemoteAgent(Agent):
         made = []
         for _ in range(n):
             agent = object.__new__(type(self))
-            agent._attach(self._connection, self._rank, self._resume)
+            agent.credentials = self.credentials
+            agent._attach(self._connection, self._rank, self._resume, None)
             made.append(agent)
         return made
 
@@ -128,6 +122,11 @@ class RemoteAgent(Agent):
     def url(self) -> str:
         """The server's URL, as it was given."""
         return self._connection.url
+
+    @property
+    def session(self) -> str:
+        """The id of its session; it is another one after `close`, or where the episode had to begin again."""
+        return self._session.id
 
     @property
     def transport(self) -> str:

@@ -58,17 +58,17 @@ class OperatedLoop:
     def pause(self) -> None:
         """Hold the robot still until `resume`."""
         if self._takeover is not None:
-            self._takeover.pause(PAUSED)
+            self._takeover.pause(PAUSED, here=False)
         else:
             self._holds = self._holds or PAUSED
 
     def resume(self) -> None:
-        """Let the policy go on; raises `ConfigError` if the robot was stopped, and a person has to start it."""
+        """Let the policy go on; raises `ConfigError` if somebody at the robot paused it, or has to start it."""
         if self._watchdog is not None and self._watchdog.stopped and self._manual:
             raise ConfigError("resume: the robot is stopped; start it where it stands")
-        self._holds = None
         if self._takeover is not None:
-            self._takeover.resume()
+            self._takeover.resume(here=False)
+        self._holds = None
 
     def stop(self, by: str) -> None:
         """Stop the robot."""

@@ -39,17 +39,18 @@ class RelayedLeader:
         self._command: np.ndarray | None = None  # None: the policy has the robot
         self._sent = -math.inf  # s of `time.monotonic`: when the last command or release was
 
-    def command(self, action: np.ndarray, ago_s: float = 0.0) -> bool:
+    def command(self, action: np.ndarray, ago_s: float = 0.0, *, at: float | None = None) -> bool:
         """Take over, or go on, with an action.
 
         Args:
             action: The human's action, (D,) float32; it is commanded at each tick until the next one.
             ago_s: How long ago it was sent, s; a sender's clock need not agree with this one.
+            at: When it was sent at the earliest, s of this computer's `time.monotonic`, in place of `ago_s`.
 
         Returns:
             Whether it counts. One that is older than the last one, or than the deadline, does not.
         """
-        sent = time.monotonic() - max(ago_s, 0.0)
+        sent = time.monotonic() - max(ago_s, 0.0) if at is None else at
         with self._lock:
             if sent < self._sent or self._is_late(sent):
                 return False

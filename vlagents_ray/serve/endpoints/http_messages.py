@@ -12,6 +12,7 @@ from starlette.formparsers import MultiPartException
 from starlette.requests import Request as HttpRequest
 from starlette.responses import JSONResponse, Response
 from starlette.types import Message, Receive, Scope
+from starlette.websockets import WebSocket
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge, Overloaded, TooManyRequests, VLAgentsError
 from vlagents_ray.protocol.frames import CONTENT_TYPE, check_request, decode_requests
@@ -32,6 +33,7 @@ from vlagents_ray.protocol.messages import (
 from vlagents_ray.serve.engine.admission import MessageAdmission
 
 LONG_BYTES = 512 * 1024  # longer JSON or msgpack is decoded in another thread, as other requests need the event loop
+_POLICY_VIOLATION = 1008  # WebSocket close code
 _GZIP = b"\x1f\x8b"  # the first bytes of a gzip file
 _HEADERS = "vlagents_ray.headers"  # key of the decoded headers in an ASGI scope
 
@@ -232,6 +234,14 @@ def request_id(http: HttpRequest) -> str:
 def named(shown: str) -> str:
     """Return the request id of a header, or a new one if that is empty, no valid name, or could forge a log line."""
     return shown if shown and is_name(shown) else uuid.uuid4().hex
+
+
+async def deny(socket: WebSocket, error: VLAgentsError) -> None:
+    """Refuse a WebSocket that was not accepted yet, with the error as an HTTP response if the server can send one."""
+    if "websocket.http.response" in (socket.scope.get("extensions") or {}):
+        await socket.send_denial_response(problem_response(error, ""))
+    else:
+        await socket.close(_POLICY_VIOLATION)
 
 
 def problem_response(error: VLAgentsError, request_id: str, status: int | None = None) -> Response:

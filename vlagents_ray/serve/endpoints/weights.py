@@ -24,10 +24,11 @@ from starlette.responses import JSONResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from vlagents_ray.errors import Forbidden, InvalidInput, MalformedMessage, MessageTooLarge, Overloaded, VLAgentsError
+from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge, Overloaded, VLAgentsError
 from vlagents_ray.protocol.json_messages import problem
 from vlagents_ray.serve.access.api_keys import Caller, current_caller
-from vlagents_ray.serve.endpoints.http_messages import problem_response, request_id
+from vlagents_ray.serve.access.scope_check import ScopeCheck
+from vlagents_ray.serve.endpoints.http_messages import deny, problem_response, request_id
 from vlagents_ray.serve.weights.updates import PushOptions, PushResult
 from vlagents_ray.weights.safetensors import MESSAGE_BYTES, ValueSpec, ValuesReader, read_header
 
@@ -35,7 +36,6 @@ logger = logging.getLogger(__name__)
 
 PATH = "/v1/weights"
 _SCOPE = "weights"
-_POLICY_VIOLATION = 1008  # a WebSocket close code
 _DIGITS = 20  # most of a version's number
 _TRUTH = {"true": True, "false": False}
 
@@ -72,24 +72,21 @@ class _WeightsEndpoint:
     def __init__(self, replicas: ReceivesWeights, slow_s: float, open_to_network: bool) -> None:
         self._replicas = replicas
         self._slow_s = slow_s
-        self._open_to_network = open_to_network
+        self._scopes = ScopeCheck("weights", open_to_network=open_to_network)
         self._receiving = False
 
     async def show(self, http: HttpRequest) -> Response:
         try:
-            self._require_scope()
+            self._scopes.require(_SCOPE)
             return JSONResponse({"versions": await self._replicas.versions_of_weights()})
         except VLAgentsError as error:
             return problem_response(error, request_id(http))
 
     async def receive(self, socket: WebSocket) -> None:
         try:
-            self._require_scope()
+            self._scopes.require(_SCOPE)
         except VLAgentsError as error:
-            if "websocket.http.response" in (socket.scope.get("extensions") or {}):
-                await socket.send_denial_response(problem_response(error, ""))
-            else:
-                await socket.close(_POLICY_VIOLATION)
+            await deny(socket, error)
             return
         await socket.accept()
         try:
@@ -139,23 +136,13 @@ class _WeightsEndpoint:
             ) from None
         if message["type"] == "websocket.disconnect":
             raise WebSocketDisconnect(message["code"])
-        self._require_scope()
+        self._scopes.require(_SCOPE)
         part: bytes | None = message.get("bytes")
         if part is None:
             raise MalformedMessage("weights: got a text message, want a binary one")
         if len(part) > MESSAGE_BYTES:
             raise MessageTooLarge(f"weights: got a part of {len(part)} bytes, the limit is {MESSAGE_BYTES}")
         return part
-
-    def _require_scope(self) -> None:
-        caller = current_caller()
-        if isinstance(caller, Caller):
-            caller.admit(free=True, scope=_SCOPE)
-        elif self._open_to_network:
-            raise Forbidden(
-                f"weights: a server with `--insecure` takes none; make a key with `vlagents-ray keys new NAME --scope "
-                f"{_SCOPE}` and serve with `--keys`, or serve on loopback without `--insecure`"
-            )
 
 
 def _options(query: Mapping[str, str]) -> PushOptions:

@@ -4,6 +4,7 @@
     GET /v1/live   what the replicas do now, as JSON without pictures; keys need the scope "watch"
     WS  /v1/live   the same with pictures, at most ten times a second
     POST /v1/live/command   {"session": …, "do": "pause"}: see `CommandBoard.press`; keys need the scope "operate"
+    WS  /v1/live/control, /v1/live/robot    a human moves a robot: see `vlagents_ray.serve.live.remote.endpoint`
     GET /v1/live/videos/7   a video to which the document refers by its number, where an evaluation is watched
 
 The viewer asks for each message, with the sessions whose pictures it shows: {"shown": ["arm-1", …]}. So a slow viewer
@@ -34,13 +35,15 @@ from starlette.responses import FileResponse, HTMLResponse, JSONResponse, Respon
 from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from vlagents_ray.errors import Forbidden, MalformedMessage, MessageTooLarge, Overloaded, VLAgentsError
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge, Overloaded, VLAgentsError
 from vlagents_ray.protocol.json_messages import problem
 from vlagents_ray.serve.access.api_keys import Caller, current_caller
 from vlagents_ray.serve.access.audit import log_pressed
+from vlagents_ray.serve.access.scope_check import ScopeCheck, caller_name
 from vlagents_ray.serve.endpoints.access_middleware import LIVE_PAGE
-from vlagents_ray.serve.endpoints.http_messages import problem_response, request_id
+from vlagents_ray.serve.endpoints.http_messages import deny, problem_response, request_id
 from vlagents_ray.serve.live.fleet import Fleet, Viewer
+from vlagents_ray.serve.live.remote.endpoint import remote_routes
 
 logger = logging.getLogger(__name__)
 
@@ -51,7 +54,7 @@ _WATCH, _OPERATE = "watch", "operate"  # scopes of keys
 _COMMAND_BYTES = 2**14  # longest command
 _VIEWERS = 32  # most viewers at once
 _SILENT_S = 30.0  # longest time between two messages of a viewer
-_SCRIPTS = ("evaluation.js", "live.js")
+_SCRIPTS = ("evaluation.js", "takeover.js", "live.js")
 _CHARACTERS = 2**16  # longest message of a viewer
 _POLICY_VIOLATION, _TRY_AGAIN_LATER = 1008, 1013  # WebSocket close codes
 
@@ -75,19 +78,20 @@ def live_routes(fleet: Fleet, *, open_to_network: bool, videos: VideoFiles | Non
         WebSocketRoute(PATH, endpoint.watch),
         Route(_COMMAND, endpoint.press, methods=["POST"]),
     ]
+    routes += remote_routes(fleet, open_to_network=open_to_network)
     return routes if videos is None else [*routes, Route(f"{PATH}/videos/{{number:int}}", endpoint.video)]
 
 
 class _LiveEndpoint:
     def __init__(self, fleet: Fleet, open_to_network: bool, videos: VideoFiles | None) -> None:
         self._fleet = fleet
-        self._open_to_network = open_to_network
+        self._scopes = ScopeCheck("live", open_to_network=open_to_network)
         self._videos = videos
         self._watching = 0
 
     async def show(self, http: HttpRequest) -> Response:
         try:
-            self._require_scope(_WATCH)
+            self._scopes.require(_WATCH)
         except VLAgentsError as error:
             return problem_response(error, request_id(http))
         viewer = self._fleet.add()
@@ -99,7 +103,7 @@ class _LiveEndpoint:
 
     async def video(self, http: HttpRequest) -> Response:
         try:
-            self._require_scope(_WATCH)
+            self._scopes.require(_WATCH)
         except VLAgentsError as error:
             return problem_response(error, request_id(http))
         path = None if self._videos is None else self._videos(http.path_params["number"])
@@ -107,10 +111,9 @@ class _LiveEndpoint:
 
     async def press(self, http: HttpRequest) -> Response:
         try:
-            self._require_scope(_OPERATE)
+            self._scopes.require(_OPERATE)
             session, do, text = _command(await _body(http))
-            caller = current_caller()
-            by = caller.name if isinstance(caller, Caller) else ""
+            by = caller_name()
             pressed = await self._fleet.press(session, do, text, by)
         except ClientDisconnect:
             return Response(status_code=499)
@@ -122,14 +125,11 @@ class _LiveEndpoint:
     async def watch(self, socket: WebSocket) -> None:
         offered = socket.scope.get("subprotocols") or []
         try:
-            self._require_scope(_WATCH)
+            self._scopes.require(_WATCH)
             if self._watching >= _VIEWERS:
                 raise Overloaded(f"live: {_VIEWERS} viewers watch already; close one")
         except VLAgentsError as error:
-            if "websocket.http.response" in (socket.scope.get("extensions") or {}):
-                await socket.send_denial_response(problem_response(error, ""))
-            else:
-                await socket.close(_POLICY_VIOLATION)
+            await deny(socket, error)
             return
         await socket.accept(_PROTOCOL if _PROTOCOL in offered else None)
         caller = current_caller()
@@ -153,8 +153,8 @@ class _LiveEndpoint:
         while True:
             viewer.shown = frozenset(await self._asked(socket))
             document, files = await viewer.next()
-            self._require_scope(_WATCH)
-            await socket.send_bytes(_message({**document, "may_operate": self._may(_OPERATE)}, files))
+            self._scopes.require(_WATCH)
+            await socket.send_bytes(_message({**document, "may_operate": self._scopes.may(_OPERATE)}, files))
 
     async def _asked(self, socket: WebSocket) -> list[str]:
         try:
@@ -171,20 +171,6 @@ class _LiveEndpoint:
         except (ValueError, TypeError, KeyError, RecursionError) as error:
             raise MalformedMessage(f'live: got {text[:80]!r}, want {{"shown": ["SESSION", ...]}}') from error
         return list(shown)
-
-    def _may(self, scope: str) -> bool:
-        caller = current_caller()
-        return caller.refusal(scope) is None if isinstance(caller, Caller) else not self._open_to_network
-
-    def _require_scope(self, scope: str) -> None:
-        caller = current_caller()
-        if isinstance(caller, Caller):
-            caller.admit(free=True, scope=scope)
-        elif self._open_to_network:
-            raise Forbidden(
-                f"live: a server with `--insecure` shows nothing; make a key with `vlagents-ray keys new NAME --scope "
-                f"{scope}` and serve with `--keys`, or serve on loopback without `--insecure`"
-            )
 
 
 async def _body(http: HttpRequest) -> bytes:

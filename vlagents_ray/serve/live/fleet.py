@@ -11,6 +11,7 @@ from functools import partial
 from typing import Any, Protocol
 
 from vlagents_ray.errors import UnknownSession
+from vlagents_ray.serve.live.remote.robot_links import RobotLinks
 from vlagents_ray.serve.live.snapshot import ReplicaView, Snapshot
 from vlagents_ray.serve.live.tap import RATE
 
@@ -21,6 +22,9 @@ _BEHIND = 20  # most gathered snapshots that wait for a slow viewer; it misses t
 Other = Callable[[int, Collection[str]], Awaitable[Snapshot]]
 """Returns another replica's snapshot: since which, and the sessions whose pictures are wanted."""
 
+
+Exchange = Callable[[str, str, dict[str, Any]], Awaitable[dict[str, Any] | None]]
+"""`vlagents_ray.serve.live.remote.robot_links.RobotLinks.exchange` of a replica."""
 
 Beside = Callable[[], dict[str, Any]]
 """Returns further entries of the document; the same object as before if nothing in them has changed."""
@@ -35,6 +39,10 @@ class OtherReplicas(Protocol):
 
     async def press(self, session: str, do: str, text: str, by: str) -> dict[str, Any] | None:
         """Give a command to a session of one of them, see `CommandBoard.press`; None if none has the session."""
+        ...
+
+    async def exchange(self, session: str) -> Exchange | None:
+        """Return `RobotLinks.exchange` of the one that has the connection of the session's robot; None if none has."""
         ...
 
 
@@ -111,6 +119,17 @@ class Fleet:
         if pressed is None:
             raise UnknownSession(f"session {session!r}: no replica has it; it has ended")
         return pressed
+
+    @property
+    def robots(self) -> RobotLinks | None:
+        """The connections of robots at this process; None if it is no replica."""
+        return None if self._own is None else self._own.robots
+
+    async def exchange(self, session: str) -> Exchange | None:
+        """Return the way to the robot of a session, at any replica; None if it lets nobody move it."""
+        if self._own is not None and await self._own.robots.exchange(session, "", {"do": "find"}) is not None:
+            return self._own.robots.exchange
+        return None if self._others is None else await self._others.exchange(session)
 
     async def _gather(self) -> None:
         while True:

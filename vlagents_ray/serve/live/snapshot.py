@@ -18,6 +18,7 @@ from vlagents_ray.serve.config.live import LiveArgs
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import SAMPLE, STAGES, LoadMeter
 from vlagents_ray.serve.live.commands import CommandBoard
+from vlagents_ray.serve.live.remote.robot_links import RobotLinks
 from vlagents_ray.serve.live.ring import Ring
 from vlagents_ray.serve.live.tap import ENCODING_SHARE, RATE, ROWS, VALUES, Answer, LiveTap, Played, Seen
 from vlagents_ray.serve.models.loaded_model import LoadedModel
@@ -60,6 +61,7 @@ class ReplicaView:
         self._about = {"name": name, "node": node, "ring_s": None if settings is None else settings.ring_s}
         self._metadata = metadata
         self.commands = CommandBoard(engine.sessions, self._see_all, save=self._save)
+        self.robots = RobotLinks()
         self.tap = LiveTap(self._show, commands=self.commands)
         self.ring = None if settings is None else Ring(self.tap, engine.sessions, settings, name)
         self._meter: LoadMeter | None = None
@@ -117,6 +119,7 @@ class ReplicaView:
             "waiting": {rank.name.lower(): depth for rank, depth in engine.queue.depth_by_rank().items()},
             "sessions": list(sessions.values()),
             "sessions_held": len(engine.sessions),
+            "robots": self.robots.describe(),
         }
         return snapshot
 

@@ -60,3 +60,7 @@ class ReplicaLive:
             return self._view.commands.press(session, do, text, by)
         except UnknownSession:
             return None
+
+    async def exchange(self, session: str, hold: str, message: dict[str, Any]) -> dict[str, Any] | None:
+        """Pass on what a human does to a robot, for another replica, see `RobotLinks.exchange`."""
+        return await self._view.robots.exchange(session, hold, message)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import Collection
+from collections.abc import Awaitable, Callable, Collection
 from functools import partial
 from typing import Any
 
@@ -14,7 +14,7 @@ import ray
 from vlagents_ray.client.transports.serve_handle import call_replica
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.serve.config.deployment import POLICY
-from vlagents_ray.serve.live.fleet import Other, OtherReplicas
+from vlagents_ray.serve.live.fleet import Exchange, Other, OtherReplicas
 from vlagents_ray.serve.live.snapshot import Snapshot
 from vlagents_ray.serve.scaling.sibling_replicas import SiblingApi, replica_actors
 
@@ -45,19 +45,35 @@ class ReplicaViews(OtherReplicas):
 
     async def press(self, session: str, do: str, text: str, by: str) -> dict[str, Any] | None:
         """Give a command to a session of one of them, see `CommandBoard.press`; None if none has the session."""
+        pressed: dict[str, Any] | None = await self._first(
+            lambda actor: _answer(actor, SiblingApi.press, session, do, text, by)
+        )
+        return pressed
+
+    async def exchange(self, session: str) -> Exchange | None:
+        """Return `RobotLinks.exchange` of the one that has the connection of the session's robot; None if none has."""
+
+        async def found(actor: Any) -> Exchange | None:
+            exchange = partial(_answer, actor, SiblingApi.exchange)
+            return None if await exchange(session, "", {"do": "find"}) is None else exchange
+
+        exchange: Exchange | None = await self._first(found)
+        return exchange
+
+    async def _first(self, ask: Callable[[Any], Awaitable[Any]]) -> Any:
+        """Ask all of them, and return the first answer that is not None; raises what a replica itself raised."""
         actors = await asyncio.to_thread(self._look_up)
-        asked = [_press(actor, session, do, text, by) for actor in actors.values()]
-        for answer in asyncio.as_completed(asked):
+        for answer in asyncio.as_completed([ask(actor) for actor in actors.values()]):
             try:
-                pressed = await answer
+                found = await answer
             except (ray.exceptions.RayError, TimeoutError, asyncio.TimeoutError) as error:
                 cause = getattr(error, "cause", None)  # what the replica itself raised
                 if isinstance(cause, VLAgentsError):
                     raise cause from error
                 logger.info("another replica does not answer: %s", error)
                 continue
-            if pressed is not None:
-                return pressed
+            if found is not None:
+                return found
         return None
 
     def _look_up(self) -> dict[str, Any]:
@@ -70,7 +86,6 @@ async def _view(actor: Any, since: int, shown: Collection[str]) -> Snapshot:
     return snapshot
 
 
-async def _press(actor: Any, session: str, do: str, text: str, by: str) -> dict[str, Any] | None:
-    call = call_replica(actor, SiblingApi.press, session, do, text, by)
-    pressed: dict[str, Any] | None = await asyncio.wait_for(call, _PRESS_S)
-    return pressed
+async def _answer(actor: Any, method: Callable[..., Any], *args: Any) -> dict[str, Any] | None:
+    answer: dict[str, Any] | None = await asyncio.wait_for(call_replica(actor, method, *args), _PRESS_S)
+    return answer

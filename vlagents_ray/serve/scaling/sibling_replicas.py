@@ -54,6 +54,10 @@ class SiblingApi(Protocol):
         """Give a command to a session from the live page; None if the session is not here."""
         ...
 
+    async def exchange(self, session: str, hold: str, message: dict[str, Any]) -> dict[str, Any] | None:
+        """Pass on what a human at the live page does to a robot; None if its connection is not here."""
+        ...
+
 
 class _Replica(Peer):
     def __init__(self, name: str, actor: Any) -> None:

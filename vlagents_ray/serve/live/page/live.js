@@ -104,6 +104,8 @@ function show(said, files) {
       cards.get(session.id).update(session, files, replica.ring_s);
     }
   }
+  const robots = Object.assign({}, ...said.replicas.map((one) => one.robots)); // a robot's connection may be at another replica than its session
+  for (const card of cards.values()) card.takeover.update(robots[card.id]);
   const names = new Set(said.replicas.map((one) => one.name));
   for (const [name, one] of replicas) if (!names.has(name) && said.time - one.time > 3) replicas.delete(name);
   for (const [id, card] of cards) if (!present.has(id) && ++card.missed > 5) { card.remove(); cards.delete(id); }
@@ -218,6 +220,7 @@ class Card {
       element("figcaption", {}, element("label", {}, "Planned and executed, joint ", this.joint), element("span")));
     const title = element("h3", { id: `session-${cards.size}-${Date.now()}` }, id);
     this.outcome = element("p", { className: "note", role: "status" });
+    this.takeover = new Takeover(this);
     this.operated = this.buttons();
     this.root = element("article", {}, element("div", {}, title, this.badge), this.instruction, this.cameras, this.drawn, this.compared, this.told, this.operated);
     this.root.setAttribute("aria-labelledby", title.id);
@@ -275,7 +278,8 @@ class Card {
     this.follows = button("Pin version", "pin", "quiet");
     this.save = button("Save", "save", "quiet");
     return element("div", { className: "operate", hidden: true },
-      element("div", { className: "row" }, button("Stop", "stop", "stop"), button("Pause", "pause"), button("Resume", "resume")),
+      element("div", { className: "row" }, button("Stop", "stop", "stop"), button("Pause", "pause"), button("Resume", "resume"), this.takeover.button),
+      this.takeover.root,
       element("div", { className: "row" }, button("Success", "success", "quiet"), button("Failure", "failure", "quiet"), this.follows, this.save),
       instruct, this.outcome);
   }
@@ -407,6 +411,7 @@ class Card {
   }
 
   remove() {
+    this.takeover.close();
     this.root.remove();
     for (const image of this.images.values()) URL.revokeObjectURL(image.src);
   }
