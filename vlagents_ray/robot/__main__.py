@@ -28,6 +28,7 @@ from vlagents_ray.robot.pacing import empty_loop
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.safety import Guard, Watchdog, measured_state
 from vlagents_ray.robot.simulated import SimulatedRobot
+from vlagents_ray.robot.teleoperation import RemoteLeader
 from vlagents_ray.viewers.targets import open_viewers
 
 MOSTLY_SAFE = 3  # exit status
@@ -81,6 +82,9 @@ def _run(options: argparse.Namespace) -> LoopReport:
         )
         agent.initialize()
         contract = agent.contract
+        if options.remote:
+            measure = measured_state(options.measure)
+            leader = stack.enter_context(RemoteLeader(agent, local=leader, step=options.step, measure=measure))
         stated = contract is not None and contract.action.relative is not None
         if options.safe == "auto" and not options.robot and not stated:
             options.safe = "hold"  # the simulated robot uses such actions as absolute targets
@@ -248,6 +252,8 @@ def _parser() -> argparse.ArgumentParser:
         help="your class of the robot, created without arguments; default: a simulated one",
     )
     add("--leader", metavar="MODULE:CLASS", help="your class of what a human moves the robot with, see Leader")
+    add("--remote", action="store_true", help="let a human at the server's live page take over")
+    add("--step", type=_number(above=True), help="what a remote human adds to a number of the action at a tick")
     add("--mode", choices=("open_loop", "ensemble", "async"), default="async", help="see ChunkPlayer (%(default)s)")
     add("--execute", type=_number(int, least=1), metavar="N", help="rows of a chunk to execute before asking again")
     add("--horizon", type=_number(int, least=1), metavar="N", help="rows of a chunk that may be executed at all")

@@ -5,6 +5,16 @@ from vlagents_ray.robot.teleoperation.agent import TeleoperatedAgent
 from vlagents_ray.robot.teleoperation.axes import AxesDevice, AxesLeader
 from vlagents_ray.robot.teleoperation.keyboard import Keyboard
 from vlagents_ray.robot.teleoperation.relay import RelayedLeader
+from vlagents_ray.robot.teleoperation.remote import RemoteLeader
 from vlagents_ray.robot.teleoperation.spacemouse import SpaceMouse
 
-__all__ = ["AxesDevice", "AxesLeader", "Keyboard", "Leader", "RelayedLeader", "SpaceMouse", "TeleoperatedAgent"]
+__all__ = [
+    "AxesDevice",
+    "AxesLeader",
+    "Keyboard",
+    "Leader",
+    "RelayedLeader",
+    "RemoteLeader",
+    "SpaceMouse",
+    "TeleoperatedAgent",
+]

@@ -12,6 +12,7 @@ import numpy as np
 from vlagents_ray.chunking.takeover import Leader
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.steering import BEAT_S, IDLE_S, SILENT_S, Steering
+from vlagents_ray.contract import Contract
 from vlagents_ray.errors import ConfigError, ConnectionLost, MalformedMessage, VLAgentsError
 from vlagents_ray.interface import Obs
 from vlagents_ray.robot.teleoperation.axes import AxesLeader
@@ -40,6 +41,7 @@ class RemoteLeader:
 
     Args:
         agent: The policy's server; the robot's card is that of its session.
+        contract: What actions are, as for `AxesLeader`; default: the policy's contract.
         local: What a human at the robot moves it with.
         deadline_s: How long a command counts, s. The time to the page and back, and 0.05 s, have to fit in.
         step: As for `AxesLeader`.
@@ -52,6 +54,7 @@ class RemoteLeader:
     def __init__(
         self,
         agent: RemoteAgent,
+        contract: Contract | None = None,
         *,
         local: Leader | None = None,
         deadline_s: float = 0.3,
@@ -60,7 +63,7 @@ class RemoteLeader:
     ) -> None:
         self._relay = RelayedLeader(deadline_s)
         self._device = _RelayedAxes(self._relay)
-        self._axes = AxesLeader(agent.contract, self._device, step=step, measure=measure)
+        self._axes = AxesLeader(contract or agent.contract, self._device, step=step, measure=measure)
         self._agent = agent
         self._local = local
         self._link = RemoteLink(agent.url, agent.credentials, self)

@@ -118,7 +118,9 @@ class Takeover {
   }
 
   say(text) {
-    if (this.status.textContent !== text) this.status.textContent = text; // a screen reader would say it again
+    const words = text.replace(/[\d.]+/g, ""); // a screen reader would say each change
+    if (this.words !== words) this.status.textContent = text;
+    this.words = words;
   }
 
   close() {
