@@ -57,7 +57,7 @@ class Steering:
 
     def message(self, hold: str) -> dict[str, Any]:
         """Return the message to the robot that is held."""
-        return {"do": "move", "hold": hold, **asdict(self)}
+        return {"do": "move", "hold": hold, **asdict(self), "axes": list(self.axes)}
 
 
 def _is_count(value: object) -> TypeGuard[int]:
