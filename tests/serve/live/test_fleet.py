@@ -14,7 +14,8 @@ from vlagents_ray.errors import UnknownSession
 from vlagents_ray.policies.noop import Noop
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.live import fleet
-from vlagents_ray.serve.live.fleet import Fleet, Other
+from vlagents_ray.serve.live.fleet import Exchange, Fleet, Other
+from vlagents_ray.serve.live.remote.robot_links import RobotLink
 from vlagents_ray.serve.live.snapshot import ReplicaView, Snapshot
 
 
@@ -31,6 +32,12 @@ class Others:
 
     async def press(self, session: str, do: str, text: str, by: str) -> dict[str, Any] | None:
         return {"do": do, "by": by} if session == "of b" else None
+
+    async def exchange(self, session: str) -> Exchange | None:
+        return self._exchange if session == "of b" else None
+
+    async def _exchange(self, session: str, hold: str, message: dict[str, Any]) -> dict[str, Any] | None:
+        return {"by": "b"}
 
     async def _read(self, name: str, since: int, shown: Collection[str]) -> Snapshot:
         self.asked.append((name, since, shown))
@@ -162,3 +169,19 @@ def test_what_is_beside_the_replicas_is_sent_when_it_has_changed() -> None:
     assert (first["evaluation"], last["evaluation"]) == ({"done": 1}, {"done": 2})
     assert "evaluation" not in second
     assert first["replicas"] == []
+
+
+def test_a_robot_is_found_at_whichever_replica_its_connection_is(own: ReplicaView) -> None:
+    async def sent(message: dict[str, Any]) -> None: ...
+
+    async def find() -> list[Exchange | None]:
+        own.robots.put("of a", RobotLink(sent))
+        gathered = Fleet(own, Others("b"))
+        return [await gathered.exchange(session) for session in ("of a", "of b", "of c")]
+
+    here, there, nowhere = asyncio.run(find())
+    assert here is not None
+    assert there is not None
+    assert nowhere is None
+    assert asyncio.run(here("of a", "1", {"do": "find"})) == {}
+    assert asyncio.run(there("of b", "1", {"do": "find"})) == {"by": "b"}

@@ -17,7 +17,7 @@ class Takeover {
       element("button", { type: "button", ariaLabel: "Gripper, Space", onclick: () => this.grip() }, "Gripper ", element("kbd", {}, "Space")));
     this.pad.setAttribute("role", "application"); // so that a screen reader leaves the keys to it
     this.pad.setAttribute("aria-label", `Move ${card.id}: W and S along x, A and D along y, R and F along z, U and O, I and K, J and L turn, Space opens and closes the gripper, Escape gives back`);
-    const release = element("button", { type: "button", className: "stop", ariaLabel: `Release: ${card.id}`, onclick: () => this.release() }, "Release ", element("kbd", {}, "Esc"));
+    const release = element("button", { type: "button", ariaLabel: `Release: ${card.id}`, onclick: () => this.release() }, "Release ", element("kbd", {}, "Esc"));
     this.root = element("section", { className: "takeover", hidden: true, ariaLabel: `You move ${card.id}` }, this.status, this.pad, release);
     this.root.addEventListener("keydown", (event) => this.key(event, true));
     this.root.addEventListener("keyup", (event) => this.key(event, false));
@@ -56,20 +56,26 @@ class Takeover {
       if (said.beat === undefined) { this.over = said.over || said.detail; return; }
       this.beat = said.beat;
       this.send();
-      if (this.root.hidden) { this.root.hidden = false; this.pad.focus(); }
+      if (this.root.hidden) this.show(true);
       this.say(said.moves ? "You move it." : `It holds still${said.why ? `: ${said.why}` : "."}`);
     };
     socket.onclose = () => { if (this.socket === socket) this.end(); };
   }
 
   end() {
-    const focused = this.root.contains(document.activeElement);
     this.socket = null;
     this.pressed.clear();
-    this.root.hidden = true;
-    this.button.disabled = false;
-    if (focused) this.button.focus();
+    this.show(false);
     this.card.say(`take over: ${this.over === "given back" ? "given back; the policy goes on" : `over: ${this.over || "the server was not reached"}`}`, this.over !== "given back");
+  }
+
+  show(shown) {
+    const focused = this.root.contains(document.activeElement);
+    this.root.hidden = !shown;
+    this.button.disabled = shown;
+    this.card.root.classList.toggle("steered", shown);
+    if (shown) this.pad.focus();
+    else if (focused) this.button.focus();
   }
 
   key(event, down) {
