@@ -53,7 +53,7 @@ _PATHS = f"""\
     that act.
 `GET /live`
     A page that shows what the sessions do now. With keys, it asks for one with the scope `watch`, and has buttons for
-    one that also has the scope `operate`.
+    one that also has the scope `operate`. Robots that offer it are moved there.
 `GET /v1/metadata`
     Policy, checkpoint, contract, protocol version, every way in.
 `GET /healthz`
