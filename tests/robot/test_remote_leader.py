@@ -18,6 +18,7 @@ from vlagents_ray.client.credentials import ANONYMOUS
 from vlagents_ray.client.steering import BEAT_S, IDLE_S, SILENT_S, Steering
 from vlagents_ray.errors import InvalidAction, MalformedMessage
 from vlagents_ray.interface import INTERVENTION, SAFE
+from vlagents_ray.robot import Guard
 from vlagents_ray.robot.operation.operated_loop import OperatedLoop
 from vlagents_ray.robot.teleoperation import RemoteLeader
 from vlagents_ray.robot.teleoperation.remote_link import RemoteLink
@@ -39,9 +40,9 @@ class Still(Agent):
 class Human:
     """A robot with a leader, and the human who moves it from far away; the test sets the time."""
 
-    def __init__(self, clock: Clock, leader: RemoteLeader) -> None:
+    def __init__(self, clock: Clock, leader: RemoteLeader, guard: Guard | None = None) -> None:
         self.clock, self.leader = clock, leader
-        self.player = ChunkPlayer(Still(), override=leader)
+        self.player = ChunkPlayer(Still(), override=leader, check=guard)
         self.player.reset(SEEN, "stack")
         self.seq, self.holds, self.beat = 0, 0, 0
 
@@ -260,6 +261,17 @@ def test_a_stop_ends_the_hold_and_nobody_takes_over_while_it_lasts(human: Human)
     human.tick()
     human.player.interrupt()
     assert human.leader.by is None
+
+
+def test_a_human_is_told_what_the_guard_refuses(clock: Clock) -> None:
+    with made(step=0.8) as leader:
+        human = Human(clock, leader, Guard(CONTRACT, high=np.array([0.5, 1, 1, 1])))
+        human.take()
+        human.move(1)
+        assert human.tick().startswith("holds: ")
+        said = leader.beat()
+        assert said["moves"] is False
+        assert "0.5" in said["why"]
 
 
 def test_a_human_at_the_robot_goes_first(clock: Clock) -> None:

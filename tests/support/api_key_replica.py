@@ -559,7 +559,7 @@ def _take_over(_mark: str) -> bytes:
 
 
 def _beat(_mark: str) -> bytes:
-    return b'{"session": "robot-1", "beat": 1, "moves": false, "why": "", "ended": ["", ""]}'
+    return b'{"session": "robot-1", "beat": 1, "hold": "", "moves": false, "why": "", "ended": ["", ""]}'
 
 
 def _read_told(data: bytes | str) -> str:

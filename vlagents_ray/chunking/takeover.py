@@ -61,6 +61,10 @@ class DistantLeader(Leader, Protocol):
         """Whether the human who is engaged is far away."""
         ...
 
+    def note_held(self, why: str) -> None:
+        """Note why the robot holds still at this tick, in place of the human's action."""
+        ...
+
     def dismiss(self, why: str) -> None:
         """Let a human who is far away have to take over again; `why` is told to him."""
         ...
@@ -189,6 +193,8 @@ class Takeover:
         try:
             action = motion.move(self._led(obs), obs)
         except InvalidAction as error:
+            if isinstance(self.leader, DistantLeader):
+                self.leader.note_held(str(error))
             action, info[SAFE] = motion.hold(obs, str(error))
         else:
             self.note_executed(action)

@@ -1,6 +1,6 @@
 """The messages by which a human at the live page moves a robot: JSON over two WebSockets that meet at the server.
 
-    robot to server     {"session": "7f3a", "beat": 42, "moves": true, "why": "", "ended": ["", ""]}
+    robot to server     {"session": "7f3a", "beat": 42, "hold": "c41d", "moves": true, "why": "", "ended": ["", ""]}
     server to robot     {"do": "begin", "hold": "c41d", "by": "lab"}
                         {"do": "move", "hold": "c41d", "seq": 7, "beat": 41, "axes": [0, 1, 0, 0, 0, 0], "grips": 2}
                         {"do": "release", "hold": "c41d"}, {"do": "gone", "hold": "c41d", "why": "…"}

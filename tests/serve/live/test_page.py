@@ -184,7 +184,7 @@ def operated(server: LiveServer, key: str | None = None) -> Iterator[list[LoopRe
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [360, 1400])
 def test_buttons_act_on_a_session(page: Page, server: LiveServer, width: int, scheme: str) -> None:
-    outcome = "document.querySelector('article .operate [role=status]')?.textContent"
+    outcome = "document.querySelector('article .operate > [role=status]')?.textContent"
     with operated(server) as reports:
         show(page, server, width=width, scheme=scheme)
         until(page, "document.querySelectorAll('.compared polyline').length > 2", want=True)
@@ -321,7 +321,7 @@ def test_it_asks_for_a_key_and_watches_with_one(page: Page) -> None:
 
 
 def test_a_session_is_saved(page: Page, tmp_path: Path) -> None:
-    outcome = "document.querySelector('article .operate [role=status]')?.textContent"
+    outcome = "document.querySelector('article .operate > [role=status]')?.textContent"
     policy = Noop.from_config({"action_dim": 7, "chunk": 8})
     with live_server(policy, settings=LiveArgs(folder=str(tmp_path))) as server, operated(server):
         show(page, server)

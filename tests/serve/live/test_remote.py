@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 import pytest
 from eval_fakes import wait_for
 from in_memory_keys import ChangingKeys
-from live_server import LiveServer, ask, live_server
+from live_server import METADATA, LiveServer, ask, live_server
 from remote_human import CuttableLink, RemoteHuman, remote_human
 
 from vlagents_ray import Act, ActionSpec, Agent, Contract, Forbidden, Obs, RemoteAgent, Unauthorized
@@ -27,6 +27,7 @@ from vlagents_ray.client.steering import ROBOT_PATH
 from vlagents_ray.client.transports.websocket import open_websocket
 from vlagents_ray.interface import INTERVENTION
 from vlagents_ray.robot import Guard, LoopReport, run_loop
+from vlagents_ray.robot.__main__ import main
 from vlagents_ray.robot.record import Recorder
 from vlagents_ray.robot.teleoperation import Leader, RemoteLeader, keyboard, remote
 from vlagents_ray.serve.access import api_keys
@@ -249,6 +250,25 @@ def test_a_robot_that_has_not_opted_in_is_moved_by_nobody(server: LiveServer) ->
         assert robot.state == "autonomous"
 
 
+def test_the_robots_command_offers_it_where_it_is_told_to(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(METADATA, "contract", CONTRACT.to_json())
+    options = ["--baseline", "0", "--seconds", "60", "--operate", "--remote", "--step", str(STEP)]
+    with live_server(Going()) as server:
+        thread = threading.Thread(target=main, args=([server.url, *options],))
+        thread.start()
+        wait_for(lambda: server.view.robots.describe().keys() & set(server.engine.sessions.ids()), 30)
+        [session] = server.engine.sessions.ids()
+        with remote_human(server.port, session) as human:
+            human.move(1.0)
+            server.view.commands.press(session, "success", "", "")
+            thread.join(30)
+    found = re.search(r"ticks at which a human moved the robot: (\d+)", capsys.readouterr().out)
+    assert found is not None
+    assert int(found[1]) > 0
+
+
 @pytest.mark.parametrize("message", [{"session": 3}, {"axes": []}, []])
 def test_a_malformed_first_message_ends_it(server: LiveServer, message: object) -> None:
     with closing(open_websocket(f"ws://127.0.0.1:{server.port}/v1/live/control", Credentials(""), 10)) as socket:
@@ -263,7 +283,7 @@ def test_a_malformed_command_ends_the_hold_and_leaves_the_robot_paused(server: L
         wait_for(lambda: robot.state == "paused", 30)
 
 
-@pytest.mark.parametrize("message", [{}, {"session": "a", "beat": "1", "why": "", "ended": ["", ""]}, []])
+@pytest.mark.parametrize("message", [{}, {"session": "a", "beat": "1", "hold": "", "why": "", "ended": ["", ""]}, []])
 def test_a_malformed_beat_ends_the_robots_connection(server: LiveServer, message: object) -> None:
     with closing(open_websocket(f"ws://127.0.0.1:{server.port}{ROBOT_PATH}", Credentials(""), 10)) as socket:
         socket.send(json.dumps(message).encode(), 10)
@@ -310,7 +330,7 @@ def test_a_key_offers_no_robot_of_another_key(monkeypatch: pytest.MonkeyPatch) -
     with live_server(Going(), keys=keys.keys) as server, RemoteAgent(server.url, api_key=one) as agent:
         address = f"ws://127.0.0.1:{server.port}{ROBOT_PATH}"
         with closing(open_websocket(address, Credentials(other), 10)) as socket:
-            beat = {"session": agent.session, "beat": 1, "why": "", "ended": ["", ""]}
+            beat = {"session": agent.session, "beat": 1, "hold": "", "why": "", "ended": ["", ""]}
             socket.send(json.dumps(beat).encode(), 10)
             assert json.loads(socket.recv(10)) == {}
             assert list(server.view.robots.describe()) == [f"other/{agent.session}"]

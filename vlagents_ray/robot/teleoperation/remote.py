@@ -13,7 +13,7 @@ from vlagents_ray.chunking.takeover import Leader
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.steering import BEAT_S, IDLE_S, SILENT_S, Steering
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import ConfigError, ConnectionLost, MalformedMessage, VLAgentsError
+from vlagents_ray.errors import ConfigError, ConnectionLost, MalformedMessage
 from vlagents_ray.interface import Obs
 from vlagents_ray.robot.teleoperation.axes import AxesLeader
 from vlagents_ray.robot.teleoperation.relay import RelayedLeader
@@ -123,13 +123,13 @@ class RemoteLeader:
         if self._local is not None and not self._distant:
             return self._local.action(obs)
         with self._lock:
-            try:
-                action = self._axes.action(obs)
-            except VLAgentsError as error:
-                self._moves, self._why = False, str(error)
-                raise
+            action = self._axes.action(obs)
             self._moves, self._why = True, ""
             return action
+
+    def note_held(self, why: str) -> None:
+        """Note why the robot holds still, for the human at the live page."""
+        self._moves, self._why = False, why
 
     def dismiss(self, why: str) -> None:
         """Let the human at the live page have to take over again, and tell him why."""
@@ -145,7 +145,7 @@ class RemoteLeader:
             self._beat += 1
             self._beats[self._beat] = time.monotonic()
             self._beats.pop(self._beat - _BEATS, None)
-            said = {"moves": self._moves, "why": self._why, "ended": list(self._ended)}
+            said = {"hold": self._hold, "moves": self._moves, "why": self._why, "ended": list(self._ended)}
             return {"session": self._agent.session, "beat": self._beat, **said}
 
     @property

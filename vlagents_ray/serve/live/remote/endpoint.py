@@ -34,7 +34,7 @@ CONTROL_PATH = "/v1/live/control"
 _OPERATE = "operate"  # scope of keys
 _PROTOCOL = "vlagents.live"
 _CHARACTERS = 2000  # longest message
-_APART_S = 0.01  # least time between two commands that are passed on: a robot's computer has other things to do
+_APART_S = 0.01  # least time between two messages of one connection, so that none floods the server, or a robot
 _POLICY_VIOLATION = 1008  # WebSocket close code
 
 Tell = Callable[[dict[str, Any]], Awaitable[dict[str, Any]]]
@@ -70,6 +70,7 @@ async def _robot(links: RobotLinks, scopes: ScopeCheck, socket: WebSocket) -> No
             said = read_beat(await _received(socket, scopes, None))
             links.put(prefix + said.pop("session"), link)
             await link.hear(said)
+            await asyncio.sleep(_APART_S)
     except WebSocketDisconnect:
         pass
     except VLAgentsError as error:

@@ -75,7 +75,9 @@ class RobotLink:
                 return {}
         if self.holder is None or self.holder.hold != hold:
             return self._gone(hold)
-        return {name: self._said[name] for name in ("beat", "moves", "why")}
+        known = self._said.get("hold") == hold  # else the robot said it before it knew of this one
+        about = {"moves": self._said["moves"], "why": self._said["why"]} if known else {"moves": False, "why": ""}
+        return {"beat": self._said["beat"], **about}
 
     async def hear(self, said: dict[str, Any]) -> None:
         """Take a beat of the robot, as `read_beat` returns it, and answer it."""
@@ -165,10 +167,10 @@ class RobotLinks:
 def read_beat(stated: object) -> dict[str, Any]:
     """Return the entries of a robot's beat; raise `MalformedMessage` if it has another form."""
     found = stated if isinstance(stated, Mapping) else {}
-    session, beat, why, ended = (found.get(name) for name in ("session", "beat", "why", "ended"))
-    texts = [session, why, *(ended if isinstance(ended, list) and len(ended) == 2 else [None])]
+    session, beat, hold, why, ended = (found.get(name) for name in ("session", "beat", "hold", "why", "ended"))
+    texts = [session, hold, why, *(ended if isinstance(ended, list) and len(ended) == 2 else [None])]
     if not all(isinstance(text, str) for text in texts) or not 0 < len(str(session)) <= _NAME or type(beat) is not int:
-        raise MalformedMessage(f"robot: got {stated!r:.80}, want a beat with session, beat, moves, why and ended")
-    _, why, hold, ended_why = (str(text) for text in texts)
-    said = {"session": session, "beat": beat, "moves": bool(found.get("moves")), "why": why[:_WHY]}
-    return {**said, "ended": (hold, ended_why[:_WHY])}
+        raise MalformedMessage(f"robot: got {stated!r:.80}, want a beat with session, beat, hold, moves, why, ended")
+    _, hold, why, ended_hold, ended_why = (str(text) for text in texts)
+    said = {"session": session, "beat": beat, "hold": hold, "moves": bool(found.get("moves")), "why": why[:_WHY]}
+    return {**said, "ended": (ended_hold, ended_why[:_WHY])}
