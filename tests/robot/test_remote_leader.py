@@ -317,9 +317,25 @@ def test_beats_are_frequent_while_somebody_holds_the_robot(human: Human) -> None
     assert human.leader.beat()["session"] == "7f3a"
 
 
-def test_a_hand_over_in_the_middle_of_a_tick_holds_the_robot(human: Human) -> None:
-    human.take()
-    assert human.leader.engaged()
-    human.tell("release")
-    with pytest.raises(InvalidAction, match="given the robot back"):
-        human.leader._axes.action(SEEN)
+def test_a_release_in_the_middle_of_a_tick_holds_the_robot_and_ends_no_pause(clock: Clock) -> None:
+    local = ScriptedLeader(np.array([0.75, 0, 0, 1], np.float32))
+    with made(local) as leader:
+        human = Human(clock, leader)
+        human.take()
+        assert leader.engaged()
+        human.tell("release")
+        with pytest.raises(InvalidAction, match="given the robot back"):
+            leader.action(SEEN)
+        assert local.given == [], "who is at the robot has not engaged his leader"
+        human.player.takeover.pause()
+        engaged = leader.engaged
+
+        def released() -> bool:
+            human.take()
+            was = engaged()
+            human.tell("release")
+            return was
+
+        leader.engaged = released  # type: ignore[method-assign]
+        for _ in range(2):
+            assert human.tick() == "holds: paused by an operator"

@@ -58,7 +58,7 @@ class DistantLeader(Leader, Protocol):
 
     @property
     def distant(self) -> bool:
-        """Whether the human who is engaged is far away."""
+        """Whether the human for whom `engaged` has returned true last is far away."""
         ...
 
     def note_held(self, why: str) -> None:
@@ -161,9 +161,7 @@ class Takeover:
             try:
                 engaged = self.leader.engaged()
             except Exception as error:  # noqa: BLE001 - a broken device must not end the loop
-                self.pause(
-                    str(error) if isinstance(error, VLAgentsError) else f"the leader failed: {error!r}", here=False
-                )
+                self.pause(_reason(error), here=False)
             if engaged and self._pause is not None and self._is_outranked(before):
                 engaged = False
             elif engaged and before != "human":

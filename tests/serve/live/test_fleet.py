@@ -15,7 +15,7 @@ from vlagents_ray.policies.noop import Noop
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.live import fleet
 from vlagents_ray.serve.live.fleet import Exchange, Fleet, Other
-from vlagents_ray.serve.live.remote.robot_links import RobotLink
+from vlagents_ray.serve.live.remote.robot_links import RobotLink, read_beat
 from vlagents_ray.serve.live.snapshot import ReplicaView, Snapshot
 
 
@@ -169,6 +169,29 @@ def test_what_is_beside_the_replicas_is_sent_when_it_has_changed() -> None:
     assert (first["evaluation"], last["evaluation"]) == ({"done": 1}, {"done": 2})
     assert "evaluation" not in second
     assert first["replicas"] == []
+
+
+def test_what_a_robot_said_of_an_earlier_hold_is_not_told_of_the_next() -> None:
+    async def sent(message: dict[str, Any]) -> None: ...
+
+    async def said() -> list[dict[str, Any]]:
+        link = RobotLink(sent)
+        beat = {"session": "a", "moves": True, "why": "", "ended": ["", ""]}
+        await link.take("first", "")
+        await link.hear(read_beat({**beat, "beat": 1, "hold": "first"}))
+        told = [await link.next("first", -1)]
+        await link.forward("first", {"do": "release"})
+        told.append(await link.next("first", 1))
+        await link.take("second", "")
+        told.append(await link.next("second", -1))
+        waits = asyncio.ensure_future(link.next("second", 1))
+        await asyncio.sleep(0)
+        await link.hear(read_beat({**beat, "beat": 2, "hold": "second"}))
+        return [*told, await waits]
+
+    first, over, early, late = asyncio.run(said())
+    assert (first, over) == ({"beat": 1, "moves": True, "why": ""}, {"over": "given back"})
+    assert (early, late) == ({"beat": 1, "moves": False, "why": ""}, {"beat": 2, "moves": True, "why": ""})
 
 
 def test_a_robot_is_found_at_whichever_replica_its_connection_is(own: ReplicaView) -> None:

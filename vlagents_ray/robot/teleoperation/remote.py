@@ -68,7 +68,7 @@ class RemoteLeader:
         self._local = local
         self._link = RemoteLink(agent.url, agent.credentials, self)
         self._lock = threading.RLock()
-        self._distant = False
+        self._here = self._distant = False  # who is engaged at this tick; set by the loop's thread alone
         self._hold = ""  # id of the human's hold; empty if there is none
         self._by = ""  # name of his key
         self._seq = -1  # of the last command that counted
@@ -88,7 +88,7 @@ class RemoteLeader:
 
     @property
     def distant(self) -> bool:
-        """Whether the human who moves the robot is at the live page."""
+        """Whether the human for whom `engaged` has returned true last is at the live page."""
         return self._distant
 
     @property
@@ -106,11 +106,12 @@ class RemoteLeader:
         """
         if not self._link.is_open:
             raise ConfigError("RemoteLeader: it was not opened; use `with RemoteLeader(agent) as leader:`")
-        local = self._local is not None and self._local.engaged()
+        self._here = self._distant = False
+        self._here = self._local is not None and self._local.engaged()
         with self._lock:
             self._expire()
-            gone, self._gone, self._distant = self._gone, None, False
-            if local:
+            gone, self._gone = self._gone, None
+            if self._here:
                 self.dismiss("somebody at the robot has taken over")
                 return True
             if gone is not None:
@@ -120,7 +121,7 @@ class RemoteLeader:
 
     def action(self, obs: Obs) -> np.ndarray:
         """Return the human's action, (D,) float32; raises `InvalidAction` if his last command is too old."""
-        if self._local is not None and not self._distant:
+        if self._local is not None and self._here:
             return self._local.action(obs)
         with self._lock:
             action = self._axes.action(obs)
@@ -198,7 +199,7 @@ class RemoteLeader:
         self._let_go()
 
     def _let_go(self) -> None:
-        self._hold, self._distant, self._moves, self._why = "", False, False, ""
+        self._hold, self._moves, self._why = "", False, ""
         self._relay.release()
         self._device.begin()
 

@@ -54,7 +54,7 @@ class ReplicaViews(OtherReplicas):
         """Return `RobotLinks.exchange` of the one that has the connection of the session's robot; None if none has."""
 
         async def found(actor: Any) -> Exchange | None:
-            exchange = partial(_answer, actor, SiblingApi.exchange)
+            exchange = partial(_exchange, actor)
             return None if await exchange(session, "", {"do": "find"}) is None else exchange
 
         exchange: Exchange | None = await self._first(found)
@@ -89,3 +89,11 @@ async def _view(actor: Any, since: int, shown: Collection[str]) -> Snapshot:
 async def _answer(actor: Any, method: Callable[..., Any], *args: Any) -> dict[str, Any] | None:
     answer: dict[str, Any] | None = await asyncio.wait_for(call_replica(actor, method, *args), _PRESS_S)
     return answer
+
+
+async def _exchange(actor: Any, session: str, hold: str, message: dict[str, Any]) -> dict[str, Any] | None:
+    try:
+        return await _answer(actor, SiblingApi.exchange, session, hold, message)
+    except (ray.exceptions.RayError, TimeoutError, asyncio.TimeoutError) as error:
+        logger.info("another replica does not answer: %s", error)
+        return None  # the robot is not reached

@@ -104,7 +104,7 @@ function show(said, files) {
       cards.get(session.id).update(session, files, replica.ring_s);
     }
   }
-  const robots = Object.assign({}, ...said.replicas.map((one) => one.robots)); // a robot's connection may be at another replica than its session
+  const robots = Object.assign({}, ...[...replicas.values()].map((one) => one.said.robots)); // at another replica than its session, maybe
   for (const card of cards.values()) card.takeover.update(robots[card.id]);
   const names = new Set(said.replicas.map((one) => one.name));
   for (const [name, one] of replicas) if (!names.has(name) && said.time - one.time > 3) replicas.delete(name);

@@ -37,19 +37,20 @@ class Takeover {
   // Whether the session's robot may be moved from here, and by whom it is.
   update(robot) {
     this.button.hidden = !robot;
-    this.button.disabled = Boolean(robot && robot.by !== null) || Boolean(this.socket);
-    const by = robot && robot.by !== null && !this.socket ? `Taken over by ${robot.by || "somebody"}` : "Take over";
+    const taken = Boolean(robot && robot.by !== null && !this.socket);
+    this.button.disabled = taken || !this.root.hidden;
+    const by = taken ? `Taken over by ${robot.by || "somebody"}` : "Take over";
     if (this.button.textContent !== by) this.button.textContent = by;
     this.button.ariaLabel = `${by}: ${this.card.id}`;
   }
 
   open() {
+    if (this.socket) return;
     const scheme = location.protocol === "https:" ? "wss" : "ws";
     const socket = new WebSocket(`${scheme}://${location.host}${path()}/control`, ["vlagents.live", ...(key ? [`vlagents.key.${key}`] : [])]);
     this.socket = socket;
     this.seq = this.grips = this.beat = 0;
     this.over = "";
-    this.button.disabled = true;
     socket.onopen = () => socket.send(JSON.stringify({ session: this.card.id }));
     socket.onmessage = (event) => {
       const said = JSON.parse(event.data);

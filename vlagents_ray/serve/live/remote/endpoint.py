@@ -175,7 +175,7 @@ async def _received(socket: WebSocket, scopes: ScopeCheck, scope: str | None) ->
     try:
         message = await asyncio.wait_for(socket.receive(), SILENT_S)
     except asyncio.TimeoutError:
-        raise MalformedMessage(f"live: said nothing for {SILENT_S:g} s; connect again") from None
+        raise MalformedMessage(f"live: nothing came for {SILENT_S:g} s; connect again") from None
     if message["type"] == "websocket.disconnect":
         raise WebSocketDisconnect(message["code"])
     scopes.require(scope)
