@@ -290,7 +290,8 @@ class Card {
     try {
       const answer = await fetch(`${path()}/command`, { method: "POST", headers, body: JSON.stringify({ session: this.id, do: command, text }) });
       const said = await answer.json();
-      this.say(answer.ok ? OUTCOMES[said.state](said) : `${command}: ${said.detail}`, !answer.ok);
+      if (answer.ok) this.commands([said]); // what came of it may have been shown already; the next message shows it again
+      else this.say(`${command}: ${said.detail}`, true);
     } catch (error) {
       this.say(`${command}: the server was not reached`, true);
     }
