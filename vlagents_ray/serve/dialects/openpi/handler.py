@@ -119,7 +119,7 @@ class MapConnection:
         obs, prompt = self.dialect.read(message)
         if not self.session.episode.begun:
             self.dialect.mapping.warn_of_unread_cameras(message, self.dialect.name)
-        trace.decoded_one()
+        trace.decoded_alike()
         reply = await self.session.act(obs, prompt, request_id)
         data = trace.written(reply, lambda: codec.encode(self.dialect.answer(reply, self._before_ms)))
         self._before_ms = (time.perf_counter() - trace.arrived) * 1e3
