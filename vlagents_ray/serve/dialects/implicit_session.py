@@ -107,8 +107,8 @@ class Seen(NamedTuple):
 async def act_together(seen: Sequence[Seen], request_id: str, **kwargs: Any) -> list[Reply]:
     """Return the policy's action for each observation of one client; their acts are queued at once.
 
-    A session whose episode begins is reset first, with `kwargs`. One that was removed because it was idle is reset again,
-    which is safe since the observation was not acted on.
+    A session whose episode begins is reset first, with `kwargs`. One that was removed because it was idle is reset
+    again, which is safe since the observation was not acted on.
 
     Raises:
         VLAgentsError: The first error among the replies.

@@ -134,7 +134,7 @@ class RequestTrace:
     def decoded_alike(self, requests: int = 1) -> None:
         """Record that the frame's requests, all of the `op` and `rank` given before, are decoded."""
         self._decoded = time.perf_counter()
-        self._asked = self._asked[:1] * requests
+        self._asked = [self._asked[0]] * requests
 
     def frame(self, replies: Sequence[Reply]) -> bytes:
         """Encode and record the replies as a frame with complete `timing`."""
