@@ -17,6 +17,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
+import msgpack
 import numpy as np
 import pytest
 from asgi_server import served
@@ -54,7 +55,6 @@ from vlagents_ray.serve import periodic
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext
-from vlagents_ray.serve.dialects.openpi import codec as openpi_codec
 from vlagents_ray.serve.dialects.routes import dialect_routes
 from vlagents_ray.serve.dialects.vla_eval import codec as vla_eval_codec
 from vlagents_ray.serve.endpoints import access_middleware, websocket_connection
@@ -409,7 +409,7 @@ def _read_vllm_omni(data: bytes | str) -> str | None:
     assert isinstance(data, bytes)
     if b"__ndarray__" in data:
         return "done"
-    said = openpi_codec.decode(data)
+    said = msgpack.unpackb(data)
     return status_of(said["message"]) if said.get("type") == "error" else None
 
 

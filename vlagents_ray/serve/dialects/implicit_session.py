@@ -75,7 +75,7 @@ class ImplicitSession:
 
     async def act(self, obs: Obs, instruction: str | None, request_id: str, **kwargs: Any) -> Reply:
         """Return the policy's action; see `act_together`."""
-        (reply,) = await act_together([Seen(self, obs, instruction)], request_id, **kwargs)
+        (reply,) = await act_together([SessionObs(self, obs, instruction)], request_id, **kwargs)
         return reply
 
     async def close(self) -> None:
@@ -96,7 +96,7 @@ class ImplicitSession:
         )
 
 
-class Seen(NamedTuple):
+class SessionObs(NamedTuple):
     """An observation of a session, and its instruction; None if there is none."""
 
     session: ImplicitSession
@@ -104,7 +104,7 @@ class Seen(NamedTuple):
     instruction: str | None
 
 
-async def act_together(seen: Sequence[Seen], request_id: str, **kwargs: Any) -> list[Reply]:
+async def act_together(seen: Sequence[SessionObs], request_id: str, **kwargs: Any) -> list[Reply]:
     """Return the policy's action for each observation of one client; their acts are queued at once.
 
     A session whose episode begins is reset first, with `kwargs`. One that was removed because it was idle is reset
@@ -125,7 +125,7 @@ async def act_together(seen: Sequence[Seen], request_id: str, **kwargs: Any) -> 
     return replies
 
 
-async def _reset(seen: Sequence[Seen], request_id: str, kwargs: dict[str, Any]) -> None:
+async def _reset(seen: Sequence[SessionObs], request_id: str, kwargs: dict[str, Any]) -> None:
     if not seen:
         return
     openings = [one.session.episode.opening(one.instruction, one.session._engine.contract) for one in seen]
@@ -144,7 +144,7 @@ async def _reset(seen: Sequence[Seen], request_id: str, kwargs: dict[str, Any]) 
 
 
 async def _ask(
-    op: Op, seen: Sequence[Seen], instructions: Sequence[str | None], request_id: str, kwargs: dict[str, Any]
+    op: Op, seen: Sequence[SessionObs], instructions: Sequence[str | None], request_id: str, kwargs: dict[str, Any]
 ) -> list[Reply]:
     names = [request_id] if len(seen) == 1 else [f"{request_id}-{place}" for place in range(len(seen))]
     return await seen[0].session._sender.ask(

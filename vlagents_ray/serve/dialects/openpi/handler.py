@@ -36,7 +36,7 @@ from vlagents_ray.serve.dialects.base import (
     decoded,
     public_problem,
 )
-from vlagents_ray.serve.dialects.implicit_session import ImplicitSession, Seen, act_together
+from vlagents_ray.serve.dialects.implicit_session import ImplicitSession, SessionObs, act_together
 from vlagents_ray.serve.dialects.openpi import codec
 from vlagents_ray.serve.dialects.openpi.presets import PRESETS
 from vlagents_ray.serve.engine.dispatch import Dispatcher
@@ -193,7 +193,7 @@ class MapConnection:
         if not sessions[0].episode.begun:
             dialect.mapping.warn_of_unread_cameras(observations[0], dialect.name)
         trace.decoded_alike(len(observations))
-        seen = [Seen(session, *one) for session, one in zip(sessions, read, strict=True)]
+        seen = [SessionObs(session, *one) for session, one in zip(sessions, read, strict=True)]
         replies = await act_together(seen, request_id, **dialect.reset_arguments(message))
         data = trace.written(
             replies, lambda: codec.encode(dialect.answer(replies, self._before_ms, batched=batch is not None))
