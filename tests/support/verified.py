@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import ast
 import json
+import os
 import platform
 import re
+import subprocess
 import sys
 from collections import Counter
 from collections.abc import Iterator
@@ -30,16 +32,16 @@ WHAT = {
     "loading": "refuses what cannot be loaded",
     "size": "has the published size",
 }
-# Of each family with a page: the file in requirements/, and the packages whose versions matter.
+# Of each family with a page: the file in requirements/, and the packages and checkouts whose versions matter.
 RUN_WITH = {
     "arro": ("hf", ("transformers", "torch")),
-    "diffusion_policy": ("diffusion_policy", ("diffusers", "torch")),
+    "diffusion_policy": ("diffusion_policy", ("DIFFUSION_POLICY_SRC", "diffusers", "torch")),
     "lerobot": ("lerobot", ("lerobot", "transformers", "torch")),
-    "octo": ("octo", ("jax", "flax")),
-    "openpi": ("openpi", ("jax", "flax", "torch")),
-    "openvla": ("openvla", ("transformers", "torch")),
+    "octo": ("octo", ("OCTO_SRC", "jax", "flax")),
+    "openpi": ("openpi", ("OPENPI_SRC", "jax", "flax", "torch")),
+    "openvla": ("openvla", ("OPENVLA_SRC", "OPENVLA_OFT_SRC", "transformers", "torch")),
     "pi0": ("hf", ("transformers", "torch")),
-    "vjepa2_ac": ("hf", ("transformers", "torch")),
+    "vjepa2_ac": ("hf", ("VJEPA2_SRC", "transformers", "torch")),
 }
 
 
@@ -130,13 +132,21 @@ def _result(outcomes: dict[str, int] | None) -> str:
     return ", ".join(f"{number} {what}" for what, number in sorted(outcomes.items()))
 
 
+def _version(name: str) -> str:
+    """Return the version of a package, or the commit of the checkout that a variable names."""
+    if name.isupper():
+        folder = os.environ.get(name)
+        command = ["git", "-C", folder or "", "rev-parse", "--short", "HEAD"]
+        done = subprocess.run(command, check=False, capture_output=True, text=True) if folder else None
+        return "not set" if done is None else done.stdout.strip() or "of no commit"
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "not installed"
+
+
 def _environment(family: str) -> dict[str, Any]:
-    versions = {}
-    for package in RUN_WITH[family][1]:
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            versions[package] = "not installed"
+    versions = {name: _version(name) for name in RUN_WITH[family][1]}
     torch = sys.modules.get("torch")
     device = torch.cuda.get_device_name() if torch is not None and torch.cuda.is_available() else "a CPU, not on a GPU"
     return {"python": ".".join(platform.python_version_tuple()[:2]), "versions": versions, "device": device}
