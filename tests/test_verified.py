@@ -46,11 +46,11 @@ def test_a_test_that_is_new_or_gone_changes_the_table(tmp_path: Path, monkeypatc
         )
     )
     said = verified.table("pi0")
-    assert "| acts as upstream's own code | acts are theirs | 2 passed |" in said
+    assert "| acts as upstream's own code | acts are theirs | `test_it.py` | 2 passed |" in said
     assert "Python 3.11, torch 2, on a CPU." in said
     assert "other" not in said
     file.write_text(file.read_text().replace("acts_are_theirs", "acts_are_like_theirs"))
-    assert "| acts as upstream's own code | acts are like theirs | not run |" in verified.table("pi0")
+    assert "| acts as upstream's own code | acts are like theirs | `test_it.py` | not run |" in verified.table("pi0")
 
 
 def test_outcomes_are_noted_by_family_and_test(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -94,18 +94,18 @@ def table(family: str) -> str:
     if noted["tests"]:
         versions = ", ".join(f"{name} {number}" for name, number in noted["versions"].items())
         ran = f"They ran with Python {noted['python']}, {versions}, on {noted['device']}."
-    rows = [
-        f"| {WHAT[what]} | {name.partition('::test_')[2].replace('_', ' ')} | {_result(noted['tests'].get(name))} |"
-        for what, name in sorted(
-            ((what, name) for name, what in marked(family)), key=lambda one: list(WHAT).index(one[0])
+    rows = []
+    for what, name in sorted(((what, name) for name, what in marked(family)), key=lambda one: list(WHAT).index(one[0])):
+        file_name, _, test = name.partition("::test_")
+        rows.append(
+            f"| {WHAT[what]} | {test.replace('_', ' ')} | `{file_name}` | {_result(noted['tests'].get(name))} |"
         )
-    ]
     return "\n".join(
         [
             f"These tests of `tests/families/{family}` use small random checkpoints. {ran}",
             "",
-            "| the policy … | test | cases |",
-            "|---|---|---|",
+            "| the policy … | test | in | cases |",
+            "|---|---|---|---|",
             *rows,
             "",
             f"`make verified FAMILIES={requirements}` runs them, and writes this table.",
