@@ -5,6 +5,7 @@
 #   make check                                                      lint, types, layers, quick tests: no Ray, torch, simulator
 #   make test [TEST_PROCESSES=2]                                    lint, types, layers, families, all tests
 #   make families [FAMILIES="lerobot hf rcs libero openvla …"]                 tests of model families, in .venv-NAME each
+#   make verified [FAMILIES="lerobot hf"]                           what they verify, into the tables of docs/policies
 #   make docs                                                       the site of docs/, in build/docs, for a browser
 #   make bench                                                      measure, and write the figures of docs/measured.md again
 #
@@ -15,7 +16,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := setup
-.PHONY: setup demo bench check test families docs fmt lint type clean
+.PHONY: setup demo bench check test families docs verified fmt lint type clean
 
 VENV ?= .venv
 TORCH ?= torch==2.13.0
@@ -77,6 +78,13 @@ families:
 family-%: $(VENV)-%/.installed
 	@echo '== tests of $(or $(TESTED_IN_$*),$*), in $(VENV)-$*'
 	$(VENV)-$*/bin/python -m pytest -p no:cacheprovider $(addprefix tests/families/,$(or $(TESTED_IN_$*),$*))
+
+verified-%: $(VENV)-%/.installed
+	$(VENV)-$*/bin/python -m pytest -p no:cacheprovider -m verifies --verified $(addprefix tests/families/,$(or $(TESTED_IN_$*),$*))
+
+verified:
+	@$(MAKE) --no-print-directory $(addprefix verified-,$(filter-out libero rcs,$(FAMILIES)))
+	$(BIN)/python tests/support/verified.py
 
 # Made once for each state of the family's requirements, of what a server installs and of what `env make` adds: not removed as a mere step.
 .PRECIOUS: $(VENV)-%/.installed

@@ -53,6 +53,7 @@ ENVS: dict[str, str] = {
 DIALECTS: dict[str, str] = {
     "openpi": "vlagents_ray.serve.dialects.openpi.handler:OpenPiDialect",
     "roboarena": "vlagents_ray.serve.dialects.roboarena.handler:RoboArenaDialect",
+    "vllm_omni": "vlagents_ray.serve.dialects.vllm_omni.handler:VllmOmniDialect",
     "openvla": "vlagents_ray.serve.dialects.openvla.handler:OpenVLADialect",
     "vla_eval": "vlagents_ray.serve.dialects.vla_eval.handler:VlaEvalDialect",
     "gr00t": "vlagents_ray.serve.dialects.gr00t.handler:GR00TDialect",

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import io
+import json
 import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import typer
 
 from vlagents_ray.cli import console
 from vlagents_ray.cli.console import PlainConsole, table
 from vlagents_ray.cli.doctor import listing
 from vlagents_ray.cli.main import envs, policies
 from vlagents_ray.envs.tabletop import Tabletop
+from vlagents_ray.registry import POLICIES, WRAPPERS
 
 CLI = Path(console.__file__).parent
 CURE = "pip install 'vlagents-ray[libero]' [/] \\[red] and /a/very/long/path/" + "of-an-interpreter/" * 8 + "bin/python"
@@ -62,31 +65,74 @@ class Elsewhere(Tabletop):
 def test_envs_are_listed_with_their_cures_and_ranges_of_tasks(
     shown: io.StringIO, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(listing, "names", lambda _: {"elsewhere": f"{__name__}:Elsewhere"})
+    monkeypatch.setattr(
+        listing, "names", lambda _: {"elsewhere": f"{__name__}:Elsewhere", "too": f"{__name__}:Elsewhere"}
+    )
     monkeypatch.setattr(listing, "env_class", lambda _: Elsewhere)
     envs()
-    assert shown.getvalue().splitlines() == [
-        f"elsewhere: {CURE}",
-        "  55 tasks: goal/0..49, other, long/1..2, odd/1, odd/3",
-    ]
+    said = shown.getvalue()
+    _, *listed = [line.split(maxsplit=2) for line in said.partition("\n\n")[0].splitlines()]
+    if not console.out.is_terminal:
+        assert [(name, here, what.strip()) for name, here, what in listed] == [
+            ("elsewhere", "no", "55 tasks: goal/0..49, other, long/1..2, odd/1, odd/3"),
+            ("too", "no", "55 tasks: goal/0..49, other, long/1..2, odd/1, odd/3"),
+        ]
+    assert said.partition("\n\n")[2] == f"for the rest:\n  elsewhere, too: {CURE}\n"
 
 
-def test_policies_and_wrappers_say_what_they_are_what_is_missing_and_what_can_be_set(
+def test_a_listing_is_as_wide_as_a_terminal_and_has_a_line_for_each_elsewhere(shown: io.StringIO) -> None:
+    policies()
+    rows = shown.getvalue().partition("\n\n")[0].splitlines()
+    if console.out.is_terminal:
+        assert max(map(len, rows)) <= 80
+    else:
+        assert len(rows) == 1 + len(POLICIES) + len(WRAPPERS)
+        assert {row.split()[0] for row in rows[1:]} == POLICIES.keys() | WRAPPERS.keys()
+    assert "…" not in shown.getvalue()
+
+
+def test_what_installs_the_rest_is_said_once_for_all_that_want_it(
     shown: io.StringIO, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(listing.importlib.util, "find_spec", lambda _: None)
-    for variable in ("OPENPI_SRC", "VJEPA2_SRC"):
-        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.delenv("VJEPA2_SRC", raising=False)
+    monkeypatch.setenv("OPENVLA_SRC", "/src/openvla")
     policies()
-    found = {part.partition(":")[0]: part.splitlines() for part in shown.getvalue().split("\n\n")}
-    assert found["noop"][0].startswith("noop: A policy that does nothing, ")
-    assert found["noop"][1:] == ["  ready", "  settings: action_dim=7, chunk=1, base_ms=0.0, per_item_ms=0.0"]
-    assert "requirements/lerobot.txt`" in found["lerobot"][1]
-    assert "OPENPI_SRC=FOLDER of a checkout" in found["openpi"][1]
-    assert "VJEPA2_SRC=FOLDER" in found["vjepa2_ac"][1]
-    assert "settings: checkpoint, checkpoint_step=None, " in found["openvla"][2]
-    assert found["arro"][0].startswith("arro: ARRO (arXiv")
-    assert "…" not in shown.getvalue()
+    rest = shown.getvalue().partition("\n\n")[2].splitlines()
+    assert rest[0] == "for the rest, whose Python a deployment names as `environment`:"
+    assert "  vlagents-ray env make requirements/hf.txt  # pi0, vjepa2_ac, arro" in rest
+    assert "  vlagents-ray env make requirements/openvla.txt  # openvla, openvla_oft" in rest
+    assert "  export VJEPA2_SRC=FOLDER  # a checkout, for vjepa2_ac" in rest
+    assert not any("OPENVLA" in line for line in rest)
+
+
+def test_of_one_policy_all_is_said(shown: io.StringIO, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(listing.importlib.util, "find_spec", lambda _: None)
+    monkeypatch.delenv("OPENPI_SRC", raising=False)
+    policies("noop")
+    assert shown.getvalue().splitlines() == [
+        "noop: A policy that does nothing, in an adjustable time: what measures everything around a policy.",
+        "  ready",
+        "  settings: action_dim=7, chunk=1, base_ms=0.0, per_item_ms=0.0",
+    ]
+    policies("openpi")
+    assert "requirements/openpi.txt`" in shown.getvalue()
+    assert "OPENPI_SRC=FOLDER of a checkout" in shown.getvalue()
+    policies("arro")
+    assert "arro: ARRO (arXiv" in shown.getvalue()
+    with pytest.raises(typer.Exit) as ended:
+        policies("opnpi")
+    assert ended.value.exit_code == 2
+    assert "'opnpi' is not registered; did you mean 'openpi'" in shown.getvalue()
+
+
+def test_a_listing_is_json_for_programs(shown: io.StringIO) -> None:
+    policies(as_json=True)
+    found = {one["name"]: one for one in json.loads(shown.getvalue())}
+    assert found.keys() == POLICIES.keys() | WRAPPERS.keys()
+    assert (found["noop"]["kind"], found["noop"]["missing"]) == ("policy", None)
+    assert found["noop"]["details"][0] == "action_dim=7"
+    assert found["arro"]["kind"] == "wrapper"
 
 
 def test_an_environment_that_has_a_family_is_ready_for_it(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import importlib.util
 
 import pytest
+from verified import VerifyingTests
 
 # folder -> the package without which its tests cannot be imported
 _NEEDS = {
@@ -24,6 +25,17 @@ _NEEDS = {
 }
 
 collect_ignore = [folder for folder, package in _NEEDS.items() if importlib.util.find_spec(package) is None]
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--verified", action="store_true", help="note what tests marked `verifies` verified, in verified.json"
+    )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    if config.getoption("--verified", False):
+        config.pluginmanager.register(VerifyingTests())
 
 
 def pytest_itemcollected(item: pytest.Item) -> None:

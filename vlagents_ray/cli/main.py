@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import json
+from collections.abc import Collection, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,7 +13,7 @@ import typer
 
 from vlagents_ray.cli.bench import bench
 from vlagents_ray.cli.cluster.command import down_command, up_command
-from vlagents_ray.cli.console import errors, fresh, out, progress
+from vlagents_ray.cli.console import errors, fail, fresh, out, progress, table
 from vlagents_ray.cli.evaluation.command import evaluate_command
 from vlagents_ray.cli.evaluation.results import export_command, merge_command, replay_command, report_command
 from vlagents_ray.cli.keys import keys
@@ -21,9 +23,14 @@ from vlagents_ray.cli.robot.command import robot_command
 from vlagents_ray.cli.serve import serve_command
 from vlagents_ray.cli.slurm import slurm
 from vlagents_ray.cli.tune.command import tune_command
+from vlagents_ray.naming import did_you_mean
 
 if TYPE_CHECKING:
+    from vlagents_ray.cli.doctor.listing import Listed
     from vlagents_ray.evaluate import Progress
+
+OneName = Annotated[str | None, typer.Argument(metavar="[NAME]", help="Say all about this one alone.")]
+AsJson = Annotated[bool, typer.Option("--json", help="As JSON, for programs.")]
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -75,21 +82,45 @@ app.add_typer(slurm, name="slurm")
 
 
 @app.command()
-def policies() -> None:
-    """List the policies and wrappers: what they are, what is missing here and how to get it, and their settings."""
-    from vlagents_ray.cli.doctor.listing import policy_lines
+def policies(name: OneName = None, as_json: AsJson = False) -> None:
+    """List the policies and wrappers: what they are, whether their packages are here, and what installs the rest."""
+    from vlagents_ray.cli.doctor.listing import policies_and_wrappers
 
-    for line in policy_lines():
-        out.print(line)
+    _list(list(policies_and_wrappers()), name, as_json=as_json)
 
 
 @app.command()
-def envs() -> None:
-    """List the environments, their tasks, and what keeps one from running here."""
-    from vlagents_ray.cli.doctor.listing import env_lines
+def envs(name: OneName = None, as_json: AsJson = False) -> None:
+    """List the environments: their tasks, whether they run here, and what installs the rest."""
+    from vlagents_ray.cli.doctor.listing import environments
 
-    for line in env_lines():
-        out.print(line)
+    _list(list(environments()), name, as_json=as_json)
+
+
+def _list(listed: Sequence[Listed], name: str | None, *, as_json: bool) -> None:
+    """Print a listing: a line for each and what installs the rest, or all that there is to say of one name."""
+    from vlagents_ray.cli.doctor.listing import installing
+
+    chosen = [one for one in listed if name in (None, one.name)]
+    if not chosen:
+        fail(f"{name!r} is not registered{did_you_mean(str(name), [one.name for one in listed])}", 2)
+    if as_json:
+        out.print(json.dumps([asdict(one) for one in chosen], indent=2, default=str))
+        return
+    if name is not None:
+        for line in chosen[0].lines():
+            out.print(line)
+        return
+    kinds = len({one.kind for one in chosen}) > 1
+    rows = table("name", *(["kind"] * kinds), "here", "what", box=None)
+    for one in chosen:
+        rows.add_row(one.name, *([one.kind] * kinds), "no" if one.missing else "yes", one.what)
+    out.print(rows)
+    if cures := list(installing(chosen)):
+        made = any("env make" in line and line.startswith("vlagents-ray") for line in cures)
+        out.print(f"\nfor the rest{', whose Python a deployment names as `environment`' * made}:")
+    for line in cures:
+        out.print(f"  {line}")
 
 
 @app.command()

@@ -67,6 +67,7 @@ def test_boxes_lie_on_the_image_and_go_by_the_phrases_that_were_asked_for(ground
             assert 0 <= top <= bottom <= height
 
 
+@pytest.mark.verifies("parity")
 def test_boxes_are_those_that_transformers_finds_itself(grounding_dino: Path) -> None:
     import torch
 
@@ -89,6 +90,7 @@ def test_boxes_are_those_that_transformers_finds_itself(grounding_dino: Path) ->
             assert set(theirs["text_labels"][same].split()) & {"red", "cube", "the", "bowl", "."}
 
 
+@pytest.mark.verifies("batches")
 def test_what_is_found_does_not_depend_on_other_images_and_texts(grounding_dino: Path) -> None:
     detector = part("detector", "grounding_dino", grounding_dino, threshold=0.0)
     together = detector.detect(images(), PHRASES)
@@ -99,6 +101,7 @@ def test_what_is_found_does_not_depend_on_other_images_and_texts(grounding_dino:
         assert np.allclose([thing.score for thing in alone], [thing.score for thing in found], atol=1e-5)
 
 
+@pytest.mark.verifies("batches")
 def test_a_segment_for_each_box_and_the_same_in_any_company(sam2: Path) -> None:
     segmenter = part("segmenter", "sam2", sam2)
     boxes = [np.array([[5, 5, 30, 30], [10, 10, 40, 40]], np.float32)[: i + 1] for i in (0, 1, 1)]
@@ -118,6 +121,7 @@ def test_regions_are_proposed_without_repetitions(sam2: Path) -> None:
     assert all(regions.shape == (0, *size) for regions, size in zip(certain.propose(images()), SIZES, strict=True))
 
 
+@pytest.mark.verifies("parity")
 def test_segments_are_followed_as_transformers_does_with_all_frames_kept(sam2: Path) -> None:
     """Here three cameras are followed in one batch, and what they no longer need is forgotten."""
     import torch
@@ -169,6 +173,7 @@ class Watcher(Agent):
         return Act(np.zeros(1, np.float32))
 
 
+@pytest.mark.verifies("isolation")
 def test_sessions_with_all_learned_parts_are_apart(sam2: Path, grounding_dino: Path) -> None:
     policy = Arro.around(
         Watcher(),
@@ -200,6 +205,7 @@ def test_sessions_with_all_learned_parts_are_apart(sam2: Path, grounding_dino: P
             assert (here != there).any(-1).mean() < 0.01  # a pixel on the edge of a mask
 
 
+@pytest.mark.verifies("loading")
 @pytest.mark.parametrize(
     ("kind", "name", "file", "says"),
     [
@@ -218,6 +224,7 @@ def test_a_checkpoint_that_is_not_whole_is_refused(
         part(kind, name, tmp_path)
 
 
+@pytest.mark.verifies("loading")
 def test_weights_that_are_missing_are_never_random(sam2: Path, tmp_path: Path) -> None:
     from safetensors.torch import load_file, save_file
 

@@ -51,6 +51,7 @@ class TorchDraws:
         return drawn.astype(dtype)
 
 
+@pytest.mark.verifies("parity")
 @pytest.mark.parametrize("kind", KINDS)
 def test_gives_what_the_authors_code_gives(kind: str, policies: Callable[[str], DiffusionPolicy]) -> None:
     import torch
@@ -76,6 +77,7 @@ def test_keeps_the_contract(kind: str, checkpoint: Checkpoint) -> None:
     check_agent(made(checkpoint(kind)), steps=5, atol=ATOL)
 
 
+@pytest.mark.verifies("batches")
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_session_gets_the_same_in_any_company(kind: str, policies: Callable[[str], DiffusionPolicy]) -> None:
     policy = policies(kind)
@@ -128,6 +130,7 @@ def test_the_state_may_be_of_several_parts(checkpoint: Checkpoint) -> None:
     assert (contract.state, contract.gripper, contract.chunk) == ({"joints": StateSpec()}, True, 2)
 
 
+@pytest.mark.verifies("isolation")
 def test_a_missing_camera_fails_its_own_session_alone(policies: Callable[[str], DiffusionPolicy]) -> None:
     policy = policies("image")
     blind = Obs(state=seen(0).state)

@@ -36,6 +36,7 @@ def test_a_folder_says_which_files_it_has(checkpoint: Checkpoint) -> None:
         load(checkpoint("unet").parents[1])
 
 
+@pytest.mark.verifies("loading")
 @pytest.mark.parametrize(
     ("config", "message"),
     [
@@ -51,6 +52,7 @@ def test_settings_that_do_not_fit_the_checkpoint(checkpoint: Checkpoint, config:
         load(checkpoint("image"), **config)
 
 
+@pytest.mark.verifies("loading")
 def test_a_checkpoint_without_its_normalizer_is_refused(tmp_path: Path) -> None:
     path = tiny.save(tmp_path / "unnormalized", "unet", normalizer=False)
     with pytest.raises(ConfigError, match=r"normalizer has nothing for \['action', 'obs'\]"):
@@ -73,6 +75,7 @@ def _spoilt(path: Path, to: Path, change: Callable[[Any], None]) -> Path:
     return to
 
 
+@pytest.mark.verifies("loading")
 @pytest.mark.parametrize(
     ("change", "message"),
     [

@@ -66,6 +66,7 @@ def step(added: dict[str, Any]) -> Change:
     return spoil
 
 
+@pytest.mark.verifies("loading")
 @pytest.mark.parametrize(
     ("spoil", "text"),
     [
@@ -149,6 +150,7 @@ def test_a_step_that_takes_code_from_the_hub_by_itself_is_refused(
     assert proof.exists()
 
 
+@pytest.mark.verifies("loading")
 @pytest.mark.parametrize(
     ("config", "text"),
     [
@@ -171,6 +173,7 @@ def test_a_wrong_setting_is_refused(config: dict[str, Any], text: str, made: Mad
         opened(made("act"), **config)
 
 
+@pytest.mark.verifies("loading")
 def test_a_residual_vq_that_is_not_trained_is_refused(copied: Callable[[str], Path]) -> None:
     folder = copied("vqbet")
     tensors("model*", lambda saved: saved["vqbet.action_head.vqvae_model.discretized"].fill_(False))(folder)
@@ -178,6 +181,7 @@ def test_a_residual_vq_that_is_not_trained_is_refused(copied: Callable[[str], Pa
         opened(folder)
 
 
+@pytest.mark.verifies("loading")
 @pytest.mark.parametrize(
     ("name", "text"),
     [("groot", "GR00T"), ("sarm", "rewards"), *((name, "openpi's changes") for name in UNPATCHED)],

@@ -68,6 +68,7 @@ def test_keeps_the_contract(kind: str, made: Callable[[str], Path]) -> None:
     check_agent(LeRobot.from_config({"checkpoint": str(made(kind))}), instructions=TASKS, atol=ATOL)
 
 
+@pytest.mark.verifies("batches")
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_session_gets_the_same_in_any_company(kind: str, made: Callable[[str], Path]) -> None:
     policy = _loaded(made(kind))
@@ -79,6 +80,7 @@ def test_a_session_gets_the_same_in_any_company(kind: str, made: Callable[[str],
         np.testing.assert_allclose(acts[0].action, alone, atol=ATOL)
 
 
+@pytest.mark.verifies("parity")
 @pytest.mark.parametrize("delay", [None, 2])
 @pytest.mark.parametrize("kind", KINDS)
 def test_flow_matching_and_its_guidance_are_theirs(kind: str, delay: int | None, made: Callable[[str], Path]) -> None:
@@ -150,6 +152,7 @@ def test_compiled_passes_act_as_without(kind: str, made: Callable[[str], Path]) 
         assert programs.rows == [2, 2]
 
 
+@pytest.mark.verifies("loading")
 @pytest.mark.parametrize("kind", KINDS)
 def test_weights_that_lerobot_would_replace_by_random_ones_are_an_error(kind: str, made: Callable[[str], Path]) -> None:
     file = made(kind) / "model.safetensors"

@@ -29,6 +29,7 @@ def test_keeps_the_contract(kind: str, made: Made) -> None:
     check_agent(LeRobot.from_config({"checkpoint": str(made(kind))}), instructions=TASKS, atol=ATOL)
 
 
+@pytest.mark.verifies("batches")
 @pytest.mark.parametrize("kind", sorted(tiny.KINDS))
 def test_a_session_gets_the_same_in_any_company(kind: str, loaded: Load) -> None:
     policy = loaded(kind)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from tests.families.lerobot import tiny
 from tests.families.lerobot.conftest import FILTERS, Load, begun, view
@@ -12,6 +13,7 @@ from vlagents_ray.interface import DELAY, LEFTOVER
 pytestmark = FILTERS
 
 
+@pytest.mark.verifies("isolation")
 def test_a_leftover_of_another_robot_fails_its_own_session_alone(loaded: Load) -> None:
     policy = loaded("smolvla")
     bad = view(**{LEFTOVER: np.zeros((3, tiny.ACTION + 1), np.float32)})
@@ -20,6 +22,7 @@ def test_a_leftover_of_another_robot_fails_its_own_session_alone(loaded: Load) -
     assert not isinstance(right, Exception)
 
 
+@pytest.mark.verifies("isolation")
 def test_leftovers_and_delays_of_neighbours_do_not_matter(loaded: Load) -> None:
     policy = loaded("smolvla", execute=tiny.CHUNK)
     plan = np.linspace(-1, 1, 5 * tiny.ACTION, dtype=np.float32).reshape(5, tiny.ACTION)

@@ -36,6 +36,7 @@ def test_others_load_and_act(tmp_path: Path, family: str) -> None:
     acts(write_checkpoint(family, tmp_path / "made", "small").config)
 
 
+@pytest.mark.verifies("size")
 @pytest.mark.parametrize(
     ("family", "millions"),
     [

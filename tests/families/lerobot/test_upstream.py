@@ -59,6 +59,7 @@ def upstream(made: Made) -> Iterator[Callable[[str], Theirs]]:
     torch.random.set_rng_state(state)
 
 
+@pytest.mark.verifies("parity")
 def test_act_is_theirs(loaded: Load, upstream: Callable[[str], Theirs]) -> None:
     theirs = upstream("act")
     rows = begun(loaded("act")).act(view()).action
@@ -66,12 +67,14 @@ def test_act_is_theirs(loaded: Load, upstream: Callable[[str], Theirs]) -> None:
         np.testing.assert_allclose(theirs.select(view()), row, atol=ATOL)
 
 
+@pytest.mark.verifies("parity")
 def test_the_ensemble_is_theirs(loaded: Load, upstream: Callable[[str], Theirs]) -> None:
     theirs, session = upstream("ensemble"), begun(loaded("ensemble"))
     for tick in range(2 * tiny.CHUNK):
         np.testing.assert_allclose(session.act(view(tick)).action, theirs.select(view(tick)), atol=ATOL)
 
 
+@pytest.mark.verifies("parity")
 @pytest.mark.parametrize("kind", ["smolvla"])
 def test_flow_matching_is_theirs_with_the_same_noise(
     kind: str, loaded: Load, upstream: Callable[[str], Theirs]
@@ -85,6 +88,7 @@ def test_flow_matching_is_theirs_with_the_same_noise(
         np.testing.assert_allclose(row, theirs.select(view()), atol=ATOL)
 
 
+@pytest.mark.verifies("parity")
 @pytest.mark.parametrize("kind", ["xvla", "vqbet", "sac"])
 def test_what_draws_by_itself_is_theirs_from_the_same_seed(
     kind: str, loaded: Load, upstream: Callable[[str], Theirs]
@@ -96,6 +100,7 @@ def test_what_draws_by_itself_is_theirs_from_the_same_seed(
         np.testing.assert_allclose(theirs.select(view()), row, atol=ATOL)
 
 
+@pytest.mark.verifies("parity")
 def test_diffusion_is_theirs_over_several_chunks(
     loaded: Load, upstream: Callable[[str], Theirs], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -118,6 +123,7 @@ def test_diffusion_is_theirs_over_several_chunks(
         np.testing.assert_allclose(session.act(view(tick)).action, wanted, atol=ATOL)
 
 
+@pytest.mark.verifies("parity")
 def test_tdmpc_plans_as_theirs_from_its_last_plan(loaded: Load, upstream: Callable[[str], Theirs]) -> None:
     theirs, policy = upstream("tdmpc"), loaded("tdmpc")
     draws, session = draws_of(policy), begun(policy)
@@ -129,6 +135,7 @@ def test_tdmpc_plans_as_theirs_from_its_last_plan(loaded: Load, upstream: Callab
         np.testing.assert_allclose(session.act(view(tick)).action[0], action, atol=ATOL)
 
 
+@pytest.mark.verifies("parity")
 def test_smolvla_with_its_language_model_in_bfloat16_is_theirs(tmp_path: Path) -> None:
     """LeRobot reads those weights from the hub first; here they come from the checkpoint alone, in the same types."""
     folder = tiny.make(tmp_path / "smolvla", "smolvla", load_vlm_weights=True)
@@ -147,6 +154,7 @@ def test_smolvla_with_its_language_model_in_bfloat16_is_theirs(tmp_path: Path) -
     assert {one.dtype for one in exact.model.kind.policy.parameters()} == {torch.float32}
 
 
+@pytest.mark.verifies("parity")
 @pytest.mark.parametrize(("left", "delay"), [(6, 2), (3, 2), (8, 0), (2, 5)])
 def test_real_time_chunking_is_theirs(left: int, delay: int, loaded: Load, upstream: Callable[[str], Theirs]) -> None:
     theirs, policy = upstream("smolvla"), loaded("smolvla", execute=tiny.CHUNK)

@@ -31,6 +31,7 @@ def load(checkpoint: Path | str, **config: Any) -> Octo:
     return policy
 
 
+@pytest.mark.verifies("loading")
 @pytest.mark.parametrize(
     ("config", "message"),
     [
@@ -78,6 +79,7 @@ def _elsewhere(folder: Path) -> None:
     path.write_text(json.dumps(config))
 
 
+@pytest.mark.verifies("loading")
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [

@@ -62,6 +62,7 @@ def test_keeps_the_contract(pretrained: Path) -> None:
     check_agent(made(pretrained, batch_sizes=[1, 4]), atol=ATOL)
 
 
+@pytest.mark.verifies("parity")
 def test_an_instruction_gives_what_octo_gives_and_only_real_frames_count(policy: Octo) -> None:
     first, second = seen(1), seen(2)
     tasks = policy.model.model.create_tasks(texts=["push the cube"])
@@ -75,6 +76,7 @@ def test_an_instruction_gives_what_octo_gives_and_only_real_frames_count(policy:
     np.testing.assert_allclose(moved.act(second).action, wanted, atol=ATOL)
 
 
+@pytest.mark.verifies("parity")
 def test_a_goal_image_gives_what_octo_gives(policy: Octo) -> None:
     goal = seen(9).cameras["front"]
     obs = seen(1, **{GOAL_IMAGE: goal})
@@ -85,6 +87,7 @@ def test_a_goal_image_gives_what_octo_gives(policy: Octo) -> None:
     np.testing.assert_allclose(begun(policy, obs, None, seed=3).act(obs).action, wanted, atol=ATOL)
 
 
+@pytest.mark.verifies("batches")
 def test_a_session_gets_the_same_in_any_company(policy: Octo) -> None:
     goal = seen(90).cameras["front"]
     views = [seen(i, **({GOAL_IMAGE: goal} if i % 3 == 2 else {})) for i in range(8)]
@@ -164,6 +167,7 @@ def test_an_episode_without_its_kind_of_task_is_refused(
         other.reset(seen(1, **info), instruction)
 
 
+@pytest.mark.verifies("isolation")
 def test_a_missing_camera_fails_its_own_session_alone(policy: Octo) -> None:
     blind = Obs(cameras={"front": np.zeros((8, 8, 3), np.uint8)})
     bad, good = policy.act_batch([blind, seen(1)], [begun(policy, seen(0)), begun(policy, seen(1))])

@@ -30,12 +30,14 @@ def load(folder: Path, **settings: Any) -> Any:
     return OpenPi.from_config({"checkpoint": str(folder), **config}).load()
 
 
+@pytest.mark.verifies("loading")
 def test_missing_statistics_are_an_error_that_names_those_that_are_there(whole: Path) -> None:
     (whole / "assets" / "tiny").rename(whole / "assets" / "other")
     with pytest.raises(ConfigError, match=r"no assets/tiny/libero/norm_stats\.json, has those of \['other/libero'\]"):
         load(whole)
 
 
+@pytest.mark.verifies("loading")
 def test_statistics_without_those_of_actions_are_an_error(whole: Path) -> None:
     file = whole / "assets" / "tiny" / "libero" / "norm_stats.json"
     stats = json.loads(file.read_text())
@@ -61,12 +63,14 @@ def test_the_folder_of_a_run_is_told_from_that_of_a_step(whole: Path) -> None:
         load(whole)
 
 
+@pytest.mark.verifies("loading")
 def test_another_configs_checkpoint_does_not_fill_the_model(whole: Path, tiny: ModuleType) -> None:
     tiny.save_statistics(whole, "pi05")
     with pytest.raises(ConfigError, match="does not fill the model of config 'tiny_pi05_droid'"):
         load(whole, config="tests.families.openpi.tiny:PI05")
 
 
+@pytest.mark.verifies("loading")
 def test_lora_weights_are_not_dropped(checkpoint: Any, tmp_path: Path, tiny: ModuleType) -> None:
     import orbax.checkpoint
 

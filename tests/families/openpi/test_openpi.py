@@ -62,6 +62,7 @@ def begun(policy: Any, kind: str, i: int) -> Any:
     return session
 
 
+@pytest.mark.verifies("parity")
 @pytest.mark.parametrize("kind", KINDS)
 def test_actions_are_those_of_openpis_own_policy(kind: str, loaded: Any, upstream: Any, checkpoint: Any) -> None:
     policy = loaded(kind)
@@ -72,6 +73,7 @@ def test_actions_are_those_of_openpis_own_policy(kind: str, loaded: Any, upstrea
         np.testing.assert_allclose(begun(policy, kind, i).act(seen(kind, i)).action, want, atol=1e-4, rtol=1e-4)
 
 
+@pytest.mark.verifies("batches")
 @pytest.mark.parametrize("kind", ["pi0", "pi05"])
 def test_neighbours_change_nothing(kind: str, loaded: Any) -> None:
     policy = loaded(kind)
@@ -121,6 +123,7 @@ def test_contracts_fit_the_mappings_of_their_clients(loaded: Any) -> None:
         assert presets()[mapping].lacks(loaded(kind).contract) == []
 
 
+@pytest.mark.verifies("isolation")
 def test_a_session_that_fails_leaves_its_neighbours_alone(loaded: Any) -> None:
     policy = loaded("pi0")
     bad = seen("pi0", 0)
@@ -156,6 +159,7 @@ def test_a_config_with_its_own_prompt_needs_no_instruction(loaded: Any) -> None:
     np.testing.assert_array_equal(session.act(seen("aloha", 0)).action, told.act(seen("aloha", 0)).action)
 
 
+@pytest.mark.verifies("parity")
 def test_fast_says_what_openpis_own_policy_says_alone_and_in_company(
     loaded: Any, upstream: Any, checkpoint: Any
 ) -> None:

@@ -42,6 +42,7 @@ def made(folder: Path, **settings: Any) -> OpenPi:
 
 
 @patched
+@pytest.mark.verifies("parity")
 def test_actions_are_those_of_openpis_own_policy_alone_and_in_company(port: Path, tiny: ModuleType) -> None:
     import torch
     from openpi.policies.policy import Policy
@@ -168,6 +169,7 @@ def test_acts_of_which_nothing_is_wanted_are_those_without_random_steps(port: Pa
 
 
 @patched
+@pytest.mark.verifies("loading")
 def test_a_lost_tensor_is_an_error(port: Path, tmp_path: Path, tiny: ModuleType) -> None:
     from safetensors.torch import load_file, save_file
 

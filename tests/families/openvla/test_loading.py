@@ -38,6 +38,7 @@ def _link(source: str, target: str) -> None:
         shutil.copy(source, target)
 
 
+@pytest.mark.verifies("loading")
 @pytest.mark.parametrize(
     ("policy", "kind", "config", "message"),
     [
@@ -70,6 +71,7 @@ def test_settings_that_do_not_fit(
         load(policy, checkpoint(kind), **config)
 
 
+@pytest.mark.verifies("loading")
 @pytest.mark.parametrize(
     "file", ["config.json", "preprocessor_config.json", "tokenizer_config.json", "model.safetensors"]
 )
@@ -80,6 +82,7 @@ def test_a_checkpoint_that_is_not_whole(copied: Callable[[str], Path], file: str
         load("openvla", folder)
 
 
+@pytest.mark.verifies("loading")
 def test_statistics_are_in_the_checkpoint_or_nothing_is_served(copied: Callable[[str], Path]) -> None:
     folder = copied("openvla")
     found = (folder / "dataset_statistics.json").read_text()
@@ -91,6 +94,7 @@ def test_statistics_are_in_the_checkpoint_or_nothing_is_served(copied: Callable[
     load("openvla", folder, unnorm_key="bridge_orig")
 
 
+@pytest.mark.verifies("loading")
 def test_weights_that_do_not_fill_the_model(copied: Callable[[str], Path]) -> None:
     folder = copied("oft")
     tensors = load_file(folder / "model.safetensors")

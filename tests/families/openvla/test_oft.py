@@ -128,6 +128,7 @@ def test_keeps_the_contract(checkpoint: Callable[[str], Path], kind: str) -> Non
     check_agent(OpenVLAOFT.from_config(config), obs=views, instructions=WORDS, steps=2, atol=SAME[kind])
 
 
+@pytest.mark.verifies("parity")
 @pytest.mark.usefixtures("fork")
 @pytest.mark.parametrize("seed", [0, 2])
 def test_answers_what_upstream_answers(
@@ -140,6 +141,7 @@ def test_answers_what_upstream_answers(
     assert np.abs(session.act(seen(seed)).action - theirs.act(seen(seed), WORDS[seed])).max() <= SAME[kind]
 
 
+@pytest.mark.verifies("parity")
 @pytest.mark.usefixtures("fork")
 def test_fewer_steps_of_diffusion_are_upstreams(
     checkpoint: Callable[[str], Path], loaded: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
@@ -151,6 +153,7 @@ def test_fewer_steps_of_diffusion_are_upstreams(
     assert np.abs(begun(policy, 0).act(seen(0)).action - theirs.act(seen(0), WORDS[0])).max() <= SAME["oft-diffusion"]
 
 
+@pytest.mark.verifies("batches")
 def test_a_session_gets_the_same_in_any_company(policy: OpenVLAOFT, kind: str) -> None:
     alone = [begun(policy, seed).act(seen(seed)).action for seed in range(8)]
     for size in (2, 3, 8):
@@ -226,6 +229,7 @@ def test_regression_is_sure_of_its_only_answer(loaded: Callable[..., Any]) -> No
     assert found["std"].max() <= SAME["oft"]
 
 
+@pytest.mark.verifies("isolation")
 @pytest.mark.parametrize(
     ("change", "error"),
     [

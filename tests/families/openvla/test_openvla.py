@@ -48,6 +48,7 @@ def test_keeps_the_contract(checkpoint: Callable[[str], Path]) -> None:
     check_agent(agent, instructions=WORDS, steps=2, atol=0)
 
 
+@pytest.mark.verifies("parity")
 @pytest.mark.parametrize("seed", range(3))
 def test_answers_what_upstream_answers(policy: OpenVLA, checkpoint: Callable[[str], Path], seed: int) -> None:
     [row] = begun(policy, seed).act(seen(seed)).action
@@ -55,6 +56,7 @@ def test_answers_what_upstream_answers(policy: OpenVLA, checkpoint: Callable[[st
     assert np.array_equal(row, want.astype(np.float32))
 
 
+@pytest.mark.verifies("batches")
 @pytest.mark.parametrize("size", [2, 3, 8])
 def test_a_session_gets_the_same_in_any_company(policy: OpenVLA, size: int) -> None:
     alone = [begun(policy, seed).act(seen(seed)).action for seed in range(size)]
@@ -75,6 +77,7 @@ def test_a_session_may_have_another_datasets_units(policy: OpenVLA, checkpoint: 
     assert not np.array_equal(plain.action, reset.action)
 
 
+@pytest.mark.verifies("isolation")
 @pytest.mark.parametrize(
     ("change", "error"),
     [

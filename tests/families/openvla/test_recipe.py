@@ -36,6 +36,7 @@ def test_it_loads_and_acts_with_every_dimension_inside_its_range(tmp_path: Path)
     assert len(np.unique(np.array(found), axis=0)) > 1
 
 
+@pytest.mark.verifies("size")
 def test_the_full_size_is_the_published_one(tmp_path: Path) -> None:
     model, _ = recipe.make_model(Recipe("openvla", tmp_path, "full", "bfloat16"), find_source(None))
     assert sum(one.numel() for one in model.parameters()) == pytest.approx(7.54e9, rel=0.01)  # its files have 15.1 GB

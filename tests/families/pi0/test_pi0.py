@@ -77,6 +77,7 @@ def test_it_states_what_it_needs_and_gives(loaded: Pi0) -> None:
     assert (contract.action.dim, contract.chunk, contract.instruction) == (tiny.ACTION_DIM, tiny.CHUNK, True)
 
 
+@pytest.mark.verifies("parity")
 def test_actions_are_those_of_transformers_own_sampling(loaded: Pi0) -> None:
     session = begun(loaded, 0)
     obs = seen(0)
@@ -93,6 +94,7 @@ def test_actions_are_those_of_transformers_own_sampling(loaded: Pi0) -> None:
     np.testing.assert_allclose(session.act(obs).action, flow * (std + 1e-8) + mean, atol=1e-5)
 
 
+@pytest.mark.verifies("batches")
 @pytest.mark.parametrize("size", [2, 3, 8])
 def test_neighbours_change_nothing(loaded: Pi0, size: int) -> None:
     alone = [begun(loaded, i).act(seen(i)).action for i in range(size)]
@@ -101,6 +103,7 @@ def test_neighbours_change_nothing(loaded: Pi0, size: int) -> None:
         np.testing.assert_allclose(act.action, one, atol=BATCHED)
 
 
+@pytest.mark.verifies("batches")
 def test_deterministic_actions_are_equal_to_the_bit_in_any_batch(folder: Path) -> None:
     policy = Pi0.from_config({"checkpoint": str(folder), "deterministic": True, "batch_sizes": [4]})
     policy.initialize()
@@ -145,6 +148,7 @@ def test_frozen_rows_come_back_as_planned_and_later_ones_follow_the_plan(loaded:
     assert off[3] < off[-1]  # it follows closely at first, loosely at the end
 
 
+@pytest.mark.verifies("isolation")
 def test_a_neighbours_plan_changes_nothing(loaded: Pi0) -> None:
     plan = np.ones((6, tiny.ACTION_DIM), np.float32)
     views = [seen(0), seen(1, **{LEFTOVER: plan, DELAY: 2})]
@@ -185,6 +189,7 @@ def test_a_state_of_another_length_is_refused(loaded: Pi0) -> None:
         begun(loaded, 0).act(obs)
 
 
+@pytest.mark.verifies("loading")
 @pytest.mark.parametrize("file", ["config.json", "processor_config.json", "model.safetensors"])
 def test_a_missing_file_is_named(whole: Path, file: str) -> None:
     (whole / file).unlink()
@@ -192,12 +197,14 @@ def test_a_missing_file_is_named(whole: Path, file: str) -> None:
         Pi0.from_config({"checkpoint": str(whole)}).initialize()
 
 
+@pytest.mark.verifies("loading")
 def test_missing_statistics_are_an_error(tmp_path: Path) -> None:
     tiny.save(tmp_path, statistics=False)
     with pytest.raises(ConfigError, match=r"has no \['state_mean', .*'actions_std'\]"):
         Pi0.from_config({"checkpoint": str(tmp_path)}).initialize()
 
 
+@pytest.mark.verifies("loading")
 def test_a_lost_tensor_is_an_error_and_not_random(whole: Path) -> None:
     tensors = load_file(whole / "model.safetensors")
     del tensors["action_out_proj.bias"]
@@ -206,6 +213,7 @@ def test_a_lost_tensor_is_an_error_and_not_random(whole: Path) -> None:
         Pi0.from_config({"checkpoint": str(whole)}).initialize()
 
 
+@pytest.mark.verifies("loading")
 def test_a_tensor_of_another_shape_is_an_error(whole: Path) -> None:
     tensors = load_file(whole / "model.safetensors")
     tensors["action_out_proj.bias"] = tensors["action_out_proj.bias"][:-1].clone()

@@ -33,6 +33,7 @@ def test_it_loads_and_acts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shar
     assert not np.allclose(*acts)
 
 
+@pytest.mark.verifies("size")
 def test_the_full_size_is_the_published_one(tmp_path: Path) -> None:
     model, _ = recipe.make_model(Recipe("pi0", tmp_path, "full", "bfloat16"))
     parameters = dict(model.named_parameters())

@@ -31,6 +31,7 @@ def pixels(count: int) -> np.ndarray:
 
 
 @torch.inference_mode()
+@pytest.mark.verifies("batches")
 def test_an_image_gives_the_same_features_in_a_batch_of_any_size(folder: Path) -> None:
     encode = Encoder(
         load_encoder(config(encoder=str(folder)), None).eval(), normalize=True, compilation=Compilation(mode=False)
@@ -43,6 +44,7 @@ def test_an_image_gives_the_same_features_in_a_batch_of_any_size(folder: Path) -
 
 
 @torch.inference_mode()
+@pytest.mark.verifies("parity")
 def test_features_are_those_of_transformers_for_an_image_shown_twice(folder: Path) -> None:
     model = load_encoder(config(encoder=str(folder)), None).eval()
     clip = torch.as_tensor(pixels(1))[:, None].expand(-1, 2, -1, -1, -1)
@@ -63,6 +65,7 @@ def test_an_encoder_for_images_of_another_size_is_refused(folder: Path) -> None:
         load_encoder(config(encoder=str(folder), image_size=256), None)
 
 
+@pytest.mark.verifies("loading")
 def test_weights_that_are_missing_are_never_random(folder: Path, tmp_path: Path) -> None:
     from safetensors.torch import load_file, save_file
 

@@ -68,6 +68,7 @@ def test_keeps_the_promises_of_an_agent(checkpoint: Path) -> None:
     )
 
 
+@pytest.mark.verifies("batches")
 def test_a_session_gets_the_same_in_any_company(policy: VJepa2Ac) -> None:
     views = [obs(10 + i) for i in range(8)]
     alone = [begun(policy, i, goal=i).act(one).action for i, one in enumerate(views)]
@@ -100,6 +101,7 @@ def test_bfloat16_plans_nearly_as_float32(checkpoint: Path, policy: VJepa2Ac) ->
     assert np.allclose(one.action[:, :3], other.action[:, :3], atol=0.05)  # of at most 0.05 to each side
 
 
+@pytest.mark.verifies("parity")
 def test_plans_are_those_of_upstreams_own_planner(policy: VJepa2Ac, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same images, pose and draws, through upstream's encoder, predictor, transform and `cem`."""
     import torch
@@ -183,6 +185,7 @@ def test_the_goal_may_come_later_and_change(policy: VJepa2Ac) -> None:
     assert session.episode.memory["goal_features"] is not features
 
 
+@pytest.mark.verifies("isolation")
 def test_a_bad_observation_fails_its_own_session_alone(policy: VJepa2Ac) -> None:
     bad = [Obs(cameras=obs(0).cameras, gripper=1.0), Obs(state=obs(0).state, gripper=1.0), obs(0), obs(1)]
     bad[2].info[GOAL_IMAGE] = np.zeros((4, 4), np.uint8)
@@ -222,6 +225,7 @@ def altered(checkpoint: Path, folder: Path, part: str, lose: str | None) -> Path
     return folder / "altered.pt"
 
 
+@pytest.mark.verifies("loading")
 @pytest.mark.parametrize(
     ("part", "lose", "says"),
     [
@@ -240,6 +244,7 @@ def test_a_checkpoint_that_is_not_whole_is_refused(
         made.initialize()
 
 
+@pytest.mark.verifies("loading")
 @pytest.mark.parametrize(
     ("settings", "says"),
     [

@@ -1,4 +1,4 @@
-"""What `vlagents-ray policies` and `vlagents-ray envs` list: whole lines, which can be copied and searched."""
+"""What `vlagents-ray policies` and `vlagents-ray envs` list: what there is, what is here, and how to get the rest."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import inspect
 import os
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import groupby
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -31,27 +32,77 @@ _NEEDS: dict[str, tuple[tuple[str, ...], tuple[str, ...], str]] = {
     "vjepa2_ac": (("transformers", "torch"), ("VJEPA2_SRC",), "hf.txt"),
     "arro": (("transformers", "torch"), (), "hf.txt"),
 }
+_SHORT = 5  # most ranges of tasks that a line of the listing names
 _CHECKOUTS = {"VJEPA2_SRC": "src"}  # whose module is not among the first ones
 
 
-def policy_lines() -> Iterator[str]:
-    """Say of each policy and wrapper what it is, what is missing here and how to get it, and its settings."""
-    for kind, find in (("policies", policy_class), ("wrappers", wrapper_class)):
-        yield f"{kind}, for `policy`:" if kind == "policies" else "wrappers, for `wrappers`:"
-        for name, target in sorted(names(kind).items()):
+@dataclass(frozen=True)
+class Listed:
+    """A line of a listing.
+
+    Attributes:
+        kind: "policy", "wrapper" or "environment".
+        name: Its registered name.
+        what: What it is, or an environment's tasks, in one line.
+        missing: What keeps it from running in this Python, with the cure; None if it is ready.
+        details: The settings of a policy or wrapper as `name=default`, the tasks of an environment.
+    """
+
+    kind: str
+    name: str
+    what: str
+    missing: str | None
+    details: list[str]
+
+    def lines(self) -> Iterator[str]:
+        """Yield all there is to say, in whole lines, which can be copied and searched."""
+        yield f"{self.name}: {self.what}"
+        yield f"  {'ready' if self.missing is None else self.missing}"
+        yield f"  {'tasks' if self.kind == 'environment' else 'settings'}: {', '.join(self.details) or 'none'}"
+
+
+def policies_and_wrappers() -> Iterator[Listed]:
+    """Yield the policies, then the wrappers."""
+    for kind, registered, find in (("policy", "policies", policy_class), ("wrapper", "wrappers", wrapper_class)):
+        for name, target in sorted(names(registered).items()):
             try:
                 cls = find(name)
             except VLAgentsError as error:
-                yield from ("", name, f"  not here: {error}")
+                yield Listed(kind, name, "its module is not here", str(error), [])
                 continue
-            missing = missing_packages(name)
-            yield from (
-                "",
-                f"{name}: {_first_line(sys.modules[target.partition(':')[0]])}",
-                f"  {'ready' if missing is None else missing}",
-            )
-            yield f"  settings: {', '.join(settings_of(cls)) or 'none'}"
-        yield ""
+            what = _first_line(sys.modules[target.partition(":")[0]])
+            yield Listed(kind, name, what, missing_packages(name), list(settings_of(cls)))
+
+
+def environments() -> Iterator[Listed]:
+    """Yield the simulators, with the ranges of their tasks."""
+    for name in sorted(names("envs")):
+        try:
+            cls = env_class(name)
+            missing, tasks = cls.missing(), cls.tasks()
+        except VLAgentsError as error:
+            missing, tasks = str(error), []
+        shown = list(ranges(tasks))
+        short = shown if len(shown) <= _SHORT else [shown[0], "…", shown[-1]]
+        what = (
+            f"{len(tasks)} task{'s' * (len(tasks) != 1)}: {', '.join(short)}" if tasks else "any task of the simulator"
+        )
+        yield Listed("environment", name, what, missing, shown)
+
+
+def installing(listed: Sequence[Listed]) -> Iterator[str]:
+    """Yield what installs the rest, a line each: a command and whom it is for, or what an environment says."""
+    wanted: dict[str, list[str]] = {}
+    for one in listed:
+        modules, sources, requirements = _lacking(one.name) if one.kind != "environment" else ([], [], "")
+        if modules or sources:
+            wanted.setdefault(f"vlagents-ray env make requirements/{requirements}  # {{}}", []).append(one.name)
+        if sources:
+            wanted.setdefault(f"export {sources[0]}=FOLDER  # a checkout, for {{}}", []).append(one.name)
+        if one.missing is not None and not (modules or sources):
+            wanted.setdefault(f"{{}}: {one.missing.replace('{', '{{').replace('}', '}}')}", []).append(one.name)
+    for line, of in wanted.items():
+        yield line.format(", ".join(of))
 
 
 def require_packages(config: ServeDeploySchema) -> None:
@@ -72,19 +123,25 @@ def missing_packages(name: str, *, checkout: bool = True) -> str | None:
         name: The name of the policy or wrapper.
         checkout: Whether the checkout that some families need counts.
     """
-    modules, variables, requirements = _NEEDS.get(name, ((), (), ""))
-    sources = [variable for variable in variables if os.environ.get(variable)]
-    needed = [one for one in modules if not (sources and one == modules[0] and variables[0] not in _CHECKOUTS)]
-    lacking = [one for one in needed if importlib.util.find_spec(one) is None]
-    no_source = bool(variables) and not sources and (variables[0] in _CHECKOUTS or modules[0] in lacking)
-    own_module = no_source and variables[0] not in _CHECKOUTS
-    if not lacking[own_module:] and not (no_source and checkout):
+    modules, sources, requirements = _lacking(name)
+    if not modules and not (sources and checkout):
         return None
     cures = [f"`vlagents-ray env make requirements/{requirements}`, and that Python in `environment` of its deployment"]
-    if no_source:
-        cures.append(f"{' or '.join(variables)}=FOLDER of a checkout")
-        lacking = [*lacking[own_module:], "its source"]
-    return f"not in this environment ({', '.join(lacking)}): {'; '.join(cures)}"
+    if sources:
+        cures.append(f"{' or '.join(sources)}=FOLDER of a checkout")
+        modules = [*modules, "its source"]
+    return f"not in this environment ({', '.join(modules)}): {'; '.join(cures)}"
+
+
+def _lacking(name: str) -> tuple[list[str], list[str], str]:
+    """Return what a family lacks: modules, variables one of which is to name a checkout; and its requirements file."""
+    modules, variables, requirements = _NEEDS.get(name, ((), (), ""))
+    given = [variable for variable in variables if os.environ.get(variable)]
+    from_checkout = bool(variables) and variables[0] not in _CHECKOUTS  # the first module is the checkout's
+    needed = [one for one in modules if not (given and from_checkout and one == modules[0])]
+    lacking = [one for one in needed if importlib.util.find_spec(one) is None]
+    no_source = bool(variables) and not given and (not from_checkout or modules[0] in lacking)
+    return lacking[no_source and from_checkout :], list(variables) if no_source else [], requirements
 
 
 def settings_of(cls: type) -> Iterator[str]:
@@ -98,18 +155,6 @@ def settings_of(cls: type) -> Iterator[str]:
         if parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY):
             required = parameter.default is parameter.empty
             yield parameter.name if required else f"{parameter.name}={parameter.default!r}"
-
-
-def env_lines() -> Iterator[str]:
-    """Say of each simulator what keeps it from running here, with the cure, and its tasks, in a line each."""
-    for name in sorted(names("envs")):
-        try:
-            cls = env_class(name)
-            missing, tasks = cls.missing(), cls.tasks()
-        except VLAgentsError as error:
-            missing, tasks = str(error), []
-        yield f"{name}: {'ready' if missing is None else missing}"
-        yield f"  {len(tasks)} tasks: {', '.join(ranges(tasks))}" if tasks else "  tasks: any that the simulator knows"
 
 
 def ranges(tasks: list[str]) -> Iterator[str]:

@@ -193,9 +193,9 @@ class RouteDialect(Dialect):
         """
         return Dispatcher(self.context.engine, self.name, caller=current_caller(), connected=False, counted=counted)
 
-    def session(self, sender: Dispatcher) -> ImplicitSession:
-        """Return a session of that sender, which begins without a reset by the client."""
-        return ImplicitSession(self.context.engine, sender, self.name, self.rank)
+    def session(self, sender: Dispatcher, name: str = "") -> ImplicitSession:
+        """Return a session of that sender, its own if `name` is empty, which begins without a reset by the client."""
+        return ImplicitSession(self.context.engine, sender, self.name, self.rank, name)
 
     def trace(self) -> RequestTrace:
         """Start the timing of an observation."""

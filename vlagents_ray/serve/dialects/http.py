@@ -57,7 +57,7 @@ class HttpDialect(RouteDialect):
             trace.arrive()
             theirs = await decoded(read, body, admission)
             obs, instruction = self.read(theirs)
-            trace.decoded_one()
+            trace.decoded_alike()
             session = self._kept_session(session_id(http)) if SESSION_HEADER in http.headers else None
             if session is None or not session.episode.begun:
                 self.mapping.warn_of_unread_cameras(theirs, self.name)

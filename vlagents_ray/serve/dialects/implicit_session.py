@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import InvalidObservation, UnknownSession
@@ -51,45 +53,109 @@ class ImplicitEpisode:
 
 
 class ImplicitSession:
-    """A session of a client on the server's own port; it must not be called concurrently."""
+    """A session of a client on the server's own port; it must not be called concurrently.
 
-    def __init__(self, engine: Engine, sender: Dispatcher, transport: str, rank: RankName = "robot") -> None:
+    Args:
+        engine: The engine that serves it.
+        sender: The dispatcher of the client.
+        transport: The dialect's name, for the statistics.
+        rank: Class of its requests.
+        name: Name of the session, unique in the replica; empty for the sender's own.
+    """
+
+    def __init__(
+        self, engine: Engine, sender: Dispatcher, transport: str, rank: RankName = "robot", name: str = ""
+    ) -> None:
         self.episode = ImplicitEpisode()
         self._engine = engine
         self._sender = sender
         self._transport = transport
         self._rank: RankName = rank
+        self._name = name
 
-    async def act(self, obs: Obs, instruction: str | None, request_id: str) -> Reply:
-        """Return the policy's action; the session is reset first if an episode begins.
+    async def act(self, obs: Obs, instruction: str | None, request_id: str, **kwargs: Any) -> Reply:
+        """Return the policy's action; see `act_together`."""
+        (reply,) = await act_together([SessionObs(self, obs, instruction)], request_id, **kwargs)
+        return reply
 
-        A session that was removed because it was idle is reset again, which is safe since the observation was not acted
-        on. Raises the error of the reply.
-        """
-        if self.episode.begins(instruction):
-            await self._reset(obs, instruction, request_id)
-        try:
-            return await self._ask("act", obs, None, request_id)
-        except UnknownSession:
-            logger.info("%s: a session was forgotten; it begins again (request %s)", self._transport, request_id)
-            await self._reset(obs, instruction, request_id)
-            return await self._ask("act", obs, None, request_id)
+    async def close(self) -> None:
+        """End the session."""
+        await self._sender.ask([self._request("close", None, None, "", {})])
 
-    async def _reset(self, obs: Obs, instruction: str | None, request_id: str) -> None:
-        instruction = self.episode.opening(instruction, self._engine.contract)
-        trace = RequestTrace(self._engine.stats, self._transport, "reset", self._rank)
-        self.episode.end()
-        try:
-            reply = await self._ask("reset", obs, instruction, request_id)
-        except Exception as error:
-            trace.refused(getattr(error, "code", "internal"))
-            raise
-        trace.written(reply, lambda: None)
-        self.episode.began(instruction)
+    def _request(
+        self, op: Op, obs: Obs | None, instruction: str | None, request_id: str, kwargs: dict[str, Any]
+    ) -> Request:
+        return Request(
+            op,
+            obs,
+            instruction=instruction,
+            kwargs=kwargs,
+            session=self._name,
+            rank=self._rank,
+            request_id=request_id,
+        )
 
-    async def _ask(self, op: Op, obs: Obs, instruction: str | None, request_id: str) -> Reply:
-        request = Request(op, obs, instruction=instruction, rank=self._rank, request_id=request_id)
-        (reply,) = await self._sender.ask([request])
+
+class SessionObs(NamedTuple):
+    """An observation of a session, and its instruction; None if there is none."""
+
+    session: ImplicitSession
+    obs: Obs
+    instruction: str | None
+
+
+async def act_together(seen: Sequence[SessionObs], request_id: str, **kwargs: Any) -> list[Reply]:
+    """Return the policy's action for each observation of one client; their acts are queued at once.
+
+    A session whose episode begins is reset first, with `kwargs`. One that was removed because it was idle is reset
+    again, which is safe since the observation was not acted on.
+
+    Raises:
+        VLAgentsError: The first error among the replies.
+    """
+    await _reset([one for one in seen if one.session.episode.begins(one.instruction)], request_id, kwargs)
+    replies = await _ask("act", seen, [None] * len(seen), request_id, {})
+    if forgotten := [i for i, reply in enumerate(replies) if isinstance(reply.error, UnknownSession)]:
+        logger.info("%s: a session was forgotten; it begins again (request %s)", seen[0].session._transport, request_id)
+        again = [seen[i] for i in forgotten]
+        await _reset(again, request_id, kwargs)
+        for i, reply in zip(forgotten, await _ask("act", again, [None] * len(again), request_id, {}), strict=True):
+            replies[i] = reply
+    _raise_first(replies)
+    return replies
+
+
+async def _reset(seen: Sequence[SessionObs], request_id: str, kwargs: dict[str, Any]) -> None:
+    if not seen:
+        return
+    openings = [one.session.episode.opening(one.instruction, one.session._engine.contract) for one in seen]
+    traces = []
+    for session, _, _ in seen:
+        session.episode.end()
+        traces.append(RequestTrace(session._engine.stats, session._transport, "reset", session._rank))
+    replies = await _ask("reset", seen, openings, request_id, kwargs)
+    for one, opening, trace, reply in zip(seen, openings, traces, replies, strict=True):
+        if reply.error is not None:
+            trace.refused(reply.error.code)
+        else:
+            trace.written(reply, lambda: None)
+            one.session.episode.began(opening)
+    _raise_first(replies)
+
+
+async def _ask(
+    op: Op, seen: Sequence[SessionObs], instructions: Sequence[str | None], request_id: str, kwargs: dict[str, Any]
+) -> list[Reply]:
+    names = [request_id] if len(seen) == 1 else [f"{request_id}-{place}" for place in range(len(seen))]
+    return await seen[0].session._sender.ask(
+        [
+            one.session._request(op, one.obs, instruction, name, kwargs)
+            for one, instruction, name in zip(seen, instructions, names, strict=True)
+        ]
+    )
+
+
+def _raise_first(replies: Sequence[Reply]) -> None:
+    for reply in replies:
         if reply.error is not None:
             raise reply.error
-        return reply

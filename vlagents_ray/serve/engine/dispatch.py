@@ -52,8 +52,8 @@ class Dispatcher:
             caller: The authenticated caller, or the reason why none is needed. It has no default, so that an endpoint
                 without authentication fails.
             connected: Whether the sender has a connection, with which its sessions end.
-            counted: Whether the first request of each message was counted for the key on arrival; by default that is
-                so for senders without a connection.
+            counted: Whether the first request of each message was counted for the key on arrival, and the others, of
+                a message that is sent without an admission, by `count`; by default for senders without a connection.
 
         Raises:
             TypeError: `caller` is neither a `Caller` nor a `NoKey`.
@@ -84,6 +84,12 @@ class Dispatcher:
             return self._count(caller, op, free)
 
         return MessageAdmission(self._engine.admission, limits, admit, size, robot=robot, keep_files=keep)
+
+    def count(self, requests: int) -> None:
+        """Count requests for the key before any of them is sent; raise `TooManyRequests` over its rate."""
+        if self._caller is not None:
+            for _ in range(requests):
+                self._count(self._caller, "act", counted=False)
 
     def throttled_s(self) -> float:
         """Return for how long the server must not read from the sender, s; 0 if its key kept within its rate limit.
@@ -130,7 +136,7 @@ class Dispatcher:
                 continue
             try:
                 if self._caller is not None:
-                    self._admit(self._caller, item, counted=admission is not None or (index == 0 and self._counted))
+                    self._admit(self._caller, item, counted=admission is not None or self._counted)
                 ready.append(self._ticket(collector, index, item, arrived))
             except VLAgentsError as error:
                 self._refuse(collector, index, item, error, arrived)

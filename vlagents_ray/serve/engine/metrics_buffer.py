@@ -131,9 +131,10 @@ class RequestTrace:
         """Record that the last byte of the frame has arrived."""
         self.arrived = self._decoded = time.perf_counter()
 
-    def decoded_one(self) -> None:
-        """Record that the frame's one request, of the `op` and `rank` given before, is decoded."""
+    def decoded_alike(self, requests: int = 1) -> None:
+        """Record that the frame's requests, all of the `op` and `rank` given before, are decoded."""
         self._decoded = time.perf_counter()
+        self._asked = [self._asked[0]] * requests
 
     def frame(self, replies: Sequence[Reply]) -> bytes:
         """Encode and record the replies as a frame with complete `timing`."""
@@ -164,17 +165,17 @@ class RequestTrace:
         document = reply_to_json(reply)
         document.pop("timing")
         text = _json(document)
-        self._written(reply, begun)
+        self._written([reply], begun)
         return f'{text[:-1]},"timing":{_json(reply.timing)}}}'.encode()
 
-    def written(self, reply: Reply, write: Callable[[], T]) -> T:
-        """Encode a reply, which must not be an error, with `write` for a client of another system, and record it.
+    def written(self, replies: Reply | Sequence[Reply], write: Callable[[], T]) -> T:
+        """Encode replies, none an error, with `write` for a client of another system, and record them.
 
-        `reply.timing` is complete only afterwards.
+        The `timing` of a reply is complete only afterwards.
         """
         begun = time.perf_counter()
         data = write()
-        self._written(reply, begun)
+        self._written([replies] if isinstance(replies, Reply) else replies, begun)
         return data
 
     def refused(self, code: str) -> None:
@@ -183,12 +184,13 @@ class RequestTrace:
         for op, rank in self._asked:
             self._stats.handled((op, self.transport, rank, code), (total_ms, *_NOTHING))
 
-    def _written(self, reply: Reply, begun: float) -> None:
+    def _written(self, replies: Sequence[Reply], begun: float) -> None:
         ended = time.perf_counter()
-        reply.timing["decode_ms"] = (self._decoded - self.arrived) * 1e3
-        reply.timing["encode_ms"] = (ended - begun) * 1e3
-        reply.timing["total_ms"] = (ended - self.arrived) * 1e3
-        self.record([reply])
+        self._set_decode_ms(replies)
+        for reply in replies:
+            reply.timing["encode_ms"] = (ended - begun) * 1e3
+            reply.timing["total_ms"] = (ended - self.arrived) * 1e3
+        self.record(replies)
 
     def _set_decode_ms(self, replies: Sequence[Reply]) -> None:
         decode_ms = (self._decoded - self.arrived) * 1e3

@@ -6,6 +6,10 @@ openpi's client takes for metadata.
 
 An error is a text with a request id, after which the connection is closed (1011) except for 429; openpi's own server
 sends a traceback.
+
+A batch, `{"batch": [observation, ...]}`, is that of openpi's pull request 941 (its head 5bdadc8), which was open when
+this was written: the reply is one map, whose `actions` are stacked. openpi's own client sends nothing when it is reset;
+the message `{"reset": True}` is that of its derivatives, such as BEHAVIOR-1K's client, which waits for no reply.
 """
 
 from __future__ import annotations
@@ -17,10 +21,11 @@ import uuid
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
+import numpy as np
 from pydantic import Field
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from vlagents_ray.errors import MalformedMessage, TooManyRequests
+from vlagents_ray.errors import MalformedMessage, TooManyRequests, VLAgentsError
 from vlagents_ray.protocol.messages import Reply
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
 from vlagents_ray.serve.dialects.base import (
@@ -31,7 +36,7 @@ from vlagents_ray.serve.dialects.base import (
     decoded,
     public_problem,
 )
-from vlagents_ray.serve.dialects.implicit_session import ImplicitSession
+from vlagents_ray.serve.dialects.implicit_session import ImplicitSession, SessionObs, act_together
 from vlagents_ray.serve.dialects.openpi import codec
 from vlagents_ray.serve.dialects.openpi.presets import PRESETS
 from vlagents_ray.serve.engine.dispatch import Dispatcher
@@ -58,19 +63,50 @@ class MapDialect(RouteDialect):
     def speaks(self, message: dict[str, Any]) -> bool:
         """Return whether a message comes from a client of this dialect."""
 
-    def begins(self, message: dict[str, Any], connection: MapConnection) -> str | None:
-        """Begin an episode if the message requires it; return the reply if the message is not an observation."""
+    @property
+    def idle_s(self) -> float | None:
+        """The time after which the connection of a client that sends nothing is closed, s; None if it stays open."""
         return None
 
-    def answer(self, reply: Reply, before_ms: float | None) -> Any:
-        """Return the reply in the client's format; `before_ms` is the server's time for the previous observation."""
-        infer_ms = reply.timing["queue_ms"] + reply.timing["inference_ms"]
-        server = {"infer_ms": infer_ms} | ({} if before_ms is None else {"prev_total_ms": before_ms})
+    def begins(self, message: dict[str, Any], connection: MapConnection) -> bytes | str | None:
+        """Begin an episode if the message requires it.
+
+        Returns:
+            The reply if the message is not an observation; empty if the client waits for none.
+        """
+        return None
+
+    def batch(self, message: dict[str, Any]) -> list[Any] | None:
+        """Return the observations of a message that is a batch; None if it is one observation."""
+        return None
+
+    def reset_arguments(self, message: dict[str, Any]) -> dict[str, Any]:
+        """Return the keyword arguments of the policy's reset, should this observation begin an episode."""
+        return {}
+
+    def answer(self, replies: Sequence[Reply], before_ms: float | None, *, batched: bool) -> Any:
+        """Return the replies in the client's format; `before_ms` is the server's time for the previous message."""
+        inference_ms = max(reply.timing["inference_ms"] for reply in replies)
+        infer_ms = max(reply.timing["queue_ms"] + reply.timing["inference_ms"] for reply in replies)
+        rows = [self.rows(reply) for reply in replies]
         return {
-            "actions": self.rows(reply),
-            "policy_timing": {"infer_ms": reply.timing["inference_ms"]},
-            "server_timing": server,
+            "actions": _stacked(rows) if batched else rows[0],
+            "policy_timing": {"infer_ms": inference_ms} | ({"batch_size": len(rows)} if batched else {}),
+            "server_timing": {"infer_ms": infer_ms} | ({} if before_ms is None else {"prev_total_ms": before_ms}),
         }
+
+    def failure(self, text: str) -> bytes | None:
+        """Return an error as a message after which the connection stays open; None: it is a text, then a close."""
+        return None
+
+
+def _stacked(chunks: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the chunks of a batch as (B, H, D)."""
+    if len(shapes := {chunk.shape for chunk in chunks}) > 1:
+        raise VLAgentsError(
+            f"batch: got chunks of the shapes {sorted(shapes)}, and its reply is one array; send each by itself"
+        )
+    return np.stack(chunks)
 
 
 class OpenPiDialectConfig(DialectConfig):
@@ -80,15 +116,23 @@ class OpenPiDialectConfig(DialectConfig):
     metadata: dict[str, Any] = Field(
         default_factory=dict, description="added to what the client is sent first, such as reset_pose"
     )
+    answer_reset: bool = Field(
+        default=False, description='whether {"reset": True} is answered, by the same; clients differ in waiting for it'
+    )
 
 
 class OpenPiDialect(MapDialect):
-    """openpi's protocol: a session begins with the connection, and an episode with each new prompt."""
+    """openpi's protocol: a session begins with the connection, and an episode with each new prompt.
+
+    The observations of a batch are those of further sessions, in order. A batch of another size ends all their
+    episodes, as nothing says which of its observations is whose.
+    """
 
     Config = OpenPiDialectConfig
     clients = "openpi"
     summary = (
-        "A session is the connection; an episode begins with each new prompt. An error is a text, then close 1011."
+        "A session is the connection, or a place in its batches; an episode begins with each new prompt. An error is a "
+        "text, then close 1011."
     )
     paths: ClassVar[Mapping[str, str]] = {"WS /openpi": "stream"}
     presets = PRESETS
@@ -101,6 +145,22 @@ class OpenPiDialect(MapDialect):
     def speaks(self, message: dict[str, Any]) -> bool:
         return "endpoint" not in message
 
+    def begins(self, message: dict[str, Any], connection: MapConnection) -> bytes | str | None:
+        if message.keys() != {"reset"}:
+            return None
+        if message["reset"] is not True:
+            raise MalformedMessage(f"reset: got {str(message['reset'])[:40]!r}, want true")
+        connection.end_episodes()
+        return codec.encode(message) if self.config.answer_reset else b""
+
+    def batch(self, message: dict[str, Any]) -> list[Any] | None:
+        if message.keys() != {"batch"}:
+            return None
+        batch = message["batch"]
+        if not isinstance(batch, list) or not batch:
+            raise MalformedMessage(f"batch: got {str(batch)[:40]!r}, want a list of one observation or more")
+        return batch
+
 
 class MapConnection:
     """The state of one dialect on a connection, with its session."""
@@ -110,20 +170,48 @@ class MapConnection:
         self.sender: Dispatcher = dialect.sender()
         self.session: ImplicitSession = dialect.session(self.sender)
         self.episode: str | None = None  # the client's name of the episode
+        self._batched: list[ImplicitSession] = []  # the session of each place in a batch
         self._before_ms: float | None = None
 
-    async def answer(self, message: dict[str, Any], trace: RequestTrace, request_id: str) -> bytes | str:
-        """Return the reply to one message."""
-        if (answer := self.dialect.begins(message, self)) is not None:
+    def end_episodes(self) -> None:
+        """Let the next observation of each session begin an episode."""
+        for session in (self.session, *self._batched):
+            session.episode.end()
+
+    async def answer(
+        self, message: dict[str, Any], trace: RequestTrace, request_id: str, gate: Dispatcher
+    ) -> bytes | str:
+        """Return the reply to one message; `gate` counts the observations of a batch after the first for the key."""
+        dialect = self.dialect
+        if (answer := dialect.begins(message, self)) is not None:
             return answer
-        obs, prompt = self.dialect.read(message)
-        if not self.session.episode.begun:
-            self.dialect.mapping.warn_of_unread_cameras(message, self.dialect.name)
-        trace.decoded_one()
-        reply = await self.session.act(obs, prompt, request_id)
-        data = trace.written(reply, lambda: codec.encode(self.dialect.answer(reply, self._before_ms)))
+        batch = dialect.batch(message)
+        observations = [message] if batch is None else batch
+        gate.count(len(observations) - 1)
+        read = [dialect.read(one) for one in observations]
+        sessions = [self.session] if batch is None else await self._of_batch(len(batch))
+        if not sessions[0].episode.begun:
+            dialect.mapping.warn_of_unread_cameras(observations[0], dialect.name)
+        trace.decoded_alike(len(observations))
+        seen = [SessionObs(session, *one) for session, one in zip(sessions, read, strict=True)]
+        replies = await act_together(seen, request_id, **dialect.reset_arguments(message))
+        data = trace.written(
+            replies, lambda: codec.encode(dialect.answer(replies, self._before_ms, batched=batch is not None))
+        )
         self._before_ms = (time.perf_counter() - trace.arrived) * 1e3
         return data
+
+    async def _of_batch(self, number: int) -> list[ImplicitSession]:
+        """Return the session of each place in a batch of that size; the episodes of another size end."""
+        if number != len(self._batched):
+            surplus, self._batched = self._batched[number:], self._batched[:number]
+            for session in surplus:
+                await session.close()
+            for session in self._batched:
+                session.episode.end()
+            while len(self._batched) < number:
+                self._batched.append(self.dialect.session(self.sender, uuid.uuid4().hex))
+        return self._batched
 
 
 class MapEndpoint:
@@ -142,11 +230,13 @@ class MapEndpoint:
         try:
             await socket.send_bytes(codec.encode(self._dialects[-1].first()))
             while True:
-                event = await socket.receive()
+                event = await asyncio.wait_for(socket.receive(), self._dialects[0].idle_s)
                 if event["type"] == "websocket.disconnect":
                     return
                 if not await self._answer(socket, event.get("bytes"), connections, gate):
                     return
+        except asyncio.TimeoutError:
+            await socket.close()
         except WebSocketDisconnect:
             return
         finally:
@@ -167,20 +257,23 @@ class MapEndpoint:
             arrived, trace = trace.arrived, dialect.trace()
             trace.arrived = arrived
             connection = connections.get(dialect.name) or connections.setdefault(dialect.name, MapConnection(dialect))
-            answer = await connection.answer(message, trace, request_id)
+            answer = await connection.answer(message, trace, request_id, gate)
         except Exception as error:  # noqa: BLE001 - the error is the reply to the client
             problem = public_problem(error, trace.transport, request_id)
             trace.refused(problem.code)
-            await socket.send_text(f"{problem} (request {request_id})")
-            if isinstance(problem, TooManyRequests):  # the connection stays open, as the message was not read
+            text = f"{problem} (request {request_id})"
+            failure = self._dialects[0].failure(text)
+            await (socket.send_text(text) if failure is None else socket.send_bytes(failure))
+            if isinstance(problem, TooManyRequests):  # the connection stays open, as nothing was acted on
                 await asyncio.sleep(gate.throttled_s())
                 return True
-            await socket.close(INTERNAL_ERROR, "Internal server error.")
-            return False
+            if failure is None:
+                await socket.close(INTERNAL_ERROR, "Internal server error.")
+            return failure is not None
         finally:
             admission.release()
         if isinstance(answer, str):
             await socket.send_text(answer)
-        else:
+        elif answer:
             await socket.send_bytes(answer)
         return True

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field
@@ -65,19 +65,19 @@ class RoboArenaDialect(MapDialect):
     def speaks(self, message: dict[str, Any]) -> bool:
         return "endpoint" in message
 
-    def begins(self, message: dict[str, Any], connection: MapConnection) -> str | None:
+    def begins(self, message: dict[str, Any], connection: MapConnection) -> bytes | str | None:
         endpoint = message.get("endpoint", "infer")
         if not isinstance(endpoint, str) or endpoint not in ("infer", "reset"):
             raise MalformedMessage(f"endpoint: got {str(endpoint)[:40]!r}, want 'infer' or 'reset'")
         if endpoint == "reset":
-            connection.session.episode.end()
+            connection.end_episodes()
             return "reset successful"
         if (named := message.get("session_id")) is not None:
             episode = str(named)[:NAME_CHARACTERS]  # the client sends a text, or an array with one text
             if connection.episode not in (None, episode):
-                connection.session.episode.end()
+                connection.end_episodes()
             connection.episode = episode
         return None
 
-    def answer(self, reply: Reply, before_ms: float | None) -> Any:
-        return self.rows(reply) if self.config.bare else super().answer(reply, before_ms)
+    def answer(self, replies: Sequence[Reply], before_ms: float | None, *, batched: bool) -> Any:
+        return self.rows(replies[0]) if self.config.bare else super().answer(replies, before_ms, batched=batched)

@@ -148,7 +148,7 @@ class VlaEvalDialect(RouteDialect):
             if not connection.session.episode.begun:
                 self.mapping.warn_of_unread_cameras(payload, self.name)
             if connection.chunk.next is None or connection.session.episode.begins(instruction):
-                trace.decoded_one()
+                trace.decoded_alike()
                 reply = await connection.session.act(obs, instruction, request_id)
                 rows = trace.written(reply, lambda: self.rows(reply))
                 connection.chunk.replace(rows[: self.config.execute])

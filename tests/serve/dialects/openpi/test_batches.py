@@ -1,0 +1,161 @@
+"""openpi's `infer_batch`, as the client of its pull request 941 sends it, and the `reset` of its derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pytest
+from asgi_server import served
+from dialect_server import ALL, LIMITS, METADATA, call, image, libero, serving
+from in_memory_keys import ChangingKeys
+from served_agents import Mirror
+from starlette.testclient import TestClient
+from starlette.websockets import WebSocketDisconnect
+from websockets.sync.client import connect
+
+from vlagents_ray.interface import Act, Obs
+from vlagents_ray.serve.config.dialects import DialectArgs
+from vlagents_ray.serve.dialects.base import ReplicaContext
+from vlagents_ray.serve.dialects.openpi import codec
+from vlagents_ray.serve.dialects.routes import dialect_routes
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.engine.engine import Engine
+
+STATE = np.array([0, 0, 0, 0, 0, 1, 0.04, -0.04])
+
+
+class Together(Mirror):
+    """`Mirror` in batches, whose sizes it notes."""
+
+    def __init__(self) -> None:
+        super().__init__(chunk=2)
+        self.sizes: list[int] = []
+
+    def shared_objects(self) -> list[object]:
+        return [self.sizes]
+
+    def act_batch(self, obs: list[Obs], sessions: list[Any]) -> list[Act]:
+        self.sizes.append(len(obs))
+        return [session.act(one) for session, one in zip(sessions, obs, strict=True)]
+
+
+def batch(*tasks: tuple[int, str | None]) -> bytes:
+    seen = [
+        {"observation/image": image(p), "observation/wrist_image": image(0), "observation/state": STATE}
+        for p, _ in tasks
+    ]
+    return codec.encode(
+        {"batch": [one | ({"prompt": text} if text else {}) for one, (_, text) in zip(seen, tasks, strict=True)]}
+    )
+
+
+@pytest.fixture(name="served_batches")
+def batches_served() -> Iterator[tuple[TestClient, Engine, list[int]]]:
+    agent = Together()
+    with serving(agent, ALL) as (client, engine):
+        yield client, engine, agent.sizes
+
+
+def test_each_observation_of_a_batch_gets_its_own_answer(served_batches: Any) -> None:
+    client, _, sizes = served_batches
+    with client.websocket_connect("/openpi") as socket:
+        socket.receive_bytes()
+        asked = batch((7, "task 1"), (8, "task 2"), (9, "task 3"))
+        for acts in (1, 2):
+            said = call(socket, asked)
+            # pixel, sum of the state, acts of the session, number of its instruction
+            assert said["actions"].shape == (3, 2, 7)
+            assert said["actions"][:, 0, :4].tolist() == [[7, 1, acts, 1], [8, 1, acts, 2], [9, 1, acts, 3]]
+        assert said["policy_timing"].keys() == {"infer_ms", "batch_size"}
+        assert said["policy_timing"]["batch_size"] == 3
+        assert said["server_timing"].keys() == {"infer_ms", "prev_total_ms"}
+        assert sizes == [3, 3]
+        assert call(socket, batch((7, None), (8, "task 5"), (9, None)))["actions"][:, 0, 2:4].tolist() == [
+            [3, 1],
+            [1, 5],
+            [3, 3],
+        ]
+
+
+def test_a_batch_does_not_disturb_the_session_of_single_observations(served_batches: Any) -> None:
+    client, engine, _ = served_batches
+    with client.websocket_connect("/openpi") as socket:
+        socket.receive_bytes()
+        for acts in (1, 2):
+            assert call(socket, libero(1))["actions"][0, 2] == acts
+            assert call(socket, batch((1, "task 1")))["actions"][:, 0, 2].tolist() == [acts]
+        assert len(engine.sessions) == 2
+    assert len(engine.sessions) == 0
+
+
+def test_a_batch_of_another_size_ends_the_episodes_of_all_its_places(served_batches: Any) -> None:
+    client, engine, _ = served_batches
+    with client.websocket_connect("/openpi") as socket:
+        socket.receive_bytes()
+        for number, acts in ((3, 1), (3, 2), (2, 1), (2, 2), (4, 1)):
+            said = call(socket, batch(*[(1, "task 1")] * number))["actions"]
+            assert said[:, 0, 2].tolist() == [acts] * number
+            assert len(engine.sessions) == number
+
+
+def test_nothing_is_acted_on_if_one_observation_is_wrong(served_batches: Any) -> None:
+    client, _, sizes = served_batches
+    wrong = codec.encode({"batch": [{"observation/image": image(0), "observation/state": STATE, "prompt": "task 1"}]})
+    for asked, said in (
+        (batch((1, "task 1"), (2, None)), "instruction"),
+        (wrong, "observation/wrist_image"),
+        (codec.encode({"batch": []}), "want a list of one observation or more"),
+        (codec.encode({"batch": np.zeros(3)}), "want a list of one observation or more"),
+        (codec.encode({"batch": [1]}), "want a map"),
+        (codec.encode({"reset": 1}), "want true"),
+    ):
+        with client.websocket_connect("/openpi") as socket:
+            socket.receive_bytes()
+            socket.send_bytes(asked)
+            assert said in socket.receive_text()
+            with pytest.raises(WebSocketDisconnect):
+                socket.receive_bytes()
+    assert sizes == []
+
+
+def test_a_key_called_batch_beside_others_is_one_of_an_observation(served_batches: Any) -> None:
+    client, *_ = served_batches
+    with client.websocket_connect("/openpi") as socket:
+        socket.receive_bytes()
+        assert call(socket, libero(4, batch=np.zeros(2)))["actions"].shape == (2, 7)
+
+
+def test_each_observation_of_a_batch_counts_for_its_key_before_any_is_acted_on() -> None:
+    keys, agent = ChangingKeys(), Together()
+    token = keys.add("slow", rate=4)  # and so many at once
+    engine = Engine(agent)
+    engine.start()
+    routes = dialect_routes(DialectArgs(**ALL), ReplicaContext(engine, lambda: METADATA, LIMITS))
+    app = AccessMiddleware(build_http_app(engine, lambda: METADATA, LIMITS, dialects=routes), keys.keys, "app")
+    header = {"authorization": f"Bearer {token}"}
+    with served(app) as port, connect(f"ws://127.0.0.1:{port}/openpi", additional_headers=header) as socket:
+        socket.recv()
+        ask = partial(batch, *[(1, "task 1")] * 3)
+        socket.send(ask())
+        assert codec.decode(socket.recv())["actions"].shape == (3, 2, 7)  # type: ignore[arg-type]
+        socket.send(ask())
+        assert "requests a second" in str(socket.recv())
+        assert agent.sizes == [3]
+    engine.close()
+
+
+@pytest.mark.parametrize("answered", [False, True])
+def test_a_reset_begins_the_next_episode_of_every_session(answered: bool) -> None:
+    settings = {"openpi": {"mapping": "openpi-libero", "answer_reset": answered}}
+    with serving(Together(), settings) as (client, _), client.websocket_connect("/openpi") as socket:
+        socket.receive_bytes()
+        for _ in range(2):
+            assert call(socket, libero(1))["actions"][0, 2] == 1
+            assert call(socket, batch((1, "task 1")))["actions"][0, 0, 2] == 1
+            socket.send_bytes(codec.encode({"reset": True}))
+            if answered:
+                assert codec.decode(socket.receive_bytes()) == {"reset": True}

@@ -1,0 +1,156 @@
+"""What the tests of a model family verify, for the family's page: `python tests/support/verified.py` writes all tables.
+
+A test states with `@pytest.mark.verifies("parity")` what it verifies. `pytest --verified tests/families/FAMILY` notes
+what became of these tests in `verified.json` of that folder, and `make verified` does both.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import os
+import platform
+import re
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+FAMILIES = ROOT / "tests" / "families"
+PAGES = ROOT / "docs" / "policies"
+BEGIN, END = "<!-- verified -->", "<!-- /verified -->"
+WHAT = {
+    "parity": "acts as upstream's own code",
+    "batches": "acts the same alone and in any batch",
+    "isolation": "leaves neighbours alone",
+    "loading": "refuses what cannot be loaded",
+    "size": "has the published size",
+}
+# Of each family with a page: the file in requirements/, and the packages and checkouts whose versions matter.
+RUN_WITH = {
+    "arro": ("hf", ("transformers", "torch")),
+    "diffusion_policy": ("diffusion_policy", ("DIFFUSION_POLICY_SRC", "diffusers", "torch")),
+    "lerobot": ("lerobot", ("lerobot", "transformers", "torch")),
+    "octo": ("octo", ("OCTO_SRC", "jax", "flax")),
+    "openpi": ("openpi", ("OPENPI_SRC", "jax", "flax", "torch")),
+    "openvla": ("openvla", ("OPENVLA_SRC", "OPENVLA_OFT_SRC", "transformers", "torch")),
+    "pi0": ("hf", ("transformers", "torch")),
+    "vjepa2_ac": ("hf", ("VJEPA2_SRC", "transformers", "torch")),
+}
+
+
+class VerifyingTests:
+    """A pytest plugin that notes the outcomes of the tests marked `verifies`, by family."""
+
+    def __init__(self) -> None:
+        self._outcomes: dict[str, dict[str, Counter[str]]] = {}
+
+    def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
+        for item in items:
+            if item.get_closest_marker("verifies"):
+                item.user_properties.append(("verifies", True))
+
+    def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
+        if not dict(report.user_properties).get("verifies"):
+            return
+        if report.when == "call" or report.outcome != "passed":
+            file, _, test = report.nodeid.partition("[")[0].partition("::")
+            family = Path(file).parent.name
+            name = f"{Path(file).name}::{test}"
+            self._outcomes.setdefault(family, {}).setdefault(name, Counter())[report.outcome] += 1
+
+    def pytest_sessionfinish(self) -> None:
+        for family, tests in self._outcomes.items():
+            noted = {**_environment(family), "tests": {name: dict(tests[name]) for name in sorted(tests)}}
+            noted_in(family).write_text(json.dumps(noted, indent=2) + "\n")
+
+
+def noted_in(family: str) -> Path:
+    """The file with the outcomes of a family's tests."""
+    return FAMILIES / family / "verified.json"
+
+
+def marked(family: str) -> Iterator[tuple[str, str]]:
+    """Yield each test of a family that is marked `verifies`, as `file::test`, and what it verifies."""
+    for file in sorted((FAMILIES / family).glob("test_*.py")):
+        for node in ast.parse(file.read_text()).body:
+            for mark in node.decorator_list if isinstance(node, ast.FunctionDef) else ():
+                if isinstance(mark, ast.Call) and ast.unparse(mark.func) == "pytest.mark.verifies":
+                    yield f"{file.name}::{node.name}", ast.literal_eval(mark.args[0])
+
+
+def table(family: str) -> str:
+    """The table of a family's page, in Markdown."""
+    requirements, _ = RUN_WITH[family]
+    file = noted_in(family)
+    noted: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {"tests": {}}
+    ran = "They have not been run for this table."
+    if noted["tests"]:
+        versions = ", ".join(f"{name} {number}" for name, number in noted["versions"].items())
+        ran = f"They ran with Python {noted['python']}, {versions}, on {noted['device']}."
+    rows = []
+    for what, name in sorted(((what, name) for name, what in marked(family)), key=lambda one: list(WHAT).index(one[0])):
+        file_name, _, test = name.partition("::test_")
+        rows.append(
+            f"| {WHAT[what]} | {test.replace('_', ' ')} | `{file_name}` | {_result(noted['tests'].get(name))} |"
+        )
+    return "\n".join(
+        [
+            f"These tests of `tests/families/{family}` use small random checkpoints. {ran}",
+            "",
+            "| the policy … | test | in | cases |",
+            "|---|---|---|---|",
+            *rows,
+            "",
+            f"`make verified FAMILIES={requirements}` runs them, and writes this table.",
+        ]
+    )
+
+
+def with_table(page: str, family: str) -> str:
+    """The text of a family's page with its table between the markers."""
+    if page.count(BEGIN) != 1 or page.count(END) != 1:
+        raise ValueError(f"docs/policies/{family}.md: want {BEGIN} and {END} once each, around its table")
+    return re.sub(f"{BEGIN}.*{END}", lambda _: f"{BEGIN}\n{table(family)}\n{END}", page, flags=re.DOTALL)
+
+
+def main() -> None:
+    for family in RUN_WITH:
+        file = PAGES / f"{family}.md"
+        file.write_text(with_table(file.read_text(), family))
+
+
+def _result(outcomes: dict[str, int] | None) -> str:
+    if outcomes is None:
+        return "not run"
+    return ", ".join(f"{number} {what}" for what, number in sorted(outcomes.items()))
+
+
+def _version(name: str) -> str:
+    """Return the version of a package, or the commit of the checkout that a variable names."""
+    if name.isupper():
+        folder = os.environ.get(name)
+        command = ["git", "-C", folder or "", "rev-parse", "--short", "HEAD"]
+        done = subprocess.run(command, check=False, capture_output=True, text=True) if folder else None
+        return "not set" if done is None else done.stdout.strip() or "of no commit"
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def _environment(family: str) -> dict[str, Any]:
+    versions = {name: _version(name) for name in RUN_WITH[family][1]}
+    torch = sys.modules.get("torch")
+    device = torch.cuda.get_device_name() if torch is not None and torch.cuda.is_available() else "a CPU, not on a GPU"
+    return {"python": ".".join(platform.python_version_tuple()[:2]), "versions": versions, "device": device}
+
+
+if __name__ == "__main__":
+    main()

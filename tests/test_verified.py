@@ -1,0 +1,79 @@
+"""The pages of model families say what their tests verify, and no more."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+
+import pytest
+import verified
+
+
+@pytest.mark.parametrize("family", verified.RUN_WITH)
+def test_a_familys_page_names_the_tests_that_there_are_with_what_became_of_them(family: str) -> None:
+    page = (verified.PAGES / f"{family}.md").read_text()
+    assert verified.with_table(page, family) == page, "run `python tests/support/verified.py`"
+
+
+@pytest.mark.parametrize("family", verified.RUN_WITH)
+def test_what_is_noted_is_of_tests_that_there_are(family: str) -> None:
+    tests = dict(verified.marked(family))
+    assert {"parity", "batches", "isolation", "loading"} <= set(tests.values()) <= set(verified.WHAT)
+    if verified.noted_in(family).exists():
+        noted = json.loads(verified.noted_in(family).read_text())["tests"]
+        assert noted.keys() <= tests.keys(), f"run `make verified FAMILIES={verified.RUN_WITH[family][0]}`"
+        assert not any("failed" in outcomes for outcomes in noted.values())
+
+
+def test_each_family_with_a_page_is_listed() -> None:
+    assert set(verified.RUN_WITH) == {page.stem for page in verified.PAGES.glob("*.md")} - {"index"}
+
+
+def test_a_test_that_is_new_or_gone_changes_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(verified, "FAMILIES", tmp_path)
+    (tmp_path / "pi0").mkdir()
+    file = tmp_path / "pi0" / "test_it.py"
+    file.write_text('@pytest.mark.verifies("parity")\ndef test_acts_are_theirs(): ...\n\ndef test_other(): ...\n')
+    verified.noted_in("pi0").write_text(
+        json.dumps(
+            {
+                "python": "3.11",
+                "versions": {"torch": "2"},
+                "device": "a CPU",
+                "tests": {"test_it.py::test_acts_are_theirs": {"passed": 2}},
+            }
+        )
+    )
+    said = verified.table("pi0")
+    assert "| acts as upstream's own code | acts are theirs | `test_it.py` | 2 passed |" in said
+    assert "Python 3.11, torch 2, on a CPU." in said
+    assert "other" not in said
+    file.write_text(file.read_text().replace("acts_are_theirs", "acts_are_like_theirs"))
+    assert "| acts as upstream's own code | acts are like theirs | `test_it.py` | not run |" in verified.table("pi0")
+
+
+def test_outcomes_are_noted_by_family_and_test(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(verified, "FAMILIES", tmp_path)
+    (tmp_path / "pi0").mkdir()
+    plugin = verified.VerifyingTests()
+    for case, when, outcome in (
+        ("a", "setup", "passed"),
+        ("a", "call", "passed"),
+        ("b", "call", "failed"),
+        ("c", "setup", "skipped"),
+    ):
+        report = pytest.TestReport(
+            f"tests/families/pi0/test_it.py::test_x[{case}]",
+            ("", 0, ""),
+            {},
+            outcome,
+            None,
+            when,
+            user_properties=[("verifies", True)],
+        )
+        plugin.pytest_runtest_logreport(report)
+    plugin.pytest_sessionfinish()
+    noted = json.loads(verified.noted_in("pi0").read_text())
+    assert noted["tests"] == {"test_it.py::test_x": {"passed": 1, "failed": 1, "skipped": 1}}
+    assert Counter(noted["versions"].keys()) == Counter(["transformers", "torch"])
