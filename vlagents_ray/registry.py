@@ -58,6 +58,7 @@ DIALECTS: dict[str, str] = {
     "vla_eval": "vlagents_ray.serve.dialects.vla_eval.handler:VlaEvalDialect",
     "gr00t": "vlagents_ray.serve.dialects.gr00t.handler:GR00TDialect",
     "vlagents": "vlagents_ray.serve.dialects.vlagents.handler:VlagentsDialect",
+    "lerobot": "vlagents_ray.serve.dialects.lerobot.handler:LeRobotDialect",
 }
 
 # import name -> extra of this package that installs it
@@ -72,6 +73,7 @@ _EXTRAS = {
     "yaml": "serve",
     "typer": "serve",
     "rich": "serve",
+    "grpc": "serve",
     "zmq": "gr00t",
     "matplotlib": "bench",
     "gymnasium": "sim",

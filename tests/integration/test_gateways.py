@@ -1,4 +1,4 @@
-"""The real clients of vlagents, and GR00T's, on one batched replica of a real server."""
+"""The real clients of vlagents, and GR00T's and LeRobot's, on one batched replica of a real server."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from eval_fakes import wait_for
 from gr00t_client import PolicyClient
+from lerobot_messages import AsyncClient, robot_saw
 from peer_environment import peers_python
 from peer_versions import package
 from virtual_environments import ended
@@ -32,14 +33,15 @@ ANSWER_S = 120.0  # the client's imports included
 class Ports:
     vlagents: int
     gr00t: int
+    lerobot: int
     url: str = ""
 
 
 @pytest.fixture(scope="module")
 def ports() -> Iterator[Ports]:
-    """One replica, and a gateway with both dialects."""
-    ports = Ports(free_port(), free_port())
-    dialects = {"vlagents": {"port": ports.vlagents}, "gr00t": {"port": ports.gr00t}}
+    """One replica, and a gateway with all three dialects."""
+    ports = Ports(free_port(), free_port(), free_port())
+    dialects = {name: {"port": getattr(ports, name)} for name in ("vlagents", "gr00t", "lerobot")}
     with serving("served_agents:Witness", batch={"max_size": 8}, dialects=dialects) as server:
         ports.url = server.url
         yield ports
@@ -102,8 +104,9 @@ def test_the_metadata_say_where_the_gateways_listen(ports: Ports) -> None:
         with urllib.request.urlopen(f"{ports.url}/v1/metadata") as answer:
             return {name: one["address"] for name, one in json.load(answer)["dialects"].items()}
 
+    schemes = {"gr00t": "tcp", "vlagents": "rpyc", "lerobot": "grpc"}
     wait_for(
-        lambda: told() == {"gr00t": f"tcp://127.0.0.1:{ports.gr00t}", "vlagents": f"rpyc://127.0.0.1:{ports.vlagents}"}
+        lambda: told() == {name: f"{scheme}://127.0.0.1:{getattr(ports, name)}" for name, scheme in schemes.items()}
     )
 
 
@@ -159,9 +162,23 @@ def test_gr00t_clients_at_once_beside_vlagents(ports: Ports) -> None:
     assert all(close_to(rows, 5, number + 1) for number, rows in enumerate(acts))
 
 
+def test_clients_of_lerobots_asynchronous_inference_at_once(ports: Ports) -> None:
+    def episode(pixel: int) -> list[list[float]]:
+        with AsyncClient(ports.lerobot).begin() as client:
+            return [client.act(robot_saw(i, pixel))[0].action.tolist() for i in range(60)]
+
+    episodes = at_once(*(lambda p=pixel: episode(p) for pixel in (10, 20, 30)))  # type: ignore[misc]
+    assert episodes == [[[pixel, 0.5, -1, 3, i + 1] for i in range(60)] for pixel in (10, 20, 30)]
+
+
 def test_clients_go_on_when_the_replica_behind_the_gateway_dies(ports: Ports) -> None:
     """The last test of the server: its replica is killed, and Serve replaces it."""
-    with robots(ports.vlagents, "shm") as [robot], PolicyClient(ports.gr00t) as client:
+    with (
+        robots(ports.vlagents, "shm") as [robot],
+        PolicyClient(ports.gr00t) as client,
+        AsyncClient(ports.lerobot).begin() as arm,
+    ):
+        arm.act(robot_saw(0, 8))
         wish = {"pixel": 7, "joints": 0.5, "gripper": 0.25, "instruction": "abc"}
         [before] = robot.say(**wish)
         pid = before[0][4]["pid"]
@@ -173,3 +190,4 @@ def test_clients_go_on_when_the_replica_behind_the_gateway_dies(ports: Ports) ->
         assert after[0][4]["resumed"] is True
         assert close_to([step[1] for step in after], 7, 1)
         assert client.ping()["status"] == "ok"
+        assert arm.act(robot_saw(1, 9))[0].action[0] == 9

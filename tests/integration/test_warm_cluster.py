@@ -13,6 +13,7 @@ import psutil
 import pytest
 from eval_fakes import wait_for
 from listening_sockets import listeners
+from live_server import LivePage
 from ray_processes import processes, ray_folder
 from serve_command import healthy
 
@@ -70,6 +71,10 @@ class Serving:
         self.process.wait(RUN_S)
 
 
+def sessions(page: LivePage) -> int:
+    return sum(len(replica["sessions"]) for replica in page.document().get("replicas", []))
+
+
 def test_it_is_one_of_this_user_alone(cluster: WarmCluster) -> None:
     assert cluster.folder.stat().st_mode & 0o777 == 0o700
     again = run("up")
@@ -92,9 +97,15 @@ def test_a_server_and_an_evaluation_run_beside_each_other_and_end_alone(cluster:
         assert agent.act(Obs(gripper=0.0)).action is not None
         out = str(tmp_path / "out")
         words = ["tabletop", "--policy", "scripted", "--episodes", "2", "--out", out, "--address", "auto"]
-        played = run("eval", *words)
-        assert played.returncode == 0, played.stderr
-        assert "2/2" in played.stdout
+        page, seen = LivePage(), list[int]()
+        command = [*COMMAND, "eval", *words, "--live-at", page.address]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as played:
+            wait_for(lambda: bool(seen.append(sessions(page)) or seen[-1]) or played.poll() is not None, RUN_S)
+            output, errors = played.communicate(timeout=RUN_S)
+        assert played.returncode == 0, errors
+        assert seen[-1] > 0, "the page did not show the sessions of the cluster's replica"
+        assert "2/2" in output
+        assert f"live: {page.url}/live" in output
         assert agent.act(Obs(gripper=0.0)).action is not None
     taken = run("serve", "scripted", "--address", "auto", "--port", address(cluster).rpartition(":")[2])
     assert (taken.returncode, "serves 'noop' at the path '/' already" in taken.stderr) == (2, True)

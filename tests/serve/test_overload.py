@@ -212,7 +212,12 @@ NOTHING_TO_DECODE = {
     "`WS /v1/live`",  # is refused without the scope
     "`WS /v1/live`, scope `watch`",  # a viewer sends only names
 }
-NO_KEY = {"vlagents' gateway, `without_key: true`", "Serve handle (`serve://`)", "plasma (`serve://`)"}
+NO_KEY = {
+    "vlagents' gateway, `without_key: true`",
+    "LeRobot's gateway, `without_key: true`",
+    "Serve handle (`serve://`)",
+    "plasma (`serve://`)",
+}
 
 
 def test_a_refused_body_that_is_long_is_not_read(replica: KeyedReplica) -> None:

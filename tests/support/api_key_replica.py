@@ -26,6 +26,7 @@ from eval_fakes import wait_for
 from gr00t_client import PolicyClient
 from in_memory_keys import ChangingKeys
 from in_process_replicas import InProcess
+from lerobot_messages import AsyncClient, robot_saw
 from rpyc_client import Client, document
 from websockets.client import ClientProtocol
 from websockets.exceptions import InvalidStatus
@@ -179,6 +180,7 @@ class KeyedReplica:
         check = partial(self.at_gateway.check, app="app")
         self.gr00t = {near: self._on_own_port(stack, "gr00t", near, check) for near in (True, False)}
         self.vlagents = self._on_own_port(stack, "vlagents", False, check, without_key=True)
+        self.lerobot = self._on_own_port(stack, "lerobot", False, check, without_key=True)
         stack.callback(self._close)
 
     def visitor(self, credential: str) -> Visitor:
@@ -504,6 +506,14 @@ def over_vlagents(visitor: Visitor, _when: str) -> str:
     return "done"
 
 
+def over_lerobot(visitor: Visitor, _when: str) -> str:
+    """LeRobot's gateway, which asks for no key."""
+    visitor.become()
+    with AsyncClient(visitor.replica.lerobot).begin() as client:
+        client.act(robot_saw(0, task=visitor.mark))
+    return "done"
+
+
 class _Receiving:
     """Notes the names of weights that are pushed, as the policy notes marks."""
 
@@ -610,6 +620,7 @@ WAYS: dict[str, Way] = {
     "GR00T's gateway, replica on its host": over_gr00t(True),
     "GR00T's gateway, replica on another": over_gr00t(False),
     "vlagents' gateway, `without_key: true`": over_vlagents,
+    "LeRobot's gateway, `without_key: true`": over_lerobot,
     "Serve handle (`serve://`)": over_handle,
     "plasma (`serve://`)": over_plasma,
 }

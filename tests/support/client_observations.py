@@ -192,4 +192,16 @@ SENT = [
         {"joints": 7, "xyzrpy": 6},
         gripper=True,
     ),
+    Sent(
+        "lerobot",
+        "LeRobot 0.4.4, async_inference/robot_client.py with an SO-100, by the names of its features",
+        {
+            "observation.state": np.zeros(6, np.float32),
+            "observation.images.front": image(),
+            "observation.images.wrist": image(),
+            "task": TASK,
+        },
+        ("front", "wrist"),
+        {"joints": 6},
+    ),
 ]

@@ -106,6 +106,7 @@ def test_a_card_says_what_its_session_does(page: Page, server: LiveServer) -> No
         assert "push cube 0" in text
         assert "robot, websocket" in text
         assert "plan: 8 rows" in text
+        assert "watched" not in text  # it is for chunk players
         assert page.value("document.querySelectorAll('#fleet tr').length") == 1
         until(page, "document.getElementById('percentiles').innerText.includes(' ms')", True)
     until(page, CARDS, 0)  # it ended

@@ -57,6 +57,14 @@ class PortConfig(DialectConfig):
     )
 
 
+class KeylessPortConfig(PortConfig):
+    """The settings of a dialect with its own port, whose protocol has no field for an API key."""
+
+    without_key: bool = Field(
+        default=False, description="with API keys on: accept clients here without one, as the protocol has no key"
+    )
+
+
 class DialectArgs(BaseModel):
     """The settings of all dialects that are on, by name."""
 

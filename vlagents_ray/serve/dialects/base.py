@@ -53,12 +53,12 @@ from starlette.routing import BaseRoute, Route, WebSocketRoute
 from starlette.websockets import WebSocket
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.errors import MalformedMessage, PolicyUnavailable, VLAgentsError
+from vlagents_ray.errors import ConfigError, MalformedMessage, PolicyUnavailable, VLAgentsError
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits, Reply
 from vlagents_ray.serve.access.api_keys import Identity, NoKey, current_caller
-from vlagents_ray.serve.config.dialects import DialectConfig, PortConfig
+from vlagents_ray.serve.config.dialects import DialectConfig, KeylessPortConfig, PortConfig
 from vlagents_ray.serve.dialects.gateway_sessions import Connect
 from vlagents_ray.serve.dialects.implicit_session import ImplicitSession
 from vlagents_ray.serve.endpoints.http_messages import LONG_BYTES, problem_response
@@ -211,6 +211,11 @@ class PortDialect(Dialect):
 
     def __init__(self, name: str, config: PortConfig, context: GatewayContext) -> None:
         super().__init__(name, config, context)
+        if isinstance(config, KeylessPortConfig) and not (isinstance(context.check, NoKey) or config.without_key):
+            raise ConfigError(
+                f"dialects.{name}: the server wants API keys, and this protocol has none; remove the dialect, or "
+                "accept whoever reaches its port, with without_key: true"
+            )
 
     @classmethod
     def places(cls, config: DialectConfig) -> dict[str, Any]:

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from vlagents_ray.chunking.execution import WATCHED
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.protocol.json_messages import plain_values
 from vlagents_ray.protocol.messages import Reply
@@ -28,7 +29,7 @@ _TEXT = 200  # most characters of a text in an act's info
 _STATE_S = 0.5  # time for which slow things are not looked up again
 _SHOWN_OPS = ("act", "reset")
 _INFO = 24  # most entries of an act's info
-_REPEATED = ("timing", "policy", "behaviour", "distribution")  # entries of an act's info that are shown elsewhere
+_HIDDEN = (WATCHED, "timing", "policy", "behaviour", "distribution")  # of an act's info: shown elsewhere, or our own
 
 
 @dataclass(slots=True)
@@ -208,7 +209,7 @@ def _info(info: Mapping[str, Any]) -> dict[str, Any]:
     """Return the entries of an act's info that are numbers or short texts."""
     told: dict[str, Any] = {}
     for name, value in info.items():
-        if name in _REPEATED or len(told) == _INFO:
+        if name in _HIDDEN or len(told) == _INFO:
             continue
         if isinstance(value, str):
             told[name] = value[:_TEXT]

@@ -40,6 +40,12 @@ def open_gr00t(replicas: Replicas) -> Iterator[OpenPort]:
     yield from _opened(replicas, "gr00t")
 
 
+@pytest.fixture
+def open_lerobot(replicas: Replicas) -> Iterator[OpenPort]:
+    """Serve LeRobot's asynchronous clients; returns the port."""
+    yield from _opened(replicas, "lerobot")
+
+
 def _connector(replicas: Replicas) -> Connect:
     def connect(_key: str | None, rank: RankName | None) -> RemoteAgent:
         return replicas.agent(rank=rank or "robot")

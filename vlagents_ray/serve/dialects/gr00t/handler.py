@@ -18,6 +18,7 @@ from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.registry import require
 from vlagents_ray.serve.config.dialects import MappingSetting, PortConfig
 from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
+from vlagents_ray.serve.dialects.gateway_clients import GatewayClients
 from vlagents_ray.serve.dialects.gr00t import codec
 from vlagents_ray.serve.dialects.gr00t.connection import WAITING, GR00TConnection
 
@@ -27,7 +28,6 @@ Envelope = tuple[bytes, ...]  # sender of a message: the connection's id, and th
 _ENVELOPE = 8  # maximum number of parts
 _HEARTBEAT_MS = 10_000
 _TICK_MS = 500
-_QUIET_S = 30.0  # a client without a session is removed after this time without a request
 _END_S = 3.0
 
 
@@ -66,7 +66,7 @@ class GR00TDialect(PortDialect):
 
     def __init__(self, name: str, config: GR00TDialectConfig, context: GatewayContext) -> None:
         super().__init__(name, config, context)
-        self._clients: dict[Envelope, GR00TConnection] = {}
+        self._clients: GatewayClients[Envelope, GR00TConnection] = GatewayClients(context)
         self._looked = float("-inf")  # time of the last check of all clients, s
         self._answers: queue.SimpleQueue[tuple[Envelope, bytes]] = queue.SimpleQueue()
         self._bell, self._ring = socket.socketpair()
@@ -88,9 +88,7 @@ class GR00TDialect(PortDialect):
         self._wake()
         if self._thread is not None:
             self._thread.join(_END_S)
-        for client in list(self._clients.values()):
-            client.end()
-        for client in list(self._clients.values()):
+        for client in self._clients.end_all():
             client.join(_END_S)
         self._bell.close()
         self._ring.close()
@@ -172,34 +170,18 @@ class GR00TDialect(PortDialect):
     def _take(self, envelope: Envelope, payload: bytes) -> None:
         client = self._clients.get(envelope)
         if client is None:
-            if len(self._clients) >= self.context.sessions and not self._forget_one():
-                full = PolicyUnavailable(f"{len(self._clients)} clients are connected, the limit; try again later")
-                self.answer(envelope, codec.pack({"error": f"{full.code}: {full}"}))
+            answer = partial(self.answer, envelope)
+            try:
+                client = self._clients.add(envelope, lambda: GR00TConnection(self.context, self.mapping, answer))
+            except PolicyUnavailable as full:
+                answer(codec.pack({"error": f"{full.code}: {full}"}))
                 return
-            client = self._clients[envelope] = GR00TConnection(
-                self.context, self.mapping, partial(self.answer, envelope)
-            )
         if not client.put(payload):
             self.answer(envelope, codec.pack({"error": "malformed: wait for the answer before the next request"}))
 
     def _forget_quiet(self) -> None:
         """End the sessions of idle clients and of clients whose key is no longer valid, twice a second."""
         now = time.monotonic()
-        if now - self._looked < _TICK_MS / 1e3:
-            return
-        self._looked = now
-        for envelope, client in list(self._clients.items()):
-            patience_s = self.context.idle_s if client.begun else min(_QUIET_S, self.context.idle_s)
-            if client.quiet_s(now) > patience_s or client.refusal() is not None:
-                client.end()
-                del self._clients[envelope]
-
-    def _forget_one(self) -> bool:
-        """Remove the client without a session that has been idle for the longest; return False if there is none."""
-        now = time.monotonic()
-        idle = [(client.quiet_s(now), envelope) for envelope, client in self._clients.items() if not client.begun]
-        quiet_s, envelope = max(idle, default=(0.0, ()))
-        if quiet_s <= 0:
-            return False
-        self._clients.pop(envelope).end()
-        return True
+        if now - self._looked >= _TICK_MS / 1e3:
+            self._looked = now
+            self._clients.forget_quiet()

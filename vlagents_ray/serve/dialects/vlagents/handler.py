@@ -13,9 +13,7 @@ from typing import Any, ClassVar
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from vlagents_ray.contract import ActionSpec, Contract
-from vlagents_ray.errors import ConfigError
-from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.config.dialects import DialectConfig, PortConfig
+from vlagents_ray.serve.config.dialects import DialectConfig, KeylessPortConfig
 from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
 from vlagents_ray.serve.dialects.vlagents import codec as vlagents_codec
 from vlagents_ray.serve.dialects.vlagents.connection import Terms, VlagentsConnection, shut_down
@@ -53,7 +51,7 @@ class RobotArgs(BaseModel):
     )
 
 
-class VlagentsDialectConfig(PortConfig):
+class VlagentsDialectConfig(KeylessPortConfig):
     """The settings of the RPyC protocol of the package `vlagents`, 0.2 and 0.3.
 
     A mapping reads cameras/NAME, state/NAME, gripper, info; without one, the client's names stay as they are.
@@ -68,9 +66,6 @@ class VlagentsDialectConfig(PortConfig):
     )
     robots: dict[str, RobotArgs] = Field(default_factory=dict, description="with several, which columns are whose")
     shared_memory: bool = Field(default=True, description="read the cameras of clients on this machine in place")
-    without_key: bool = Field(
-        default=False, description="with API keys on: accept clients here without one, as the protocol has no key"
-    )
 
     @model_validator(mode="after")
     def _one_way(self) -> VlagentsDialectConfig:
@@ -103,11 +98,6 @@ class VlagentsDialect(PortDialect):
 
     def __init__(self, name: str, config: VlagentsDialectConfig, context: GatewayContext) -> None:
         super().__init__(name, config, context)
-        if not isinstance(context.check, NoKey) and not config.without_key:
-            raise ConfigError(
-                "dialects.vlagents: the server wants API keys, and this protocol has none; remove the dialect, or "
-                "accept whoever reaches its port, with without_key: true"
-            )
         self._terms = Terms(
             name=config.name or context.app,
             version=importlib.metadata.version("vlagents-ray"),

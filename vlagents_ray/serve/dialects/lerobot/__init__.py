@@ -1,0 +1,1 @@
+"""LeRobot's asynchronous inference over gRPC, on its own port."""

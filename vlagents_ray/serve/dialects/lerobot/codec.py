@@ -1,0 +1,218 @@
+"""The pickled messages of LeRobot's asynchronous inference: policy instructions, observations and chunks of actions.
+
+The facts come from LeRobot 0.4.4's `async_inference/helpers.py` and `robot_client.py`; those of 0.6.1 are the same. A
+client pickles its data classes. They are read as data, see `pickles`, and the chunk is written as a pickle in which the
+client finds its own `TimedAction` and `torch.tensor`.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, MissingCamera, MissingState
+from vlagents_ray.protocol.budget import Budget
+from vlagents_ray.protocol.messages import Limits
+from vlagents_ray.protocol.observations import is_number
+from vlagents_ray.serve.dialects.lerobot.pickled_arrays import CALLS
+from vlagents_ray.serve.dialects.lerobot.pickles import Name, read_pickle
+
+_HELPERS = "lerobot.async_inference.helpers"
+_SETUP, _OBSERVATION = Name(_HELPERS, "RemotePolicyConfig"), Name(_HELPERS, "TimedObservation")
+_RECORDS: Mapping[Name, Sequence[str]] = {
+    _SETUP: (
+        "policy_type", "pretrained_name_or_path", "lerobot_features", "actions_per_chunk", "device", "rename_map",
+    ),
+    _OBSERVATION: ("timestamp", "timestep", "observation", "must_go"),
+}  # fmt: skip
+STATE, IMAGES, TASK = "observation.state", "observation.images.", "task"
+_STEPS = 2**31  # time steps fit into a pickle's plain integers
+_SHOWN = 40  # maximum number of a client's keys in an error, and of characters of each
+
+
+@dataclass(frozen=True, slots=True)
+class PolicyInstructions:
+    """What a client says of itself before its first observation."""
+
+    policy_type: str
+    checkpoint: str  # the checkpoint that LeRobot's own server would load
+    state: tuple[str, ...]  # names of the numbers of `observation.state`, in order
+    cameras: tuple[str, ...]
+    actions_per_chunk: int
+
+
+@dataclass(frozen=True, slots=True)
+class RobotObservation:
+    """A client's observation."""
+
+    timestamp: float  # the client's clock, s since 1970
+    timestep: int  # number of the last action that the client executed
+    values: Mapping[str, Any]  # numbers, texts and arrays by the robot's names
+    must_go: bool  # whether the client has no action left
+
+
+def read_instructions(data: bytes, limits: Limits) -> PolicyInstructions:
+    """Return the policy instructions in a pickle.
+
+    Raises:
+        MalformedMessage: The pickle has anything but these, see `pickles`.
+        MessageTooLarge: It exceeds a limit.
+        InvalidObservation: The robot's features are none of numbers and cameras, or are to be renamed.
+    """
+    stated = _fields(data, limits, _SETUP)
+    policy_type, checkpoint = (_text(stated, name) for name in ("policy_type", "pretrained_name_or_path"))
+    rows, features, renames = (stated[name] for name in ("actions_per_chunk", "lerobot_features", "rename_map"))
+    if type(rows) is not int or rows < 1:
+        raise MalformedMessage(f"actions_per_chunk: got {_shown(rows)}, want an integer of 1 or more")
+    if not (isinstance(features, dict) and isinstance(renames, dict)):
+        raise MalformedMessage(f"lerobot_features, rename_map: got {_shown(features)}, {_shown(renames)}, want dicts")
+    if renames:
+        raise InvalidObservation("rename_map: got names, want none; rename them in dialects.lerobot.mapping")
+    state: tuple[str, ...] = ()
+    for name, feature in features.items():
+        if not isinstance(feature, dict):
+            raise MalformedMessage(f"lerobot_features: {name[:_SHOWN]!r}: got {_shown(feature)}, want a dict")
+        kind = _text(feature, "dtype")
+        if name == STATE and kind == "float32":
+            state = _names(feature)
+        elif not (name.startswith(IMAGES) and kind in ("image", "video")):
+            raise InvalidObservation(
+                f"lerobot_features: got {name[:_SHOWN]!r} of {kind[:_SHOWN]!r}, want {STATE!r} of float32, and "
+                f"images {IMAGES + 'NAME'!r}"
+            )
+    cameras = tuple(name.removeprefix(IMAGES) for name in features if name != STATE)
+    if len(cameras) > limits.cameras or len(state) > limits.state_values:
+        raise MessageTooLarge(
+            f"lerobot_features: got {len(cameras)} cameras and {len(state)} numbers of state, the limits are "
+            f"{limits.cameras} and {limits.state_values}"
+        )
+    return PolicyInstructions(policy_type, checkpoint, state, cameras, rows)
+
+
+def read_observation(data: bytes, budget: Budget) -> RobotObservation:
+    """Return the observation in a pickle; its arrays view the pickle, and are counted in `budget`.
+
+    Raises:
+        MalformedMessage: The pickle has anything but an observation, see `pickles`.
+        MessageTooLarge: It exceeds a limit.
+    """
+    stated = _fields(data, budget.limits, _OBSERVATION)
+    timestamp, timestep, values, must_go = (stated[name] for name in _RECORDS[_OBSERVATION])
+    if not is_number(timestamp) or not math.isfinite(timestamp):
+        raise MalformedMessage(f"timestamp: got {_shown(timestamp)}, want a finite number")
+    if type(timestep) is not int or not 0 <= timestep < _STEPS:
+        raise MalformedMessage(f"timestep: got {_shown(timestep)}, want an integer in [0, 2**31)")
+    if type(must_go) is not bool:
+        raise MalformedMessage(f"must_go: got {_shown(must_go)}, want a bool")
+    if not isinstance(values, dict):
+        raise MalformedMessage(f"observation: got {_shown(values)}, want a dict")
+    for name, value in values.items():
+        if isinstance(value, np.ndarray):
+            budget.count(value.nbytes)
+        elif not (isinstance(value, (str, bool)) or is_number(value)):
+            raise MalformedMessage(
+                f"observation: {name[:_SHOWN]!r}: got {_shown(value)}, want a number, text or numpy array"
+            )
+    return RobotObservation(float(timestamp), timestep, values, must_go)
+
+
+def frame(observation: RobotObservation, robot: PolicyInstructions) -> dict[str, Any]:
+    """Return an observation by LeRobot's names, as LeRobot's own server does before it calls a policy.
+
+    Returns:
+        `observation.state`, (D,) float32, in the order of the robot's features, `observation.images.NAME`, and `task`.
+
+    Raises:
+        MissingState, MissingCamera: The observation lacks a feature that the policy instructions state.
+        InvalidObservation: A number of the state is none.
+    """
+    values = observation.values
+    have = [name[:_SHOWN] for name in values][:_SHOWN]
+    found: dict[str, Any] = {}
+    if robot.state:
+        numbers = []
+        for name in robot.state:
+            if name not in values:
+                raise MissingState(name[:_SHOWN], have=have)
+            value = values[name]
+            if isinstance(value, np.ndarray) and value.size == 1:
+                value = value.item()
+            if not is_number(value):
+                raise InvalidObservation(f"{name[:_SHOWN]!r}: got {_shown(value)}, want a number")
+            numbers.append(value)
+        with np.errstate(over="ignore"):  # becomes infinite, as at LeRobot's own server
+            found[STATE] = np.array(numbers, np.float64).astype(np.float32)
+    for name in robot.cameras:
+        if name not in values:
+            raise MissingCamera(name[:_SHOWN], have=have)
+        found[IMAGES + name] = values[name]
+    if TASK in values:
+        found[TASK] = values[TASK]
+    return found
+
+
+def write_chunk(rows: np.ndarray, timestamp: float, timestep: int, period_s: float) -> bytes:
+    """Return the pickle of a chunk: a list of `TimedAction`, which the client unpickles.
+
+    The pickle has the form that LeRobot's server writes, except that each tensor is a call of `torch.tensor` with its
+    numbers, of float32's values: that needs no torch here, and no archive within the pickle.
+
+    Args:
+        rows: The chunk, (H, D) float32.
+        timestamp: Time of the observation, s, which is that of the first action.
+        timestep: Number of the first action, that of the observation.
+        period_s: Time between two actions, s.
+    """
+    if timestep + len(rows) > _STEPS:
+        raise InvalidObservation(f"timestep: got {timestep}, which leaves no numbers for {len(rows)} actions")
+    parts = [b"\x80\x02", _global(0, _HELPERS, "TimedAction"), _global(1, "torch", "tensor"), b"]("]
+    for number, row in enumerate(rows):
+        values = b"".join(b"G" + struct.pack(">d", value) for value in row.tolist())
+        parts += [
+            b"h\0)\x81}(",
+            _key("timestamp"), b"G", struct.pack(">d", timestamp + number * period_s),
+            _key("timestep"), b"J", struct.pack("<i", timestep + number),
+            _key("action"), b"h\1](", values, b"e\x85R",
+            b"ub",
+        ]  # fmt: skip
+    return b"".join([*parts, b"e."])
+
+
+def _global(memo: int, module: str, name: str) -> bytes:
+    """Return the opcodes that put a class or function into the memo."""
+    return f"c{module}\n{name}\n".encode() + bytes([ord("q"), memo, ord("0")])
+
+
+def _key(name: str) -> bytes:
+    return b"X" + struct.pack("<I", len(name)) + name.encode()
+
+
+def _fields(data: bytes, limits: Limits, wanted: Name) -> dict[str, Any]:
+    record = read_pickle(data, limits, _RECORDS, CALLS)
+    if record.name != wanted or record.fields is None:
+        raise MalformedMessage(f"pickle: got a {record.name.name}, want a {wanted.name}")
+    return record.fields
+
+
+def _text(stated: Mapping[str, Any], name: str) -> str:
+    value = stated.get(name)
+    if not isinstance(value, str):
+        raise MalformedMessage(f"{name}: got {_shown(value)}, want text")
+    return value
+
+
+def _shown(value: object) -> str:
+    """Return a client's value as an error shows it: a number, or the type of anything else, whatever its size."""
+    return repr(value) if is_number(value) else type(value).__name__
+
+
+def _names(feature: Mapping[str, Any]) -> tuple[str, ...]:
+    names = feature.get("names")
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise InvalidObservation(f"lerobot_features: {STATE!r}: want `names`, a list of texts")
+    return tuple(names)

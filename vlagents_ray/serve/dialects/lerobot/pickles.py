@@ -1,0 +1,345 @@
+"""Pickles of a few known shapes, whose opcodes are read as data: nothing is unpickled, looked up or imported.
+
+A pickle is a program for a stack machine, and its dangerous opcodes import and call whatever it names. This reader has
+no such opcode: a pair of module and name is compared, as text, with the closed lists of its caller, whose entries stand
+for the caller's own functions. An opcode, a name or a shape that is not listed is refused.
+
+The opcodes are those that Python's own pickler writes in protocol 4 and 5 for dicts, lists, tuples, texts, numbers,
+numpy's arrays and data classes. `Limits` bound the number of opcodes (`items`), the nesting (`depth`) and the texts.
+Bytes are not copied, so that memory is bounded by the message.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from vlagents_ray.errors import MalformedMessage, MessageTooLarge
+from vlagents_ray.protocol.messages import Limits
+
+_PROTOCOLS = (4, 5)
+_INTEGER = 9  # maximum number of bytes of an integer
+_SHOWN = 60  # maximum number of characters of a client's text in an error
+
+
+class Name(NamedTuple):
+    """A class or function that a pickle names."""
+
+    module: str
+    name: str
+
+
+class Record:
+    """An object of a data class, of which only the name and the fields are known."""
+
+    __slots__ = ("fields", "name")
+
+    def __init__(self, name: Name) -> None:
+        self.name = name
+        self.fields: dict[str, Any] | None = None  # None until they were read
+
+
+class Reduced:
+    """An object that a pickle makes by a call, and may describe afterwards."""
+
+    __slots__ = ("read_state", "value")
+
+    def __init__(self, read_state: Callable[[Any], Any] | None = None, value: Any = None) -> None:
+        self.read_state = read_state
+        self.value = value  # None until it was described
+
+
+Call = Callable[[tuple[Any, ...]], "Reduced | int | float"]
+"""Returns what a call in a pickle stands for, given its arguments; raises `MalformedMessage` for others."""
+
+
+class _StackValue(NamedTuple):
+    """A value on the stack."""
+
+    value: Any
+    depth: int = 0  # levels of containers in it
+    items: int = 1  # values in it
+
+
+def read_pickle(
+    data: bytes, limits: Limits, records: Mapping[Name, Sequence[str]], calls: Mapping[Name, Call | None]
+) -> Record:
+    """Return the object of a data class that a pickle consists of.
+
+    Args:
+        data: The pickle. Arrays of the result view its memory.
+        limits: Limits of the number of opcodes (`items`), of nesting (`depth`) and of texts (`text`).
+        records: The data classes that may occur, with the names of their fields.
+        calls: The functions that may occur, with our own in their place; None for a class that is an argument only.
+
+    Raises:
+        MalformedMessage: The bytes are no pickle, or have another opcode, name or shape than those listed here.
+        MessageTooLarge: The pickle exceeds a limit.
+    """
+    return _StackMachine(data, limits, records, calls).whole()
+
+
+class _StackMachine:
+    """A stack machine without calls."""
+
+    def __init__(
+        self, data: bytes, limits: Limits, records: Mapping[Name, Sequence[str]], calls: Mapping[Name, Call | None]
+    ) -> None:
+        self._data = memoryview(data)
+        self._at = 0
+        self._limits = limits
+        self._records = records
+        self._calls = calls
+        self._items = 0
+        self._stack: list[_StackValue] = []
+        self._below: list[list[_StackValue]] = []  # the stacks below each open mark
+        self._memo: list[_StackValue] = []
+
+    def whole(self) -> Record:
+        """Read the pickle to its end."""
+        if self.take(1)[0] != _PROTO or self.take(1)[0] not in _PROTOCOLS:
+            raise MalformedMessage(f"pickle: want one of protocol {_PROTOCOLS[0]} or {_PROTOCOLS[1]}")
+        while (opcode := self.take(1)[0]) != _STOP:
+            self._count(1)
+            read = _OPCODES.get(opcode)
+            if read is None:
+                raise MalformedMessage(f"pickle: got opcode {opcode:#04x}, which is not read here")
+            read(self)
+        root = self.pop()
+        if self._stack or self._below or self._at != len(self._data):
+            raise MalformedMessage("pickle: more than one object in a message")
+        if not isinstance(root, Record) or root.fields is None:
+            raise MalformedMessage(f"pickle: got {_kind(root)}, want {[name.name for name in self._records]}")
+        return root
+
+    def take(self, length: int) -> memoryview:
+        """Return the next bytes."""
+        end = self._at + length
+        if end > len(self._data):
+            raise MalformedMessage("pickle: a message that ends too early")
+        found = self._data[self._at : end]
+        self._at = end
+        return found
+
+    def skip(self, length: int) -> None:
+        """Leave out the next bytes."""
+        self.take(length)
+
+    def push(self, value: Any, depth: int = 0, items: int = 1) -> None:
+        """Put a value onto the stack."""
+        if depth > self._limits.depth:
+            raise MessageTooLarge(f"pickle: more than {self._limits.depth} levels of nesting")
+        self._stack.append(_StackValue(value, depth, items))
+
+    def pop(self) -> Any:
+        """Take the value at the top of the stack."""
+        return self._entry().value
+
+    def text(self, length: int) -> None:
+        """Read a text."""
+        if length > self._limits.text:
+            raise MessageTooLarge(f"pickle: a text of {length} bytes, the limit is {self._limits.text}")
+        try:
+            self.push(str(self.take(length), "utf-8"))
+        except UnicodeDecodeError as error:
+            raise MalformedMessage(f"pickle: a text that is not UTF-8 ({error.reason})") from error
+
+    def integer(self) -> None:
+        """Read an integer of a stated number of bytes."""
+        length = self.take(1)[0]
+        if length > _INTEGER:
+            raise MessageTooLarge(f"pickle: an integer of {length} bytes, the limit is {_INTEGER}")
+        self.push(int.from_bytes(self.take(length), "little", signed=True))
+
+    def mark(self) -> None:
+        """Begin a group of values."""
+        self._below.append(self._stack)
+        self._stack = []
+
+    def remember(self) -> None:
+        """Put the value at the top of the stack into the memo, too."""
+        self._memo.append(self._top())
+
+    def recall(self, index: int) -> None:
+        """Push a value of the memo; one that can still change is refused, so that no value contains itself."""
+        if index >= len(self._memo):
+            raise MalformedMessage("pickle: a reference to nothing")
+        entry = self._memo[index]
+        value = entry.value
+        if isinstance(value, (list, dict, Record)) or (isinstance(value, Reduced) and value.value is None):
+            raise MalformedMessage(f"pickle: a second reference to {_kind(value)}; send a copy")
+        self._count(entry.items)
+        self._stack.append(entry)
+
+    def tuple_of(self, entries: Sequence[_StackValue]) -> None:
+        """Make a tuple of values."""
+        self.push(
+            tuple(_finished(entry.value) for entry in entries),
+            _above(entries),
+            1 + sum(entry.items for entry in entries),
+        )
+
+    def extend(self, entries: Sequence[_StackValue]) -> None:
+        """Append values to the list below them."""
+        self._into(list, entries).extend(_finished(entry.value) for entry in entries)
+
+    def update(self, entries: Sequence[_StackValue]) -> None:
+        """Put keys and values into the dict below them."""
+        keys = [entry.value for entry in entries[::2]]
+        if len(entries) % 2 or not all(type(key) is str for key in keys):
+            raise MalformedMessage("pickle: want a dict with texts as keys")
+        values = [_finished(entry.value) for entry in entries[1::2]]
+        self._into(dict, entries).update(zip(keys, values, strict=True))
+
+    def last(self, number: int | None) -> list[_StackValue]:
+        """Take the last values, or all since the mark, from the stack."""
+        if number is not None:
+            return [self._entry() for _ in range(number)][::-1]
+        if not self._below:
+            raise MalformedMessage("pickle: a group without its mark")
+        group, self._stack = self._stack, self._below.pop()
+        return group
+
+    def name(self) -> None:
+        """Replace module and name by the entry of the closed list that they stand for."""
+        name, module = self.pop(), self.pop()
+        if not (type(module) is str and type(name) is str):
+            raise MalformedMessage("pickle: a name that is no text")
+        found = Name(module, name)
+        if found not in self._calls and found not in self._records:
+            raise MalformedMessage(
+                f"pickle: names {module[:_SHOWN]!r} {name[:_SHOWN]!r}, which is not read here; send numbers, texts and "
+                "numpy arrays of numbers"
+            )
+        self.push(found)
+
+    def reduce(self) -> None:
+        """Make the object that a call stands for."""
+        arguments, name = self.pop(), self.pop()
+        read = self._calls.get(name) if isinstance(name, Name) else None
+        if read is None or type(arguments) is not tuple:
+            raise MalformedMessage(f"pickle: got a call of {_kind(name)}, want a numpy array of numbers")
+        self.push(read(arguments))
+
+    def new(self) -> None:
+        """Begin an object of a data class."""
+        arguments, name = self.pop(), self.pop()
+        if arguments != () or not isinstance(name, Name) or name not in self._records:
+            raise MalformedMessage(f"pickle: got an object of {_kind(name)}, want one of LeRobot's messages")
+        self.push(Record(name))
+
+    def build(self) -> None:
+        """Describe the object below the value at the top."""
+        state = self._entry()
+        target = self._top().value
+        if isinstance(target, Record) and target.fields is None and type(state.value) is dict:
+            fields = self._records[target.name]
+            if state.value.keys() != set(fields):
+                got = [str(key)[:_SHOWN] for key in state.value][: 2 * len(fields)]
+                raise MalformedMessage(f"pickle: {target.name.name}: got the fields {got}, want {list(fields)}")
+            target.fields = state.value
+            self._stack[-1] = _StackValue(target, state.depth + 1)
+        elif isinstance(target, Reduced) and target.value is None and target.read_state is not None:
+            target.value = target.read_state(state.value)
+        else:
+            raise MalformedMessage(f"pickle: got the state of {_kind(target)}, which has none")
+
+    def _count(self, items: int) -> None:
+        self._items += items
+        if self._items > self._limits.items:
+            raise MessageTooLarge(f"pickle: more than {self._limits.items} values in a message")
+
+    def _top(self) -> _StackValue:
+        if not self._stack:
+            raise MalformedMessage("pickle: an opcode without its value")
+        return self._stack[-1]
+
+    def _entry(self) -> _StackValue:
+        entry = self._top()
+        self._stack.pop()
+        return entry
+
+    def _into(self, kind: type, entries: Sequence[_StackValue]) -> Any:
+        """Return the container below `entries`, which will contain them."""
+        container = self._entry()
+        if type(container.value) is not kind:
+            raise MalformedMessage(f"pickle: got {_kind(container.value)}, want a {kind.__name__}")
+        items = container.items + sum(entry.items for entry in entries)
+        self.push(container.value, max(container.depth, _above(entries)), items)
+        return container.value
+
+
+def _above(entries: Sequence[_StackValue]) -> int:
+    return 1 + max((entry.depth for entry in entries), default=0)
+
+
+def _finished(value: Any) -> Any:
+    """Return the value that a container keeps of one on the stack."""
+    if not isinstance(value, Reduced):
+        return value
+    if value.value is None:
+        raise MalformedMessage("pickle: an array or a type without its content")
+    return value.value
+
+
+def _kind(value: Any) -> str:
+    if isinstance(value, Record):
+        return value.name.name
+    if isinstance(value, Name):
+        return f"{value.module}.{value.name}"
+    return "an array" if isinstance(value, Reduced) else type(value).__name__
+
+
+_PROTO, _STOP = 0x80, ord(".")
+_U1, _U2, _U4, _U8 = (struct.Struct(f"<{kind}") for kind in "BHIQ")
+_I4, _F8 = struct.Struct("<i"), struct.Struct(">d")
+
+
+def _number(form: struct.Struct, then: Callable[[_StackMachine, Any], None]) -> Callable[[_StackMachine], None]:
+    return lambda reader: then(reader, form.unpack(reader.take(form.size))[0])
+
+
+def _bytes(reader: _StackMachine, length: int) -> None:
+    reader.push(reader.take(length))
+
+
+def _fixed(value: Any) -> Callable[[_StackMachine], None]:
+    return lambda reader: reader.push(value)
+
+
+_OPCODES: dict[int, Callable[[_StackMachine], None]] = {
+    ord("N"): _fixed(None),
+    0x88: _fixed(True),
+    0x89: _fixed(False),
+    ord("K"): _number(_U1, _StackMachine.push),
+    ord("M"): _number(_U2, _StackMachine.push),
+    ord("J"): _number(_I4, _StackMachine.push),
+    0x8A: _StackMachine.integer,
+    ord("G"): _number(_F8, _StackMachine.push),
+    0x8C: _number(_U1, _StackMachine.text),
+    ord("X"): _number(_U4, _StackMachine.text),
+    ord("C"): _number(_U1, _bytes),
+    ord("B"): _number(_U4, _bytes),
+    0x96: _number(_U8, _bytes),  # a bytearray
+    ord("("): _StackMachine.mark,
+    ord(")"): _fixed(()),
+    0x85: lambda reader: reader.tuple_of(reader.last(1)),
+    0x86: lambda reader: reader.tuple_of(reader.last(2)),
+    0x87: lambda reader: reader.tuple_of(reader.last(3)),
+    ord("t"): lambda reader: reader.tuple_of(reader.last(None)),
+    ord("]"): lambda reader: reader.push([], 1),
+    ord("a"): lambda reader: reader.extend(reader.last(1)),
+    ord("e"): lambda reader: reader.extend(reader.last(None)),
+    ord("}"): lambda reader: reader.push({}, 1),
+    ord("s"): lambda reader: reader.update(reader.last(2)),
+    ord("u"): lambda reader: reader.update(reader.last(None)),
+    0x94: _StackMachine.remember,
+    ord("h"): _number(_U1, _StackMachine.recall),
+    ord("j"): _number(_U4, _StackMachine.recall),
+    0x93: _StackMachine.name,
+    ord("R"): _StackMachine.reduce,
+    0x81: _StackMachine.new,
+    ord("b"): _StackMachine.build,
+    0x95: lambda reader: reader.skip(_U8.size),  # a frame, whose length is of no use here
+}
