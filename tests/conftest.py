@@ -50,6 +50,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Put the files in order: a file's tests stay together, and share what it starts."""
     files: dict[object, int] = {}
     for item in items:
+        if " at 0x" in item.nodeid:  # processes that share the tests must collect the same
+            raise pytest.UsageError(f"{item.nodeid}: got an address in a test's name; name its parameters with ids=")
         marked = {marker.name for marker in item.iter_markers()}
         place = next((number for number, name in enumerate(_ORDER) if name in marked), len(_ORDER))
         if "alone" in marked:

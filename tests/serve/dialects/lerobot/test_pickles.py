@@ -240,7 +240,6 @@ class Text(str):
         ({1: 2}, "texts as keys"),
         (TimedObservation(0.0, 0, {}), "got Record, want a number"),
     ],
-    ids=str,
 )
 def test_what_is_no_number_text_or_array_of_numbers_is_refused(value: Any, says: str) -> None:
     with pytest.raises(InvalidInput, match=says), WATCH.watching():
