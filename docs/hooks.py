@@ -46,7 +46,7 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 
 
 def on_nav(nav: Any, config: Any, files: Files) -> None:
-    """Write llms.txt, what programs that read the documentation for somebody look for: each page with what it is about."""
+    """Write llms.txt, which programs read that look something up for somebody: each page, and what it is about."""
     lines = [f"# {config['site_name']}", "", f"> {config['site_description']}"]
     for section in nav.items:
         lines += ["", f"## {section.title}", ""]
