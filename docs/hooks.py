@@ -45,6 +45,29 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     return _LINK.sub(turned, _ABOVE_A_BLOCK.sub("", markdown))
 
 
+def on_nav(nav: Any, config: Any, files: Files) -> None:
+    """Write llms.txt, which programs read that look something up for somebody: each page, and what it is about."""
+    lines = [f"# {config['site_name']}", "", f"> {config['site_description']}"]
+    for section in nav.items:
+        lines += ["", f"## {section.title}", ""]
+        lines += [_entry(page) for page in (section, *_pages(section)) if page.is_page]
+    files.append(File.generated(config, "llms.txt", content="\n".join([*lines, ""])))
+
+
+def _pages(section: Any) -> list[Any]:
+    """The pages of a section, and those of the sections in it."""
+    return [page for child in section.children or [] for page in (child, *_pages(child))]
+
+
+def _entry(page: Any) -> str:
+    """A page's line: its title, where it stands, and its first sentence."""
+    title, _, rest = re.sub(r"<!--.*?-->", "", page.file.content_string, flags=re.DOTALL).lstrip("# \n").partition("\n")
+    prose = next((block for block in rest.split("\n\n") if re.match(r"\s*(?!```)[\w`*\[]", block)), "")
+    plain = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", " ".join(prose.split()))
+    about = re.split(r"(?<=\.) (?=[A-Z`])", plain)[0].removesuffix(":")
+    return f"- [{title.strip()}]({page.file.dest_uri})" + (f": {about}" if about else "")
+
+
 def _path(page: str, link: str) -> str:
     """The path in the repository of what a page of the site links to."""
     folder = posixpath.dirname(page if page in PAGES else f"docs/{page}")

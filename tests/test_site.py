@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
@@ -53,6 +54,16 @@ def test_every_link_within_the_site_leads_to_a_file_and_an_anchor_in_it() -> Non
                 broken.add(target)
     assert sum(len(links.targets) for links in pages.values()) > len(pages)
     assert broken == set()
+
+
+def test_llms_txt_names_each_page_of_the_navigation() -> None:
+    listing = (SITE / "llms.txt").read_text()
+    named = re.findall(r"^- \[.+?\]\((.+?)\)", listing, re.MULTILINE)
+    pages = {page.relative_to(SITE).as_posix() for page in SITE.rglob("*.html")} - {"404.html"}
+    assert listing.startswith("# vlagents_ray\n\n> ")
+    assert set(named) == pages
+    assert len(named) == len(pages)
+    assert "- [LeRobot](policies/lerobot.html): Serves what LeRobot" in listing
 
 
 # The lines of the module's path that heads a page of the reference.
