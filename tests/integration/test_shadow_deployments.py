@@ -50,7 +50,7 @@ def test_the_candidate_changes_its_settings_and_the_live_policy_does_not_restart
         return ServeDeploySchema.model_validate(found)
 
     def difference() -> float:
-        played(server, "http")
+        played(server, "http", app="Seeded")
         acts = [line for line in recorded(tmp_path) if line["op"] == "act" and not line["dropped"]]
         return acts[-1]["difference"]["mean"] if acts else 0.0
 
