@@ -15,7 +15,7 @@ from page_commands import PAGES, commands, read_as_typed
 from vlagents_ray.cli.evaluation.command import read_run
 from vlagents_ray.envs import metaworld
 from vlagents_ray.envs.benchmark_protocol import BenchmarkProtocol
-from vlagents_ray.envs.gymnasium_registry import known
+from vlagents_ray.envs.gymnasium.known import known
 from vlagents_ray.errors import BY_CODE, Overloaded, VLAgentsError
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.interface import Act

@@ -15,7 +15,7 @@ import numpy as np
 
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.envs.base import EvalEnv, one_row
-from vlagents_ray.envs.gymnasium_registry import known
+from vlagents_ray.envs.gymnasium.known import known
 from vlagents_ray.envs.mapping import RENDER, Pick, as_image, bounds, parts, plain, uniform
 from vlagents_ray.envs.recording import record_size_of
 from vlagents_ray.envs.rendering.headless import prepare_rendering
