@@ -107,7 +107,7 @@ class Aloha(EvalEnv):
         simulator = require("gym_aloha.env")
         with failing(self._name, "make"):
             self._env = simulator.AlohaEnv(task)
-            # gym-aloha renders three cameras at 640x480 in each step; here only those asked for are rendered, on demand.
+            # gym-aloha renders three cameras at 640x480 in each step; here only those of the contract are rendered.
             self._env._env.task.get_observation = self._env._env.task.get_qpos
             self._env._format_raw_obs = np.array
             self._physics = self._env._env.physics
