@@ -3,23 +3,32 @@
 from __future__ import annotations
 
 import importlib.util
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
+from vlagents_ray.envs.base import require_known
 from vlagents_ray.envs.gymnasium import Gymnasium
 
 _ID = "gym_pusht/PushT-v0"
+# What is observed in each task: options of `Gymnasium`.
+_TASKS: dict[str, Mapping[str, Any]] = {
+    "image": {},
+    "keypoints": {"kwargs": {"obs_type": "environment_state_agent_pos"}, "cameras": {}},
+}
 
 
 class PushT(Gymnasium):
-    """PushT by its published protocol.
+    """PushT by its published protocol, "image" or "keypoints".
 
-    Observation: "front", (96, 96, 3) by default, and `state["agent_pos"]`, (2,) in pixels of the field, 512 by 512.
+    Observation: `state["agent_pos"]`, (2,) in pixels of the field, 512 by 512. For "image": "front", (96, 96, 3) by
+    default. For "keypoints": `state["environment_state"]`, (16,), eight points of the block, x and y in the same pixels.
 
     Action: (2,) in [0, 512]: where the disc shall go, in the same pixels.
     """
 
     def __init__(
         self,
+        task: str = "image",
         *,
         width: int | None = None,
         height: int | None = None,
@@ -29,16 +38,27 @@ class PushT(Gymnasium):
         """Make the environment.
 
         Args:
+            task: What is observed, "image" or "keypoints".
             width: The width to which the image is stretched, pixels.
             height: The height to which the image is stretched, pixels.
             max_steps: The step limit; 300 by default.
             record_size: Height and width of further copies of the image, for recordings only.
 
         Raises:
+            UnknownEnv: There is no such task.
             ConfigError: An option has a wrong value.
             MissingDependency: gym-pusht is not installed.
         """
-        super().__init__(_ID, width=width, height=height, max_steps=max_steps, record_size=record_size)
+        self.require_task(task)
+        super().__init__(_ID, **_TASKS[task], width=width, height=height, max_steps=max_steps, record_size=record_size)
+
+    @classmethod
+    def tasks(cls) -> list[str]:
+        return list(_TASKS)
+
+    @classmethod
+    def require_task(cls, task: str | None) -> None:
+        require_known("pusht", task or "image", cls.tasks())
 
     @classmethod
     def missing(cls) -> str | None:

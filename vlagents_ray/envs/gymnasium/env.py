@@ -99,7 +99,7 @@ class Gymnasium(EvalEnv):
         self._steps = 0
         self._env = self._make(max_steps)
         try:
-            self._instruction = instruction if instruction is not None else defaults.instruction or self._words()
+            self._instruction = instruction if instruction is not None else defaults.instruction or self._stated_task()
             self.max_steps = self._step_limit(max_steps)
             self._action_space = str(self._env.action_space)
             mapped = Mapped(
@@ -186,8 +186,8 @@ class Gymnasium(EvalEnv):
         """Make the rows of one VectorEnv, if these options make one."""
         if not cls._makes_vectors(options):
             return None
-        several = type(cls.__name__, (cls,), {"rows": num_envs})(**options)
-        return several._as_batch()
+        several: type[Gymnasium] = type(cls.__name__, (cls,), {"rows": num_envs})
+        return several(**options)._as_batch()
 
     @classmethod
     def _makes_vectors(cls, options: Mapping[str, Any]) -> bool:
@@ -206,10 +206,6 @@ class Gymnasium(EvalEnv):
             rows=self.rows,
             max_steps=max_steps,
         )
-
-    def _words(self) -> str:
-        """Return the task in words, as far as the environment states it; "" if it does not."""
-        return ""
 
     def _as_batch(self) -> GymnasiumBatch:
         return GymnasiumBatch(
@@ -234,9 +230,20 @@ class Gymnasium(EvalEnv):
                 f"autoreset mode"
             )
 
+    def _stated_task(self) -> str:
+        """Return the task in words that the rows of a VectorEnv state as those of LeRobot do; "" if there is none."""
+        if not isinstance(self._env, VectorRows):
+            return ""
+        words = self._env.stated("task_description") or self._env.stated("task")
+        return words if isinstance(words, str) else ""
+
     def _step_limit(self, wanted: int | None) -> int:
-        spec = getattr(self._env, "spec", None)
+        spec = self._env.spec
         limit = wanted or (spec.max_episode_steps if spec is not None else None)
+        if limit is None and isinstance(self._env, VectorRows):
+            limit = self._env.stated(
+                "_max_episode_steps"
+            )  # as Gymnasium's TimeLimit and LeRobot's environments have it
         if limit is None or limit < 1:
             raise ConfigError(f"{self._name}: its step limit is {limit}; set `max_steps` to 1 or more")
         return int(limit)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -108,8 +109,8 @@ class GymnasiumBatch(BatchEnv):
             self._rows.close()
 
     def _observed(self, nested: Sequence[Any]) -> list[Obs]:
-        pictures = self._call("render_all") if self._view.renders else ()
-        return [self._view.observe(one, lambda i=i: pictures[i]) for i, one in enumerate(nested)]
+        pictures: Sequence[Any] = self._call("render_all") if self._view.renders else ()
+        return [self._view.observe(one, partial(pictures.__getitem__, i)) for i, one in enumerate(nested)]
 
     def _call(self, method: str, *args: Any) -> Any:
         if self._closed:

@@ -102,6 +102,13 @@ class VectorRows:
             raise ConfigError(f"{self._name}: render gives {got} pictures, want one for each of {self.num_envs} rows")
         return pictures
 
+    def stated(self, attribute: str) -> Any:
+        """Return an attribute of the first row's environment; None if it has none, or lives in another process."""
+        envs = getattr(self._vector, "envs", None)
+        if not envs or not envs[0].has_wrapper_attr(attribute):
+            return None
+        return envs[0].get_wrapper_attr(attribute)
+
     def close(self) -> None:
         self._vector.close()
 

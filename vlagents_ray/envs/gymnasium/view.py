@@ -89,7 +89,8 @@ class View:
 
     def idle(self) -> np.ndarray:
         """Return an action for an environment whose episode is over, (D,)."""
-        return np.clip(np.zeros_like(self._low), self._low, self._high).astype(self._dtype)
+        still: np.ndarray = np.clip(np.zeros_like(self._low), self._low, self._high).astype(self._dtype)
+        return still
 
     def succeeded(self, info: Mapping[str, Any], terminated: bool) -> bool:
         """Whether the task is solved after a step."""
