@@ -41,8 +41,8 @@ class HubFile:
         revision, path = match["revision"] or "", match["file"] or "env.py"
         if not _COMMIT.fullmatch(revision):
             raise UnknownEnv(
-                f"hub/{task}: got the revision {revision or 'none'!r}, want a commit, 40 hex digits, as a branch or tag "
-                f"can change; the repository's page lists its commits"
+                f"hub/{task}: got the revision {revision or 'none'!r}, want a commit, 40 hex digits, as a branch or "
+                f"tag can change; the repository's page lists its commits"
             )
         if ".." in Path(path).parts or Path(path).is_absolute() or not path.endswith(".py"):
             raise UnknownEnv(
