@@ -20,8 +20,8 @@ _TASKS: dict[str, Mapping[str, Any]] = {
 class PushT(Gymnasium):
     """PushT by its published protocol, "image" or "keypoints".
 
-    Observation: `state["agent_pos"]`, (2,) in pixels of the field, 512 by 512. With "image" also "front", (96, 96, 3) by
-    default; with "keypoints" `state["environment_state"]`, (16,), eight points of the block, x and y, in the same pixels.
+    Observation: `state["agent_pos"]`, (2,) in pixels of the field, 512 by 512. With "image" also "front", (96, 96, 3)
+    by default; with "keypoints" `state["environment_state"]`, (16,), x and y of eight points of the block, in pixels.
 
     Action: (2,) in [0, 512]: where the disc shall go, in the same pixels.
     """

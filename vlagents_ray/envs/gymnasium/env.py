@@ -241,9 +241,7 @@ class Gymnasium(EvalEnv):
         spec = self._env.spec
         limit = wanted or (spec.max_episode_steps if spec is not None else None)
         if limit is None and isinstance(self._env, VectorRows):
-            limit = self._env.stated(
-                "_max_episode_steps"
-            )  # as Gymnasium's TimeLimit and LeRobot's environments have it
+            limit = self._env.stated("_max_episode_steps")  # as LeRobot's environments have it
         if limit is None or limit < 1:
             raise ConfigError(f"{self._name}: its step limit is {limit}; set `max_steps` to 1 or more")
         return int(limit)
