@@ -13,9 +13,9 @@ import yaml
 from page_commands import PAGES, commands, read_as_typed
 
 from vlagents_ray.cli.evaluation.command import read_run
-from vlagents_ray.envs import metaworld
+from vlagents_ray.envs import aloha, metaworld
 from vlagents_ray.envs.benchmark_protocol import BenchmarkProtocol
-from vlagents_ray.envs.gymnasium_registry import known
+from vlagents_ray.envs.gymnasium.known import known
 from vlagents_ray.errors import BY_CODE, Overloaded, VLAgentsError
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.interface import Act
@@ -110,6 +110,7 @@ def test_files_of_runs_on_the_pages_are_accepted() -> None:
     ("page", "protocol"),
     [
         ("metaworld", metaworld.PROTOCOL),
+        ("aloha", aloha.PROTOCOL),
         ("pusht", known("gym_pusht/PushT-v0").protocol),
         ("gymnasium", known("FetchReach-v4").protocol),
     ],

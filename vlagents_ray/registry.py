@@ -43,7 +43,10 @@ ENVS: dict[str, str] = {
     "metaworld": "vlagents_ray.envs.metaworld:MetaWorld",
     "libero": "vlagents_ray.envs.libero:Libero",
     "simpler": "vlagents_ray.envs.simpler:Simpler",
+    "aloha": "vlagents_ray.envs.aloha:Aloha",
+    "pusht": "vlagents_ray.envs.pusht:PushT",
     "gymnasium": "vlagents_ray.envs.gymnasium:Gymnasium",
+    "hub": "vlagents_ray.envs.hub:EnvHub",
     "rcs": "vlagents_ray.envs.rcs:Rcs",
     "duobench": "vlagents_ray.envs.rcs:DuoBench",
 }
@@ -87,6 +90,8 @@ _EXTRAS = {
     "libero": "libero",
     "robosuite": "libero",
     "gym_pusht": "pusht",
+    "gym_aloha": "aloha",
+    "dm_control": "aloha",
     "gymnasium_robotics": "robotics",
     "mujoco": "robotics",
     "opentelemetry": "otel",
@@ -200,12 +205,17 @@ def env_class(name: str) -> type[Any]:
 
 def env_suite(name: str) -> str:
     """The registered part of an env's name: "maniskill" of "maniskill/PushCube-v1"."""
-    return name if ":" in name else name.partition("/")[0]
+    return name if _is_class(name) else name.partition("/")[0]
 
 
 def env_task(name: str) -> str | None:
     """The task within the suite: "PushCube-v1" of "maniskill/PushCube-v1"; None if not given."""
-    return None if ":" in name else name.partition("/")[2] or None
+    return None if _is_class(name) else name.partition("/")[2] or None
+
+
+def _is_class(name: str) -> bool:
+    """Whether an env's name is "module:Class"; a task may hold a colon, too, as in "hub/USER/REPO@COMMIT:FILE"."""
+    return ":" in name and name.partition("/")[0] not in ENVS
 
 
 def named_class(name: str, known: dict[str, str], unknown: type[ConfigError] = ConfigError) -> type[Any]:

@@ -15,7 +15,7 @@ from vlagents_ray.envs.rendering.graphics import Renderer
 from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.interface import Act, Obs
 
-__all__ = ["BatchEnv", "Options", "SequentialBatch", "Steps", "episodes_of", "make_batch"]
+__all__ = ["BatchEnv", "Options", "SequentialBatch", "Steps", "episodes_of", "images_in_rows", "make_batch"]
 
 
 def make_batch(name: str, num_envs: int, **options: Any) -> BatchEnv:
@@ -117,9 +117,15 @@ class SequentialBatch(BatchEnv):
         shown = seen[min(moved)].cameras
         if not shown:
             return seen
-        cameras = [obs.cameras if i in moved else {**shown, **obs.cameras} for i, obs in enumerate(seen)]
-        images = {name: np.stack([one[name] for one in cameras]) for name in shown}
-        return [replace(obs, cameras={name: rows[i] for name, rows in images.items()}) for i, obs in enumerate(seen)]
+        return images_in_rows(
+            [obs if i in moved else replace(obs, cameras={**shown, **obs.cameras}) for i, obs in enumerate(seen)]
+        )
+
+
+def images_in_rows(seen: Sequence[Obs]) -> list[Obs]:
+    """Return observations with the images of each camera, which all of them have, as rows of one array."""
+    images = {name: np.stack([obs.cameras[name] for obs in seen]) for name in seen[0].cameras}
+    return [replace(obs, cameras={name: rows[i] for name, rows in images.items()}) for i, obs in enumerate(seen)]
 
 
 def _begun(env: EvalEnv, seed: int, options: Options | None) -> Obs:

@@ -17,6 +17,7 @@ EXPERTS: dict[str, str] = {
     "tabletop": "vlagents_ray.policies.experts.tabletop:TabletopExpert",
     "maniskill/PushCube-v1": "vlagents_ray.policies.experts.maniskill:PushCube",
     "maniskill/PickCube-v1": "vlagents_ray.policies.experts.maniskill:PickCube",
+    "aloha": "vlagents_ray.policies.experts.aloha:AlohaExpert",
     "metaworld": "vlagents_ray.policies.experts.metaworld:MetaWorldExpert",
     "rcs/pick": "vlagents_ray.policies.experts.rcs:RcsPick",
     "gymnasium/FetchReach-v4": "vlagents_ray.policies.experts.fetch:FetchReach",
