@@ -20,7 +20,9 @@ const VIEWS = {
   "<f8": Float64Array,
 } as const;
 
-export type TypedArray = InstanceType<(typeof VIEWS)[DType]>;
+export type TypedArray =
+  | Int8Array | Int16Array | Int32Array | BigInt64Array | Uint8Array | Uint16Array | Uint32Array | BigUint64Array
+  | Float32Array | Float64Array;
 
 /** An array of numbers or booleans; its last axis is the fastest. */
 export class NdArray {
