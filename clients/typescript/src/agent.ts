@@ -163,23 +163,13 @@ export class RemoteAgent {
   /** Make sure that the session is at the connection: move it there, or begin it again. */
   private async here(episode: Episode, ends: number, resumed: () => void): Promise<void> {
     if (this.held !== undefined && this.moving) {
-      const old = this.held;
-      this.connection = undefined;
-      this.held = this.connection = await this.connected(ends).catch((error) => {
-        this.connection = old; // the old replica still answers, or says that it does not
-        throw error;
-      });
-      this.moving = false;
-      old.close();
+      this.held = await this.connected(ends); // with the same session and step: it moves there with its state
       return;
     }
     if (this.held?.isOpen) return;
-    if (this.held !== undefined && !this.options.resume) {
-      this.held = undefined;
+    this.held = undefined;
+    if (!this.options.resume) {
       throw new ConnectionLost("the connection was lost, and with it the session; reset it", "connection_lost");
-    }
-    if (this.held === undefined && !this.options.resume) {
-      throw new UnknownSession("the session was lost with its connection; reset it", "unknown_session");
     }
     await this.begin(episode, ends);
     resumed();
@@ -212,10 +202,11 @@ export class RemoteAgent {
 
   /** Return an open connection, a new one if need be. */
   private async connected(ends: number): Promise<Connection> {
-    if (this.connection?.isOpen) return this.connection;
-    this.connection = undefined;
-    this.moving = false;
+    const old = this.connection;
+    if (old?.isOpen && !this.moving) return old;
     this.connection = await connect(this.server, this.options.transport, Math.max(1, ends - Date.now()));
+    this.moving = false;
+    old?.close();
     return this.connection;
   }
 
