@@ -44,7 +44,7 @@ interface Episode {
 
 const GRACE_MS = 250; // the answer to a deadline that passed is waited for so much longer
 const CLOSE_MS = 1000;
-const RETRY_MS = 200;
+const RETRY_MS = 100;
 const MOST_HISTORY = 256;
 
 /** A session of a policy: one robot or one environment. It makes one call at a time. */

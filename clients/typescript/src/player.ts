@@ -70,9 +70,8 @@ export class ChunkPlayer {
         this.ask(obs); // the chunk came too late to have a row for this tick
         await this.take();
       }
-    } else if (this.asked === undefined && this.left() <= (this.options.ahead ?? 0)) {
-      this.ask(obs);
     }
+    if (this.asked === undefined && this.left() <= (this.options.ahead ?? 0)) this.ask(obs);
     const { answer, number, at } = this.plan!;
     const row = this.tick - at;
     this.tick += 1;

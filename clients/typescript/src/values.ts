@@ -1,6 +1,6 @@
 /** Values of a message: JSON with references to binary blobs for what JSON does not have. */
 
-import { InvalidInput, MalformedMessage } from "./errors.js";
+import { InvalidInput, InvalidObservation, MalformedMessage } from "./errors.js";
 
 export type DType =
   | "|b1" | "|i1" | "<i2" | "<i4" | "<i8" | "|u1" | "<u2" | "<u4" | "<u8" | "<f2" | "<f4" | "<f8";
@@ -79,7 +79,7 @@ export class ValueWriter {
     if (value instanceof ImageFile) return { $: ["img", this.blob(value.file)] };
     const { height, width, data } = value;
     if (!(data instanceof Uint8Array) || data.length !== height * width * 3) {
-      throw new InvalidInput(
+      throw new InvalidObservation(
         `camera '${name}': got ${data?.length} bytes, want ${height} x ${width} x 3 of RGB, or new ImageFile(bytes)`,
         "invalid_observation",
       );
@@ -143,8 +143,8 @@ export class ValueReader {
       if (first === "nan") return Number.NaN;
       if (first === "inf" || first === "-inf") return first === "inf" ? Infinity : -Infinity;
     }
-    if (kind === "bin" && reference.length === 2) return this.blob(first).slice();
-    if (kind === "img" && reference.length === 2) return new ImageFile(this.blob(first).slice());
+    if (kind === "bin" && reference.length === 2) return new Uint8Array(this.blob(first));
+    if (kind === "img" && reference.length === 2) return new ImageFile(new Uint8Array(this.blob(first)));
     if (kind === "nd" && reference.length === 4) return readArray(this.blob(first), dtype, shape);
     throw malformed(`reference: got ${show(node)}, want 'nd', 'img', 'bin' or 'float'`);
   }
@@ -169,8 +169,8 @@ function readArray(data: Uint8Array, dtype: unknown, shape: unknown): NdArray {
   if (sizes.reduce((all, n) => all * n, View.BYTES_PER_ELEMENT) !== data.length) {
     throw malformed(`array: got ${data.length} bytes, want [${sizes}] of ${dtype}`);
   }
-  const copy = data.slice(); // typed arrays must begin at a multiple of their size
-  return new NdArray(dtype as DType, sizes, new View(copy.buffer, copy.byteOffset, data.length / View.BYTES_PER_ELEMENT));
+  const copy = new Uint8Array(data); // typed arrays must begin at a multiple of their size; `slice` of a Buffer copies nothing
+  return new NdArray(dtype as DType, sizes, new View(copy.buffer, 0, data.length / View.BYTES_PER_ELEMENT));
 }
 
 function bytesOf(data: TypedArray): Uint8Array {
