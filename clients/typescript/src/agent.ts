@@ -144,6 +144,7 @@ export class RemoteAgent {
 
   /** Begin the episode, at a server that may not be ready yet. */
   private async begin(episode: Episode, ends: number): Promise<Record<string, Value>> {
+    let why: unknown; // it could not be begun so far
     for (;;) {
       try {
         const connection = await this.connected(ends);
@@ -154,6 +155,8 @@ export class RemoteAgent {
         return reply.info ?? {};
       } catch (error) {
         const wait = waitOf(error, this.options.resume && this.episode === episode);
+        if (!(error instanceof Unreachable)) why = error;
+        else if (why !== undefined && ends - Date.now() < RETRY_MS) throw why; // not that time ran out in another try
         if (wait === undefined || Date.now() + wait >= ends) throw error;
         await pause(wait, ends);
       }

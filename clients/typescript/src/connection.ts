@@ -88,7 +88,7 @@ async function ask(
     response = await fetch(url, { ...options, signal, redirect: "error" });
     body = new Uint8Array(await response.arrayBuffer());
   } catch (error) {
-    if (signal.aborted) throw late(url, timeoutMs);
+    if (signal.aborted && sent) throw late(url, timeoutMs);
     const cause = error instanceof Error && error.cause !== undefined ? error.cause : error;
     const detail = `${url}: ${String(cause)}; is the server running?`;
     throw sent ? new ConnectionLost(detail, "connection_lost") : new Unreachable(detail, "unavailable");

@@ -1,10 +1,13 @@
 // A server that answers as a test says, on a port of its own.
 
+import assert from "node:assert/strict";
 import { createServer } from "node:http";
 
 import { WebSocketServer } from "ws";
 
-import { pack, unpack, ValueReader } from "vlagents-ray";
+import { pack, RemoteAgent, unpack, ValueReader } from "vlagents-ray";
+
+export const LONG_MS = 20000;
 
 /** The frame of a reply; an action becomes its blob. */
 export function reply(node, action) {
@@ -21,7 +24,7 @@ export function reply(node, action) {
 export async function fakeServer({ http, stream = answer, metadata = {}, sockets = () => undefined } = {}) {
   const requests = []; // the headers of all messages
   const server = createServer((request, response) => {
-    if (http?.(request, response, url)) return;
+    if (http?.(request, response)) return;
     response.setHeader("content-type", "application/json");
     response.end(JSON.stringify({ protocol: 1, contract: null, stream: null, ...metadata }));
   });
@@ -57,3 +60,22 @@ export function answer(message, socket, number) {
 export function fail(message, socket, error, more = {}) {
   socket.send(reply({ request_id: message.request_id, error, ...more }));
 }
+
+/** Run a test with a fake server and a client of it. */
+export async function with_(server, options, body) {
+  const fake = await fakeServer(server);
+  const agent = new RemoteAgent(fake.url, { timeoutMs: LONG_MS, ...options });
+  try {
+    await body(agent, fake);
+  } finally {
+    await agent.close();
+    await fake.close();
+  }
+}
+
+/** Fails unless the promise is rejected with that error. */
+export const thrown = (promise, kind, code) => assert.rejects(promise, (error) => {
+  assert.ok(error instanceof kind, `${error.name}: ${error.message}`);
+  assert.equal(error.code, code);
+  return true;
+});

@@ -2,37 +2,16 @@
 
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
-import { createServer } from "node:net";
 import { test } from "node:test";
 
 import {
-  ChunkPlayer, ConnectionLost, DeadlineExceeded, InvalidInput, InvalidObservation, MessageTooLarge, NoReplica, NotReset,
+  ConnectionLost, DeadlineExceeded, InvalidInput, InvalidObservation, MessageTooLarge, NoReplica, NotReset,
   OutcomeUnknown, Overloaded, PolicyFailed, PolicyUnavailable, RemoteAgent, Unauthorized, UnknownSession, VLAgentsError,
 } from "vlagents-ray";
 
-import { answer, fail, fakeServer, reply } from "./fake-server.mjs";
+import { answer, fail, fakeServer, LONG_MS, reply, thrown, with_ } from "./fake-server.mjs";
 
 const golden = new URL("../../golden/", import.meta.url);
-const LONG_MS = 20000;
-
-/** Run a test with a fake server and a client of it. */
-async function with_(server, options, body) {
-  const fake = await fakeServer(server);
-  const agent = new RemoteAgent(fake.url, { timeoutMs: LONG_MS, ...options });
-  try {
-    await body(agent, fake);
-  } finally {
-    await agent.close();
-    await fake.close();
-  }
-}
-
-const thrown = (promise, kind, code) => assert.rejects(promise, (error) => {
-  assert.ok(error instanceof kind, `${error.name}: ${error.message}`);
-  assert.equal(error.code, code);
-  assert.equal(error.name, kind === VLAgentsError ? "VLAgentsError" : error.name);
-  return true;
-});
 
 test("a wrong url, and act before reset, are refused without a server", async () => {
   assert.throws(() => new RemoteAgent("gpu-box:8000"), InvalidInput);
@@ -240,32 +219,6 @@ test("a server that is gone for good ends the act with its deadline", async () =
   await agent.close();
 });
 
-test("a server that froze is left after five seconds without a sign of it", async () => {
-  let frozen;
-  const stream = (message, socket, number) => {
-    if (message.op !== "act" || number > 0) return answer(message, socket, number);
-    frozen ??= socket._socket.pause(); // it reads no more, and answers no ping
-  };
-  await with_({ stream }, {}, async (agent, fake) => {
-    await agent.reset({});
-    while (fake.connections() === 1) await agent.act({}, 1500).catch((error) => assert.ok(error instanceof DeadlineExceeded));
-    assert.deepEqual([...(await agent.act({})).rows[0]], [1]);
-  });
-});
-
-test("a stream that cannot be reached is replaced by the path through the proxy", async () => {
-  const deaf = createServer(() => undefined); // accepts, and says nothing
-  await new Promise((resolve) => deaf.listen(0, "127.0.0.1", resolve));
-  for (const port of [9, deaf.address().port]) {
-    await with_({ metadata: { stream: { port, path: "/v1/stream/x" } } }, {}, async (agent) => {
-      await agent.reset({});
-      assert.equal(agent.transport, "websocket");
-    });
-  }
-  deaf.close();
-  deaf.unref();
-});
-
 test("what is wrong on this side is said before it is sent", async () => {
   await with_({}, {}, async (agent, fake) => {
     await agent.reset({});
@@ -299,46 +252,4 @@ test("over HTTP, an answer that is no frame is an error, and a lost answer begin
     assert.deepEqual(asked, ["/v1/reset", "/v1/act", "/v1/reset", "/v1/act"]);
     await thrown(agent.act({}), InvalidInput, "malformed");
   });
-});
-
-test("a player plays the rows of a chunk in order, and the next one is asked for in time", async () => {
-  let asked = 0;
-  const agent = {
-    reset: async () => ({}),
-    close: async () => undefined,
-    act: async () => {
-      const number = asked++;
-      const rows = [0, 1, 2, 3].map((row) => Float32Array.of(number, row));
-      return { rows, done: number === 2, info: {}, timing: {}, resumed: false };
-    },
-  };
-  const player = new ChunkPlayer(agent, { ahead: 2 });
-  await player.reset({});
-  const played = [];
-  for (let tick = 0; tick < 8; tick++) {
-    const { action, chunk, row, ageTicks, done } = await player.act({});
-    assert.deepEqual([chunk, row, ageTicks], [...action, action[1]]);
-    played.push([...action, done]);
-  }
-  // The second chunk was asked for with two rows left, at the third tick: its first two rows had passed by then.
-  const want = [[0, 0], [0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 2], [2, 3]];
-  assert.deepEqual(played, want.map(([chunk, row]) => [chunk, row, chunk === 2 && row === 3]));
-  assert.throws(() => new ChunkPlayer(agent, { ahead: -1 }), InvalidInput);
-});
-
-test("a player says what failed where the rows are over, and goes on after it", async () => {
-  let fails = false;
-  const agent = {
-    act: async () => {
-      if (fails) throw new PolicyFailed("no", "policy_failed");
-      return { rows: [0, 1].map((row) => Float32Array.of(row)), done: false, info: {}, timing: {}, resumed: false };
-    },
-  };
-  const player = new ChunkPlayer(agent, { ahead: 1 });
-  await player.act({});
-  fails = true;
-  assert.equal((await player.act({})).row, 1);
-  await thrown(player.act({}), PolicyFailed, "policy_failed");
-  fails = false;
-  assert.equal((await player.act({})).row, 0);
 });
