@@ -45,7 +45,7 @@ export async function connect(server: Server, transport: "websocket" | "http", t
   const metadata = await readMetadata(server, timeoutMs);
   if (transport === "http") return new HttpConnection(server, metadata);
   const address = new URL(server.url.replace(/^http/, "ws"));
-  if (metadata.stream) {
+  if (metadata.stream && address.protocol === "ws:") { // the port is not encrypted
     const own = `ws://${address.hostname}:${metadata.stream.port}${metadata.stream.path}`;
     try {
       return await openWebSocket(own, "stream", server, metadata, Math.min(OWN_PORT_MS, ends - Date.now()));
