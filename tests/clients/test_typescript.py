@@ -52,7 +52,9 @@ def test_it_passes_its_tests_with_the_golden_files_and_with_servers_that_fail_or
     client: Path, servers: dict[str, str]
 ) -> None:
     files = sorted(str(file.relative_to(client)) for file in (client / "test").glob("*.test.mjs"))
-    assert passed(node(client, "--test", "--test-reporter=tap", "--test-concurrency=4", *files, environment=servers)) > 0
+    assert (
+        passed(node(client, "--test", "--test-reporter=tap", "--test-concurrency=4", *files, environment=servers)) > 0
+    )
 
 
 def test_its_example_runs(client: Path, servers: dict[str, str]) -> None:

@@ -141,7 +141,7 @@ class Chunks(Agent):
     def act(self, obs: Obs) -> Act:
         if obs.info.get("fail"):
             raise RuntimeError("no")
-        return Act(np.ones((2, 3)), info={"nan": np.nan, "raw": b"\0", "pixels": {k: v for k, v in obs.cameras.items()}})
+        return Act(np.ones((2, 3)), info={"nan": np.nan, "raw": b"\0", "pixels": dict(obs.cameras)})
 
 
 def test_what_a_server_answers_is_what_the_schema_says() -> None:

@@ -1,4 +1,4 @@
-"""The servers with which clients in other languages are tested, over a policy of their own in this process, without Ray."""
+"""Servers for the tests of clients in other languages, over a policy of their own in this process, without Ray."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ ROWS = 4
 class Told(Agent):
     """Acts with what it was told, so that a client can say whether all of it arrived.
 
-    Each of the ROWS rows of its chunk has: the acts of the episode so far, the row's number, the gripper, the mean of the
-    camera `front`, and the first number of the state `joints`; -1 for what is missing.
+    Each of the ROWS rows of its chunk has: the acts of the episode so far, the row's number, the gripper, the mean of
+    the camera `front`, and the first number of the state `joints`; -1 for what is missing.
     """
 
     @property
@@ -59,8 +59,8 @@ class Told(Agent):
 def client_servers() -> Iterator[dict[str, str]]:
     """Yield the variables that the tests of a client read.
 
-    VLAGENTS_TEST_URL: a server whose replica has a port of its own; VLAGENTS_TEST_PROXIED_URL: the same policy without that
-    port; VLAGENTS_TEST_KEYED_URL: the same behind API keys, of which VLAGENTS_TEST_KEY is one.
+    VLAGENTS_TEST_URL: a server whose replica has a port of its own; VLAGENTS_TEST_PROXIED_URL: the same policy without
+    that port; VLAGENTS_TEST_KEYED_URL: the same behind API keys, of which VLAGENTS_TEST_KEY is one.
     """
     engine = Engine(Told())
     own = WebSocketServer(engine, DEFAULT_LIMITS, "127.0.0.1", None, NoKey.OPEN)
