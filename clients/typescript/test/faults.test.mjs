@@ -50,10 +50,10 @@ for (const [status, type, body, kind, code] of [
 ]) {
   test(`metadata with status ${status}, ${type}, ${body} is the error ${code}`, async () => {
     const http = (request, response) => {
-      response.writeHead(status, { "content-type": type }).end(body);
+      response.writeHead(status, { "content-type": type, "retry-after": "1000" }).end(body); // longer than it waits
       return true;
     };
-    await with_({ http }, { timeoutMs: 400 }, (agent) => thrown(agent.reset({}), kind, code));
+    await with_({ http }, {}, (agent) => thrown(agent.reset({}), kind, code));
   });
 }
 
@@ -215,7 +215,7 @@ test("a server that is gone for good ends the act with its deadline", async () =
   const agent = new RemoteAgent(fake.url, { timeoutMs: LONG_MS });
   await agent.reset({});
   await fake.close();
-  await thrown(agent.act({}, 700), PolicyUnavailable, "unavailable");
+  await assert.rejects(agent.act({}, 700), PolicyUnavailable);
   await agent.close();
 });
 

@@ -10,14 +10,16 @@ import { answer, with_ } from "./fake-server.mjs";
 
 test("a server that froze is left after five seconds without a sign of it", async () => {
   let frozen;
+  const errors = [];
   const stream = (message, socket, number) => {
     if (message.op !== "act" || number > 0) return answer(message, socket, number);
     frozen ??= socket._socket.pause(); // it reads no more, and answers no ping
   };
   await with_({ stream }, {}, async (agent, fake) => {
     await agent.reset({});
-    while (fake.connections() === 1) await agent.act({}, 1500).catch((error) => assert.ok(error instanceof DeadlineExceeded));
-    assert.deepEqual([...(await agent.act({})).rows[0]], [1]);
+    while (fake.connections() === 1) await agent.act({}, 1500).catch((error) => errors.push(error));
+    assert.ok(errors[0] instanceof DeadlineExceeded);
+    assert.equal((await agent.act({})).rows[0][0], fake.connections() - 1);
   });
 });
 
