@@ -61,6 +61,8 @@ class Driver {
   Json operator()(const Json& asked) {
     const std::string what = asked["do"];
     if (what == "decode") return decode(from_hex(asked["data"]));
+    if (what == "reply") return reply(from_hex(asked["data"]));
+    if (what == "jpeg") return to_hex(detail::prepared(observation(asked["obs"]), asked["quality"]).cameras.at("front").data);
     if (what == "connect") return connect(asked);
     if (what == "metadata") return client_->metadata();
     if (what == "reset") {
@@ -123,6 +125,15 @@ class Driver {
             {"blobs", blobs},
             {"same", again.header == frame.header && again.blobs == frame.blobs},
             {"values", detail::resolved(frame.header, frame.blobs)}};
+  }
+
+  // A reply as `act`, `reset` and `close` read it.
+  static Json reply(const Bytes& data) {
+    const detail::Frame frame = detail::decode_frame(data);
+    const auto error = frame.header.find("error");
+    if (error != frame.header.end()) throw detail::stated_error(*error, "internal", "");
+    if (!frame.header.contains("info")) return shown(detail::decode_act(frame));
+    return {{"info", detail::resolved(detail::object_at(frame.header, "info"), frame.blobs)}};
   }
 
   std::unique_ptr<Client> client_;

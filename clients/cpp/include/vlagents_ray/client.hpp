@@ -25,7 +25,7 @@ struct Options {
   double timeout_s = 30.0;        // what one call may take, reconnecting included; 2 to 5 for a robot
   int jpeg_quality = 90;          // 1 to 100 of raw images, colours at full resolution; 0 sends raw pixels
   bool resume = true;             // begin the session again where its connection was lost
-  std::size_t history = 16;       // observations that are kept for that, at most 256
+  std::size_t history = 16;       // observations that are kept for that, if the policy's contract wants no fewer; at most 256
   std::string rank = "robot";     // or "simulation", which robots go before
   std::string session;            // 1 to 128 visible ASCII characters; "" makes a UUID
   Json contract;                  // what the robot gives and takes; the server compares it with the policy's
@@ -141,11 +141,13 @@ class Client {
   static constexpr double life_s = 1.0;    // for a sign of life, after a call without an answer
 
   /// A connection to where the metadata says by now: the replica's own port, or the server's.
-  std::unique_ptr<detail::Connection> open(const detail::Deadline& deadline) const {
+  std::unique_ptr<detail::Connection> open(const detail::Deadline& deadline) {
     const Json metadata = detail::get_json(url_, "/v1/metadata", headers_, deadline);
     const auto version = detail::number_at(metadata, "protocol", 1000);
     if (version && *version != detail::protocol_version)
       throw Error("malformed", "got version " + std::to_string(*version) + " of the protocol, want 1; update the client");
+    const auto wanted = detail::number_at(detail::object_at(metadata, "contract"), "history", options_.history);
+    kept_ = wanted ? static_cast<std::size_t>(*wanted) : options_.history;
     const Json stream = detail::object_at(metadata, "stream");
     const auto port = detail::number_at(stream, "port", 65535);
     const auto path = detail::text_at(stream, "path");
@@ -234,7 +236,7 @@ class Client {
     episode_.later.push_back(std::move(obs));
     std::size_t bytes = detail::size_of(episode_.first);
     for (const Observation& each : episode_.later) bytes += detail::size_of(each);
-    for (; !episode_.later.empty() && (episode_.later.size() > options_.history || bytes > most_history);
+    for (; !episode_.later.empty() && (episode_.later.size() > kept_ || bytes > most_history);
          episode_.later.pop_front())
       bytes -= detail::size_of(episode_.later.front());
   }
@@ -257,6 +259,7 @@ class Client {
   std::optional<std::string> step_;
   std::optional<std::uint64_t> silent_since_;  // messages received when a call was not answered at all
   std::uint64_t requests_ = 0;
+  std::size_t kept_ = 0;  // observations for a session that begins again: as many as the policy's contract looks at
   bool begun_ = false;
   bool draining_ = false;
 };
