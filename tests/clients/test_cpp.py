@@ -162,14 +162,13 @@ def plain(meaning: Any) -> Any:
             return {key: plain(value) for key, value in meaning.items()}
 
 
-def stated(node: Any) -> Any:
-    """Without what a meaning adds to a frame: defaults."""
-    left_out: dict[str, Any] = {"gripper": None, "state": {}, "cameras": {}, "info": {}, "instruction": None}
-    if isinstance(node, list):
-        return [stated(each) for each in node]
-    if not isinstance(node, dict):
-        return node
-    return {k: stated(v) for k, v in node.items() if k != "blobs" and not (k in left_out and v == left_out[k])}
+def states(found: Any, meaning: Any) -> bool:
+    """Does a value of a frame say all that a meaning does? It may have further keys, and lack what is a default."""
+    if isinstance(meaning, dict) and isinstance(found, dict):
+        return all(states(found.get(key), value) for key, value in meaning.items())
+    if isinstance(meaning, list) and isinstance(found, list):
+        return len(found) == len(meaning) and all(map(states, found, meaning))
+    return bool(found == meaning or (found is None and meaning in ({}, None)))
 
 
 @pytest.mark.parametrize("entry", FRAMES, ids=lambda entry: Path(entry["file"]).stem)
@@ -182,10 +181,8 @@ def test_golden_frames_are_read_with_their_meaning(entry: dict[str, Any], shared
     assert frame["same"]
     meaning = json.loads((GOLDEN / entry["meaning"]).read_text())
     values = frame["values"]
-    got = values.get("requests") or values.get("replies") or [values]
-    for one, wanted in zip(got, meaning, strict=True):
-        wanted, found = stated(plain(wanted)), stated(one)
-        assert {key: found.get(key) for key in wanted} == wanted
+    found = values.get("requests") or values.get("replies") or [values]
+    assert states(found, plain(meaning)), (found, plain(meaning))
     if "error" in meaning[0]:
         error = refused(shared_driver, "reply", data=data)
         wanted = meaning[0]["error"]
@@ -270,9 +267,12 @@ def test_errors_of_the_server_have_its_code(server: Replica, programs: Path) -> 
         client.reset()
         assert refused(client, obs={"gripper": 1e300}).code == "invalid_observation"
         assert client.act(info={"value": 4})["values"][0] == 4  # the session goes on
-        with pytest.raises(CppError) as error:
-            client.act(cameras={"front": {"rgb": 0, "height": 3000, "width": 2000}}, info={"raw": True})
-        assert error.value.code in ("too_large", "invalid_input")
+        assert refused(client, obs={"cameras": {"front": {"rgb": 0, "height": 0, "width": 9}}}).code == "invalid_input"
+    with CppClient(programs, server.url, jpeg_quality=0) as client:
+        client.reset()
+        large = {"cameras": {"front": {"rgb": 0, "height": 3000, "width": 2000}}}
+        assert refused(client, obs=large).code == "too_large"  # 18 MB, which are not sent
+        assert client.act(info={"value": 4})["values"][0] == 4
 
 
 def test_a_call_ends_at_its_time_and_the_next_one_goes_on(server: Replica, programs: Path) -> None:
@@ -426,8 +426,7 @@ def test_a_wrong_message_is_an_error_and_the_next_call_begins_again(sent: bytes,
         request = visit.request()
         if visit.number == 0:
             visit.raw(sent)
-            threading.Event().wait(20 if code == "outcome_unknown" else 0)
-            visit.socket.recv()
+            visit.watch()
         visit.answer(request)
 
     with scripted_server(script) as server, CppClient(programs, server.url, timeout_s=1.5, resume=False) as client:
@@ -462,9 +461,9 @@ def test_a_draining_replica_is_left_with_session_and_step(programs: Path) -> Non
         if visit.number == 0:
             visit.answer(visit.request(), step=2**62 + 1)
             visit.answer(visit.request(), step=2**62 + 2, draining=True)
-            for _ in visit.socket:
-                pass
+            visit.watch()
             ended.set()
+            return
         while True:
             visit.answer(visit.request(), step=2**62 + 3)
 
@@ -484,7 +483,7 @@ def test_a_silent_replica_is_left_at_the_next_call(programs: Path) -> None:
         visit.answer(visit.request())
         if visit.number == 0:
             visit.request()
-            threading.Event().wait(20)
+            visit.watch()
         obedient(visit)
 
     with scripted_server(script) as server, CppClient(programs, server.url, timeout_s=2.0) as client:
@@ -522,13 +521,13 @@ def test_an_error_of_a_full_server_is_not_retried(programs: Path) -> None:
     def script(visit: Visit) -> None:
         visit.answer(visit.request())
         request = visit.request()
-        visit.answer(request, act=None, error=Overloaded("full", retry_after_s=0.25))
+        visit.answer(request, act=None, error=Overloaded("full"))
         obedient(visit)
 
     with scripted_server(script) as server, CppClient(programs, server.url) as client:
         client.reset()
         error = refused(client)
-        assert (error.code, error.retry_after_s) == ("overloaded", 0.25)
+        assert (error.code, error.retry_after_s) == ("overloaded", 1.0)
         assert client.act()["values"] == [7]
         assert [request.op for request in server.visits[0].requests] == ["reset", "act", "act"]
 

@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import Any
 
 CLIENT = Path(__file__).parents[2] / "clients" / "cpp"
-_NEEDED = "#include <nlohmann/json.hpp>\n#include <cstdio>\n#include <jpeglib.h>\n"
+_NEEDED = "#if !__has_include(<nlohmann/json.hpp>) || !__has_include(<jpeglib.h>)\n#error missing\n#endif\n"
 _BUILD_S = 300
 _ANSWER_S = 60
 

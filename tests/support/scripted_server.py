@@ -46,6 +46,11 @@ class Visit:
     def answer(self, request: Request, **more: Any) -> None:
         self.socket.send(answer(request, **more))
 
+    def watch(self) -> None:
+        """Receive, and say nothing, until the client leaves."""
+        for _ in self.socket:
+            pass
+
     def raw(self, data: bytes) -> None:
         """Bytes past the WebSocket."""
         self.socket.socket.sendall(data)

@@ -64,15 +64,18 @@ class ChunkPlayer {
  private:
   std::optional<Command> next(const Observation& obs, bool wait) {
     std::unique_lock<std::mutex> lock(mutex_);
-    if (left() == 0 && answer_) take();
-    if (left() <= ahead_ && !asking_ && !answer_ && !failure_) ask(obs);
     while (left() == 0) {
-      if (!wait && asking_) return std::nullopt;
-      changed_.wait(lock, [this] { return !asking_; });
-      if (failure_) std::rethrow_exception(std::exchange(failure_, nullptr));
-      if (answer_) take();
-      if (left() == 0) ask(obs);  // all of its rows came too late
+      if (answer_) {
+        take();  // there may be none left: all of its rows came too late
+      } else if (failure_) {
+        std::rethrow_exception(std::exchange(failure_, nullptr));
+      } else {
+        if (!asking_) ask(obs);
+        if (!wait) return std::nullopt;
+        changed_.wait(lock, [this] { return !asking_; });
+      }
     }
+    if (left() <= ahead_ && !asking_ && !answer_ && !failure_) ask(obs);
     Command command;
     command.action = chunk_->row(at_);
     command.row = at_++;

@@ -85,6 +85,8 @@ class Client {
     const detail::Frame request = detail::act_request(sent);
     bool resumed = false;
     if (!answers(deadline)) drop();
+    if (connection_ == nullptr && !options_.resume)
+      throw Error("connection_lost", "the session ended with its connection; call reset");
     if (connection_ != nullptr && draining_) move(deadline);
     for (double pause_s = 0.05;; pause_s = std::min(2 * pause_s, 1.0)) {
       bool acting = connection_ != nullptr;
