@@ -28,7 +28,7 @@ std::string to_hex(const Bytes& bytes) {
   return text;
 }
 
-// {"cameras": {"front": {"rgb": VALUE, "height", "width"}} or {"file": HEX}, "state", "gripper", "info"}
+// {"cameras": {"front": {"rgb": VALUE or "pixels": HEX, "height", "width"} or {"file": HEX}}, "state", "gripper", "info"}
 Observation observation(const Json& asked) {
   Observation obs;
   const Json cameras = asked.value("cameras", Json::object());
@@ -39,7 +39,9 @@ Observation observation(const Json& asked) {
       continue;
     }
     const std::size_t height = image["height"], width = image["width"];
-    obs.cameras[name] = Image::rgb(Bytes(height * width * 3, image["rgb"].get<std::uint8_t>()), height, width);
+    obs.cameras[name] = image.contains("pixels")
+                            ? Image::rgb(from_hex(image["pixels"]), height, width)
+                            : Image::rgb(Bytes(height * width * 3, image["rgb"].get<std::uint8_t>()), height, width);
   }
   for (const auto& [name, values] : state.items()) obs.state[name] = values.get<std::vector<float>>();
   if (asked.contains("gripper")) obs.gripper = asked["gripper"].get<double>();
@@ -62,6 +64,7 @@ class Driver {
     const std::string what = asked["do"];
     if (what == "decode") return decode(from_hex(asked["data"]));
     if (what == "reply") return reply(from_hex(asked["data"]));
+    if (what == "request") return to_hex(detail::encode_frame(request(asked)));
     if (what == "jpeg") return to_hex(detail::prepared(observation(asked["obs"]), asked["quality"]).cameras.at("front").data);
     if (what == "connect") return connect(asked);
     if (what == "metadata") return client_->metadata();
@@ -125,6 +128,14 @@ class Driver {
             {"blobs", blobs},
             {"same", again.header == frame.header && again.blobs == frame.blobs},
             {"values", detail::resolved(frame.header, frame.blobs)}};
+  }
+
+  // What `reset` and `act` send, but for what names the session and the request.
+  static detail::Frame request(const Json& asked) {
+    if (asked["op"] == "act") return detail::act_request(observation(asked["obs"]));
+    detail::Episode episode{observation(asked["obs"]), asked["instruction"], asked.value("kwargs", Json::object()), {}};
+    for (const Json& each : asked.value("history", Json::array())) episode.later.push_back(observation(each));
+    return detail::reset_request(episode, asked.value("contract", Json()));
   }
 
   // A reply as `act`, `reset` and `close` read it.
