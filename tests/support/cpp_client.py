@@ -26,7 +26,11 @@ def no_compiler() -> str | None:
         ["c++", "-std=c++17", *_includes(), "-fsyntax-only", "-x", "c++", "-"],
         input=_NEEDED, text=True, capture_output=True, check=False,
     )  # fmt: skip
-    return None if found.returncode == 0 else "no nlohmann/json.hpp, or no jpeglib.h (Debian: nlohmann-json3-dev, libjpeg-dev)"
+    return (
+        None
+        if found.returncode == 0
+        else "no nlohmann/json.hpp, or no jpeglib.h (Debian: nlohmann-json3-dev, libjpeg-dev)"
+    )
 
 
 def _includes() -> list[str]:

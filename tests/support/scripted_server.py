@@ -6,7 +6,7 @@ import http
 import json
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -98,10 +98,8 @@ def scripted_server(script: Script) -> Iterator[ScriptedServer]:
     def handle(socket: ServerConnection) -> None:
         visit = Visit(socket, len(server.visits))
         server.visits.append(visit)
-        try:
+        with suppress(ConnectionClosed, OSError):
             script(visit)
-        except (ConnectionClosed, OSError):
-            pass
 
     with serve(
         handle, "127.0.0.1", 0, process_request=process_request, compression=None, max_size=None, close_timeout=1
