@@ -1,7 +1,7 @@
 """The golden files of the protocol, for clients in any language: `python tests/support/golden.py` writes them all.
 
-They lie in clients/golden, whose README.md says what each contains. Each frame is built here from its layout and from the
-meaning that is written beside it; tests/protocol/test_golden.py holds the codec of this package to both.
+They lie in clients/golden, whose README.md says what each contains. tests/protocol/test_golden.py holds the codec of
+this package to each frame's bytes, and to the meaning that is written beside it.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ def _requests() -> list[Golden]:
         "yes": True,
         "whole": -7,
         "half": 0.5,
-        "text": "Würfel 方块 🤖 \"quoted\" \\ \n",
+        "text": 'Würfel 方块 🤖 "quoted" \\ \n',
         "bytes": b"\x00\x01\xfe\xff\x80",
         "list": [1, [2.5, "three"], {}],
         "nan": math.nan,
@@ -182,7 +182,7 @@ def _requests() -> list[Golden]:
         Golden(name, "requests", says, encode_requests(requests), [of_request(one) for one in requests], by_codec=True)
         for name, (says, requests) in say.items()
     ]
-    return [*written, *(_with_file(*one) for one in (("png", png(PIXELS), PIXELS), ("jpeg", JPEG_FILE.read_bytes(), None)))]
+    return [*written, _with_file("png", png(PIXELS), PIXELS), _with_file("jpeg", JPEG_FILE.read_bytes(), None)]
 
 
 def _with_file(format_: str, file: bytes, pixels: np.ndarray | None) -> Golden:
@@ -194,7 +194,9 @@ def _with_file(format_: str, file: bytes, pixels: np.ndarray | None) -> Golden:
     means = {"op": "act", "request_id": format_, "obs": {"cameras": {"front": camera}, "gripper": None}}
     means["obs"] |= {"state": {"joints": joints}, "info": {}}  # type: ignore[operator]
     says = f"an act with a {format_.upper()} file, and a state as a list of numbers"
-    return _packed(f"act_{format_}", "requests", says, {"op": "act", "obs": obs, "request_id": format_}, [file], [means])
+    return _packed(
+        f"act_{format_}", "requests", says, {"op": "act", "obs": obs, "request_id": format_}, [file], [means]
+    )
 
 
 def _packed(

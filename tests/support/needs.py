@@ -21,6 +21,7 @@ from assets import assets
 from browser import CHROMIUM
 from cluster_hosts import no_hosts
 from cpp_client import no_compiler
+from typescript_client import node_version
 
 # Ray makes a session's folder in this one: in no process of the test does one start that finds a file in its place.
 _NO_RAY = "/dev/null/not-marked-ray"  # short: a longer name would be replaced, as sockets in it could not be named
@@ -59,6 +60,8 @@ def skip_what_is_missing(item: pytest.Item) -> None:
         pytest.skip(reason)
     if item.get_closest_marker("browser") and CHROMIUM is None:
         pytest.skip("no Chromium")
+    if item.get_closest_marker("node") and node_version() < 18:
+        pytest.skip("no Node.js 18 with npm")
     if item.get_closest_marker("vulkan"):
         from vlagents_ray.envs.maniskill import ManiSkill
 

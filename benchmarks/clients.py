@@ -1,0 +1,81 @@
+"""Round trips of the clients in other languages beside those of the Python client, in turns at one server.
+
+Each client is a process of its own, and all send the same pixels as they are. The client in TypeScript is built before:
+`cd clients/typescript && npm ci && npm run build`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import shutil
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from vlagents_ray.bench.clients import OwnClient, connected, observation
+from vlagents_ray.bench.line_process import Driver, LineProcess, ProcessDriver
+from vlagents_ray.bench.rtt import POLICY, RoundTripsOfAll, in_turns
+from vlagents_ray.cli.bench import Json, show_round_trips
+from vlagents_ray.cli.console import errors, progress, save
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.interface import Obs
+from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.server import running_server
+
+TYPESCRIPT = Path(__file__).parents[1] / "clients" / "typescript"
+PYTHON = (OwnClient("websocket", "raw"), OwnClient("http", "raw"))
+NODE = {"Node.js, websocket": "websocket", "Node.js, http": "http"}
+
+
+def measure_clients(url: str, calls: int, progress: Callable[[str], None] = lambda _: None) -> RoundTripsOfAll:
+    """Measure `calls` round trips of each client at the server of `url`.
+
+    Raises:
+        ConfigError: Node.js is missing, or the client was not built.
+    """
+    node = shutil.which("node")
+    if node is None or not (TYPESCRIPT / "dist" / "index.js").exists():
+        raise ConfigError(f"clients: want Node.js 18, and `npm ci && npm run build` in {TYPESCRIPT}")
+    with contextlib.ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        _save(observation(), folder)
+        drivers: dict[str, Driver] = {
+            f"Python, {one.transport}": stack.enter_context(connected(one, url, "")) for one in PYTHON
+        }
+        script = str(Path(__file__).with_name("node_client.mjs"))
+        for name, transport in NODE.items():
+            command = [node, script, str(TYPESCRIPT / "dist" / "index.js"), url, transport, str(folder)]
+            drivers[name] = ProcessDriver(stack.enter_context(LineProcess(name, command)))
+        for driver in drivers.values():
+            driver.ready()
+        return RoundTripsOfAll(tuple(in_turns(drivers, calls, progress).values()))
+
+
+def _save(obs: Obs, folder: Path) -> None:
+    """Write what a client in any language reads: the pixels of each camera, and the rest as JSON."""
+    cameras = {}
+    for name, image in obs.cameras.items():
+        (folder / name).write_bytes(image.tobytes())
+        cameras[name] = image.shape[:2]
+    state = {name: part.tolist() for name, part in obs.state.items()}
+    (folder / "obs.json").write_text(json.dumps({"cameras": cameras, "gripper": obs.gripper, "state": state}))
+
+
+def main(
+    calls: Annotated[int, typer.Option(min=1, help="Acts of each client.")] = 2000, json_file: Json = None
+) -> None:
+    """Round trips of the clients in other languages, beside the Python client's."""
+    with errors():
+        with running_server(deployment(POLICY), host="127.0.0.1") as server:
+            [url] = server.apps.values()
+            found = measure_clients(url, calls, progress).to_json()
+        show_round_trips(found, "one act, raw pixels, on one machine")
+        save(found, json_file)
+
+
+if __name__ == "__main__":
+    typer.run(main)

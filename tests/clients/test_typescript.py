@@ -1,0 +1,77 @@
+"""The TypeScript client, by its own tests: golden files, a server that fails as told, and servers of this project."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import typescript_client
+from client_servers import client_servers
+
+pytestmark = pytest.mark.node
+
+
+@pytest.fixture(scope="module")
+def client() -> Path:
+    return typescript_client.build()
+
+
+@pytest.fixture(scope="module")
+def servers() -> Iterator[dict[str, str]]:
+    with client_servers() as urls:
+        yield urls
+
+
+def node(client: Path, *words: str, environment: dict[str, str] | None = None) -> str:
+    """What a script says; raises with all of it if it fails."""
+    named = {name: value for name, value in os.environ.items() if name != "VLAGENTS_RAY_API_KEY"}
+    done = subprocess.run(
+        [str(typescript_client.NODE), *words],
+        cwd=client,
+        env=named | (environment or {}),
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def passed(said: str) -> int:
+    """How many tests passed, of which none was left out."""
+    counts = dict(line.removeprefix("# ").split(" ", 1) for line in said.splitlines() if line.startswith("# "))
+    assert [counts[word] for word in ("fail", "cancelled", "skipped", "todo")] == ["0"] * 4
+    return int(counts["pass"])
+
+
+def test_it_passes_its_tests_with_the_golden_files_and_with_servers_that_fail_or_are_real(
+    client: Path, servers: dict[str, str]
+) -> None:
+    files = sorted(str(file.relative_to(client)) for file in (client / "test").glob("*.test.mjs"))
+    assert (
+        passed(node(client, "--test", "--test-reporter=tap", "--test-concurrency=4", *files, environment=servers)) > 0
+    )
+
+
+def test_its_example_runs(client: Path, servers: dict[str, str]) -> None:
+    said = node(client, "examples/loop.mjs", servers["VLAGENTS_TEST_URL"], "--ticks", "12")
+    assert "12 ticks" in said
+
+
+def test_the_package_has_what_its_users_need_and_nothing_else(client: Path) -> None:
+    said = subprocess.run(
+        [str(typescript_client.NPM), "pack", "--dry-run", "--ignore-scripts", "--json"],
+        cwd=client,
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    assert '"dist/index.js"' in said
+    assert '"dist/index.d.ts"' in said
+    assert '"README.md"' in said
+    assert "test/" not in said
+    assert "node_modules" not in said
