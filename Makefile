@@ -39,7 +39,7 @@ TEST_PROCESSES ?= 2
 # Quick tests wait for a third of their time.
 CHECK_PROCESSES ?= 3
 # Marked so: what wants more than Python, takes long, or wants the machine for itself (pyproject.toml, tests/support/needs.py).
-NOT_QUICK := ray or server or hosts or sim or vulkan or torch or gpu or browser or node or alone or slow
+NOT_QUICK := ray or server or hosts or sim or vulkan or torch or gpu or browser or node or compiler or alone or slow
 # Environments of model families: requirements/NAME.txt, in $(VENV)-NAME. What is tested in each is in tests/families,
 # in folders of the family's name. Those whose code is on no package index want its source, too: OPENPI_SRC, OPENVLA_SRC,
 # OPENVLA_OFT_SRC, OCTO_SRC, DIFFUSION_POLICY_SRC, VJEPA2_SRC.

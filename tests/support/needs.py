@@ -20,6 +20,7 @@ import pytest
 from assets import assets
 from browser import CHROMIUM
 from cluster_hosts import no_hosts
+from cpp_client import no_compiler
 from typescript_client import node_version
 
 # Ray makes a session's folder in this one: in no process of the test does one start that finds a file in its place.
@@ -54,6 +55,8 @@ def skip_what_is_missing(item: pytest.Item) -> None:
         if assets(simulator) is None:
             pytest.skip(f"no assets of {simulator}: VLAGENTS_RAY_ASSETS names their folder")
     if item.get_closest_marker("hosts") and (reason := no_hosts()):
+        pytest.skip(reason)
+    if item.get_closest_marker("compiler") and (reason := no_compiler()):
         pytest.skip(reason)
     if item.get_closest_marker("browser") and CHROMIUM is None:
         pytest.skip("no Chromium")

@@ -1,0 +1,125 @@
+// Requests and replies of the protocol as frames.
+#pragma once
+
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <deque>
+#include <random>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "vlagents_ray/detail/frames.hpp"
+#include "vlagents_ray/detail/jpeg.hpp"
+
+namespace vlagents_ray::detail {
+
+/// The observation with its raw images as JPEG files; as it is if `quality` is 0.
+inline Observation prepared(const Observation& obs, int quality) {
+  Observation copy = obs;
+  for (auto& [name, image] : copy.cameras) {
+    if (image.data.empty() || (!image.is_file() && image.data.size() != image.height * image.width * 3))
+      throw Error("invalid_input", "camera '" + name + "': want Image::rgb or Image::file");
+    if (!image.is_file() && quality > 0) image = encode_jpeg(image, quality);
+  }
+  return copy;
+}
+
+/// The observation as the JSON of a header; appends its images and states to `blobs`.
+inline Json encode_observation(const Observation& obs, std::vector<Bytes>& blobs) {
+  Json found = Json::object();
+  for (const auto& [name, image] : obs.cameras) {
+    const Json reference = image.is_file() ? Json::array({"img", blobs.size()})
+                                           : Json::array({"nd", blobs.size(), "|u1", Json::array({image.height, image.width, 3})});
+    found["cameras"][name]["$"] = reference;
+    blobs.push_back(image.data);
+  }
+  for (const auto& [name, values] : obs.state) {
+    Bytes bytes(values.size() * sizeof(float));
+    if (!values.empty()) std::memcpy(bytes.data(), values.data(), bytes.size());
+    found["state"][name]["$"] = Json::array({"nd", blobs.size(), "<f4", Json::array({values.size()})});
+    blobs.push_back(std::move(bytes));
+  }
+  if (obs.gripper) {
+    if (!std::isfinite(*obs.gripper)) throw Error("invalid_input", "gripper: got NaN or infinity, want a number from 0 to 1");
+    found["gripper"] = *obs.gripper;
+  }
+  if (!obs.info.is_null() && !obs.info.empty()) found["info"] = obs.info;
+  return found;
+}
+
+/// Bytes of its images and states.
+inline std::size_t size_of(const Observation& obs) {
+  std::size_t bytes = 0;
+  for (const auto& each : obs.cameras) bytes += each.second.data.size();
+  for (const auto& each : obs.state) bytes += each.second.size() * sizeof(float);
+  return bytes;
+}
+
+/// What begins an episode, kept so that it can begin again.
+struct Episode {
+  Observation first;
+  std::string instruction;
+  Json kwargs = Json::object();
+  std::deque<Observation> later;  // those that were acted on since, oldest first
+};
+
+inline Frame reset_request(const Episode& episode, const Json& contract) {
+  Frame request;
+  request.header["op"] = "reset";
+  request.header["obs"] = encode_observation(episode.first, request.blobs);
+  request.header["instruction"] = episode.instruction;
+  if (!episode.kwargs.is_null() && !episode.kwargs.empty()) request.header["kwargs"] = episode.kwargs;
+  if (contract.is_object()) request.header["contract"] = contract;
+  for (const Observation& each : episode.later)
+    request.header["history"].push_back(encode_observation(each, request.blobs));
+  return request;
+}
+
+inline Frame act_request(const Observation& obs) {
+  Frame request;
+  request.header["op"] = "act";
+  request.header["obs"] = encode_observation(obs, request.blobs);
+  return request;
+}
+
+/// The action of a reply, checked: no robot gets NaN, infinity, or rows of another length.
+inline Act decode_act(const Frame& reply) {
+  const auto found = reply.header.find("act");
+  if (found == reply.header.end() || !found->is_object() || !found->contains("action"))
+    throw Error("malformed", "got a reply to `act` without `act`");
+  const Json* pointed = reference((*found)["action"]);
+  if (pointed == nullptr) throw Error("malformed", "got an action that is no reference");
+  const Array array = array_of(*pointed, reply.blobs);
+  if (array.type != "<f4" || array.shape.empty() || array.shape.size() > 2 || array.bytes.empty())
+    throw Error("invalid_action", "got the action " + pointed->dump() + ", want <f4 and the shape [D] or [H, D]");
+  Act act;
+  act.chunk = array.shape.size() == 2;
+  act.rows = act.chunk ? array.shape[0] : 1;
+  act.dim = array.shape.back();
+  act.values.resize(array.bytes.size() / sizeof(float));
+  std::memcpy(act.values.data(), array.bytes.data(), array.bytes.size());
+  for (const float value : act.values)
+    if (!std::isfinite(value)) throw Error("invalid_action", "got NaN or infinity in an action");
+  const auto done = found->find("done");
+  act.done = done != found->end() && done->is_boolean() && done->get<bool>();
+  act.info = resolved(object_at(*found, "info"), reply.blobs);
+  act.timing = object_at(reply.header, "timing");
+  return act;
+}
+
+/// A random UUID, version 4.
+inline std::string new_uuid() {
+  std::random_device random;
+  std::string text;
+  for (int i = 0; i < 32; ++i) {
+    if (i == 8 || i == 12 || i == 16 || i == 20) text += '-';
+    const unsigned digit = random() & 15;
+    text += "0123456789abcdef"[i == 12 ? 4 : i == 16 ? (digit & 3) | 8 : digit];
+  }
+  return text;
+}
+
+}  // namespace vlagents_ray::detail
