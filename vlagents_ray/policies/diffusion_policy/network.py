@@ -62,10 +62,13 @@ class DiffusionNetwork:
 
 def _file(config: DiffusionPolicyConfig) -> Path:
     path = find_checkpoint(config.checkpoint, config.checkpoint_step)
-    if path.is_dir():
-        found = sorted(str(p.relative_to(path)) for p in path.rglob("*.ckpt"))[:10]
-        raise ConfigError(f"checkpoint {path}: a folder, want a .ckpt file; it has {found or 'none'}")
-    return path
+    if path.is_file():
+        return path
+    found = sorted(path.rglob("*.ckpt"))
+    if len(found) != 1:
+        names = [str(file.relative_to(path)) for file in found[:10]]
+        raise ConfigError(f"checkpoint {path}: a folder with {names}, want one .ckpt file, or a folder with only one")
+    return find_checkpoint(str(found[0]))
 
 
 def _read(path: Path) -> tuple[Any, Mapping[str, Any]]:

@@ -67,7 +67,8 @@ class Comparer:
                 continue
             line: dict[str, Any] = {"time": time.time(), "session": request.session, "op": request.op}
             if request.op == "reset":
-                line |= {"instruction": request.instruction, "candidate": _described(theirs)}
+                line |= {"instruction": request.instruction}
+                line |= {"live": _identity(ours), "candidate": _described(theirs) | _identity(theirs)}
             else:
                 line |= {
                     "step": ours.step,
@@ -112,6 +113,11 @@ class Comparer:
             "first_row": found.first_row.tolist(),
             "cosine": found.cosine,
         }
+
+
+def _identity(reply: Reply) -> dict[str, Any]:
+    """Return the checkpoint and weights that a reset named."""
+    return {name: reply.info[name] for name in ("checkpoint", "weights", "revision") if name in (reply.info or {})}
 
 
 def _described(reply: Reply) -> dict[str, Any]:
