@@ -36,7 +36,7 @@ class DiffusionNetwork:
                 f"checkpoint {config.checkpoint!r}: this family's checkpoints are pickles, and loading one runs "
                 f"whatever code its author put in; set trust_checkpoint: true if you trust its origin"
             )
-        path = _file(config)
+        path = checkpoint_file(config)
         ensure_torchvision()
         use_source("diffusion_policy", "DIFFUSION_POLICY_SRC", config.source_dir)
         settings, state = _read(path)
@@ -60,7 +60,8 @@ class DiffusionNetwork:
         return cls(module.to(device).eval(), device, images, vectors, absolute)
 
 
-def _file(config: DiffusionPolicyConfig) -> Path:
+def checkpoint_file(config: DiffusionPolicyConfig) -> Path:
+    """Find the .ckpt file; raises `ConfigError` if there is none, or if a folder has several."""
     path = find_checkpoint(config.checkpoint, config.checkpoint_step)
     if path.is_file():
         return path
