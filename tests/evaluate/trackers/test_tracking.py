@@ -97,6 +97,16 @@ def test_an_unfinished_cell_is_told_by_the_run_that_completes_it_and_no_other_tw
     assert len(ids) == 1
 
 
+def test_the_weights_of_the_server_are_in_the_settings_of_the_run(config: Config) -> None:
+    settings = config(episodes=1, track=["wandb"])
+    said = {"policy": "act", "checkpoint": "runs/last", "weights": {"digest": "x", "revision": None}}
+    play(settings)
+    with Store(settings.model_copy(update={"resume": True})) as store:
+        store.note_policy("policy", {**said, "version": "1"})
+    tell(settings)
+    assert Listener.begun[0].config["served"] == said
+
+
 def test_a_cell_that_stopped_early_is_complete(config: Config) -> None:
     settings = config(episodes=40, stop={"target": 0.3}, track=["wandb"])
     [cell] = play(settings, left_out=range(30, 40)).cells

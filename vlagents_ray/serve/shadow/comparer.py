@@ -16,7 +16,7 @@ from vlagents_ray.errors import NotReset, UnknownSession
 from vlagents_ray.interface import POLICY, Act
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.metrics_buffer import Sample
-from vlagents_ray.serve.shadow.comparison import ActionDifference, action_difference, identity
+from vlagents_ray.serve.shadow.comparison import ActionDifference, action_difference
 from vlagents_ray.serve.shadow.comparison_log import ComparisonLog
 
 logger = logging.getLogger(__name__)
@@ -68,7 +68,7 @@ class Comparer:
             line: dict[str, Any] = {"time": time.time(), "session": request.session, "op": request.op}
             if request.op == "reset":
                 line |= {"instruction": request.instruction}
-                line |= {"live": identity(ours), "candidate": _described(theirs) | identity(theirs)}
+                line |= {"live": ours.identity, "candidate": _described(theirs) | theirs.identity}
             else:
                 line |= {
                     "step": ours.step,

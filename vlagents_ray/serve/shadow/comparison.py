@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
 from vlagents_ray.contract import Contract, differences
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.protocol.messages import Reply
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,12 +45,6 @@ def action_difference(live: np.ndarray, candidate: np.ndarray, *, last_rows: boo
     lengths = np.linalg.norm(ours) * np.linalg.norm(theirs)
     cosine = float(np.vdot(ours, theirs) / lengths) if lengths else float(not (ours.any() or theirs.any()))
     return ActionDifference(rows, apart.mean(axis=0), apart[0], min(1.0, max(-1.0, cosine)))
-
-
-def identity(reset: Reply) -> dict[str, Any]:
-    """Return the checkpoint, the digest and the commit of its weights that the reply to a reset names."""
-    info = reset.info or {}
-    return {name: info[name] for name in ("checkpoint", "weights", "revision") if name in info}
 
 
 def require_comparable(live: Contract | None, candidate: Contract | None) -> None:

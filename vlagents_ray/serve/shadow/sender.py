@@ -24,7 +24,6 @@ from vlagents_ray.interface import POLICY, Act, Obs
 from vlagents_ray.protocol.frames import encode_request
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.responses import Done
-from vlagents_ray.serve.shadow.comparison import identity
 
 logger = logging.getLogger(__name__)
 
@@ -86,7 +85,7 @@ class _Entry:
         act = reply.act
         if act is not None:
             act = Act(act.action, act.done, {name: act.info[name] for name in (POLICY,) if name in act.info})
-        about = Reply(act=act, info=None if act else identity(reply), step=reply.step, timing=dict(reply.timing))
+        about = Reply(act=act, info=None if act else reply.identity, step=reply.step, timing=dict(reply.timing))
         return Turn(self.session, self.frame, about, self.dropped)
 
 
