@@ -84,6 +84,9 @@ def test_a_repository_with_one_file_of_diffusion_policy_is_enough(
     weights = weights_of(found)
     assert weights is not None
     assert weights["revision"] == COMMIT
+    branch = DiffusionPolicyConfig(checkpoint="org/name@main", trust_checkpoint=True)
+    with pytest.raises(ConfigError, match=rf"pickle of the hub, .* want the commit that you trust, such as {NAMED}"):
+        checkpoint_file(branch)
     (snapshot / "other.ckpt").touch()
     with pytest.raises(ConfigError, match=r"\['checkpoints/latest.ckpt', 'other.ckpt'\], want one \.ckpt file"):
         checkpoint_file(config)

@@ -13,6 +13,7 @@ from in_process_evaluation import play
 
 from vlagents_ray.errors import MissingDependency
 from vlagents_ray.evaluate import EvalConfig, evaluate
+from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.trackers import TrackerFeed, tracking
 from vlagents_ray.evaluate.trackers.base import About, TrackerRun
 

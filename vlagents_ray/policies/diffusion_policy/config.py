@@ -14,7 +14,7 @@ class DiffusionPolicyConfig(ModelConfig):
 
     checkpoint: str = Field(
         min_length=1,
-        description="a .ckpt file, or a folder or hub id (org/name@COMMIT) with only one; `{step}` stands for "
+        description="a .ckpt file, or a folder or org/name@COMMIT of the hub, with only one; `{step}` stands for "
         "checkpoint_step",
     )
     trust_checkpoint: bool = Field(

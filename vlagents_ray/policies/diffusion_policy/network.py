@@ -10,6 +10,7 @@ from typing import Any
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, require_loaded
+from vlagents_ray.policies.base.checkpoint_files import revision
 from vlagents_ray.policies.base.model_code import use_source
 from vlagents_ray.policies.diffusion_policy.config import DiffusionPolicyConfig
 from vlagents_ray.registry import require
@@ -61,8 +62,20 @@ class DiffusionNetwork:
 
 
 def checkpoint_file(config: DiffusionPolicyConfig) -> Path:
-    """Find the .ckpt file; raises `ConfigError` if there is none, or if a folder has several."""
+    """Find the .ckpt file.
+
+    Raises:
+        ConfigError: There is none, a folder has several, or it is of a hub id without the commit, whose pickle may be
+            another one tomorrow than the one that the user trusts.
+    """
     path = find_checkpoint(config.checkpoint, config.checkpoint_step)
+    commit = revision(path)
+    if commit is not None and commit not in config.checkpoint:
+        repository = config.checkpoint.partition("@")[0]
+        raise ConfigError(
+            f"checkpoint {config.checkpoint!r}: a pickle of the hub, whose branches and tags may become others; want "
+            f"the commit that you trust, such as {repository}@{commit}, which it is now"
+        )
     if path.is_file():
         return path
     found = sorted(path.rglob("*.ckpt"))
