@@ -75,7 +75,7 @@ def test_a_repository_with_one_file_of_diffusion_policy_is_enough(
     blob.write_bytes(b"weights")
     (snapshot / "checkpoints" / "latest.ckpt").symlink_to(blob)  # as in the hub's cache
     (snapshot / "big.mp4").touch()
-    hub = SimpleNamespace(snapshot_download=lambda _name, revision: str(snapshot))
+    hub = SimpleNamespace(snapshot_download=lambda *_args, **_options: str(snapshot))
     monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
     config = DiffusionPolicyConfig(checkpoint=NAMED, trust_checkpoint=True)
     with used_checkpoints() as found:

@@ -33,8 +33,7 @@ def test_a_file_of_something_else_is_named(tmp_path: Path) -> None:
 
 def test_a_folder_with_several_files_says_which(checkpoint: Checkpoint, tmp_path: Path) -> None:
     folder = checkpoint("unet").parents[1]
-    (tmp_path / "a").symlink_to(folder / "checkpoints" / "latest.ckpt")
-    (tmp_path / "a").rename(tmp_path / "a.ckpt")
+    (tmp_path / "a.ckpt").symlink_to(folder / "checkpoints" / "latest.ckpt")
     load(tmp_path)
     (tmp_path / "b.ckpt").touch()
     with pytest.raises(ConfigError, match=r"a folder with \['a.ckpt', 'b.ckpt'\], want one \.ckpt file"):

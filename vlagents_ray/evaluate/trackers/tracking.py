@@ -112,7 +112,8 @@ class TrackerFeed:
         return About(
             out, names.project, names.group or out.resolve().name, policy,
             fingerprint([results.runs[0].started, policy]),
-            {"evaluation": results.runs[-1].config, "served": served, "code": code}, sorted((out / PROVENANCE).glob("*.diff")),
+            {"evaluation": results.runs[-1].config, "served": served, "code": code},
+            sorted((out / PROVENANCE).glob("*.diff")),
         )  # fmt: skip
 
     def _videos(self, cell: CellResults) -> list[Path]:

@@ -12,7 +12,15 @@ import yaml
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.results.reader import CellResults, Results, Run
 from vlagents_ray.evaluate.results.statistics import Rate
-from vlagents_ray.evaluate.results.summary import TOTAL, Summary, checkpoint_of, group_of, pushed_of, revision_of, weights_of
+from vlagents_ray.evaluate.results.summary import (
+    TOTAL,
+    Summary,
+    checkpoint_of,
+    group_of,
+    pushed_of,
+    revision_of,
+    weights_of,
+)
 
 PROTOCOL = "protocol"  # of what an env describes: the constants of its benchmark
 _SETTINGS = ("env_options", "reset_options", "clock")
