@@ -117,9 +117,8 @@ def test_other_weights_under_one_name_are_told_apart_by_their_folders(tmp_path: 
 
     first = played("first", LINE, "runs/last", "a")
     assert combined([first, played("same", OTHER_LINE, "runs/last", "a")]).contenders == ["pi0"]
-    assert combined([first, played("another", OTHER_LINE, "runs/best", "b")]).contenders == [
-        "pi0"
-    ]  # the page names both
+    another = played("another", OTHER_LINE, "runs/best", "b")
+    assert combined([first, another]).contenders == ["pi0"]  # the page names both
     other = combined([first, played("later", OTHER_LINE, "runs/last", "b")])
     assert other.contenders == ["pi0 (first)", "pi0 (later)"]
     assert ("pi0 (later)", "b") in configuration(other).checkpoints

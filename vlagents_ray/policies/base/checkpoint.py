@@ -82,10 +82,8 @@ def _holds(folder: Path, path: Path) -> bool:
     """Whether `path` is in the folder, or the folder itself under another name, as behind a link `last`."""
     if not folder.is_dir():
         return False
-    places = (
-        path.resolve(),
-        path.parent.resolve() / path.name,
-    )  # a file of the hub's cache is a link out of its folder
+    # A file of the hub's cache is a link out of its folder.
+    places = (path.resolve(), path.parent.resolve() / path.name)
     return any(folder.resolve() in (place, *place.parents) for place in places)
 
 
