@@ -13,7 +13,6 @@ from in_process_evaluation import play
 
 from vlagents_ray.errors import MissingDependency
 from vlagents_ray.evaluate import EvalConfig, evaluate
-from vlagents_ray.evaluate.results.store import Store
 from vlagents_ray.evaluate.trackers import TrackerFeed, tracking
 from vlagents_ray.evaluate.trackers.base import About, TrackerRun
 
@@ -101,9 +100,11 @@ def test_an_unfinished_cell_is_told_by_the_run_that_completes_it_and_no_other_tw
 def test_the_weights_of_the_server_are_in_the_settings_of_the_run(config: Config) -> None:
     settings = config(episodes=1, track=["wandb"])
     said = {"policy": "act", "checkpoint": "runs/last", "weights": {"digest": "x", "revision": None}}
-    play(settings)
-    with Store(settings.model_copy(update={"resume": True})) as store:
-        store.note_policy("policy", {**said, "version": "1"})
+
+    class Served(ToZero):
+        metadata: ClassVar = {**said, "version": "1"}
+
+    play(settings, Served)
     tell(settings)
     assert Listener.begun[0].config["served"] == said
 
