@@ -284,3 +284,13 @@ def test_servers_that_tell_other_weights_are_named(tmp_path: Path, config: Confi
             store.note_policy("policy", said)
     with pytest.raises(ConfigError, match=r"policy 'policy' has weights .*'y'.*before it .*'x'"):
         merge(tmp_path / "out", folders)
+
+
+def test_a_checkpoint_with_other_weights_in_another_task_is_not_merged(tmp_path: Path, config: Config) -> None:
+    folders = []
+    for env, weights in ((LINE, "x"), (OTHER_LINE, "y")):
+        settings = config(envs=[env], episodes=2, out=tmp_path / weights)
+        play(settings)
+        folders.append(with_weights(settings.out, weights))
+    with pytest.raises(ConfigError, match=r"policy .*: was played by several weights under one name: .*'x'.*'y'"):
+        merge(tmp_path / "out", folders)

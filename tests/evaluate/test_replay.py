@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from in_process_evaluation import play
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig, Results, evaluate
 from vlagents_ray.evaluate.episode.records import EpisodeResult
+from vlagents_ray.evaluate.exports import tables
 from vlagents_ray.evaluate.plan.cases import cells
 from vlagents_ray.evaluate.plan.config import PushedWeights
 from vlagents_ray.evaluate.replay import compare, find
@@ -117,6 +119,28 @@ def test_an_episode_is_found_by_its_key_and_by_env_and_number(config: Config) ->
     results = play(config(envs=[LINE, OTHER_LINE], episodes=2))
     key = results.cells[1].episodes[1].result.key
     assert find(results, str(key)).episode == find(results, f"{OTHER_LINE}#1").episode == results.cells[1].episodes[1]
+
+
+def with_weights(results: Results, weights: str) -> Results:
+    [cell] = results.cells
+    episodes = [replace(one, result=replace(one.result, weights=weights)) for one in cell.episodes]
+    return results.among([replace(cell, episodes=tuple(episodes))])
+
+
+def test_a_key_ends_with_the_weights_that_played_it(config: Config) -> None:
+    results = with_weights(play(config(episodes=2)), f"sampled-sha256:{'9f2c' * 16}")
+    first, second = results.cells[0].episodes
+    assert second.result.full_key == f"{second.result.key}~9f2c9f2c9f2c9f2c"
+    assert [row["key"] for row in tables.rows(results)] == [first.result.full_key, second.result.full_key]
+    assert find(results, second.result.full_key).episode == find(results, str(second.result.key)).episode == second
+
+
+def test_a_replay_that_differs_says_that_the_weights_are_others(config: Config, tmp_path: Path) -> None:
+    results = with_weights(play(config(episodes=1)), "a")
+    recorded = find(results, f"{LINE}#0")
+    assert compare(recorded, with_weights(play(recorded.config(tmp_path / "same")), "b")) == []
+    found = compare(recorded, with_weights(play(recorded.config(tmp_path / "other"), Noisy), "b"))
+    assert found[-1] == "weights: a played it, now it is b: another checkpoint, or other files in it"
 
 
 @pytest.mark.parametrize("name", [LINE, f"{LINE}#7", "tabletop#0", f"{LINE}#0@0"])

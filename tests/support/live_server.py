@@ -31,6 +31,7 @@ from vlagents_ray.serve.ports import free_port
 METADATA = {
     "policy": "noop",
     "checkpoint": "org/model@4f0c",
+    "weights": {"digest": "sampled-sha256:9f2c", "revision": None},
     "policy_version": {"newest": {"version": 3, "fingerprint": "ab"}, "pinned": {"version": 0, "fingerprint": "cd"}},
     "version": "0",
     "protocol": PROTOCOL_VERSION,

@@ -167,17 +167,23 @@ def _differences(known: Row, row: Row) -> str:
 
 
 def _require_one_checkpoint(merged: _Merged) -> None:
-    for column, what in (("checkpoint", "checkpoints"), ("weights", "weights under one name")):
-        played: dict[str, dict[str, str]] = {}
-        for row in merged.episodes.values():
-            if (found := row.get(column)) is not None:  # older results have no weights
-                played.setdefault(row["cell"], {}).setdefault(found, row["key"])
-        for cell, several in played.items():
-            if len(several) > 1:
-                raise ConfigError(
-                    f"{merged.cells[cell]['env']}: was played by several {what}: {several}; merge those apart, or give "
-                    f"one of them another policy's `name` in its evaluation"
-                )
+    """Raise `ConfigError` for a cell of several checkpoints, or a policy's checkpoint of several weights."""
+    checkpoints: dict[str, dict[str, str]] = {}  # the key of an episode of each, by cell
+    weights: dict[tuple[str, int | None, str | None], dict[str, str]] = {}  # by policy, step and checkpoint
+    for row in merged.episodes.values():
+        cell, checkpoint = merged.cells[row["cell"]], row["checkpoint"]
+        if checkpoint is not None:
+            checkpoints.setdefault(row["cell"], {}).setdefault(checkpoint, row["key"])
+        if (found := row.get("weights")) is not None:  # older results have none
+            weights.setdefault((cell["policy"], cell["step"], checkpoint), {}).setdefault(found, row["key"])
+    several = [(merged.cells[cell]["env"], "checkpoints", found) for cell, found in checkpoints.items()]
+    several += [(f"{policy} {name!r}", "weights under one name", found) for (policy, _, name), found in weights.items()]
+    for where, what, found_keys in several:
+        if len(found_keys) > 1:
+            raise ConfigError(
+                f"{where}: was played by several {what}: {found_keys}; merge those apart, or give one of them another "
+                f"policy's `name` in its evaluation"
+            )
 
 
 def _link_files(merged: _Merged, out: Path, folders: Sequence[Path]) -> None:

@@ -60,13 +60,13 @@ def find(results: Results, name: str) -> Recorded:
         Recorded(results, cell, one)
         for cell in results.cells
         for one in cell.episodes
-        if name in (str(one.result.key), f"{cell.env}#{one.result.key.episode}")
+        if name in (one.result.full_key, str(one.result.key), f"{cell.env}#{one.result.key.episode}")
     ]
     if not found:
-        have = [str(one.result.key) for cell in results.cells for one in cell.episodes][:_FEW]
+        have = [one.result.full_key for cell in results.cells for one in cell.episodes][:_FEW]
         raise ConfigError(f"{results.out}: has no episode {name!r}, want a key as {have}, or ENV#NUMBER")
     if len(found) > 1:
-        keys = [f"{one.episode.result.key} ({one.cell.contender})" for one in found]
+        keys = [f"{one.episode.result.full_key} ({one.cell.contender})" for one in found]
         raise ConfigError(f"{name!r} stands for {len(found)} episodes; want one of the keys {keys}")
     if found[0].episode.result.status == "infra_failed":
         raise ConfigError(f"{name!r} was never played to its end: {found[0].episode.result.error}")
@@ -89,6 +89,11 @@ def compare(recorded: Recorded, replayed: Results) -> list[str]:
     ]
     if before["actions_sha256"] != now["actions_sha256"]:
         found.insert(0, _actions(recorded, replayed.file(str(again.trajectory))))
+    weights = [one.result.weights for one in (recorded.episode, again)]
+    if found and None not in weights and weights[0] != weights[1]:
+        found.append(
+            f"weights: {weights[0]} played it, now it is {weights[1]}: another checkpoint, or other files in it"
+        )
     return found
 
 

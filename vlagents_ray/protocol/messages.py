@@ -75,6 +75,12 @@ class Reply:
     draining: bool = False  # the replica stops or is overloaded: connect again, and the session is moved
     timing: dict[str, float] = field(default_factory=dict)  # ms, by stage
 
+    @property
+    def identity(self) -> dict[str, Any]:
+        """The checkpoint, the digest of its weights and their commit, as far as the info of a reset names them."""
+        info = self.info or {}
+        return {name: info[name] for name in ("checkpoint", "weights", "revision") if name in info}
+
 
 @dataclass(frozen=True, slots=True)
 class Limits:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ from recorded_results import record, runs
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import Results
+from vlagents_ray.evaluate.report.html.provenance import configuration
 from vlagents_ray.evaluate.results.combine import combined
 from vlagents_ray.evaluate.results.comparison import (
     clock_gaps,
@@ -101,6 +103,25 @@ def test_policies_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) ->
     first = folder(tmp_path / "first", "pi0")
     second = folder(tmp_path / "second", "pi0", reset_options={"instruction": "go"})
     assert combined([first, second]).contenders == ["pi0 (first)", "pi0 (second)"]
+
+
+def test_other_weights_under_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
+    """Also where no task is in both folders, so that their rates would be added up."""
+
+    def played(by: str, env: str, checkpoint: str, weights: str) -> Results:
+        results = folder(tmp_path / by, "pi0", envs=[env])
+        [cell] = results.cells
+        said = {"checkpoint": checkpoint, "weights": weights}
+        episodes = tuple(replace(one, result=replace(one.result, **said)) for one in cell.episodes)
+        return results.among([replace(cell, episodes=episodes)])
+
+    first = played("first", LINE, "runs/last", "a")
+    assert combined([first, played("same", OTHER_LINE, "runs/last", "a")]).contenders == ["pi0"]
+    another = played("another", OTHER_LINE, "runs/best", "b")
+    assert combined([first, another]).contenders == ["pi0"]  # the page names both
+    other = combined([first, played("later", OTHER_LINE, "runs/last", "b")])
+    assert other.contenders == ["pi0 (first)", "pi0 (later)"]
+    assert ("pi0 (later)", "b") in configuration(other).checkpoints
 
 
 def test_parts_of_one_evaluation_are_to_be_merged(tmp_path: Path) -> None:

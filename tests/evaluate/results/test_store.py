@@ -8,6 +8,7 @@ from dataclasses import replace
 from subprocess import PIPE, Popen
 
 import pytest
+from eval_fakes import LINE, OTHER_LINE
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import EvalConfig
@@ -300,6 +301,22 @@ def test_an_episode_of_other_weights_under_the_same_name_is_not_added(config: Co
     assert [one.weights for one in recorded(config())] == ["a", "a", None]
 
 
+def test_a_checkpoint_has_the_same_weights_in_all_tasks(config: Config) -> None:
+    """Its server may have been replaced between two of them."""
+    settings = config(envs=[LINE, OTHER_LINE], episodes=1)
+    first, second = (job.key for job in planned(settings))
+    with Store(settings) as store:
+        store.begin_run(settings, {})
+        store.record(replace(done(first), checkpoint="runs/last", weights="a"), attempts=1)
+        with pytest.raises(ConfigError, match=r"'runs/last' is b now, and was a"):
+            store.record(replace(done(second), checkpoint="runs/last", weights="b"), attempts=1)
+    with Store(settings.model_copy(update={"resume": True})) as store:
+        store.begin_run(settings, {})
+        with pytest.raises(ConfigError, match=r"'runs/last' is b now, and was a"):
+            store.record(replace(done(second), checkpoint="runs/last", weights="b"), attempts=1)
+        store.record(replace(done(second), checkpoint="runs/other", weights="b"), attempts=1)  # chosen by its task
+
+
 def test_a_server_with_other_weights_is_noticed_before_anything_is_played(config: Config) -> None:
     said = {"policy": "act", "checkpoint": "a"}
     with Store(config()) as store:
@@ -317,7 +334,7 @@ def test_results_that_were_begun_without_weights_are_gone_on_with(config: Config
         store.begin_run(config(), {})
         store.record(done(first), attempts=1)
     with closing(sqlite3.connect(config().out / "results.db")) as db:
-        for column in ("weights", "policy_version", "policy_fingerprint", "first_policy_version"):
+        for column in ("weights", "revision", "policy_version", "policy_fingerprint", "first_policy_version"):
             db.execute(f"ALTER TABLE episodes DROP COLUMN {column}")
         db.commit()
     assert [one.weights for one in recorded(config())] == [None]  # as it is

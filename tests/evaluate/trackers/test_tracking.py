@@ -97,6 +97,18 @@ def test_an_unfinished_cell_is_told_by_the_run_that_completes_it_and_no_other_tw
     assert len(ids) == 1
 
 
+def test_the_weights_of_the_server_are_in_the_settings_of_the_run(config: Config) -> None:
+    settings = config(episodes=1, track=["wandb"])
+    said = {"policy": "act", "checkpoint": "runs/last", "weights": {"digest": "x", "revision": None}}
+
+    class Served(ToZero):
+        metadata: ClassVar = {**said, "version": "1"}
+
+    play(settings, Served)
+    tell(settings)
+    assert Listener.begun[0].config["served"] == said
+
+
 def test_a_cell_that_stopped_early_is_complete(config: Config) -> None:
     settings = config(episodes=40, stop={"target": 0.3}, track=["wandb"])
     [cell] = play(settings, left_out=range(30, 40)).cells

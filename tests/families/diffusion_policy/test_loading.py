@@ -31,9 +31,13 @@ def test_a_file_of_something_else_is_named(tmp_path: Path) -> None:
         load(path)
 
 
-def test_a_folder_says_which_files_it_has(checkpoint: Checkpoint) -> None:
-    with pytest.raises(ConfigError, match=r"want a \.ckpt file; it has \['checkpoints/latest.ckpt'\]"):
-        load(checkpoint("unet").parents[1])
+def test_a_folder_with_several_files_says_which(checkpoint: Checkpoint, tmp_path: Path) -> None:
+    folder = checkpoint("unet").parents[1]
+    (tmp_path / "a.ckpt").symlink_to(folder / "checkpoints" / "latest.ckpt")
+    load(tmp_path)
+    (tmp_path / "b.ckpt").touch()
+    with pytest.raises(ConfigError, match=r"a folder with \['a.ckpt', 'b.ckpt'\], want one \.ckpt file"):
+        load(tmp_path)
 
 
 @pytest.mark.verifies("loading")

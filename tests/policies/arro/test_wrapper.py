@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from vlagents_ray.envs.tabletop import Tabletop
 from vlagents_ray.errors import ConfigError, InvalidObservation, MissingCamera, NotReset
 from vlagents_ray.policies.arro import Arro
 from vlagents_ray.policies.arro.parts import Detection
+from vlagents_ray.policies.base.checkpoint import find_checkpoint
 from vlagents_ray.policies.wrapper import build_agent
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.testing import check_agent
@@ -242,3 +244,37 @@ def test_an_expert_that_sees_only_segments_still_solves_its_tasks() -> None:
             assert all(robots.map(solves, range(12)))
     finally:
         replicas.close()
+
+
+class Stored(OwnDetector):
+    """A detector with a file."""
+
+    def load(self) -> None:
+        find_checkpoint("detector.pt")
+
+
+class StoredPolicy(Watcher):
+    """A policy with a file, or with an identity that it states itself."""
+
+    stated: dict[str, Any] | None = None
+
+    def initialize(self) -> None:
+        find_checkpoint("policy.pt")
+        self.weights_id = self.stated
+
+
+@pytest.mark.parametrize("stated", [None, {"digest": "mine", "revision": "c0ffee", "adapters": {}}])
+def test_the_weights_are_those_of_the_policy_and_of_the_parts(
+    stated: dict[str, Any] | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(StoredPolicy, "stated", stated)
+    found = []
+    for policy, detector in ((b"1", b"1"), (b"1", b"1"), (b"1", b"2"), (b"2", b"1")):
+        Path("policy.pt").write_bytes(policy)
+        Path("detector.pt").write_bytes(detector)
+        detector_settings = {f"{__name__}:Stored": {"boxes": [[10, 10, 20, 20]]}}
+        found.append(arro(StoredPolicy(), detector=detector_settings).weights_id)
+    assert found[0] == found[1] != found[2]
+    assert (found[0] == found[3]) == (stated is not None)  # the policy's own word counts
+    assert {**found[0], "digest": ""} == {"revision": None, **(stated or {}), "digest": ""}

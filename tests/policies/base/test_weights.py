@@ -14,7 +14,7 @@ import pytest
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, used_checkpoints
-from vlagents_ray.policies.base.checkpoint_files import digest, revision, weights_of
+from vlagents_ray.policies.base.checkpoint_files import digest, revision, weights_of, with_parts
 
 TENSORS, LENGTH = 40, 300_000  # bytes of each: 12 MB together, more than is read from end to end
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
@@ -36,6 +36,10 @@ def tensors() -> list[bytes]:
 def folder(tmp_path: Path) -> Path:
     made = tmp_path / "checkpoint"
     (made / "sub").mkdir(parents=True)
+    linked = tmp_path / "linked"
+    linked.mkdir()
+    (linked / "params").write_text("a")
+    (made / "step").symlink_to(linked)
     save(made / "model.safetensors", tensors())
     (made / "config.json").write_text('{"a": 1}')
     (made / "sub" / "opaque").write_bytes(bytes(9 * 2**20))
@@ -63,6 +67,7 @@ CHANGES: dict[str, Callable[[Path], object]] = {
     "a name": lambda folder: (folder / "config.json").rename(folder / "b.json"),
     "a place": lambda folder: (folder / "config.json").rename(folder / "sub" / "config.json"),
     "one more file": lambda folder: (folder / "more.json").touch(),
+    "a file behind a link to a folder": lambda folder: (folder.with_name("linked") / "params").write_text("b"),
 }
 
 
@@ -97,6 +102,68 @@ def test_what_a_policy_found_stands_for_its_weights_and_a_part_for_the_whole(fol
     assert found == [other, folder / "config.json", folder / "sub"]
     find_checkpoint(str(folder))
     assert len(found) == 3
+
+
+def test_another_name_of_a_folder_is_not_counted_beside_it(folder: Path) -> None:
+    """LeRobot's `checkpoints/last` is a link to the newest step."""
+    last = folder.with_name("last")
+    last.symlink_to(folder)
+    found = []
+    for names in ((folder / "sub",), (last, folder / "sub"), (last, last / "sub")):
+        with used_checkpoints() as used:
+            for name in names:
+                find_checkpoint(str(name))
+        found.append(digest(used))
+    assert found[0] == found[1] == found[2]
+    with used_checkpoints() as used:
+        find_checkpoint(str(last))
+        find_checkpoint(str(folder))
+    assert digest(used) == digest([folder])
+
+
+def test_a_link_to_a_folder_above_is_no_endless_way(folder: Path) -> None:
+    before = digest([folder])
+    (folder / "sub" / "round").symlink_to(folder)
+    assert digest([folder]) == before
+
+
+def test_the_commit_is_that_of_the_policy_and_not_of_an_encoder_beside_it(folder: Path, tmp_path: Path) -> None:
+    snapshot = tmp_path / "models--org--encoder" / "snapshots" / COMMIT
+    snapshot.mkdir(parents=True)
+    assert weights_of([folder, snapshot]) == {"digest": digest([folder, snapshot]), "revision": None}
+    assert weights_of([snapshot, folder]) == {"digest": digest([snapshot, folder]), "revision": COMMIT}
+
+
+def test_other_parts_beside_a_policy_are_other_weights(folder: Path) -> None:
+    own = weights_of([folder])
+    assert own is not None
+    assert with_parts(own, []) == own
+    both = with_parts({**own, "revision": COMMIT}, [folder / "sub"])
+    assert both is not None
+    assert both["digest"] not in (own["digest"], digest([folder / "sub"]))
+    assert both["revision"] == COMMIT
+    assert with_parts(None, [folder]) != with_parts(None, [folder / "sub"])
+
+
+class RevisionNotFoundError(Exception):
+    """Stands in for that of huggingface_hub, known by its name."""
+
+
+def test_a_revision_that_is_not_there_is_named_with_those_that_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    def download(name: str, revision: str | None) -> str:
+        raise RevisionNotFoundError(name)
+
+    refs = SimpleNamespace(branches=[SimpleNamespace(name="main")], tags=[SimpleNamespace(name="v1")])
+    api = SimpleNamespace(list_repo_refs=lambda _name: refs)
+    hub = SimpleNamespace(snapshot_download=download, HfApi=lambda: api)
+    monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
+    with pytest.raises(ConfigError, match=r"org/name has no revision 'v2', want one of its commits.*are main, v1$"):
+        find_checkpoint("org/name@v2")
+    del hub.HfApi  # such as without a network
+    with pytest.raises(ConfigError, match=r"no revision 'v2'.*not known here"):
+        find_checkpoint("org/name@v2")
+    with pytest.raises(ConfigError, match=r"'org/name@': got no revision after the @, want a commit"):
+        find_checkpoint("org/name@")
 
 
 def test_a_hub_id_takes_a_commit_and_says_which_it_was(

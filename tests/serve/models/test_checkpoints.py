@@ -403,7 +403,8 @@ def test_what_is_loaded_is_told_by_its_digest_in_the_metadata_and_with_each_rese
         engine.start()
         try:
             reply = begin(engine, "s").get(timeout=10)
-            assert reply.info == {"weights": told["digest"]}
+            assert reply.info == {"weights": told["digest"], **({"revision": "c0ffee"} if own else {})}
+            assert engine.models.describe()["weights"] == [told]
             assert engine.models.weights == told
         finally:
             engine.close()

@@ -59,6 +59,16 @@ def test_each_act_is_a_frame_with_its_whole_chunk(tmp_path: Path) -> None:
     assert [from_text(text, budget) if text else None for text in frames["reset"]] == [{"seed": 7}, *[None] * 4]
 
 
+def test_the_first_frame_names_the_weights_that_act_in_this_episode(tmp_path: Path) -> None:
+    agent = Brightness()
+    agent.weights_id = {"digest": "sampled-sha256:9f2c", "revision": "c0ffee"}
+    with recorded(tmp_path, agent) as server:
+        server.robot().play(3)
+    budget = Budget(DEFAULT_LIMITS)
+    found = [from_text(text, budget) if text else None for text in rows(only(tmp_path))["weights"]]
+    assert found == [{"weights": "sampled-sha256:9f2c", "revision": "c0ffee"}, None, None]
+
+
 def test_pictures_are_those_of_the_policy_to_the_bit(tmp_path: Path) -> None:
     with recorded(tmp_path) as server:
         server.robot().play(3)

@@ -65,6 +65,15 @@ def test_an_action_that_cannot_be_compared_has_failed() -> None:
     assert comparer.collect().outcomes == {"failed": 1}
 
 
+def test_a_reset_is_recorded_with_the_weights_of_both(tmp_path: Path) -> None:
+    comparer = Comparer(ComparisonLog(tmp_path, "app", "replica", LIMIT))
+    ours, theirs = ({"checkpoint": "runs/last", "weights": weights} for weights in ("a", "b"))
+    request = Request("reset", Obs(), "stack", session="a")
+    comparer.add([request], [Reply(info=ours)], [Reply(info={**theirs, "told": 1})], [0])
+    line = json.loads((tmp_path / "app-replica.jsonl").read_text())
+    assert (line["instruction"], line["live"], line["candidate"]) == ("stack", ours, theirs | {"timing": {}})
+
+
 def test_an_episode_whose_reset_fails_is_lost() -> None:
     comparer = Comparer()
     request = Request("reset", Obs(), "stack", session="a")

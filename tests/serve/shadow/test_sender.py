@@ -72,7 +72,7 @@ class Followed:
         done([reply or Reply(act=Act(np.zeros(7, np.float32)))])
 
     def reset(self, session: str = "a") -> None:
-        self.ask(Request("reset", observed(), "stack", {"seed": 3}), session, Reply(info={}))
+        self.ask(Request("reset", observed(), "stack", {"seed": 3}), session, Reply(info={"weights": "a", "told": 1}))
 
     def act(self, value: int = 0, session: str = "a", reply: Reply | None = None) -> None:
         self.ask(Request("act", observed(value)), session, reply)
@@ -120,6 +120,7 @@ def test_the_candidate_gets_what_the_live_policy_has_acted_on(followed: Followed
     assert (reset.instruction, reset.kwargs, reset.session) == ("stack", {"seed": 3}, "a")
     assert [one.obs and int(one.obs.cameras["front"][0, 0, 0]) for one in followed.candidate.asked()] == [0, 1, 2]
     assert [turn.dropped for turn in followed.candidate.turns] == [0] * 4
+    assert followed.candidate.turns[0].reply.info == {"weights": "a"}
     assert followed.candidate.turns[1].reply.act is not None
 
 

@@ -11,6 +11,8 @@ from vlagents_ray.ray_tools.git_state import GitState
 Status = Literal["done", "policy_error", "infra_failed"]
 Ending = Literal["terminated", "truncated", "policy_done", "error"]
 
+_DIGITS = 16  # of a digest in a key
+
 
 @dataclass(frozen=True, slots=True)
 class EpisodeResult:
@@ -41,10 +43,17 @@ class EpisodeResult:
     transport: str = "local"
     checkpoint: str | None = None  # the checkpoint that the policy's reset returned
     weights: str | None = None  # digest of the loaded weights, for a policy that reports it
+    revision: str | None = None  # the hub's commit of them, if they were in its cache
     policy_version: int | None = None  # of the weights that computed the last act; 0 is the loaded checkpoint
     policy_fingerprint: str | None = None  # of that version, computed by the replica from what it holds
     first_policy_version: int | None = None  # of the weights that computed the first act
     actions_sha256: str | None = None  # digest of the executed actions, (steps, D) little-endian float32, row by row
+
+    @property
+    def full_key(self) -> str:
+        """The key, and the beginning of the digest of the weights that played it, which no plan can know."""
+        digits = (self.weights or "").rpartition(":")[2][:_DIGITS]
+        return f"{self.key}~{digits}" if digits else str(self.key)
 
     @property
     def outcome(self) -> dict[str, Any]:
@@ -64,7 +73,7 @@ _TIMES = {
 }
 _POLICY = {"policy_version", "policy_fingerprint", "first_policy_version"}
 # Older results lack the weights: "weights" is checked separately, and other versions show in the actions.
-_CIRCUMSTANCES = _TIMES | _POLICY | {"transport", "weights"}
+_CIRCUMSTANCES = _TIMES | _POLICY | {"transport", "weights", "revision"}
 
 
 @dataclass(frozen=True, slots=True)

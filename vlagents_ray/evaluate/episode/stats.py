@@ -34,6 +34,7 @@ class EpisodeStats:
     instruction: str = ""
     checkpoint: str | None = None
     weights: str | None = None
+    revision: str | None = None
     policy_version: int | None = None
     policy_fingerprint: str | None = None
     first_policy_version: int | None = None
@@ -50,8 +51,9 @@ class EpisodeStats:
     def began(self, info: object) -> None:
         """Record the info of the policy's reset."""
         said = info if isinstance(info, dict) else {}
-        self.checkpoint, self.weights = (
-            value if isinstance(value := said.get(name), str) else None for name in ("checkpoint", "weights")
+        self.checkpoint, self.weights, self.revision = (
+            value if isinstance(value := said.get(name), str) else None
+            for name in ("checkpoint", "weights", "revision")
         )
 
     def acted(self, act: Act, seconds: float, latency_s: float | None) -> None:
@@ -113,6 +115,7 @@ class EpisodeStats:
             transport=transport,
             checkpoint=self.checkpoint,
             weights=self.weights,
+            revision=self.revision,
             policy_version=self.policy_version,
             policy_fingerprint=self.policy_fingerprint,
             first_policy_version=self.first_policy_version,

@@ -44,7 +44,7 @@ def _of_episode(name: str, kind: Type, meaning: str) -> Column:
 
 
 COLUMNS = (
-    Column("key", "string", "stands for all that decides the episode", lambda _cell, episode: str(episode.result.key)),
+    _of_result("key", "string", "stands for all that decides the episode, its weights included", "full_key"),
     _of_cell("policy", "string", "its name in the evaluation"),
     _of_cell("step", "integer", "of training, in a sweep over checkpoints"),
     _of_result("checkpoint", "string", "that the policy's reset named"),
@@ -88,6 +88,7 @@ COLUMNS = (
     Column("finished", "time", "when it was recorded", lambda _cell, episode: _time(episode.finished)),
     _of_episode("videos", "json", "paths in the folder of results"),
     _of_episode("trajectory", "string", "path in the folder of results"),
+    _of_result("revision", "string", "the hub's commit of the checkpoint, if it was loaded from the hub's cache"),
 )  # fmt: skip
 
 

@@ -107,7 +107,7 @@ class ResultsDocument:
     def _failure(self, cell: CellResults, one: Episode) -> dict[str, Any]:
         result = one.result
         return {
-            "key": str(result.key),
+            "key": result.full_key,
             "policy": cell.contender,
             "task": cell.task,
             "episode": result.key.episode,

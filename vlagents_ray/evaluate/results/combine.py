@@ -11,12 +11,14 @@ from typing import Any
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.results.reader import CellResults, Results, Run, Worker
+from vlagents_ray.evaluate.results.summary import checkpoint_of, weights_of
 
 
 def combined(folders: Sequence[Results]) -> Results:
     """Combine the results of several folders.
 
-    A policy that two folders have in the same env gets the folder's name appended: "pi0 (second)".
+    A policy that two folders have in the same env, or with other weights under the same name of its checkpoint, gets
+    the folder's name appended: "pi0 (second)".
 
     Raises:
         ConfigError: There is no folder, or two of them are parts of one evaluation, which are merged, not compared.
@@ -28,6 +30,7 @@ def combined(folders: Sequence[Results]) -> Results:
     _require_apart(folders)
     counts = Counter((cell.contender, cell.suite, cell.env) for each in folders for cell in each.cells)
     clashing = {cell.policy for each in folders for cell in each.cells if counts[_name(cell)] > 1}
+    clashing |= _of_other_weights(folders)
     base = Path(os.path.commonpath([each.out.resolve() for each in folders]))
     cells: list[CellResults] = []
     runs: list[Run] = []
@@ -57,6 +60,17 @@ def _require_apart(folders: Sequence[Results]) -> None:
                     f"report: {first} and {each.out} both have {cell.contender!r} in {cell.env!r} with the same "
                     f"settings: parts of one evaluation; merge them into a folder first"
                 )
+
+
+def _of_other_weights(folders: Sequence[Results]) -> set[str]:
+    """The policies of which a checkpoint's name stands for several weights."""
+    first: dict[tuple[str, str | None], str] = {}  # by policy id and checkpoint
+    found = set()
+    for cell in (cell for each in folders for cell in each.cells):
+        weights = weights_of(cell)
+        if weights is not None and first.setdefault((cell.contender, checkpoint_of(cell)), weights) != weights:
+            found.add(cell.policy)
+    return found
 
 
 def _labels(folders: Sequence[Results], base: Path) -> list[str]:

@@ -41,7 +41,7 @@ CREATE TABLE episodes (
     error TEXT, seconds REAL NOT NULL, reset_ms REAL, env_step_ms REAL, env_seconds REAL, acts INTEGER NOT NULL,
     policy_ms REAL, policy_p95_ms REAL, policy_seconds REAL, latency_ms REAL,
     ticks_waited INTEGER NOT NULL, ticks_held INTEGER NOT NULL,
-    timing_ms TEXT NOT NULL, transport TEXT NOT NULL, checkpoint TEXT, weights TEXT,
+    timing_ms TEXT NOT NULL, transport TEXT NOT NULL, checkpoint TEXT, weights TEXT, revision TEXT,
     policy_version INTEGER, policy_fingerprint TEXT, first_policy_version INTEGER,
     actions_sha256 TEXT, videos TEXT NOT NULL, trajectory TEXT, attempts INTEGER NOT NULL,
     run INTEGER NOT NULL REFERENCES runs, finished REAL NOT NULL
@@ -75,6 +75,7 @@ _COLUMNS = {
         "first_policy_version": "INTEGER",
         "env_seconds": "REAL",
         "policy_seconds": "REAL",
+        "revision": "TEXT",
     }
 }
 

@@ -10,7 +10,7 @@ import json
 import os
 import sqlite3
 import time
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -60,7 +60,8 @@ class Store:
             self._out.mkdir(parents=True, exist_ok=True)
             self._lock = lock.acquire(self._out)
         self._run = 0
-        self._weights: dict[str, str | None] = {}  # by the cell that they played; read when first needed
+        self._cell = {cell.fingerprint: cell for cell in self.cells}
+        self._weights: dict[Hashable, str] = {}  # by cell, and by (policy, step, checkpoint); read when first needed
         self._made: set[str] = set()  # places whose env is known to be that of earlier runs
         try:
             with storing(config.out):
@@ -161,19 +162,24 @@ class Store:
             )
 
     def _require_same_weights(self, result: EpisodeResult) -> None:
-        cell = result.key.settings
         if result.weights is None:
             return
-        if self._weights.get(cell) is None:
-            query = "SELECT weights FROM episodes WHERE cell = ? AND weights IS NOT NULL LIMIT 1"
-            row = self._db.execute(query, (cell,)).fetchone()
-            self._weights[cell] = result.weights if row is None else row[0]
-        if result.weights != self._weights[cell]:
-            raise ConfigError(
-                f"policy: {result.key} was played by other weights than the results in {self._out}: "
-                f"{result.checkpoint!r} is {result.weights} now, and was {self._weights[cell]}. Bring the old weights "
-                f"back, or choose another out folder"
+        if not self._weights:
+            query = (
+                "SELECT DISTINCT e.cell, c.policy, c.step, e.checkpoint, e.weights FROM episodes e"
+                " JOIN cells c ON c.cell = e.cell WHERE e.weights IS NOT NULL"
             )
+            for of, *checkpoint, weights in self._db.execute(query):
+                self._weights |= {of: weights, tuple(checkpoint): weights}
+        cell = self._cell[result.key.settings]
+        for of in (cell.fingerprint, (cell.policy.name, cell.step, result.checkpoint)):
+            known = self._weights.setdefault(of, result.weights)
+            if result.weights != known:
+                raise ConfigError(
+                    f"policy: {result.key} was played by other weights than the results in {self._out}: "
+                    f"{result.checkpoint!r} is {result.weights} now, and was {known}. Bring the old weights "
+                    f"back, or choose another out folder"
+                )
 
     def record_attempt(self, job: Job, failure: Failure, *, retried: bool) -> None:
         """Record an attempt that infrastructure failed."""

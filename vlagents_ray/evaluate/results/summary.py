@@ -148,7 +148,8 @@ class Summary:
         """The content of summary.json."""
         cells = [
             group.to_json()
-            | {"checkpoint": checkpoint_of(cell), "weights": weights_of(cell), "pushed_weights": pushed_of(cell)}
+            | {"checkpoint": checkpoint_of(cell), "weights": weights_of(cell), "revision": revision_of(cell)}
+            | {"pushed_weights": pushed_of(cell)}
             | {"settings": cell.settings, "env": cell.env}
             | {"described": cell.described, "contract": cell.contract, "code": cell.code}
             | {"stopped_at": cell.stopped_at, "gap_to_synchronous": gap_to_synchronous(self.results, cell)}
@@ -191,6 +192,11 @@ def checkpoint_of(cell: CellResults) -> str | None:
 def weights_of(cell: CellResults) -> str | None:
     """The digest of the weights that the episodes of a cell were played by; None if no server reported it."""
     return next((one.weights for one in cell.counted if one.weights is not None), None)
+
+
+def revision_of(cell: CellResults) -> str | None:
+    """The hub's commit of these weights; None if they are not of the hub's cache."""
+    return next((one.revision for one in cell.counted if one.revision is not None), None)
 
 
 def pushed_of(cell: CellResults) -> str | None:

@@ -18,7 +18,7 @@ class About:
     group: str
     name: str  # of the policy
     id: str  # stays the same when an evaluation resumes this folder
-    config: dict[str, Any]  # `evaluation`: its settings; `code`: the git state of policy, envs and driver
+    config: dict[str, Any]  # `evaluation`: its settings; `served`: the policy's identity; `code`: git states
     diffs: Sequence[Path]  # of the working trees from their commits
 
 

@@ -13,6 +13,7 @@ from vlagents_ray.evaluate.artifacts.storage import PROVENANCE
 from vlagents_ray.evaluate.plan.config import EvalConfig, Tracker, fingerprint
 from vlagents_ray.evaluate.results.database import FILE, WAIT_S
 from vlagents_ray.evaluate.results.reader import CellResults, Results
+from vlagents_ray.evaluate.results.store import IDENTITY
 from vlagents_ray.evaluate.results.summary import Group, summarize
 from vlagents_ray.evaluate.trackers.base import About, TrackerRun
 from vlagents_ray.registry import named_class, require
@@ -103,13 +104,16 @@ class TrackerFeed:
 
     def _about(self, results: Results, policy: str) -> About:
         out, names = self._config.out, self._config.tracking
+        metadata = results.policies.get(policy, {})
+        served = {name: metadata.get(name) for name in IDENTITY}
         code: dict[str, Any] = dict(results.runs[-1].versions.get("code", {}))
-        code[f"policy {policy}"] = results.policies.get(policy, {}).get("code")
+        code[f"policy {policy}"] = metadata.get("code")
         code |= {f"env {cell.env}": cell.code for cell in results.cells}
         return About(
             out, names.project, names.group or out.resolve().name, policy,
             fingerprint([results.runs[0].started, policy]),
-            {"evaluation": results.runs[-1].config, "code": code}, sorted((out / PROVENANCE).glob("*.diff")),
+            {"evaluation": results.runs[-1].config, "served": served, "code": code},
+            sorted((out / PROVENANCE).glob("*.diff")),
         )  # fmt: skip
 
     def _videos(self, cell: CellResults) -> list[Path]:

@@ -31,17 +31,20 @@ class Adapter:
     source: str = ""  # path or hub id, as the settings name it
     weights: str = ""  # digest of the base's files and the adapter's
     fingerprint: str = ""  # the beginning of that; empty: none, the session acts with the base alone
+    revision: str | None = None  # the hub's commit of the adapter
 
     @classmethod
-    def of(cls, source: str, base: str, own: str) -> Adapter:
-        """Return the adapter with that source, on a base and with files of these digests."""
+    def of(cls, source: str, base: str, own: str, revision: str | None = None) -> Adapter:
+        """Return the adapter with that source and commit, on a base and with files of these digests."""
         digest = hashlib.sha256(f"{base} {own}".encode()).hexdigest()
-        return cls(source, f"{own.partition(':')[0]}:{digest}", digest[:_DIGITS])
+        return cls(source, f"{own.partition(':')[0]}:{digest}", digest[:_DIGITS], revision)
 
     @property
     def identity(self) -> dict[str, Any]:
-        """Checkpoint and digest, for the info of a reset; empty without an adapter."""
-        return {"checkpoint": self.source, "weights": self.weights} if self.fingerprint else {}
+        """Checkpoint, digest and commit, for the info of a reset; empty without an adapter."""
+        if not self.fingerprint:
+            return {}
+        return {"checkpoint": self.source, "weights": self.weights, "revision": self.revision}
 
 
 class Adapters:

@@ -126,7 +126,7 @@ def make_part(kind: str, entry: str | Mapping[str, Mapping[str, Any]]) -> Any:
 class PretrainedConfig(BaseModel, extra="forbid"):
     """The weights, and their device."""
 
-    checkpoint: str = Field(min_length=1, description="a folder as transformers saves it, or a hub id")
+    checkpoint: str = Field(min_length=1, description="a folder as transformers saves it, or a hub id: org/name@COMMIT")
     device: str = Field(default="auto", description="'auto' (an accelerator if there is one), 'cpu', 'cuda', 'cuda:1'")
     dtype: DType = Field(default="float32", description="of the weights")
 

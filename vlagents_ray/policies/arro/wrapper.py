@@ -14,6 +14,8 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.policies.arro.background import Background
 from vlagents_ray.policies.arro.config import ArroConfig
 from vlagents_ray.policies.arro.tracking import Track, Tracking
+from vlagents_ray.policies.base.checkpoint import used_checkpoints
+from vlagents_ray.policies.base.checkpoint_files import weights_of, with_parts
 from vlagents_ray.policies.wrapper import Wrapper
 
 INFO = "arro"  # in Act.info and what `reset` returns: {camera: {"seen": labels, "missing": labels, "searched": bool}}
@@ -54,9 +56,12 @@ class Arro(Wrapper):
 
     def initialize(self) -> None:
         """Load the parts, then the inner agent."""
-        self.background.load()
-        self.tracking.load()
-        super().initialize()
+        with used_checkpoints() as parts:
+            self.background.load()
+            self.tracking.load()
+        with used_checkpoints() as own:
+            super().initialize()
+        self.weights_id = with_parts(self.weights_id or weights_of(own), parts)
         stated = self.agent.contract.cameras if self.agent.contract is not None else None
         idle = sorted(set(self.config.cameras or ()) - set(stated or ())) if stated else []
         if idle:

@@ -14,7 +14,7 @@ from typing import Any
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.adapters import FILES, Adapter, base_of
-from vlagents_ray.policies.base.checkpoint_files import digest
+from vlagents_ray.policies.base.checkpoint_files import digest, revision
 from vlagents_ray.registry import require
 
 log = logging.getLogger(__name__)
@@ -74,8 +74,17 @@ def find_checkpoint(name: str, step: int | None = None, needs: Iterable[str] = (
                 f"is it a checkpoint of this family, and whole?"
             )
     if (used := _used.get()) is not None and path not in used:
-        used[:] = [*(one for one in used if one not in path.parents), path]
+        used[:] = [*(one for one in used if not _holds(one, path)), path]
     return path
+
+
+def _holds(folder: Path, path: Path) -> bool:
+    """Whether `path` is in the folder, or the folder itself under another name, as behind a link `last`."""
+    if not folder.is_dir():
+        return False
+    # A file of the hub's cache is a link out of its folder.
+    places = (path.resolve(), path.parent.resolve() / path.name)
+    return any(folder.resolve() in (place, *place.parents) for place in places)
 
 
 def find_adapter(source: str, checkpoint: str, base: Sequence[Path], digest_of_base: str) -> tuple[Adapter, Path]:
@@ -99,7 +108,7 @@ def find_adapter(source: str, checkpoint: str, base: Sequence[Path], digest_of_b
             f"{folder}: was trained on {trained_on!r}, want an adapter of {checkpoint!r}, the policy's checkpoint; "
             f"if these are the same weights, name it so as base_model_name_or_path in its adapter_config.json"
         )
-    return Adapter.of(source, digest_of_base, digest([folder])), folder
+    return Adapter.of(source, digest_of_base, digest([folder]), revision(folder)), folder
 
 
 def _is_other(trained_on: str, checkpoint: str, base: Sequence[Path], digest_of_base: str) -> bool:
@@ -125,10 +134,17 @@ def _beside(path: Path) -> str:
 
 def _from_hub(name: str) -> Path:
     hub = require("huggingface_hub")
-    repository, _, revision = name.partition("@")
+    repository, at, wanted = name.partition("@")
+    if at and not wanted:
+        raise ConfigError(f"checkpoint {name!r}: got no revision after the @, want a commit, a tag or a branch")
     try:
-        path = Path(hub.snapshot_download(repository, revision=revision or None))
+        path = Path(hub.snapshot_download(repository, revision=wanted or None))
     except Exception as error:  # of many classes: no such id, no access, no network, offline mode
+        if type(error).__name__ == "RevisionNotFoundError":
+            raise ConfigError(
+                f"checkpoint {name!r}: {repository} has no revision {wanted!r}, want one of its commits, or of its "
+                f"branches and tags, which are {_revisions(hub, repository)}"
+            ) from error
         raise ConfigError(
             f"checkpoint {name!r}: neither a path here nor to be had from the hub ({type(error).__name__}); "
             f"download it to a folder and name that, or check the id (org/name or org/name@COMMIT), the network and "
@@ -136,6 +152,16 @@ def _from_hub(name: str) -> Path:
         ) from error
     log.info("checkpoint %s: commit %s", name, path.name)
     return path
+
+
+def _revisions(hub: Any, repository: str) -> str:
+    """List the branches and tags of a repository, for an error message."""
+    try:
+        refs = hub.HfApi().list_repo_refs(repository)
+        names = [one.name for one in (*refs.branches, *refs.tags)]
+    except Exception as error:  # noqa: BLE001 - the message is about another error
+        return f"not known here ({type(error).__name__})"
+    return ", ".join(names[:_LISTED]) + (", …" if len(names) > _LISTED else "")
 
 
 class SavedTensors:

@@ -11,11 +11,12 @@ import fnmatch
 import hashlib
 import itertools
 import json
+import os
 import re
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 # The names that trainers give to files in progress: orbax' folders, and the usual suffixes.
 TEMPORARY = ("*.orbax-checkpoint-tmp*", "*.tmp", "*.tmp-*", "*.part", "*.partial", "*.incomplete", "tmp-*", ".tmp*")
@@ -114,8 +115,26 @@ _CHECKS: dict[str, Callable[[Path], str | None]] = {
 
 
 def weights_of(paths: Sequence[Path]) -> dict[str, str | None] | None:
-    """Return `Agent.weights_id`: the digest of these files and folders, and their commit; None if there are none."""
-    return {"digest": digest(paths), "revision": next(filter(None, map(revision, paths)), None)} if paths else None
+    """Return `Agent.weights_id` of files and folders, of which the first is the policy's own; None if there are none.
+
+    The digest is that of all of them, the revision that of the first: those after it, as an encoder's, may be another
+    repository's.
+    """
+    return {"digest": digest(paths), "revision": revision(paths[0])} if paths else None
+
+
+def with_parts(policy: dict[str, Any] | None, parts: Sequence[Path]) -> dict[str, Any] | None:
+    """Return the `Agent.weights_id` of a policy that acts with the files and folders `parts` beside its own.
+
+    Args:
+        policy: That of the policy alone.
+        parts: Files of other models, such as those that change what the policy sees.
+    """
+    if not parts:
+        return policy
+    own = policy or {"digest": None, "revision": None}
+    both = hashlib.sha256(f"{own['digest']} {digest(parts)}".encode()).hexdigest()
+    return {**own, "digest": f"{METHOD}:{both}"}
 
 
 def digest(paths: Iterable[Path]) -> str:
@@ -150,13 +169,21 @@ def revision(path: Path) -> str | None:
 def _files(path: Path) -> list[Path]:
     if path.is_file():
         return [path]
-    return sorted(
-        file
-        for file in path.rglob("*")
-        if file.is_file()
-        and file.suffix not in _BESIDE
-        and not any(part.startswith((".", "__pycache__")) for part in file.relative_to(path).parts)
-    )
+    return sorted(_below(path, frozenset()))
+
+
+def _below(folder: Path, above: frozenset[str]) -> Iterator[Path]:
+    """Yield what counts in a folder, also behind links to folders, as loaders follow them; `above` are its parents."""
+    within = above | {os.path.realpath(folder)}
+    with contextlib.suppress(OSError):  # unreadable or gone
+        for entry in list(folder.iterdir()):
+            if entry.name.startswith((".", "__pycache__")):
+                continue
+            if entry.is_file():
+                if entry.suffix not in _BESIDE:
+                    yield entry
+            elif entry.is_dir() and os.path.realpath(entry) not in within:
+                yield from _below(entry, within)
 
 
 def _parts(file: Path, opened: BinaryIO, size: int) -> Iterator[bytes]:

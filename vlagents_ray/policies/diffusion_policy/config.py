@@ -12,7 +12,11 @@ from vlagents_ray.policies.base import ModelConfig
 class DiffusionPolicyConfig(ModelConfig):
     """Settings of Diffusion Policy, beside those of all models."""
 
-    checkpoint: str = Field(min_length=1, description="a .ckpt file; `{step}` stands for checkpoint_step")
+    checkpoint: str = Field(
+        min_length=1,
+        description="a .ckpt file, or a folder or org/name@COMMIT of the hub, with only one; `{step}` stands for "
+        "checkpoint_step",
+    )
     trust_checkpoint: bool = Field(
         default=False,
         description="these checkpoints are pickles, and loading one runs the code that its author put in: set true if "

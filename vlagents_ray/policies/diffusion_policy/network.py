@@ -10,6 +10,7 @@ from typing import Any
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device
 from vlagents_ray.policies.base.checkpoint import find_checkpoint, require_loaded
+from vlagents_ray.policies.base.checkpoint_files import revision
 from vlagents_ray.policies.base.model_code import use_source
 from vlagents_ray.policies.diffusion_policy.config import DiffusionPolicyConfig
 from vlagents_ray.registry import require
@@ -36,7 +37,7 @@ class DiffusionNetwork:
                 f"checkpoint {config.checkpoint!r}: this family's checkpoints are pickles, and loading one runs "
                 f"whatever code its author put in; set trust_checkpoint: true if you trust its origin"
             )
-        path = _file(config)
+        path = checkpoint_file(config)
         ensure_torchvision()
         use_source("diffusion_policy", "DIFFUSION_POLICY_SRC", config.source_dir)
         settings, state = _read(path)
@@ -60,12 +61,28 @@ class DiffusionNetwork:
         return cls(module.to(device).eval(), device, images, vectors, absolute)
 
 
-def _file(config: DiffusionPolicyConfig) -> Path:
+def checkpoint_file(config: DiffusionPolicyConfig) -> Path:
+    """Find the .ckpt file.
+
+    Raises:
+        ConfigError: There is none, a folder has several, or it is of a hub id without the commit, whose pickle may be
+            another one tomorrow than the one that the user trusts.
+    """
     path = find_checkpoint(config.checkpoint, config.checkpoint_step)
-    if path.is_dir():
-        found = sorted(str(p.relative_to(path)) for p in path.rglob("*.ckpt"))[:10]
-        raise ConfigError(f"checkpoint {path}: a folder, want a .ckpt file; it has {found or 'none'}")
-    return path
+    commit = revision(path)
+    if commit is not None and commit not in config.checkpoint:
+        repository = config.checkpoint.partition("@")[0]
+        raise ConfigError(
+            f"checkpoint {config.checkpoint!r}: a pickle of the hub, whose branches and tags may become others; want "
+            f"the commit that you trust, such as {repository}@{commit}, which it is now"
+        )
+    if path.is_file():
+        return path
+    found = sorted(path.rglob("*.ckpt"))
+    if len(found) != 1:
+        names = [str(file.relative_to(path)) for file in found[:10]]
+        raise ConfigError(f"checkpoint {path}: a folder with {names}, want one .ckpt file, or a folder with only one")
+    return find_checkpoint(str(found[0]))
 
 
 def _read(path: Path) -> tuple[Any, Mapping[str, Any]]:

@@ -13,7 +13,8 @@ class OctoConfig(ModelConfig):
     """Settings of Octo, beside those of all models."""
 
     checkpoint: str = Field(
-        min_length=1, description="folder of `save_pretrained` (its newest step, or `folder/{step}`), or hub id"
+        min_length=1,
+        description="folder of `save_pretrained` (its newest step, or `folder/{step}`), or hub id: org/name@COMMIT",
     )
     dtype: Literal["auto", "float32"] = Field(default="auto", description="float32, as Octo computes")
     compile: Literal[True] = Field(default=True, description="JAX always compiles, once for each of `batch_sizes`")

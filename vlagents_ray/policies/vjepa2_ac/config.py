@@ -15,7 +15,8 @@ class VJepa2AcConfig(ModelConfig):
 
     deterministic: Literal[False] = Field(default=False, description="not for this family")
     encoder: str | None = Field(
-        default=None, description="folder or hub id of a `VJEPA2Model` instead of the encoder in the checkpoint"
+        default=None,
+        description="folder or hub id (org/name@COMMIT) of a `VJEPA2Model` instead of the encoder in the checkpoint",
     )
     source_dir: str | None = Field(
         default=None,

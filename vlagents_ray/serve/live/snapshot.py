@@ -147,6 +147,7 @@ class ReplicaView:
             self._slow = {
                 "policy": metadata["policy"],
                 "checkpoint": metadata["checkpoint"],
+                "digest": (metadata["weights"] or {}).get("digest"),
                 "weights": metadata["policy_version"],
                 "ready": engine.ready,
                 "step": engine.models.step,

@@ -59,8 +59,9 @@ class LoadedModel:
 
     @property
     def identity(self) -> dict[str, str]:
-        """Checkpoint and digest of the loaded weights, for the info of a reset."""
-        known = {"checkpoint": self.checkpoint, "weights": None if self.weights is None else self.weights["digest"]}
+        """Checkpoint, digest and commit of the loaded weights, for the info of a reset."""
+        weights = self.weights or {}
+        known = {"checkpoint": self.checkpoint, "weights": weights.get("digest"), "revision": weights.get("revision")}
         return {name: value for name, value in known.items() if value is not None}
 
     def check(self, request: Request) -> None:
@@ -153,7 +154,7 @@ class Loader:
         padding = Padding(self._batch_sizes, copies.make)
         version = (self.version(settings), f"{copies.fingerprint} {weights['digest'] if weights else ''}")
         if weights is not None:
-            logger.info("weights: %s, revision: %s", weights["digest"], weights["revision"])
+            logger.info("weights: %s, revision: %s", weights["digest"], weights.get("revision"))
         busy = threading.Lock()
         digest = ((weights or {}).get("digest") or "").rpartition(":")[2][:DIGITS]
         parameters = ModelWeights(agent, busy, digest, version)

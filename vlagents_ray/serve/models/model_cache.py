@@ -76,7 +76,8 @@ class ModelCache:
         elif self.failure is not None:
             swap = {"state": "failed", "error": self.failure}
         loaded = [model.checkpoint for model in self.loaded.values()]
-        return {**self._source.describe(self.config), "loaded": loaded, "swap": swap}
+        weights = [model.weights for model in self.loaded.values()]
+        return {**self._source.describe(self.config), "loaded": loaded, "weights": weights, "swap": swap}
 
     def offers(self, choice: CheckpointChoice, settings: Mapping[str, Any]) -> bool:
         """Return whether the deployment offers that choice, and it results in these settings."""

@@ -67,6 +67,7 @@ class _Running:
     number: int  # of the session, the same in all its episodes
     instruction: str
     reset: str  # options of the reset, as `to_text` writes them; empty once they are recorded
+    weights: str  # what the reset said of the loaded weights, as text; empty once it is recorded
     shelf: _Shelf | None = None  # of `episode`
     episode: RobotEpisode | None = None  # None before the first frame
     frames: int = 0  # of `episode`
@@ -112,12 +113,19 @@ class EpisodeWriter:
         self._numbers = 0
         self._looked = float("-inf")  # time at which the size of the folder was looked up, s
 
-    def begin(self, session: str, instruction: str, reset: str) -> None:
-        """Begin to record a session, and end its episode before; `reset` are its options, as text."""
+    def begin(self, session: str, instruction: str, reset: str, weights: str) -> None:
+        """Begin to record a session, and end its episode before.
+
+        Args:
+            session: The session.
+            instruction: Its instruction.
+            reset: The options of its reset, as text.
+            weights: The checkpoint and the weights that it acts with, as text; empty if that is not known.
+        """
         self.end(session)
         if len(self._running) >= _SESSIONS:
             return
-        self._running[session] = _Running(self._numbers, instruction, reset)
+        self._running[session] = _Running(self._numbers, instruction, reset, weights)
         self._numbers += 1
 
     def __contains__(self, session: str) -> bool:
@@ -141,12 +149,13 @@ class EpisodeWriter:
         columns = {
             **frame.columns,
             "reset": running.reset,
+            "weights": running.weights,
             SESSION: running.number,
             ROWS: rows,
             CHUNK: padded(frame.chunk, running.shelf.rows).ravel(),
         }
         running.episode.add(frame.obs, frame.chunk[0], frame.captured_at, frame.tick, False, more=columns)
-        running.reset = ""
+        running.reset = running.weights = ""
         running.frames += 1
         running.size += columns[CHUNK].nbytes + sum(len(text) for text in columns.values() if isinstance(text, str))
 

@@ -238,7 +238,8 @@ class SessionRecorder:
                 if self._first[session] is None:
                     self._writer.end(session)
                 else:
-                    self._writer.begin(session, asked.instruction, asked.options)
+                    weights = to_text(reply.identity) if reply.identity else ""
+                    self._writer.begin(session, asked.instruction, asked.options, weights)
             elif op == "close":
                 self._first.pop(session, None)
                 self._writer.end(session)
@@ -263,7 +264,7 @@ class SessionRecorder:
             if random.random() < self._share:
                 instruction, first = self._find(session)
                 self._first[session] = first
-                self._writer.begin(session, instruction, "")
+                self._writer.begin(session, instruction, "", "")
         return self._first[session] is not None
 
     def _end_others(self, held: Collection[str]) -> None:

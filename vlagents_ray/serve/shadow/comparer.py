@@ -67,7 +67,8 @@ class Comparer:
                 continue
             line: dict[str, Any] = {"time": time.time(), "session": request.session, "op": request.op}
             if request.op == "reset":
-                line |= {"instruction": request.instruction, "candidate": _described(theirs)}
+                line |= {"instruction": request.instruction}
+                line |= {"live": ours.identity, "candidate": _described(theirs) | theirs.identity}
             else:
                 line |= {
                     "step": ours.step,

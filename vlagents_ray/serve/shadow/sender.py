@@ -85,7 +85,7 @@ class _Entry:
         act = reply.act
         if act is not None:
             act = Act(act.action, act.done, {name: act.info[name] for name in (POLICY,) if name in act.info})
-        about = Reply(act=act, info=None if act else {}, step=reply.step, timing=dict(reply.timing))
+        about = Reply(act=act, info=None if act else reply.identity, step=reply.step, timing=dict(reply.timing))
         return Turn(self.session, self.frame, about, self.dropped)
 
 

@@ -12,7 +12,15 @@ import yaml
 from vlagents_ray.evaluate.plan.config import EvalConfig
 from vlagents_ray.evaluate.results.reader import CellResults, Results, Run
 from vlagents_ray.evaluate.results.statistics import Rate
-from vlagents_ray.evaluate.results.summary import TOTAL, Summary, checkpoint_of, group_of, pushed_of, weights_of
+from vlagents_ray.evaluate.results.summary import (
+    TOTAL,
+    Summary,
+    checkpoint_of,
+    group_of,
+    pushed_of,
+    revision_of,
+    weights_of,
+)
 
 PROTOCOL = "protocol"  # of what an env describes: the constants of its benchmark
 _SETTINGS = ("env_options", "reset_options", "clock")
@@ -34,7 +42,7 @@ class Configuration:
     """Runs, workers, versions, the metadata of each policy's server, and all settings."""
 
     runs: tuple[Run, ...]
-    checkpoints: list[tuple[str, str]]  # (policy id, checkpoint, digest or version of its weights)
+    checkpoints: list[tuple[str, str]]  # (policy id, checkpoint, commit, digest or version of its weights)
     workers: list[tuple[str, str, str, str, int]]  # (host, policy, transport, renderer, workers)
     versions: list[Mapping[str, Any]]  # of each folder
     policies: list[tuple[str, str]]  # (name, metadata as YAML)
@@ -82,7 +90,7 @@ def protocol(results: Results) -> list[Env]:
 
 def configuration(results: Results) -> Configuration:
     """What the results say of the software and the machines that made them."""
-    named = {cell.contender: (checkpoint_of(cell), weights_of(cell), pushed_of(cell)) for cell in results.cells}
+    named = [(cell.contender, one) for cell in results.cells for one in _identity(cell)]
     workers: dict[tuple[str, str, str, str], set[tuple[int, int]]] = {}
     for one in results.workers:
         where = (one.host, one.policy, one.transport, one.renderer or "none")
@@ -90,12 +98,18 @@ def configuration(results: Results) -> Configuration:
     last = _last_runs(results)
     return Configuration(
         results.runs,
-        [(name, one) for name, found in named.items() for one in found if one is not None],
+        list(dict.fromkeys(named)),
         [(*where, len(alike)) for where, alike in sorted(workers.items())],
         [{name: value for name, value in run.versions.items() if value is not None} for run in last],
         [(name, _yaml(metadata)) for name, metadata in results.policies.items()],
         [(str(run.config.get("out")), _yaml(run.config)) for run in last],
     )
+
+
+def _identity(cell: CellResults) -> list[str]:
+    commit = revision_of(cell)
+    found = (checkpoint_of(cell), commit and f"commit {commit}", weights_of(cell), pushed_of(cell))
+    return [one for one in found if one is not None]
 
 
 def repeat(summary: Summary) -> Repeat:

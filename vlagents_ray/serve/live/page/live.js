@@ -129,7 +129,9 @@ function showFleet(now) {
   if (!policies.length) return;
   if (!evaluation) {
     byId("policy").textContent = policies[0].policy;
-    byId("checkpoint").textContent = policies[0].checkpoint || "";
+    const digests = [...new Set(policies.map((one) => one.digest).filter(Boolean))];
+    byId("checkpoint").textContent = [policies[0].checkpoint, ...digests.map((one) => one.slice(0, 31))].filter(Boolean).join(" · ");
+    byId("checkpoint").title = digests.join("\n");
     document.title = `${policies[0].policy}, live`;
   }
   const several = new Set(policies.map((one) => one.policy)).size > 1;

@@ -1,0 +1,92 @@
+"""Every setting that names a checkpoint takes a commit of a repository on the hub."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.policies.base.checkpoint import find_adapter, used_checkpoints
+from vlagents_ray.policies.base.checkpoint_files import weights_of
+from vlagents_ray.policies.diffusion_policy.config import DiffusionPolicyConfig
+from vlagents_ray.policies.diffusion_policy.network import checkpoint_file
+from vlagents_ray.registry import POLICIES, named_class
+
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
+NAMED = f"org/name@{COMMIT}"
+NEEDED = {"openpi": {"config": "pi0_droid"}, "diffusion_policy": {"trust_checkpoint": True}}
+# What needs the family's packages, and comes before the checkpoint is looked for.
+BEFORE = {
+    "octo": ["vlagents_ray.policies.octo.network.octo_model_class"],
+    "openpi": [f"vlagents_ray.policies.openpi.policy.{name}" for name in ("use_source", "train_config")],
+}
+
+
+def families() -> list[Any]:
+    with_checkpoints = [
+        name
+        for name, target in POLICIES.items()
+        if "checkpoint" in getattr(named_class(target, {}).Config, "model_fields", ())
+    ]
+    return [pytest.param(name, marks=pytest.mark.torch if name == "vjepa2_ac" else ()) for name in with_checkpoints]
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str | None]]:
+    """What is asked of the hub, which has nothing."""
+    found: list[tuple[str, str | None]] = []
+
+    def download(name: str, revision: str | None) -> str:
+        found.append((name, revision))
+        raise ValueError("not here")
+
+    monkeypatch.setitem(sys.modules, "huggingface_hub", SimpleNamespace(snapshot_download=download))
+    return found
+
+
+@pytest.mark.parametrize("family", families())
+def test_a_family_asks_for_the_commit(
+    family: str, asked: list[tuple[str, str | None]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for function in BEFORE.get(family, ()):
+        monkeypatch.setattr(function, lambda *_args, **_options: None)
+    policy = named_class(POLICIES[family], {}).from_config({"checkpoint": NAMED, **NEEDED.get(family, {})})
+    with pytest.raises(ConfigError, match="nor to be had from the hub"):
+        policy.initialize()
+    assert asked == [("org/name", COMMIT)]
+
+
+def test_an_adapter_is_asked_for_by_its_commit(asked: list[tuple[str, str | None]]) -> None:
+    with pytest.raises(ConfigError, match="nor to be had from the hub"):
+        find_adapter(NAMED, "org/base", [], "")
+    assert asked == [("org/name", COMMIT)]
+
+
+def test_a_repository_with_one_file_of_diffusion_policy_is_enough(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    snapshot = tmp_path / "models--org--name" / "snapshots" / COMMIT
+    (snapshot / "checkpoints").mkdir(parents=True)
+    blob = tmp_path / "blob"
+    blob.write_bytes(b"weights")
+    (snapshot / "checkpoints" / "latest.ckpt").symlink_to(blob)  # as in the hub's cache
+    (snapshot / "big.mp4").touch()
+    hub = SimpleNamespace(snapshot_download=lambda *_args, **_options: str(snapshot))
+    monkeypatch.setitem(sys.modules, "huggingface_hub", hub)
+    config = DiffusionPolicyConfig(checkpoint=NAMED, trust_checkpoint=True)
+    with used_checkpoints() as found:
+        assert checkpoint_file(config) == snapshot / "checkpoints" / "latest.ckpt"
+    assert found == [snapshot / "checkpoints" / "latest.ckpt"]
+    weights = weights_of(found)
+    assert weights is not None
+    assert weights["revision"] == COMMIT
+    branch = DiffusionPolicyConfig(checkpoint="org/name@main", trust_checkpoint=True)
+    with pytest.raises(ConfigError, match=rf"pickle of the hub, .* want the commit that you trust, such as {NAMED}"):
+        checkpoint_file(branch)
+    (snapshot / "other.ckpt").touch()
+    with pytest.raises(ConfigError, match=r"\['checkpoints/latest.ckpt', 'other.ckpt'\], want one \.ckpt file"):
+        checkpoint_file(config)
