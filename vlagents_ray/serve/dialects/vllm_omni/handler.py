@@ -16,9 +16,9 @@ from pydantic import Field
 
 from vlagents_ray.errors import MalformedMessage
 from vlagents_ray.interface import Obs
-from vlagents_ray.serve.dialects.openpi import codec
 from vlagents_ray.serve.dialects.openpi.handler import MapConnection
 from vlagents_ray.serve.dialects.roboarena.handler import RoboArenaDialect, RoboArenaDialectConfig
+from vlagents_ray.wire.openpi import codec
 
 
 class VllmOmniDialectConfig(RoboArenaDialectConfig):

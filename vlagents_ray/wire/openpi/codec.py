@@ -13,7 +13,7 @@ import numpy as np
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge
 from vlagents_ray.protocol.arrays import plain_dtype, read_array
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
-from vlagents_ray.serve.dialects.msgpack import pack, unpack
+from vlagents_ray.wire.msgpack import pack, unpack
 
 
 def decode(data: bytes, limits: Limits = DEFAULT_LIMITS) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
-from vlagents_ray.serve.dialects import json_numpy
+from vlagents_ray.wire import json_numpy
 
 
 def decode(body: bytes, limits: Limits = DEFAULT_LIMITS) -> tuple[dict[str, Any], bool]:
