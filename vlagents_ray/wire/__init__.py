@@ -1,1 +1,1 @@
-"""Bytes of other systems' protocols to values and back, and key mappings: for dialects (server) and `upstream` (client)."""
+"""Other systems' messages and key mappings, for the dialects of a server and for the policy `upstream`."""
