@@ -21,10 +21,15 @@ def decode(data: bytes, limits: Limits = DEFAULT_LIMITS) -> dict[str, Any]:
 
     Raises `MalformedMessage` or `MessageTooLarge`.
     """
-    value = unpack(data, limits, lambda node: _array(node, limits.items))
+    value = decode_any(data, limits)
     if not isinstance(value, dict):
         raise MalformedMessage(f"message: got {type(value).__name__}, want a map")
     return value
+
+
+def decode_any(data: bytes, limits: Limits = DEFAULT_LIMITS) -> Any:
+    """Return the value in a message, which need not be a map; else as `decode`."""
+    return unpack(data, limits, lambda node: _array(node, limits.items))
 
 
 def encode(value: Any) -> bytes:
