@@ -32,7 +32,8 @@ class UpstreamConfig(BaseModel, extra="forbid"):
         "protocol's own, except for openpi, whose robots have different keys",
     )
     contract: dict[str, Any] = Field(
-        default_factory=dict, description="what is known about the model beyond the mapping, e.g. action: {dim: 7}, chunk"
+        default_factory=dict,
+        description="what is known about the model beyond the mapping, e.g. action: {dim: 7}, chunk",
     )
     sessions: Literal["none", "connection"] | None = Field(
         default=None,
@@ -46,7 +47,9 @@ class UpstreamConfig(BaseModel, extra="forbid"):
     retry_s: float = Field(
         default=2.0, ge=0, description="for a lost upstream to return, before a request is answered with 503, s"
     )
-    connect_timeout_s: float = Field(default=600.0, gt=0, description="for the first upstream to answer at the start, s")
+    connect_timeout_s: float = Field(
+        default=600.0, gt=0, description="for the first upstream to answer at the start, s"
+    )
     key_env: str | None = Field(
         default=None, description="name of the environment variable with the upstream's API key"
     )
@@ -68,10 +71,12 @@ class UpstreamConfig(BaseModel, extra="forbid"):
                 want = " or ".join(f"{scheme}://HOST:PORT" for scheme in self.client.schemes)
                 raise ValueError(f"urls: got {url!r}, want {want} for {self.protocol}")
             if parts.username is not None or parts.password is not None:
-                raise ValueError("urls: got a name or a password in one; put the key into a variable, and name it in key_env")
+                raise ValueError(
+                    "urls: got a name or a password in one; put the key into a variable, and name it in key_env"
+                )
         if self.mapping is None and self.client.mapping is None:
             raise ValueError(
-                f"mapping: {self.protocol}'s robots have different keys; give a preset, such as openpi-libero, or an object"
+                f"mapping: {self.protocol} has none of its own; give a preset, such as openpi-libero, or an object"
             )
         self.keys()
         return self

@@ -71,7 +71,9 @@ class Outgoing:
         if not ranges:
             if len(named) == 1:
                 return next(iter(named.values()))
-            raise InvalidAction(f"action: got {sorted(named)[:16]}, want one array; say in mapping.action which columns each is")
+            raise InvalidAction(
+                f"action: got {sorted(named)[:16]}, want one array; say in mapping.action which columns each is"
+            )
         if absent := [name for name in ranges if name not in named]:
             raise InvalidAction(f"action: got {sorted(named)[:16]}, which lacks {absent}; change mapping.action")
         parts = {name: named[name] if named[name].ndim > 0 else named[name][None] for name in ranges}
@@ -101,7 +103,7 @@ class Outgoing:
                 for name, parts in mapping.state.items()
                 if named(name) and not all(part.optional for part in parts)
             },
-            gripper=self._own_gripper() and mapping.gripper is not None and not mapping.gripper.optional or None,
+            gripper=(self._own_gripper() and mapping.gripper is not None and not mapping.gripper.optional) or None,
             instruction=True if mapping.instruction is not None else None,
             action=ActionSpec(
                 dim=max((stop for stop in stops if stop is not None), default=None) if None not in stops else None,
@@ -184,16 +186,16 @@ def _width(parts: tuple[StateKey, ...]) -> int | None:
     return sum(known) if len(known) == len(widths) else None
 
 
-def _split(
-    name: str, vector: np.ndarray, keys: list[tuple[str, StateKey]]
-) -> list[tuple[str, StateKey, np.ndarray]]:
+def _split(name: str, vector: np.ndarray, keys: list[tuple[str, StateKey]]) -> list[tuple[str, StateKey, np.ndarray]]:
     """Return the parts of a state's vector; the last one without `stop` has what the others leave."""
     widths = [_width((part,)) for _, part in keys]
     if widths.count(None) > 1:
         raise ConfigError(f"mapping.state.{name}: got {widths.count(None)} parts without `stop`, want one at most")
     known = sum(width for width in widths if width is not None)
     if (vector.size < known) if None in widths else (vector.size != known):
-        raise InvalidObservation(f"state {name!r}: got {vector.size} numbers, the mapping says {known}; change one of them")
+        raise InvalidObservation(
+            f"state {name!r}: got {vector.size} numbers, the mapping says {known}; change one of them"
+        )
     found, at = [], 0
     for (key, part), width in zip(keys, widths, strict=True):
         end = at + (vector.size - known if width is None else width)
@@ -202,7 +204,9 @@ def _split(
     return found
 
 
-def _joined(key: str, pieces: list[tuple[int, np.ndarray]], error: type[InvalidObservation | InvalidAction]) -> np.ndarray:
+def _joined(
+    key: str, pieces: list[tuple[int, np.ndarray]], error: type[InvalidObservation | InvalidAction]
+) -> np.ndarray:
     """Join vectors or columns at their places along the last axis, which they must fill without gaps."""
     end = max(start + piece.shape[-1] for start, piece in pieces)
     if min(start for start, _ in pieces) < 0 or end > _MOST:

@@ -50,7 +50,7 @@ class UpstreamClient(abc.ABC):
     @staticmethod
     def is_nested(key: str) -> bool:
         """Return whether a key `a/b` of the mapping is the key `b` within `a`; else, it is one key."""
-        return True
+        return "/" in key
 
     @abc.abstractmethod
     def connect(self, timeout_s: float) -> dict[str, Any]:
@@ -75,7 +75,7 @@ class UpstreamClient(abc.ABC):
             MalformedMessage, MessageTooLarge: Its answer is invalid.
         """
 
-    def begin(self) -> None:
+    def begin(self) -> None:  # noqa: B027 - not abstract: a protocol may have no such message
         """Say that an episode begins, if the protocol can; raises what `ask` raises."""
 
     @abc.abstractmethod

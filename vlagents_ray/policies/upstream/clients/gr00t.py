@@ -87,7 +87,9 @@ class GR00TClient(UpstreamClient):
             stated = metadata.get(kind, {"keys": [], "steps": []})
             given = [one.removeprefix(f"{kind}/").removeprefix(f"{kind}.") for key in keys for one in key.split("|")]
             if lacks := [key for key in stated["keys"] if not any(matches(key, one) for one in given)]:
-                found.append(f"{kind}: the upstream needs {lacks}, the mapping gives {given}; add them to mapping.{field}")
+                found.append(
+                    f"{kind}: the upstream needs {lacks}, the mapping gives {given}; add them to mapping.{field}"
+                )
             if len(stated["steps"]) > 1:
                 found.append(
                     f"{kind}: the upstream needs the moments {stated['steps']}, and only the newest is sent; "
@@ -130,10 +132,8 @@ class GR00TClient(UpstreamClient):
         if self._socket in ready:
             return
         self.close()
-        lost = self._monitor in ready
-        raise ConnectionLost(
-            f"upstream {self.options.url}: {'the connection ended' if lost else f'{what} within {deadline - begun:.3g} s'}"
-        )
+        why = "the connection ended" if self._monitor in ready else f"{what} within {deadline - begun:.3g} s"
+        raise ConnectionLost(f"upstream {self.options.url}: {why}")
 
 
 def _is_flat(reply: Any) -> bool:

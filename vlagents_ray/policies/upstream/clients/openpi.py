@@ -114,10 +114,13 @@ class RoboArenaClient(OpenPiClient):
         have = sum("exterior" in key for key in cameras)
         if isinstance(external, int) and external > have:
             found.append(
-                f"cameras: the upstream needs {external} external ones, the mapping has {have}; add them to mapping.cameras"
+                f"cameras: the upstream needs {external} external ones, the mapping has {have}; "
+                f"add them to mapping.cameras"
             )
         if metadata.get("needs_wrist_camera") is True and not any("wrist" in key for key in cameras):
-            found.append("cameras: the upstream needs one at the wrist, the mapping has none; add it to mapping.cameras")
+            found.append(
+                "cameras: the upstream needs one at the wrist, the mapping has none; add it to mapping.cameras"
+            )
         return found
 
     def _read(self, data: bytes | str) -> Any:

@@ -31,7 +31,7 @@ class OpenVLAClient(UpstreamClient):
         self._connection: http.client.HTTPConnection | None = None
 
     @staticmethod
-    def is_nested(key: str) -> bool:
+    def is_nested(key: str) -> bool:  # noqa: ARG004 - overrides
         """Return False: an observation is one flat map."""
         return False
 

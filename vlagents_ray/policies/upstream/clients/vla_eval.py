@@ -41,7 +41,9 @@ class VlaEvalClient(UpstreamClient):
         self._socket.open(timeout_s)
         version = importlib.metadata.version("vlagents-ray")
         try:
-            self._send("hello", {"harness_version": f"vlagents-ray {version}", "protocol_version": codec.PROTOCOL_VERSION})
+            self._send(
+                "hello", {"harness_version": f"vlagents-ray {version}", "protocol_version": codec.PROTOCOL_VERSION}
+            )
             hello = self._answer("hello", timeout_s)
         except VLAgentsError as error:
             self.close()

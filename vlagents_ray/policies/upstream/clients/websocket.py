@@ -6,10 +6,10 @@ import inspect
 import logging
 from typing import TYPE_CHECKING, Any
 
-from websockets.exceptions import ConnectionClosed, InvalidHandshake
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
 from websockets.sync.client import connect
 
-from vlagents_ray.errors import ConnectionLost, PolicyUnavailable
+from vlagents_ray.errors import ConnectionLost, PolicyUnavailable, Unauthorized
 
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger("vlagents_ray.upstream.websocket")
 _LOG.setLevel(logging.CRITICAL)  # it logs each lost connection as an error, which is raised as well
 _CLOSE_S = 1
+_REFUSED = (401, 403)
 # An upstream that computes on its event loop answers no pings meanwhile. Older versions of `websockets` send none.
 _NO_PINGS: dict[str, Any] = {"ping_interval": None} if "ping_interval" in inspect.signature(connect).parameters else {}
 
@@ -40,7 +41,7 @@ class UpstreamSocket:
         return self._connection is not None
 
     def open(self, timeout_s: float) -> None:
-        """Connect; raises `PolicyUnavailable` if the upstream cannot be reached or refuses."""
+        """Connect; raises `PolicyUnavailable` if it cannot be reached, `Unauthorized` if it refuses the key."""
         url = self._options.url
         try:
             self._connection = connect(
@@ -53,6 +54,13 @@ class UpstreamSocket:
                 logger=_LOG,
                 **_NO_PINGS,
             )
+        except InvalidStatus as error:
+            if error.response.status_code in _REFUSED:
+                raise Unauthorized(
+                    f"upstream {url}: it refuses the API key (HTTP {error.response.status_code}); name the environment "
+                    f"variable with the right one in key_env"
+                ) from error
+            raise PolicyUnavailable(f"upstream {url}: refused with HTTP {error.response.status_code}") from error
         except (OSError, InvalidHandshake, TimeoutError) as error:
             raise PolicyUnavailable(f"upstream {url}: cannot connect ({error}); is it running?") from error
 

@@ -50,7 +50,7 @@ class VllmOmniDialect(RoboArenaDialect):
         "connection stays open."
     )
     paths: ClassVar[Mapping[str, str]] = {"WS /v1/realtime/robot/openpi": "stream"}
-    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
+    presets: ClassVar[dict[str, dict[str, Any]]] = {}
     config: VllmOmniDialectConfig
 
     @property
