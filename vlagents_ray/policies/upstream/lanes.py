@@ -140,6 +140,8 @@ class Lanes:
                 return
             except Exception as error:  # noqa: BLE001 - the result of these rows alone
                 answers = [error] * len(share.rows)
+                if len(share.rows) > 1:  # one of them may be the reason, which must not fail the others
+                    work.extend(_Share(range(row, row + 1), share.attempts) for row in share.rows)
             for row, answer in zip(share.rows, answers, strict=True):
                 results[row] = answer
             if not client.is_open:
