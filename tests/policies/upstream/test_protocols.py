@@ -98,7 +98,8 @@ def served(request: pytest.FixtureRequest) -> Iterator[tuple[str, dict[str, Any]
         for port in ports:
             stack.enter_context(upstream(protocol, port))
         scheme = SCHEMES.get(protocol, "ws")
-        settings = {"protocol": protocol, "urls": [f"{scheme}://127.0.0.1:{port}" for port in ports]}
+        urls = [f"{scheme}://127.0.0.1:{port}" for port in ports]
+        settings = {"protocol": protocol, "urls": urls, "connect_timeout_s": 30}
         yield protocol, settings | ({"mapping": MAPPINGS[protocol]} if protocol in MAPPINGS else {})
 
 

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
-from vlagents_ray.errors import ConnectionLost, NoReplica, VLAgentsError
+from vlagents_ray.errors import ConnectionLost, NoReplica, PolicyFailed, VLAgentsError
 from vlagents_ray.policies.upstream.clients.base import Answer, UpstreamClient
 
 logger = logging.getLogger(__name__)
@@ -164,20 +164,24 @@ class Lanes:
 
     def _connect(self, client: UpstreamClient) -> None:
         """Connect until it works."""
-        pause_s = _FIRST_PAUSE_S
+        pause_s, logged = _FIRST_PAUSE_S, ""
         while not self._closed:
             try:
                 self._check(client, client.connect(_CONNECT_S))
             except Exception as error:
-                reason = error if isinstance(error, VLAgentsError) else NoReplica(f"upstream: {error}")
-                if not isinstance(error, VLAgentsError):
+                if isinstance(error, VLAgentsError):
+                    reason = error
+                else:
                     logger.exception("upstream %s: connecting failed", client.options.url)
+                    reason = PolicyFailed(
+                        f"upstream {client.options.url}: connecting failed, the server's log says how"
+                    )
                 client.close()
             else:
                 break
             with self._changed:
-                if str(reason) != str(self._reason):
-                    logger.warning("%s", reason)
+                if str(reason) != logged:
+                    logger.warning("%s", logged := str(reason))
                 self._reason = reason
                 self._changed.notify_all()
                 self._changed.wait_for(lambda: self._closed, pause_s)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import logging
 from typing import TYPE_CHECKING, Any
@@ -34,6 +35,7 @@ class UpstreamSocket:
         self._options = options
         self._headers = headers
         self._connection: ClientConnection | None = None
+        self._open = contextlib.ExitStack()
 
     @property
     def is_open(self) -> bool:
@@ -44,7 +46,7 @@ class UpstreamSocket:
         """Connect; raises `PolicyUnavailable` if it cannot be reached, `Unauthorized` if it refuses the key."""
         url = self._options.url
         try:
-            self._connection = connect(
+            opening = connect(
                 url,
                 open_timeout=timeout_s,
                 close_timeout=_CLOSE_S,
@@ -54,6 +56,7 @@ class UpstreamSocket:
                 logger=_LOG,
                 **_NO_PINGS,
             )
+            self._connection = self._open.enter_context(opening)
         except InvalidStatus as error:
             if error.response.status_code in _REFUSED:
                 raise Unauthorized(
@@ -87,9 +90,8 @@ class UpstreamSocket:
 
     def close(self) -> None:
         """Close the connection."""
-        if self._connection is not None:
-            self._connection.close()
-            self._connection = None
+        self._connection = None
+        self._open.close()
 
     def _opened(self) -> ClientConnection:
         if self._connection is None:
