@@ -109,7 +109,7 @@ def roboarena(connection: Any) -> None:
 
 def vla_eval(connection: Any) -> None:
     def array(one: Any) -> Any:
-        return {"__ndarray__": True, "data": one.tobytes(), "dtype": str(one.dtype), "shape": list(one.shape)}
+        return {"__ndarray__": True, "data": one.tobytes(), "dtype": one.dtype.str, "shape": list(one.shape)}
 
     def node(one: dict) -> Any:
         if "__ndarray__" in one:

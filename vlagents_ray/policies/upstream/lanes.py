@@ -47,6 +47,7 @@ class Lanes:
         self._ready: list[UpstreamClient] = []
         self._changed = threading.Condition()
         self._reason: VLAgentsError = NoReplica("upstream: not connected yet")  # why the last attempt failed
+        self._connecting: list[threading.Thread] = []
         self._closed = False
         self._pool = ThreadPoolExecutor(max(1, len(clients) - 1), "upstream")
 
@@ -99,9 +100,12 @@ class Lanes:
         with self._changed:
             self._closed = True
             self._changed.notify_all()
+            ready, self._ready = self._ready, []
         self._pool.shutdown()
-        for client in self._clients:
+        for client in ready:  # one that is being connected belongs to its thread, which closes it
             client.close()
+        for thread in self._connecting:
+            thread.join(2 * _CONNECT_S)
 
     def _shares(self, rows: int, lanes: int) -> list[_Share]:
         """Return the rows one by one, or, if the protocol has batches, in as many parts as there are lanes."""
@@ -160,7 +164,9 @@ class Lanes:
         self._connect_in_background(client)
 
     def _connect_in_background(self, client: UpstreamClient) -> None:
-        threading.Thread(target=self._connect, args=(client,), name="upstream-connect", daemon=True).start()
+        thread = threading.Thread(target=self._connect, args=(client,), name="upstream-connect", daemon=True)
+        self._connecting = [one for one in self._connecting if one.is_alive()] + [thread]
+        thread.start()
 
     def _connect(self, client: UpstreamClient) -> None:
         """Connect until it works."""
