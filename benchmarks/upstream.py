@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import multiprocessing
-import tempfile
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
-import yaml
 from websockets.sync.client import connect
 from websockets.sync.server import serve
 
@@ -26,6 +23,7 @@ from vlagents_ray.cli.console import errors, progress, save
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.upstream import Upstream
+from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.ports import free_port
@@ -52,7 +50,8 @@ def measure_upstream(
     obs = _observation(size)
     with contextlib.ExitStack() as stack:
         url = stack.enter_context(_serving())
-        drivers: dict[str, Any] = {DIRECT: stack.enter_context(_Direct(url, obs)), QUEUE: _Queue(url, obs, stack)}
+        queue = _Queue(url, obs, stack)  # first, as it waits until the server answers
+        drivers: dict[str, _Driver] = {DIRECT: stack.enter_context(_Direct(url, obs)), QUEUE: queue}
         if whole:
             drivers[SERVER] = _Server(url, obs, stack)
         for driver in drivers.values():
@@ -123,14 +122,7 @@ class _Server(_Driver):
     """A server of ours in front of the other one, and a client in this process."""
 
     def __init__(self, url: str, obs: Obs, stack: contextlib.ExitStack) -> None:
-        file = Path(stack.enter_context(tempfile.TemporaryDirectory())) / "upstream.yaml"
-        args = {"policy": "upstream", "config": _settings(url)}
-        file.write_text(
-            yaml.safe_dump(
-                {"applications": [{"name": "u", "import_path": "vlagents_ray.serve.app:build", "args": args}]}
-            )
-        )
-        server = stack.enter_context(running_server(file))
+        server = stack.enter_context(running_server(deployment("upstream", config=_settings(url)), ingress=False))
         agent = stack.enter_context(RemoteAgent(server.url))
         agent.reset(obs, "a task")
         self.call = lambda: agent.act(obs)

@@ -1,7 +1,7 @@
 """Servers of other systems, one process each, in the bytes of their own packers; none of our codecs is used.
 
-`python upstream_servers.py PROTOCOL PORT`. What they answer depends on each bit of the observation, so that an action that
-equals `answer` was computed from the very observation. The formats are those of openpi_client.msgpack_numpy,
+`python upstream_servers.py PROTOCOL PORT`. What they answer depends on each bit of the observation, so that an action
+that equals `answer` was computed from the very observation. The formats are those of openpi_client.msgpack_numpy,
 gr00t/policy/server_client.py, json_numpy, and vla_eval.protocol.
 """
 

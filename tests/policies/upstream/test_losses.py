@@ -168,8 +168,8 @@ def test_an_upstream_that_is_killed_and_restarted_fails_no_episode(protocol: str
     def kill() -> None:
         """Three times, each when the last server has answered some more."""
         while len(servers) < 4 and not over.is_set():
-            asked = len(replicas.frames)
-            wait_for(lambda: over.is_set() or len(replicas.frames) > asked + 10, every_s=0.002)
+            enough = len(replicas.frames) + 10
+            wait_for(lambda enough=enough: over.is_set() or len(replicas.frames) > enough, every_s=0.002)
             servers[-1].kill()
             servers[-1].wait()
             servers.append(start(port, protocol))
