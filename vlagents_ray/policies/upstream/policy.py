@@ -44,7 +44,7 @@ class Upstream(Agent):
 
     @property
     def contract(self) -> Contract:
-        """What the mapping and the settings say, and the rows of a chunk, if the upstream says how many they are."""
+        """The contract by the mapping and the settings, with the length of a chunk, if the upstream states it."""
         contract: Contract = self._state["contract"]
         return contract
 
