@@ -84,7 +84,7 @@ class UpstreamSocket:
         try:
             return self._opened().recv(timeout=wait_s)
         except TimeoutError as error:
-            raise self._lost(f"no answer within {wait_s:g} s") from error
+            raise self._lost(f"no answer within {wait_s:.3g} s") from error
         except (ConnectionClosed, OSError) as error:
             raise self._lost(str(error)) from error
 
