@@ -95,7 +95,7 @@ class _Direct(_Driver, contextlib.ExitStack):
 
         def call() -> Any:
             connection.send(codec.encode(theirs))
-            return codec.decode(connection.recv())  # type: ignore[arg-type]  # the server sends bytes
+            return codec.decode(connection.recv(decode=False))
 
         self.call = call
 

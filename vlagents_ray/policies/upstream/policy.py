@@ -76,7 +76,8 @@ class Upstream(Agent):
         if self._sessions is not None:
             self._session = uuid.uuid4().hex
             self._sessions.begin(self._session)
-            weakref.finalize(self, self._sessions.drop, self._session)  # the copy ends with its session
+            ended = weakref.finalize(self, self._sessions.drop, self._session)  # the copy ends with its session
+            ended.atexit = False
         return {}
 
     def act_batch(self, obs: Sequence[Obs], sessions: Sequence[Agent]) -> list[Act | Exception]:

@@ -14,6 +14,8 @@ from vlagents_ray.policies.upstream.clients.websocket import UpstreamSocket
 from vlagents_ray.wire.mapping.outgoing import Outgoing
 from vlagents_ray.wire.openpi import codec
 
+_RESET = "reset successful"  # what RoboArena's servers answer to `reset`
+
 
 class OpenPiClient(UpstreamClient):
     """A client of a server that speaks openpi's protocol, which keeps nothing between two observations."""
@@ -103,9 +105,8 @@ class RoboArenaClient(OpenPiClient):
         self._session = uuid.uuid4().hex
         self._socket.send(codec.encode({"endpoint": "reset"}))
         answer = self._socket.recv()
-        if isinstance(answer, str) and "reset successful" not in answer:
-            self.close()
-            raise self.failed(answer)
+        if answer != _RESET:
+            self._read(answer)  # vLLM-Omni answers a map; any other text is an error
 
     def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
         cameras = [camera.key.partition("|")[0] for camera in outgoing.mapping.cameras.values()]
@@ -124,7 +125,8 @@ class RoboArenaClient(OpenPiClient):
         return found
 
     def _read(self, data: bytes | str) -> Any:
-        """Return a map, or the array that older servers answer."""
-        if isinstance(data, str):
-            return self._map(data)
-        return codec.decode_any(data, self.options.limits)
+        """Return a map, or the array that older servers answer; vLLM-Omni says an error in a map."""
+        reply = self._map(data) if isinstance(data, str) else codec.decode_any(data, self.options.limits)
+        if isinstance(reply, dict) and reply.get("type") == "error":
+            raise self.failed(reply.get("message"))
+        return reply
