@@ -19,7 +19,7 @@ from vlagents_ray.wire.presets import read_mapping
 class UpstreamConfig(BaseModel, extra="forbid"):
     """Where the other policy server is, how it is asked, and how long it is waited for."""
 
-    protocol: Literal["openpi", "openpi-batch", "roboarena", "gr00t", "openvla", "vla_eval"]
+    protocol: Literal["openpi", "openpi-batch", "roboarena", "gr00t", "openvla", "vla_eval", "vlagents"]
     urls: list[str] = Field(
         min_length=1,
         max_length=64,

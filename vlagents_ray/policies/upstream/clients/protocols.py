@@ -7,6 +7,7 @@ from vlagents_ray.policies.upstream.clients.gr00t import GR00TClient
 from vlagents_ray.policies.upstream.clients.openpi import OpenPiBatchClient, OpenPiClient, RoboArenaClient
 from vlagents_ray.policies.upstream.clients.openvla import OpenVLAClient
 from vlagents_ray.policies.upstream.clients.vla_eval import VlaEvalClient
+from vlagents_ray.policies.upstream.clients.vlagents import VlagentsClient
 
 PROTOCOLS: dict[str, type[UpstreamClient]] = {
     "openpi": OpenPiClient,
@@ -15,4 +16,5 @@ PROTOCOLS: dict[str, type[UpstreamClient]] = {
     "gr00t": GR00TClient,
     "openvla": OpenVLAClient,
     "vla_eval": VlaEvalClient,
+    "vlagents": VlagentsClient,
 }
