@@ -34,6 +34,7 @@ OPENPI: dict[str, Any] = {"protocol": "openpi", "urls": ["ws://127.0.0.1:9"], "m
         ({"mapping": "openpi-libera"}, "openpi-libero"),
         ({"mapping": {"camera": {}}}, "unknown keys"),
         ({"contract": {"chunks": 3}}, "unknown keys"),
+        ({"protocol": "vlagents", "urls": ["rpyc://box:1"], "key_env": "KEY"}, "no place for a key"),
         ({"speed": 3}, "speed"),
     ],
 )

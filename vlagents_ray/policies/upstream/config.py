@@ -74,6 +74,8 @@ class UpstreamConfig(BaseModel, extra="forbid"):
                 raise ValueError(
                     "urls: got a name or a password in one; put the key into a variable, and name it in key_env"
                 )
+        if self.key_env is not None and not self.client.takes_key:
+            raise ValueError(f"key_env: {self.protocol} has no place for a key; remove it")
         if self.mapping is None and self.client.mapping is None:
             raise ValueError(
                 f"mapping: {self.protocol} has none of its own; give a preset, such as openpi-libero, or an object"

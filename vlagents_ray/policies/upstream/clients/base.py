@@ -41,6 +41,8 @@ class UpstreamClient(abc.ABC):
     """The preset that is used if the deployment states no mapping."""
     schemes: ClassVar[tuple[str, ...]] = ()
     """The schemes that a URL may have, the usual one first."""
+    takes_key: ClassVar[bool] = True
+    """Whether the protocol has a place for an API key."""
     text_key: ClassVar[str] = "task"
     """What the `*` of the instruction's key stands for."""
 

@@ -20,6 +20,7 @@ class VlagentsClient(UpstreamClient):
     """A client of one agent, which all connections share; the instruction is in each observation."""
 
     schemes: ClassVar[tuple[str, ...]] = ("rpyc",)
+    takes_key: ClassVar[bool] = False
 
     def __init__(self, options: ClientOptions) -> None:
         super().__init__(options)
