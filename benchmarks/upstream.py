@@ -14,6 +14,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.sync.server import serve
 
@@ -122,7 +123,7 @@ class _Server(_Driver):
     """A server of ours in front of the other one, and a client in this process."""
 
     def __init__(self, url: str, obs: Obs, stack: contextlib.ExitStack) -> None:
-        server = stack.enter_context(running_server(deployment("upstream", config=_settings(url)), ingress=False))
+        server = stack.enter_context(running_server(deployment("upstream", config=_settings(url)), num_cpus=2))
         agent = stack.enter_context(RemoteAgent(server.url))
         agent.reset(obs, "a task")
         self.call = lambda: agent.act(obs)
@@ -155,9 +156,10 @@ def _serving() -> Iterator[str]:
 def _serve(port: int) -> None:
     def answer(connection: Any) -> None:
         connection.send(codec.encode({}))
-        for message in connection:
-            codec.decode(message)
-            connection.send(codec.encode({"actions": _ACTIONS}))
+        with contextlib.suppress(ConnectionClosed):
+            for message in connection:
+                codec.decode(message)
+                connection.send(codec.encode({"actions": _ACTIONS}))
 
     with serve(answer, "127.0.0.1", port, **_UNBOUNDED) as server:
         server.serve_forever()
