@@ -28,6 +28,7 @@ POLICIES: dict[str, str] = {
     "random": "vlagents_ray.policies.random:Random",
     "replay": "vlagents_ray.policies.replay:Replay",
     "scripted": "vlagents_ray.policies.scripted:Scripted",
+    "upstream": "vlagents_ray.policies.upstream:Upstream",
     "vjepa2_ac": "vlagents_ray.policies.vjepa2_ac:VJepa2Ac",
 }
 

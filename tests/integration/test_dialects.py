@@ -14,9 +14,9 @@ import yaml
 from peer_environment import drive, peers_python
 from websockets.sync.client import connect
 
-from vlagents_ray.serve.dialects.openpi import codec as openpi_codec
 from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH, read_deployment
 from vlagents_ray.serve.launch.server import Server, running_server
+from vlagents_ray.wire.openpi import codec as openpi_codec
 
 CALLS = 12
 DIALECTS = {

@@ -32,10 +32,10 @@ from tests.integration.conftest import serving
 from vlagents_ray import Obs, RemoteAgent
 from vlagents_ray.protocol.frames import CONTENT_TYPE, decode_reply, encode_request
 from vlagents_ray.protocol.messages import Request
-from vlagents_ray.serve.dialects.openpi import codec as openpi_codec
-from vlagents_ray.serve.dialects.openvla import codec as openvla_codec
-from vlagents_ray.serve.dialects.vla_eval import codec as vla_eval_codec
 from vlagents_ray.serve.launch.server import Server
+from vlagents_ray.wire.openpi import codec as openpi_codec
+from vlagents_ray.wire.openvla import codec as openvla_codec
+from vlagents_ray.wire.vla_eval import codec as vla_eval_codec
 
 FRAMES = int(os.environ.get("VLAGENTS_FUZZ_FRAMES", "2800"))
 ANSWER_S = 60.0

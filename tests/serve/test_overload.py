@@ -61,16 +61,16 @@ from vlagents_ray.protocol.messages import (
     Request,
 )
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.dialects.gr00t import codec as gr00t_codec
-from vlagents_ray.serve.dialects.openpi import codec as openpi_codec
-from vlagents_ray.serve.dialects.openvla import codec as openvla_codec
-from vlagents_ray.serve.dialects.vla_eval import codec as vla_eval_codec
 from vlagents_ray.serve.endpoints import weights
 from vlagents_ray.serve.endpoints.local.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.admission import Admission, MessageAdmission, NeedsDecodingThread
 from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.wire.gr00t import codec as gr00t_codec
+from vlagents_ray.wire.openpi import codec as openpi_codec
+from vlagents_ray.wire.openvla import codec as openvla_codec
+from vlagents_ray.wire.vla_eval import codec as vla_eval_codec
 
 JPEG = jpeg_png.encode_jpeg(np.full((32, 32, 3), 9, np.uint8))
 PNG = jpeg_png.encode_png(np.full((32, 32, 3), 9, np.uint8))

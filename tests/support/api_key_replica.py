@@ -57,7 +57,6 @@ from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.dialects.base import GatewayContext, ReplicaContext
 from vlagents_ray.serve.dialects.routes import dialect_routes
-from vlagents_ray.serve.dialects.vla_eval import codec as vla_eval_codec
 from vlagents_ray.serve.endpoints import access_middleware, websocket_connection
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
@@ -71,6 +70,7 @@ from vlagents_ray.serve.live.snapshot import ReplicaView
 from vlagents_ray.serve.ports import free_port, reserve
 from vlagents_ray.serve.weights.updates import PushResult
 from vlagents_ray.weights.safetensors import header_of
+from vlagents_ray.wire.vla_eval import codec as vla_eval_codec
 
 ANSWER_S = 10.0
 LIMITS = Limits(body_bytes=2**20)

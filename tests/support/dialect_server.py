@@ -14,13 +14,13 @@ from vlagents_ray.interface import Agent
 from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.dialects.base import ReplicaContext
-from vlagents_ray.serve.dialects.openpi import codec as openpi_codec
-from vlagents_ray.serve.dialects.openvla import codec as openvla_codec
 from vlagents_ray.serve.dialects.routes import dialect_routes
-from vlagents_ray.serve.dialects.vla_eval import codec as vla_eval_codec
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.wire.openpi import codec as openpi_codec
+from vlagents_ray.wire.openvla import codec as openvla_codec
+from vlagents_ray.wire.vla_eval import codec as vla_eval_codec
 
 LIMITS = Limits(body_bytes=300_000, pixels=64 * 64)
 METADATA = {"policy": "mirror", "version": "0", "protocol": 1, "checkpoint": None}

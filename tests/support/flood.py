@@ -31,16 +31,16 @@ from vlagents_ray.protocol.frames import CONTENT_TYPE
 from vlagents_ray.protocol.messages import Limits, LocalAddress
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.config.dialects import DialectArgs
-from vlagents_ray.serve.dialects import json_numpy
 from vlagents_ray.serve.dialects.base import ReplicaContext
-from vlagents_ray.serve.dialects.openpi import codec as openpi_codec
 from vlagents_ray.serve.dialects.routes import dialect_routes
-from vlagents_ray.serve.dialects.vla_eval import codec as vla_eval_codec
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.endpoints.local.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.wire import json_numpy
+from vlagents_ray.wire.openpi import codec as openpi_codec
+from vlagents_ray.wire.vla_eval import codec as vla_eval_codec
 
 HEIGHT, WIDTH = 2304, 4096  # of the largest image
 IMAGES = 4  # of these in the largest request

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.serve.dialects import json_numpy
-from vlagents_ray.serve.dialects.vlagents import brine, rpyc
-from vlagents_ray.serve.dialects.vlagents.rpyc import Handler
+from vlagents_ray.wire import json_numpy
+from vlagents_ray.wire.vlagents import brine, rpyc
+from vlagents_ray.wire.vlagents.rpyc import Handler
 
 ROOT = ("vlagents_ray.Policy", 1, 1)
 VALUE, TUPLE, LOCAL, REMOTE = 1, 2, 3, 4

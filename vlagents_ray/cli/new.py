@@ -177,7 +177,7 @@ import json
 
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
 from vlagents_ray.serve.dialects.http import HttpDialect
-from vlagents_ray.serve.dialects import json_numpy
+from vlagents_ray.wire import json_numpy
 
 
 def decode(data, limits):

@@ -18,14 +18,14 @@ from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.serve.config.deployment import ServerArgs
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.dialects.base import ReplicaContext
-from vlagents_ray.serve.dialects.openpi import codec as openpi_codec
-from vlagents_ray.serve.dialects.openvla import codec as openvla_codec
 from vlagents_ray.serve.dialects.routes import describe, dialect_routes, require_fit
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.docs_page import docs_page
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.wire.openpi import codec as openpi_codec
+from vlagents_ray.wire.openvla import codec as openvla_codec
 
 
 def test_a_replica_that_stops_keeps_no_session_that_nobody_will_ask_for() -> None:

@@ -2,7 +2,8 @@
 
 A dialect is another system's protocol. It has one folder, `vlagents_ray/serve/dialects/NAME/`:
 
-1. `codec.py` converts bytes to values and back, within `Limits`, without unpickling. It imports nothing of the server.
+1. A codec converts bytes to values and back, within `Limits`, without unpickling. It imports nothing of the server; one
+   that the policy `upstream` uses as well lies in `vlagents_ray/wire/`.
 2. `handler.py` has one class, which states its settings (`Config`), the system whose clients it serves, the packages
    that it requires and the mappings that deployment files may name, and serves those clients: an `HttpDialect` for
    plain requests over HTTP, a `RouteDialect` for WebSockets and anything else on the server's own port, or a
@@ -16,7 +17,7 @@ The following is a complete dialect, for clients that post `{"q": [...], "task":
 
     from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
     from vlagents_ray.serve.dialects.http import HttpDialect
-    from vlagents_ray.serve.dialects import json_numpy
+    from vlagents_ray.wire import json_numpy
 
 
     class PlainConfig(DialectConfig):
@@ -66,8 +67,8 @@ from vlagents_ray.serve.engine.admission import Admission, MessageAdmission
 from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
-from vlagents_ray.serve.mapping.presets import read_mapping
 from vlagents_ray.serve.ports import LOOPBACK
+from vlagents_ray.serve.presets import read_mapping
 
 T = TypeVar("T")
 Stream = Callable[[WebSocket], Awaitable[None]]

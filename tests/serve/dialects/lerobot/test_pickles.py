@@ -28,7 +28,7 @@ from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
 from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.serve.dialects.lerobot import codec
-from vlagents_ray.serve.mapping.presets import read_mapping
+from vlagents_ray.serve.presets import read_mapping
 
 LIMITS = Limits(body_bytes=2**20)
 MUTATED = int(os.environ.get("VLAGENTS_RAY_FUZZ", many(5000)))

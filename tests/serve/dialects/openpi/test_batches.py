@@ -19,11 +19,11 @@ from websockets.sync.client import connect
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.dialects.base import ReplicaContext
-from vlagents_ray.serve.dialects.openpi import codec
 from vlagents_ray.serve.dialects.routes import dialect_routes
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.wire.openpi import codec
 
 STATE = np.array([0, 0, 0, 0, 0, 1, 0.04, -0.04])
 

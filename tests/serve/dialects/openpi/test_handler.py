@@ -16,11 +16,11 @@ from websockets.sync.client import connect
 from vlagents_ray.protocol.messages import STREAM_BYTES, Limits
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.dialects.base import ReplicaContext
-from vlagents_ray.serve.dialects.openpi import codec as openpi_codec
 from vlagents_ray.serve.dialects.routes import dialect_routes
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.wire.openpi import codec as openpi_codec
 
 METADATA_TOLD = {"policy": "mirror", "checkpoint": None, "version": "0", "reset_pose": [0.5]}
 

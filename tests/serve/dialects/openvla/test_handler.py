@@ -16,11 +16,11 @@ from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.access.key_store import new_key, revoke
 from vlagents_ray.serve.config.dialects import DialectArgs
 from vlagents_ray.serve.dialects.base import ReplicaContext
-from vlagents_ray.serve.dialects.openvla import codec as openvla_codec
 from vlagents_ray.serve.dialects.routes import dialect_routes
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
 from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.wire.openvla import codec as openvla_codec
 
 
 def test_openvla_answers_an_action_plain_and_encoded_twice(context: tuple[TestClient, Engine]) -> None:

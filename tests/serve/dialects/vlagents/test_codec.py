@@ -17,8 +17,8 @@ from vlagents_ray.images.jpeg_png import encode_jpeg
 from vlagents_ray.interface import GOAL_IMAGE, Act
 from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.messages import Limits
-from vlagents_ray.serve.dialects import json_numpy
 from vlagents_ray.serve.dialects.vlagents import codec as vlagents_codec
+from vlagents_ray.wire import json_numpy
 
 LIMITS = Limits()
 

@@ -15,9 +15,9 @@ from starlette.websockets import WebSocketDisconnect
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Obs
-from vlagents_ray.serve.dialects.openpi import codec
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.wire.openpi import codec
 
 PATH = "/v1/realtime/robot/openpi"
 

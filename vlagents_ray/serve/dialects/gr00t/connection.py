@@ -17,10 +17,10 @@ from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.dialects.base import GatewayContext
 from vlagents_ray.serve.dialects.gateway_sessions import GatewaySessions
-from vlagents_ray.serve.dialects.gr00t import codec
-from vlagents_ray.serve.dialects.gr00t.codec import GR00TRequest, Observations
-from vlagents_ray.serve.mapping.key_paths import matches
-from vlagents_ray.serve.mapping.mapping import KeyMapping
+from vlagents_ray.wire.gr00t import codec
+from vlagents_ray.wire.gr00t.codec import GR00TRequest, Observations
+from vlagents_ray.wire.mapping.key_paths import matches
+from vlagents_ray.wire.mapping.mapping import KeyMapping
 
 logger = logging.getLogger(__name__)
 

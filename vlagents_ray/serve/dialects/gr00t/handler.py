@@ -8,9 +8,8 @@ import queue
 import socket
 import threading
 import time
-from collections.abc import Mapping
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
 from pydantic import Field
 
@@ -19,8 +18,9 @@ from vlagents_ray.registry import require
 from vlagents_ray.serve.config.dialects import MappingSetting, PortConfig
 from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
 from vlagents_ray.serve.dialects.gateway_clients import GatewayClients
-from vlagents_ray.serve.dialects.gr00t import codec
 from vlagents_ray.serve.dialects.gr00t.connection import WAITING, GR00TConnection
+from vlagents_ray.wire.gr00t import codec
+from vlagents_ray.wire.gr00t.presets import PRESETS
 
 logger = logging.getLogger(__name__)
 
@@ -48,21 +48,7 @@ class GR00TDialect(PortDialect):
         "sessions. `api_token` is the API key. An error is a map with `error`."
     )
     requires = ("zmq", "msgpack")
-    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        # N1.6 and newer: {"video": {k: (1, T, H, W, 3)}, "state": {k: (1, T, D)}, "language": {"task": [[text]]}}; the
-        # names of an action's columns depend on the robot, so a deployment adds `action`
-        "gr00t": {
-            "cameras": {"*": "video/*"},
-            "state": {"*": "state/*"},
-            "instruction": "language/*",
-        },
-        # N1.5 has the same with flat keys
-        "gr00t-n1.5": {
-            "cameras": {"*": "video.*"},
-            "state": {"*": "state.*"},
-            "instruction": "annotation.human.*",
-        },
-    }
+    presets = PRESETS
 
     def __init__(self, name: str, config: GR00TDialectConfig, context: GatewayContext) -> None:
         super().__init__(name, config, context)

@@ -19,7 +19,7 @@ from vlagents_ray.serve.dialects.gateway_sessions import GatewaySessions
 from vlagents_ray.serve.dialects.lerobot import codec
 from vlagents_ray.serve.dialects.lerobot.codec import PolicyInstructions, RobotObservation
 from vlagents_ray.serve.engine.admission import MessageAdmission
-from vlagents_ray.serve.mapping.mapping import KeyMapping
+from vlagents_ray.wire.mapping.mapping import KeyMapping
 
 logger = logging.getLogger(__name__)
 

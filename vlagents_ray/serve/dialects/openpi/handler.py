@@ -37,10 +37,10 @@ from vlagents_ray.serve.dialects.base import (
     public_problem,
 )
 from vlagents_ray.serve.dialects.implicit_session import ImplicitSession, SessionObs, act_together
-from vlagents_ray.serve.dialects.openpi import codec
-from vlagents_ray.serve.dialects.openpi.presets import PRESETS
 from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
+from vlagents_ray.wire.openpi import codec
+from vlagents_ray.wire.openpi.presets import PRESETS
 
 
 class MapDialect(RouteDialect):

@@ -16,8 +16,8 @@ from starlette.responses import Response
 from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
 from vlagents_ray.serve.dialects.http import HttpDialect
-from vlagents_ray.serve.dialects.openvla import codec
-from vlagents_ray.serve.dialects.openvla.presets import PRESETS
+from vlagents_ray.wire.openvla import codec
+from vlagents_ray.wire.openvla.presets import PRESETS
 
 
 class OpenVLADialectConfig(DialectConfig):

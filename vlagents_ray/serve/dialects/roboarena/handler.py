@@ -11,6 +11,7 @@ from vlagents_ray.errors import MalformedMessage
 from vlagents_ray.protocol.messages import NAME_CHARACTERS, Reply
 from vlagents_ray.serve.config.dialects import DialectConfig, MappingSetting
 from vlagents_ray.serve.dialects.openpi.handler import MapConnection, MapDialect
+from vlagents_ray.wire.openpi.presets import ROBOARENA
 
 
 class RoboArenaDialectConfig(DialectConfig):
@@ -42,21 +43,7 @@ class RoboArenaDialect(MapDialect):
         "then close 1011."
     )
     paths: ClassVar[Mapping[str, str]] = {"WS /roboarena": "stream"}
-    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        # openpi's DROID keys, but the numbers of the cameras begin with 0
-        "roboarena": {
-            "cameras": {
-                "front": {"key": "observation/exterior_image_0_left", "layout": "any"},
-                "front_2": {"key": "observation/exterior_image_1_left", "layout": "any", "optional": True},
-                "wrist": {"key": "observation/wrist_image_left", "layout": "any", "optional": True},
-            },
-            "state": {"joints": {"key": "observation/joint_position", "stop": 7}},
-            "gripper": {"key": "observation/gripper_position", "open": 0.0, "closed": 1.0},
-            "instruction": "prompt",
-            "info": {"session_id": "session_id"},
-            "action_gripper": {"index": 7, "open": 0.0, "closed": 1.0},
-        },
-    }
+    presets = ROBOARENA
     config: RoboArenaDialectConfig
 
     def first(self) -> dict[str, Any]:

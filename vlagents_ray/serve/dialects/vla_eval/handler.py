@@ -35,10 +35,11 @@ from vlagents_ray.serve.dialects.base import (
     public_problem,
 )
 from vlagents_ray.serve.dialects.implicit_session import ImplicitSession
-from vlagents_ray.serve.dialects.vla_eval import codec
 from vlagents_ray.serve.endpoints.http_messages import LONG_BYTES, problem_response
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.serve.engine.dispatch import Dispatcher
+from vlagents_ray.wire.vla_eval import codec
+from vlagents_ray.wire.vla_eval.presets import PRESETS
 
 _WAITING = 16  # maximum of waiting messages of a client that does not wait for replies
 
@@ -62,15 +63,7 @@ class VlaEvalDialect(RouteDialect):
     summary = "A session is the connection, which says where episodes begin and end. An error is an `error` message."
     paths: ClassVar[Mapping[str, str]] = {"WS /vla-eval": "stream"}
     root = "vla_eval"
-    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        # The benchmark chooses the cameras' names. Most benchmarks call the state `states`, some `state`, as vla-eval's
-        # types.py recommends; its own servers prefer the former.
-        "vla-eval": {
-            "cameras": {"*": "images/*"},
-            "state": {"state": {"key": "states|state", "optional": True}},
-            "instruction": "task_description",
-        },
-    }
+    presets = PRESETS
     config: VlaEvalDialectConfig
 
     def routes(self) -> list[BaseRoute]:

@@ -19,7 +19,7 @@ from vlagents_ray.protocol.arrays import read_array
 from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.protocol.observations import is_number
-from vlagents_ray.serve.dialects import json_numpy
+from vlagents_ray.wire import json_numpy
 
 RAW, JPEG, SHARED = "raw", "jpeg_encoded", "shared_memory"
 _TOP_3 = {"obs", "language_instruction", "goal_image", "goal_image_data_type"}

@@ -14,15 +14,15 @@ from typing import Any
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge, VLAgentsError
 from vlagents_ray.interface import Obs
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.dialects import json_numpy
 from vlagents_ray.serve.dialects.base import GatewayContext
 from vlagents_ray.serve.dialects.gateway_sessions import GatewaySessions
 from vlagents_ray.serve.dialects.vlagents import codec as vlagents_codec
-from vlagents_ray.serve.dialects.vlagents import rpyc
 from vlagents_ray.serve.dialects.vlagents.client_shm import SharedMemory
-from vlagents_ray.serve.dialects.vlagents.rpyc import Handler, RpycCall
 from vlagents_ray.serve.engine.admission import MessageAdmission
-from vlagents_ray.serve.mapping.mapping import KeyMapping
+from vlagents_ray.wire import json_numpy
+from vlagents_ray.wire.mapping.mapping import KeyMapping
+from vlagents_ray.wire.vlagents import rpyc
+from vlagents_ray.wire.vlagents.rpyc import Handler, RpycCall
 
 logger = logging.getLogger(__name__)
 

@@ -16,9 +16,9 @@ from pydantic import Field
 
 from vlagents_ray.errors import MalformedMessage
 from vlagents_ray.interface import Obs
-from vlagents_ray.serve.dialects.openpi import codec
 from vlagents_ray.serve.dialects.openpi.handler import MapConnection
 from vlagents_ray.serve.dialects.roboarena.handler import RoboArenaDialect, RoboArenaDialectConfig
+from vlagents_ray.wire.openpi import codec
 
 
 class VllmOmniDialectConfig(RoboArenaDialectConfig):
@@ -50,7 +50,7 @@ class VllmOmniDialect(RoboArenaDialect):
         "connection stays open."
     )
     paths: ClassVar[Mapping[str, str]] = {"WS /v1/realtime/robot/openpi": "stream"}
-    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {}
+    presets: ClassVar[dict[str, dict[str, Any]]] = {}
     config: VllmOmniDialectConfig
 
     @property

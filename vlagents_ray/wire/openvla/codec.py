@@ -7,14 +7,14 @@ encode twice: a request is `{"encoded": "<the JSON>"}` and its reply a JSON stri
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
-from vlagents_ray.serve.dialects import json_numpy
+from vlagents_ray.wire import json_numpy
 
 
 def decode(body: bytes, limits: Limits = DEFAULT_LIMITS) -> tuple[dict[str, Any], bool]:
@@ -43,3 +43,39 @@ def _load(text: bytes, limits: Limits) -> dict[str, Any]:
     if not isinstance(payload, dict):
         raise MalformedMessage(f"body: got {type(payload).__name__}, want an object")
     return payload
+
+
+def encode_observation(observation: Mapping[str, Any]) -> bytes:
+    """Return the body of a request, encoded once."""
+    return json_numpy.dumps(observation).encode()
+
+
+def decode_action(body: bytes, limits: Limits = DEFAULT_LIMITS) -> np.ndarray | None:
+    """Return the action in a reply, (D,) or (H, D); None if the reply is "error", as OpenVLA's own server says it.
+
+    Raises `MalformedMessage` or `MessageTooLarge`.
+    """
+    value = json_numpy.loads(body, limits)
+    if isinstance(value, str) and value != "error":  # encoded twice
+        value = json_numpy.loads(value, limits)
+    if isinstance(value, str):
+        return None
+    if isinstance(value, list) and value and all(isinstance(row, np.ndarray) for row in value):
+        if len(shapes := {row.shape for row in value}) != 1:
+            raise MalformedMessage(f"action: got rows of the shapes {sorted(shapes)[:8]}, want the same in all")
+        value = np.stack(value)
+    elif isinstance(value, list):
+        value = _plain_numbers(value)
+    if not isinstance(value, np.ndarray):
+        raise MalformedMessage(f"action: got {type(value).__name__}, want an array, or a list of rows")
+    return value
+
+
+def _plain_numbers(values: list[Any]) -> np.ndarray:
+    try:
+        array = np.asarray(values)
+    except ValueError as error:
+        raise MalformedMessage(f"action: no array of numbers ({error})") from error
+    if array.dtype.kind not in "fiu":
+        raise MalformedMessage(f"action: got {array.dtype}, want numbers")
+    return array

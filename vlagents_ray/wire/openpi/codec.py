@@ -13,7 +13,7 @@ import numpy as np
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge
 from vlagents_ray.protocol.arrays import plain_dtype, read_array
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
-from vlagents_ray.serve.dialects.msgpack import pack, unpack
+from vlagents_ray.wire.msgpack import pack, unpack
 
 
 def decode(data: bytes, limits: Limits = DEFAULT_LIMITS) -> dict[str, Any]:
@@ -21,10 +21,15 @@ def decode(data: bytes, limits: Limits = DEFAULT_LIMITS) -> dict[str, Any]:
 
     Raises `MalformedMessage` or `MessageTooLarge`.
     """
-    value = unpack(data, limits, lambda node: _array(node, limits.items))
+    value = decode_any(data, limits)
     if not isinstance(value, dict):
         raise MalformedMessage(f"message: got {type(value).__name__}, want a map")
     return value
+
+
+def decode_any(data: bytes, limits: Limits = DEFAULT_LIMITS) -> Any:
+    """Return the value in a message, which need not be a map; else as `decode`."""
+    return unpack(data, limits, lambda node: _array(node, limits.items))
 
 
 def encode(value: Any) -> bytes:

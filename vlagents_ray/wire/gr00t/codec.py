@@ -18,8 +18,8 @@ import numpy as np
 from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge
 from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.registry import require
-from vlagents_ray.serve.dialects import msgpack
-from vlagents_ray.serve.dialects.gr00t import npy
+from vlagents_ray.wire import msgpack
+from vlagents_ray.wire.gr00t import npy
 
 ENDPOINTS = ("get_action", "reset", "ping", "get_modality_config")
 TEXT_KEY = "task"  # our key in "language", in place of the client's

@@ -17,7 +17,7 @@ from vlagents_ray.images.codecs import decode_files
 from vlagents_ray.protocol.arrays import read_array
 from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
-from vlagents_ray.serve.dialects.msgpack import pack, unpack
+from vlagents_ray.wire.msgpack import pack, unpack
 
 PROTOCOL_VERSION = 1
 Kind = Literal["hello", "observation", "action", "episode_start", "episode_end", "error"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from vlagents_ray.serve.mapping.robots import ALOHA_ACTION, ALOHA_STATE, libero_state
+from vlagents_ray.wire.mapping.robots import ALOHA_ACTION, ALOHA_STATE, libero_state
 
 PRESETS: dict[str, dict[str, Any]] = {
     # openvla, vla-scripts/deploy.py

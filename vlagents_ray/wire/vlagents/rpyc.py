@@ -17,7 +17,7 @@ from enum import IntEnum
 from typing import Any
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge
-from vlagents_ray.serve.dialects.vlagents import brine
+from vlagents_ray.wire.vlagents import brine
 
 HEADER = struct.Struct("!LB")  # size of the message in bytes, and whether it is compressed
 END = b"\n"
@@ -122,6 +122,41 @@ def reference_reply(sequence: int, number: int) -> bytes:
 def exception(sequence: int, kind: str, text: str) -> bytes:
     """Return the frame that raises the built-in exception `kind` at the peer, without a traceback."""
     return _frame(_EXCEPTION, (sequence, (("builtins", kind), (text,), (), "")))
+
+
+def request(sequence: int, handler: Handler, boxed_args: tuple[int, Any]) -> bytes:
+    """Return the frame of a request to a server, with its arguments in boxes."""
+    return _frame(_REQUEST, (sequence, (int(handler), boxed_args)))
+
+
+def boxed_value(value: Any) -> tuple[int, Any]:
+    """Return the box of a value without references."""
+    return _VALUE, value
+
+
+def boxed_tuple(*boxes: tuple[int, Any]) -> tuple[int, Any]:
+    """Return the box of a tuple of boxes."""
+    return _TUPLE, boxes
+
+
+def boxed_reference(name: tuple[Any, ...]) -> tuple[int, Any]:
+    """Return the box of a reference to the peer's own object, by the name that the peer gave it."""
+    return _LOCAL, name
+
+
+def read_reply(body: bytes | bytearray, compressed: bool, limit: int) -> tuple[int, bool, Any] | None:
+    """Return a reply's sequence number, whether it is one and no exception, and its content; None for a request."""
+    message = memoryview(body)[: -len(END)]
+    if compressed:
+        message = memoryview(_inflate(message, limit))
+    if len(message) == 0:
+        raise MalformedMessage("rpyc: an empty message")
+    if message[0] not in (_REPLY, _EXCEPTION):  # nothing is offered to a server, so its requests get no answer
+        return None
+    content = brine.read(message[1:])
+    if not (isinstance(content, tuple) and len(content) == 2 and _is_int(content[0])):
+        raise MalformedMessage("rpyc: want (sequence number, reply)")
+    return content[0], message[0] == _REPLY, content[1]
 
 
 def _frame(kind: int, content: tuple[Any, ...]) -> bytes:

@@ -10,10 +10,9 @@ from collections.abc import Iterator, Mapping
 from functools import cache
 from typing import Any
 
-from vlagents_ray.errors import ConfigError
-from vlagents_ray.naming import did_you_mean
 from vlagents_ray.registry import DIALECTS, dialect_class, names
-from vlagents_ray.serve.mapping.mapping import KeyMapping
+from vlagents_ray.wire import presets as wire_presets
+from vlagents_ray.wire.mapping.mapping import KeyMapping
 
 
 def read_mapping(value: str | Mapping[str, Any]) -> KeyMapping:
@@ -25,13 +24,7 @@ def read_mapping(value: str | Mapping[str, Any]) -> KeyMapping:
     Raises:
         ConfigError: The preset is unknown, or the object is invalid.
     """
-    if isinstance(value, str):
-        return _preset(value)
-    if not isinstance(value, Mapping):
-        raise ConfigError(f"mapping: got {type(value).__name__}, want a preset's name or an object")
-    own = dict(value)
-    base = _preset(own.pop("preset")).to_json() if "preset" in own else {}
-    return KeyMapping.from_json(base | own)
+    return wire_presets.read_mapping(value, _preset)
 
 
 @cache
@@ -40,13 +33,11 @@ def presets() -> dict[str, KeyMapping]:
     return {name: KeyMapping.from_json(one) for stated in _stated() for name, one in stated.items()}
 
 
-def _preset(name: object) -> KeyMapping:
+def _preset(name: str) -> Mapping[str, Any]:
     for stated in _stated():
-        if isinstance(name, str) and name in stated:
-            return KeyMapping.from_json(stated[name])
-    known = presets()
-    meant = did_you_mean(str(name), known)
-    raise ConfigError(f"mapping: got {name!r}, want one of the presets {sorted(known)}, or an object{meant}")
+        if name in stated:
+            return stated[name]
+    raise wire_presets.unknown_preset(name, presets())
 
 
 def _stated() -> Iterator[Mapping[str, Mapping[str, Any]]]:

@@ -1,4 +1,4 @@
-"""Mappings of openpi's example clients.
+"""Mappings of openpi's example clients, and of RoboArena's.
 
 openpi's servers accept images as (H, W, 3) or (3, H, W), in uint8 or floats in [0, 1]: see `_parse_image` in its
 src/openpi/policies/libero_policy.py and droid_policy.py, and `convert_image` in aloha_policy.py.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from vlagents_ray.serve.mapping.robots import ALOHA_ACTION, ALOHA_STATE, libero_state
+from vlagents_ray.wire.mapping.robots import ALOHA_ACTION, ALOHA_STATE, libero_state
 
 PRESETS: dict[str, dict[str, Any]] = {
     # openpi, examples/libero/main.py
@@ -42,5 +42,21 @@ PRESETS: dict[str, dict[str, Any]] = {
         "state": ALOHA_STATE,
         "instruction": "prompt",
         "action_gripper": ALOHA_ACTION,
+    },
+}
+
+ROBOARENA: dict[str, dict[str, Any]] = {
+    # openpi's DROID keys, but the numbers of the cameras begin with 0
+    "roboarena": {
+        "cameras": {
+            "front": {"key": "observation/exterior_image_0_left", "layout": "any"},
+            "front_2": {"key": "observation/exterior_image_1_left", "layout": "any", "optional": True},
+            "wrist": {"key": "observation/wrist_image_left", "layout": "any", "optional": True},
+        },
+        "state": {"joints": {"key": "observation/joint_position", "stop": 7}},
+        "gripper": {"key": "observation/gripper_position", "open": 0.0, "closed": 1.0},
+        "instruction": "prompt",
+        "info": {"session_id": "session_id"},
+        "action_gripper": {"index": 7, "open": 0.0, "closed": 1.0},
     },
 }

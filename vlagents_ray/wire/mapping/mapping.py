@@ -1,6 +1,6 @@
 """Conversion of another system's observation to an `Obs`, and of our action to theirs: keys, layouts, grippers.
 
-A deployment file states a mapping as a preset's name (see `vlagents_ray.serve.mapping.presets`), as an object, or as an
+A deployment file states a mapping as a preset's name (see `vlagents_ray.serve.presets`), as an object, or as an
 object that names a preset and changes some of its fields:
 
     {"cameras": {"front": "observation/image", "wrist": {"key": "images/wrist", "layout": "chw"}},
@@ -40,7 +40,7 @@ from vlagents_ray.errors import (
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.protocol.observations import as_camera, as_state, is_number
-from vlagents_ray.serve.mapping.fields import (
+from vlagents_ray.wire.mapping.fields import (
     ActionGripper,
     ActionRange,
     CameraKey,
@@ -52,7 +52,7 @@ from vlagents_ray.serve.mapping.fields import (
     parts,
     stated,
 )
-from vlagents_ray.serve.mapping.key_paths import (
+from vlagents_ray.wire.mapping.key_paths import (
     keys,
     leaves,
     lookup,

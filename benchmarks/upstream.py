@@ -1,0 +1,182 @@
+"""What `upstream` adds to another policy server: one `act`, asked directly and through us, in turns.
+
+The server speaks openpi's protocol and answers at once, so that all of the time is that of the way. It is asked as
+openpi's own client asks it; by the policy `upstream`, as our batch queue does; and through a whole server of ours.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import time
+from collections.abc import Callable, Iterator
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import connect
+from websockets.sync.server import serve
+
+from vlagents_ray.bench.rtt import RoundTripsOfAll, in_turns
+from vlagents_ray.cli.bench import Json, show_round_trips
+from vlagents_ray.cli.console import errors, progress, save
+from vlagents_ray.client.agent import RemoteAgent
+from vlagents_ray.interface import Obs
+from vlagents_ray.policies.upstream import Upstream
+from vlagents_ray.serve.launch.deployment_file import deployment
+from vlagents_ray.serve.launch.server import running_server
+from vlagents_ray.serve.models.agent_copies import AgentCopies
+from vlagents_ray.serve.ports import free_port
+from vlagents_ray.wire.openpi import codec
+
+DIRECT, QUEUE, SERVER = "directly", "policy upstream", "server of ours"
+_WARM_UP = 50
+_UNBOUNDED: dict[str, Any] = {"compression": None, "max_size": None}
+_ACTIONS = np.zeros((10, 7))
+"""The actions of the server, (H, D)."""
+
+
+def measure_upstream(
+    calls: int, size: int, whole: bool, progress: Callable[[str], None] = lambda _: None
+) -> RoundTripsOfAll:
+    """Measure `calls` acts by each way.
+
+    Args:
+        calls: The number of acts by each way.
+        size: Height and width of the two cameras' images, pixels.
+        whole: Whether a whole server of ours is measured, too, which starts Ray.
+        progress: Called with a line for each part of the measurement.
+    """
+    obs = _observation(size)
+    with contextlib.ExitStack() as stack:
+        url = stack.enter_context(_serving())
+        queue = _Queue(url, obs, stack)  # first, as it waits until the server answers
+        drivers: dict[str, _Driver] = {DIRECT: stack.enter_context(_Direct(url, obs)), QUEUE: queue}
+        if whole:
+            drivers[SERVER] = _Server(url, obs, stack)
+        for driver in drivers.values():
+            driver.measure(_WARM_UP)
+        return RoundTripsOfAll(tuple(in_turns(drivers, calls, progress).values()))
+
+
+class _Driver:
+    """Makes calls of one way."""
+
+    call: Callable[[], Any]
+
+    def ready(self) -> dict[str, Any]:
+        """Return nothing: the way is ready."""
+        return {}
+
+    def measure(self, calls: int) -> list[float]:
+        """Make calls; returns the milliseconds of each."""
+        taken = []
+        for _ in range(calls):
+            begun = time.perf_counter()
+            self.call()
+            taken.append((time.perf_counter() - begun) * 1e3)
+        return taken
+
+
+class _Direct(_Driver, contextlib.ExitStack):
+    """What openpi_client.websocket_client_policy does: pack, send, receive, unpack."""
+
+    def __init__(self, url: str, obs: Obs) -> None:
+        super().__init__()
+        connection = self.enter_context(connect(url, **_UNBOUNDED))
+        connection.recv()
+        state = np.concatenate([obs.state["xyz_axis_angle"], obs.state["gripper_qpos"]])
+        theirs = {
+            "observation/image": obs.cameras["front"],
+            "observation/wrist_image": obs.cameras["wrist"],
+            "observation/state": state,
+            "prompt": "a task",
+        }
+
+        def call() -> Any:
+            connection.send(codec.encode(theirs))
+            return codec.decode(connection.recv(decode=False))
+
+        self.call = call
+
+
+class _Queue(_Driver):
+    """The policy, called as an engine calls it."""
+
+    def __init__(self, url: str, obs: Obs, stack: contextlib.ExitStack) -> None:
+        agent = stack.enter_context(Upstream.from_config(_settings(url)))
+        agent.initialize()
+        session = AgentCopies(agent).make()
+        session.reset(obs, "a task")
+
+        def call() -> Any:
+            [act] = agent.act_batch([obs], [session])
+            if isinstance(act, Exception):
+                raise act
+            return act
+
+        self.call = call
+
+
+class _Server(_Driver):
+    """A server of ours in front of the other one, and a client in this process."""
+
+    def __init__(self, url: str, obs: Obs, stack: contextlib.ExitStack) -> None:
+        server = stack.enter_context(running_server(deployment("upstream", config=_settings(url)), num_cpus=2))
+        agent = stack.enter_context(RemoteAgent(server.url))
+        agent.reset(obs, "a task")
+        self.call = lambda: agent.act(obs)
+
+
+def _settings(url: str) -> dict[str, Any]:
+    return {"protocol": "openpi", "urls": [url], "mapping": "openpi-libero"}
+
+
+def _observation(size: int) -> Obs:
+    rng = np.random.default_rng(0)
+    pixels = rng.integers(0, 256, (2, size, size, 3), np.uint8)
+    state = {"xyz_axis_angle": np.zeros(6, np.float32), "gripper_qpos": np.zeros(2, np.float32)}
+    return Obs({"front": pixels[0], "wrist": pixels[1]}, 0.5, state)
+
+
+@contextlib.contextmanager
+def _serving() -> Iterator[str]:
+    """Run the other server in a process of its own."""
+    port = free_port()
+    process = multiprocessing.get_context("spawn").Process(target=_serve, args=(port,), daemon=True)
+    process.start()
+    try:
+        yield f"ws://127.0.0.1:{port}"
+    finally:
+        process.kill()
+        process.join()
+
+
+def _serve(port: int) -> None:
+    def answer(connection: Any) -> None:
+        connection.send(codec.encode({}))
+        with contextlib.suppress(ConnectionClosed):
+            for message in connection:
+                codec.decode(message)
+                connection.send(codec.encode({"actions": _ACTIONS}))
+
+    with serve(answer, "127.0.0.1", port, **_UNBOUNDED) as server:
+        server.serve_forever()
+
+
+def main(
+    calls: Annotated[int, typer.Option(min=1, help="Acts by each way.")] = 2000,
+    size: Annotated[int, typer.Option(min=1, help="Height and width of the two images, pixels.")] = 224,
+    whole: Annotated[bool, typer.Option(help="Measure a whole server of ours, too, which starts Ray.")] = False,
+    json_file: Json = None,
+) -> None:
+    """What the policy `upstream` adds to the policy server that it asks."""
+    with errors():
+        found = measure_upstream(calls, size, whole, progress).to_json()
+    show_round_trips(found, f"one act, two images of {size} x {size} pixels")
+    save(found, json_file)
+
+
+if __name__ == "__main__":
+    typer.run(main)

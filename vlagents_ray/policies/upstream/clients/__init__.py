@@ -1,0 +1,1 @@
+"""The clients of other policy servers, one module a protocol."""

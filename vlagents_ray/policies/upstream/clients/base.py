@@ -1,0 +1,104 @@
+"""What the clients of all protocols have in common."""
+
+from __future__ import annotations
+
+import abc
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+
+from vlagents_ray.errors import MalformedMessage, PolicyFailed
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
+from vlagents_ray.wire.mapping.outgoing import Outgoing
+
+logger = logging.getLogger(__name__)
+
+Answer = np.ndarray | Mapping[str, np.ndarray]  # (D,) or (H, D), or such by the upstream's names
+_LOGGED = 8000  # characters of an upstream's error
+
+
+@dataclass(frozen=True, slots=True)
+class ClientOptions:
+    """What a client needs to know about its upstream."""
+
+    url: str
+    timeout_s: float  # s: an answer that takes longer counts as lost
+    key: str | None = field(default=None, repr=False)  # the upstream's API key
+    limits: Limits = DEFAULT_LIMITS
+
+
+class UpstreamClient(abc.ABC):
+    """One connection to an upstream, which one thread uses at a time."""
+
+    batches: ClassVar[bool] = False
+    """Whether `ask` sends all observations in one message."""
+    keeps_sessions: ClassVar[bool] = False
+    """Whether the upstream keeps a session for each connection, by default."""
+    mapping: ClassVar[str | None] = None
+    """The preset that is used if the deployment states no mapping."""
+    schemes: ClassVar[tuple[str, ...]] = ()
+    """The schemes that a URL may have, the usual one first."""
+    takes_key: ClassVar[bool] = True
+    """Whether the protocol has a place for an API key."""
+    text_key: ClassVar[str] = "task"
+    """What the `*` of the instruction's key stands for."""
+
+    def __init__(self, options: ClientOptions) -> None:
+        self.options = options
+
+    @staticmethod
+    def is_nested(key: str) -> bool:
+        """Return whether a key `a/b` of the mapping is the key `b` within `a`; else, it is one key."""
+        return "/" in key
+
+    @abc.abstractmethod
+    def connect(self, timeout_s: float) -> dict[str, Any]:
+        """Connect, and return what the upstream says about itself.
+
+        Raises:
+            PolicyUnavailable: It cannot be reached.
+        """
+
+    @property
+    @abc.abstractmethod
+    def is_open(self) -> bool:
+        """Whether the connection can be used."""
+
+    @abc.abstractmethod
+    def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
+        """Return the actions for one observation, or for several if `batches`.
+
+        Raises:
+            ConnectionLost: The connection broke, or there was no answer in time; `close` was called.
+            PolicyFailed: The upstream answered with an error.
+            MalformedMessage, MessageTooLarge: Its answer is invalid.
+        """
+
+    def begin(self) -> None:  # noqa: B027 - not abstract: a protocol may have no such message
+        """Say that an episode begins, if the protocol can; raises what `ask` raises."""
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Close the connection; it may be called twice."""
+
+    def differences(self, metadata: Mapping[str, Any], outgoing: Outgoing) -> list[str]:
+        """Return in what the upstream, by what it said about itself, differs from the mapping, with a remedy each."""
+        return []
+
+    def chunk(self, metadata: Mapping[str, Any]) -> int | None:
+        """Return the number of rows of the upstream's actions, if it said so."""
+        return None
+
+    def failed(self, text: object) -> PolicyFailed:
+        """Log an error that the upstream answered with, and return ours, without the upstream's details."""
+        logger.error("upstream %s answered with an error: %s", self.options.url, str(text)[:_LOGGED])
+        return PolicyFailed(f"upstream {self.options.url}: it answered with an error, which the server's log has")
+
+    def unreadable(self, got: object, want: str) -> MalformedMessage:
+        """Return the error for an answer that is not what the protocol says."""
+        return MalformedMessage(
+            f"upstream {self.options.url}: got {got}, want {want}; does it speak the protocol of the deployment?"
+        )

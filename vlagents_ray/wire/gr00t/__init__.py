@@ -1,0 +1,1 @@
+"""The messages and the mappings of GR00T's protocol."""

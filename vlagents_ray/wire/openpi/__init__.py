@@ -1,0 +1,1 @@
+"""The messages and the mappings of openpi's protocol, and of RoboArena's copy of it."""

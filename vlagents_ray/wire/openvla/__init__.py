@@ -1,0 +1,1 @@
+"""The bodies and the mappings of OpenVLA's REST protocol."""

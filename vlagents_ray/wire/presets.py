@@ -1,0 +1,50 @@
+"""The mappings of known clients by name, and the reading of a mapping that may name one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.naming import did_you_mean
+from vlagents_ray.wire.gr00t.presets import PRESETS as GR00T
+from vlagents_ray.wire.mapping.mapping import KeyMapping
+from vlagents_ray.wire.openpi.presets import PRESETS as OPENPI
+from vlagents_ray.wire.openpi.presets import ROBOARENA
+from vlagents_ray.wire.openvla.presets import PRESETS as OPENVLA
+from vlagents_ray.wire.vla_eval.presets import PRESETS as VLA_EVAL
+
+PRESETS: dict[str, Mapping[str, Any]] = {**OPENPI, **ROBOARENA, **OPENVLA, **VLA_EVAL, **GR00T}
+
+
+def read_mapping(
+    value: str | Mapping[str, Any], preset: Callable[[str], Mapping[str, Any] | None] = PRESETS.get
+) -> KeyMapping:
+    """Read a mapping.
+
+    Args:
+        value: A preset's name, or an object. The fields of an object with `preset` replace those of that preset.
+        preset: Returns the preset of a name; None if there is none.
+
+    Raises:
+        ConfigError: The preset is unknown, or the object is invalid.
+    """
+    if isinstance(value, str):
+        return KeyMapping.from_json(_found(value, preset))
+    if not isinstance(value, Mapping):
+        raise ConfigError(f"mapping: got {type(value).__name__}, want a preset's name or an object")
+    own = dict(value)
+    base = KeyMapping.from_json(_found(own.pop("preset"), preset)).to_json() if "preset" in own else {}
+    return KeyMapping.from_json(base | own)
+
+
+def _found(name: object, preset: Callable[[str], Mapping[str, Any] | None]) -> Mapping[str, Any]:
+    if isinstance(name, str) and (found := preset(name)) is not None:
+        return found
+    raise unknown_preset(name, PRESETS)
+
+
+def unknown_preset(name: object, known: Mapping[str, Any]) -> ConfigError:
+    """Return the error for the name of a preset that does not exist."""
+    meant = did_you_mean(str(name), known)
+    return ConfigError(f"mapping: got {name!r}, want one of the presets {sorted(known)}, or an object{meant}")

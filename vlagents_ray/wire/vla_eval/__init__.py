@@ -1,0 +1,1 @@
+"""The messages and the mapping of vla-eval's protocol."""
