@@ -10,7 +10,7 @@ import typer
 
 from vlagents_ray.cli.console import errors, fresh, out
 from vlagents_ray.cli.evaluation.open_loop import is_dataset, replay_dataset
-from vlagents_ray.cli.options import Address, Live, LiveAt, parse_list
+from vlagents_ray.cli.options import Address, Live, LiveAt, parse_list, parse_settings
 from vlagents_ray.errors import ConfigError
 
 
@@ -57,8 +57,14 @@ def report_command(
 
 def export_command(
     folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the results.")],
-    path: Annotated[Path, typer.Argument(metavar="PATH", help="File to write; of lerobot, a new folder.")],
-    to: Annotated[str, typer.Option(help="json, csv, parquet: a row an episode; lerobot: a dataset of what was seen.")],
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="File to write; of lerobot and hub, a new folder.")],
+    to: Annotated[
+        str,
+        typer.Option(
+            help="json, csv, parquet: a row an episode; lerobot: a dataset of what was seen; hub: scores for a model's "
+            "repository; vla-eval: for its leaderboard."
+        ),
+    ],
     policy: Annotated[str | None, typer.Option(help="Only this one: NAME, or NAME@STEP in a sweep.")] = None,
     env: Annotated[str | None, typer.Option(help="Only this one.")] = None,
     cameras: Annotated[
@@ -76,11 +82,15 @@ def export_command(
     cut_idle: Annotated[
         bool, typer.Option("--cut-idle", help="lerobot: end each episode where nothing moves after it was solved.")
     ] = False,
+    settings: Annotated[
+        list[str],
+        typer.Option("--set", metavar="KEY=VALUE", help="hub: dataset=OWNER/NAME; vla-eval: curated_by=@handle, …"),
+    ] = [],  # noqa: B006 - typer reads it
 ) -> None:
-    """Write the episodes of an evaluation as JSON, CSV, Parquet or a LeRobotDataset v3.0."""
+    """Write the episodes of an evaluation as JSON, CSV, Parquet or a LeRobotDataset v3.0; or its scores, to publish."""
     from vlagents_ray.evaluate import Results
     from vlagents_ray.evaluate.artifacts.storage import storing
-    from vlagents_ray.evaluate.exports import EXPORTS
+    from vlagents_ray.evaluate.exports import EXPORTS, SCORES
 
     with errors():
         if to not in EXPORTS:
@@ -91,6 +101,9 @@ def export_command(
         if chosen and to != "lerobot":
             given = ", ".join(f"--{name.replace('_', '-')}" for name in chosen)
             raise ConfigError(f"{given}: got --to {to}, want --to lerobot, whose frames they choose")
+        if settings and to not in SCORES:
+            raise ConfigError(f"--set: got --to {to}, want one of {', '.join(SCORES)}")
+        chosen |= parse_settings(settings, "--set")
         results = Results.load(folder).only(policy, env)
         with storing(path.parent):
             number = EXPORTS[to](results, path, **chosen)
