@@ -136,13 +136,15 @@ def _table(found: list[Score]) -> str:
     """The scores as Markdown, in which names are code: they are text of others."""
     lines = ["# Evaluation", "", "| benchmark | success | episodes | interval |", "| --- | --- | --- | --- |"]
     for one in found:
-        low, high = one.rate.interval
-        name = one.name.replace("`", "'").replace("|", "/")
-        lines.append(
-            f"| `{name}` | {_percent(one.rate.rate):g} % | {one.rate.episodes} | {100 * low:.1f} to {100 * high:.1f} % |"
-        )
-    notes = [f"- `{one.name.replace('`', chr(39))}`: `{one.note.replace('`', chr(39))}`" for one in found]
-    return "\n".join([*lines, "", *notes]) + "\n"
+        low, high = (f"{100 * bound:.1f}" for bound in one.rate.interval)
+        success = f"{_percent(one.rate.rate):g} %"
+        lines.append(f"| {_code(one.name)} | {success} | {one.rate.episodes} | {low} to {high} % |")
+    return "\n".join([*lines, "", *(f"- {_code(one.name)}: {_code(one.note)}" for one in found)]) + "\n"
+
+
+def _code(text: str) -> str:
+    plain_text = " ".join(text.split()).replace("`", "'").replace("|", "/")
+    return f"`{plain_text}`"
 
 
 def _yaml(value: Any) -> str:
