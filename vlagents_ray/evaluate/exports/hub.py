@@ -17,7 +17,7 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.storage import whole_folder
 from vlagents_ray.evaluate.exports.scores import Score, scores
 from vlagents_ray.evaluate.results.reader import Results, rate_of
-from vlagents_ray.naming import plain
+from vlagents_ray.naming import distinct, plain
 
 _ID = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 _NAMES = {"success_once": "success rate (after some step)", "success_at_end": "success rate (after the last step)"}
@@ -68,18 +68,20 @@ def to_hub(results: Results, path: Path, **settings: Any) -> int:
         )
     if path.exists() and (not path.is_dir() or any(path.iterdir())):
         raise ConfigError(f"{path}: is there already; want a new folder")
-    card = {"tags": ["robotics"], "model-index": _index(found, given)}
+    ids = _task_ids([one.name for one in found])
+    tasks = [(one, given.task_id or ids[one.name]) for one in found]
+    card = {"tags": ["robotics"], "model-index": _index(tasks, given)}
     with whole_folder(path) as folder:
         entries = folder / ".eval_results" / f"{plain(given.dataset)}.yaml"
         entries.parent.mkdir()
-        entries.write_text(_yaml([_entry(one, given) for one in found]), encoding="utf-8")
+        entries.write_text(_yaml([_entry(one, task, given) for one, task in tasks]), encoding="utf-8")
         (folder / "README.md").write_text(f"---\n{_yaml(card)}---\n\n{_table(found)}", encoding="utf-8")
     return sum(one.rate.episodes for one in found)
 
 
-def _entry(score: Score, given: HubSettings) -> dict[str, Any]:
+def _entry(score: Score, task: str, given: HubSettings) -> dict[str, Any]:
     entry: dict[str, Any] = {
-        "dataset": {"id": given.dataset, "task_id": given.task_id or _task_id(score)},
+        "dataset": {"id": given.dataset, "task_id": task},
         "value": _percent(score.rate.rate),
         "date": score.date.isoformat().replace("+00:00", "Z"),
         "notes": score.note,
@@ -89,21 +91,21 @@ def _entry(score: Score, given: HubSettings) -> dict[str, Any]:
     return entry
 
 
-def _index(found: list[Score], given: HubSettings) -> list[dict[str, Any]]:
+def _index(found: list[tuple[Score, str]], given: HubSettings) -> list[dict[str, Any]]:
     source = (
         {} if given.source_url is None else {"source": {"url": given.source_url, "name": "results by vlagents-ray"}}
     )
     return [
         {
-            "name": given.model or found[0].results.contenders[0],
+            "name": given.model or found[0][0].results.contenders[0],
             "results": [
                 {
                     "task": {"type": "robotics", "name": "Robotics"},
-                    "dataset": {"name": one.name, "type": given.dataset, "config": given.task_id or _task_id(one)},
+                    "dataset": {"name": one.name, "type": given.dataset, "config": task},
                     "metrics": _metrics(one),
                     **source,
                 }
-                for one in found
+                for one, task in found
             ],
         }
     ]
@@ -123,9 +125,10 @@ def _metrics(score: Score) -> list[dict[str, Any]]:
     ]
 
 
-def _task_id(score: Score) -> str:
-    """The name without its simulator: "libero_spatial" of "libero/libero_spatial"."""
-    return plain(score.name.rpartition("/")[2])
+def _task_ids(names: list[str]) -> dict[str, str]:
+    """The names without their simulator, "libero_spatial" of "libero/libero_spatial", where that tells them apart."""
+    short = [plain(name.rpartition("/")[2]) for name in names]
+    return dict(zip(names, short, strict=True)) if len(set(short)) == len(short) else distinct(names)
 
 
 def _percent(rate: float | None) -> float:

@@ -69,7 +69,7 @@ class Score:
             "checkpoints": _distinct([checkpoint_of(cell) for cell in self.cells]),
             "weights": _distinct([weights_of(cell) for cell in self.cells]),
             "pushed_weights": _distinct([pushed_of(cell) for cell in self.cells]),
-            "policy": self.results.policies.get(self.cells[0].policy, {}).get("policy"),
+            "policies": _distinct([self.results.policies.get(cell.policy, {}).get("policy") for cell in self.cells]),
             "code": _distinct([_code(run.versions) for run in self.results.runs]),
         }
 
