@@ -6,7 +6,6 @@ import sqlite3
 import tempfile
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 from vlagents_ray.evaluate.artifacts.provenance import versions
 from vlagents_ray.evaluate.artifacts.storage import PROVENANCE, inside, link_or_copy, require_below, storing
@@ -70,15 +69,9 @@ def configurations(summary: Summary) -> dict[str, str]:
     return {f"{CONFIG}-{number}.yaml": text for number, text in enumerate(texts, 1)}
 
 
-def has_videos(names: Any) -> bool:
-    """Return whether a bundle with files of these names has videos."""
-    return any(str(name).endswith(".mp4") for name in names)
-
-
 def _copy_database(folder: Path, stage: Path) -> None:
     """Copy one consistent state of results.db, also while an evaluation writes to it."""
     with reading(folder) as source, closing(sqlite3.connect(stage / DATABASE)) as target:
-        source.execute("COMMIT")  # the backup reads in a transaction of its own
         source.backup(target)
         target.execute("PRAGMA journal_mode = DELETE")
 
