@@ -1,4 +1,4 @@
-"""The commands that read a folder of results: `vlagents-ray report`, `export`, `merge` and `replay`."""
+"""The commands that read results: `vlagents-ray report`, `export`, `merge`, `bundle`, `verify` and `replay`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from vlagents_ray.cli.console import errors, fresh, out
+from vlagents_ray.cli.console import errors, fresh, out, table
 from vlagents_ray.cli.evaluation.open_loop import is_dataset, replay_dataset
 from vlagents_ray.cli.options import Address, Live, LiveAt, parse_list, parse_settings
 from vlagents_ray.errors import ConfigError
@@ -124,6 +124,53 @@ def merge_command(
 
     with errors():
         print_summary(out, merge(into, folders, keep_first=keep_first))
+
+
+def bundle_command(
+    folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the results.")],
+    file: Annotated[Path | None, typer.Option("--out", help="The file; default: OUT.bundle.zip beside OUT.")] = None,
+    videos: Annotated[bool, typer.Option("--videos", help="With its videos, which may be large.")] = False,
+) -> None:
+    """Write an evaluation as one file: database, report, settings, versions of packages, trajectories, digests."""
+    from vlagents_ray.evaluate.bundle import write_bundle
+
+    with errors():
+        path = file or folder.absolute().with_name(f"{folder.absolute().name}.bundle.zip")
+        digest = write_bundle(folder, path, videos=videos)
+    out.print(f"bundle: {path}, {path.stat().st_size / 1e6:.1f} MB\nto cite: sha256:{digest}")
+
+
+def verify_command(
+    bundle: Annotated[Path, typer.Argument(metavar="BUNDLE", help="A file that `vlagents-ray bundle` wrote.")],
+    replay: Annotated[
+        int, typer.Option(min=0, help="Play the recorded actions of so many episodes in their simulator.")
+    ] = 3,
+    into: Annotated[
+        Path | None, typer.Option(help="Keep its results in this new folder, to merge, export or replay them.")
+    ] = None,
+    trust: Annotated[
+        bool,
+        typer.Option("--trust", help="Make its environments also by 'module:Class' and with options that name files."),
+    ] = False,
+    most_gb: Annotated[float, typer.Option(min=0, help="Refuse a bundle that unpacks to more.")] = 16.0,
+) -> None:
+    """Check a bundle, also a stranger's: what is equal, what differs, what could not be checked.
+
+    Exit code 0 if nothing contradicts it, 1 if something does: a digest, the tables, a recording, an outcome of a
+    replay. Other versions of software here are named, and contradict nothing.
+    """
+    from vlagents_ray.evaluate.bundle import verify
+
+    with errors():
+        found = verify(bundle, into=into, replay=replay, trust=trust, most_bytes=int(most_gb * 1e9))
+        rows = table("what", "found", "detail", box=None)
+        for one in found.findings:
+            rows.add_row(one.subject, one.verdict, one.detail)
+        out.print(rows)
+        out.print(f"\nbundle sha256:{found.digest}: {'holds' if found.holds else 'is contradicted'}")
+        if into is not None:
+            out.print(f"results: {into}")
+    raise typer.Exit(not found.holds)
 
 
 def replay_command(

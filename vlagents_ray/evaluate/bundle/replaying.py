@@ -65,15 +65,12 @@ def _replay(cell: CellResults, episode: Episode, trajectory: Trajectory, *, trus
     if played.outcome != (result.success_once, result.success_at_end, result.first_success):
         now = "solved" if played.outcome[0] else "not solved"
         return Finding(subject, "differs", f"{now} here, {_outcome(result.success_once)} there; {_from(played)}")
-    if played.same:
-        detail = f"{played.steps} actions, every state, reward and success to the bit"
-        verdict = "equal"
-    else:
+    detail = f"{played.steps} actions, every state, reward and success to the bit"
+    if not played.same:
         detail = f"the same outcome, other numbers; {_from(played)}"
-        verdict = "other here"
     if odd := _described(cell.described, played.described):
         detail += f"; the environment says of itself here: {odd}"
-    return Finding(subject, "equal" if verdict == "equal" else "other here", detail)
+    return Finding(subject, "equal" if played.same else "other here", detail)
 
 
 def _from(played: Replayed) -> str:

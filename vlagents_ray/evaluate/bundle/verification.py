@@ -68,7 +68,7 @@ def verify(
         if parent is not None:
             parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix="bundle.part-", dir=parent) as temporary:
-            folder = Path(temporary) / "results"
+            folder = Path(temporary) / "bundle"  # its name is in the page
             folder.mkdir()
             manifest, digest, odd = unpack(bundle, folder, most_bytes=most_bytes)
             findings = [check_digests(odd, len(manifest.files))]

@@ -41,7 +41,7 @@ def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
     with storing(archive.parent):
         archive.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f"{archive.name}.part-", dir=archive.parent) as temporary:
-            stage = Path(temporary) / "results"
+            stage = Path(temporary) / "bundle"  # its name is in the page
             stage.mkdir()
             _copy_database(folder, stage)
             results = Results.load(stage)
