@@ -105,7 +105,7 @@ class _Comparison:
             return
         pairs = [(self._recorded.state[part][number], values) for part, values in now.items()]
         if self._recorded.gripper is not None:
-            pairs.append((self._recorded.gripper[number], np.float32(obs.gripper)))
+            pairs.append((self._recorded.gripper[number], np.asarray(obs.gripper, np.float32)))
         for before, values in pairs:
             self._compare(number, np.asarray(before), np.asarray(values))
 

@@ -15,7 +15,7 @@ import numpy as np
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
 from vlagents_ray.evaluate.bundle.archive import CONFIG, MANIFEST
-from vlagents_ray.evaluate.bundle.finding import Finding
+from vlagents_ray.evaluate.bundle.finding import Finding, Verdict
 from vlagents_ray.evaluate.plan.config import fingerprint
 from vlagents_ray.evaluate.report.html import FILE as REPORT
 from vlagents_ray.evaluate.results.reader import Episode, Results, reading, table
@@ -72,7 +72,7 @@ def check_derived(stated: dict[str, bytes], computed: Path, *, same_software: bo
         if same:
             yield Finding(name, "equal", "the settings in the database")
         else:
-            verdict = "differs" if same_software else "not checked"
+            verdict: Verdict = "differs" if same_software else "not checked"
             yield Finding(name, verdict, "is not what the database gives here")
 
 

@@ -13,11 +13,9 @@ def pins() -> str:
 
     One that was not installed from an index, such as a checkout, has a comment instead of its path or URL.
     """
-    lines = {}
+    lines: dict[str, str] = {}
     for one in distributions():
-        name = one.metadata["Name"]
-        if name is None:
-            continue
+        name = str(one.metadata["Name"])
         elsewhere = "  # not from an index" if one.read_text("direct_url.json") is not None else ""
         lines.setdefault(_canonical(name), f"{_canonical(name)}=={one.version}{elsewhere}")
     return "".join(f"{lines[name]}\n" for name in sorted(lines))

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, field_validator
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate.artifacts.storage import whole_folder
-from vlagents_ray.evaluate.exports.scores import Score, scores
+from vlagents_ray.evaluate.exports.scores import Metric, Score, scores
 from vlagents_ray.evaluate.results.reader import Results, rate_of
 from vlagents_ray.naming import distinct, plain
 
@@ -113,7 +113,7 @@ def _index(found: list[tuple[Score, str]], given: HubSettings) -> list[dict[str,
 
 def _metrics(score: Score) -> list[dict[str, Any]]:
     """The success that the protocol counts, with all facts; then the other one, with its interval."""
-    other = "success_at_end" if score.metric == "success_once" else "success_once"
+    other: Metric = "success_at_end" if score.metric == "success_once" else "success_once"
     return [
         {"type": score.metric, "name": _NAMES[score.metric], "value": _percent(score.rate.rate), "args": score.facts},
         {

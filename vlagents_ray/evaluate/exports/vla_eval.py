@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -150,7 +150,7 @@ def _task(cell: CellResults) -> str:
     return said if env_suite(cell.env) == "libero" and isinstance(said, str) else str(env_task(cell.env))
 
 
-def _mean(rates: Any) -> float:
+def _mean(rates: Iterable[float]) -> float:
     values = list(rates)
     return round(sum(values) / len(values), 1)
 
