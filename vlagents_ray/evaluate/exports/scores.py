@@ -105,8 +105,9 @@ def scores(results: Results) -> list[Score]:
         raise ConfigError(f"got the policies {results.contenders}, want one: name it with --policy NAME, or NAME@STEP")
     groups: dict[tuple[str, str], list[CellResults]] = {}
     for cell in results.cells:
-        if cell.counted:
-            groups.setdefault((cell.suite, benchmark_of(cell.env)), []).append(cell)
+        groups.setdefault((cell.suite, benchmark_of(cell.env)), []).append(cell)
+    # A task all of whose episodes were lost stays with its benchmark, whose score has it among the deviations.
+    groups = {name: cells for name, cells in groups.items() if any(cell.counted for cell in cells)}
     if not groups:
         raise ConfigError(f"{results.out}: has no finished episode, want results that a rate can be made of")
     names = [benchmark for _, benchmark in groups]
@@ -116,7 +117,7 @@ def scores(results: Results) -> list[Score]:
         if have_common_rate(cells):
             found.append(Score(results, name, tuple(cells)))
         else:  # they stopped after different numbers of episodes, or some were in real time
-            found += [Score(results, cell.task, (cell,)) for cell in cells]
+            found += [Score(results, cell.task, (cell,)) for cell in cells if cell.counted]
     return found
 
 

@@ -140,7 +140,8 @@ def _by_task(found: list[Score]) -> Mapping[str, float]:
             task = _task(cell)
             if task in rates:
                 raise ConfigError(f"{cell.env}: is in several suites of these results, want one; choose one with --env")
-            rates[task] = 100 * (rate_of([cell], score.metric).rate or 0.0)
+            if cell.counted:
+                rates[task] = 100 * (rate_of([cell], score.metric).rate or 0.0)
     return rates
 
 
