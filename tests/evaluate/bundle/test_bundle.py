@@ -176,7 +176,7 @@ def test_a_table_that_the_database_does_not_give_is_contradicted(bundle: Path, t
             "trajectories",
         ),
         ("UPDATE episodes SET episode_return = episode_return + 1", "trajectories"),
-        ("UPDATE episodes SET seed = seed + 100, key = replace(key, '@', '@10')", "database"),
+        ("UPDATE episodes SET seed = seed + 100", "database"),
         ("UPDATE cells SET settings = replace(settings, '\"execute\":null', '\"execute\":1')", "database"),
     ],
 )
@@ -298,7 +298,7 @@ def test_a_recording_that_states_more_than_it_has_is_refused(bundle: Path, tmp_p
     with zipfile.ZipFile(npz, "w") as file:
         file.writestr("actions.npy", header)
         file.writestr("cameras.npy", header)
-    with pytest.raises(ConfigError, match="memory|cannot be read as a trajectory"):
+    with pytest.raises(ConfigError, match=r"memory|cannot be read as a trajectory"):
         verify(rewritten(bundle, tmp_path / "b.zip", {name: npz.read_bytes()}, honest=True))
 
 

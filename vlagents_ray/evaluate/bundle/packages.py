@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+import functools
 import re
 from importlib.metadata import distributions
 
 _PIN = re.compile(r"([A-Za-z0-9][\w.-]{0,100})==([\w.+!-]{1,100})")
 
 
+@functools.cache
 def pins() -> str:
-    """The packages of this environment, a line each: `numpy==2.4.6`.
+    """The packages of this environment at the first call, a line each: `numpy==2.4.6`.
 
     One that was not installed from an index, such as a checkout, has a comment instead of its path or URL.
     """
     lines: dict[str, str] = {}
     for one in distributions():
-        name = str(one.metadata["Name"])
+        metadata = one.metadata  # parsed at each access
+        name = _canonical(str(metadata["Name"]))
         elsewhere = "  # not from an index" if one.read_text("direct_url.json") is not None else ""
-        lines.setdefault(_canonical(name), f"{_canonical(name)}=={one.version}{elsewhere}")
+        lines.setdefault(name, f"{name}=={metadata['Version']}{elsewhere}")
     return "".join(f"{lines[name]}\n" for name in sorted(lines))
 
 

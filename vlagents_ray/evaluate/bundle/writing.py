@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sqlite3
 import tempfile
 from contextlib import closing
@@ -11,6 +12,7 @@ from vlagents_ray.evaluate.artifacts.provenance import versions
 from vlagents_ray.evaluate.artifacts.storage import PROVENANCE, inside, link_or_copy, require_below, storing
 from vlagents_ray.evaluate.bundle.archive import CONFIG, PACKAGES, pack
 from vlagents_ray.evaluate.bundle.packages import pins
+from vlagents_ray.evaluate.plan.config import canonical
 from vlagents_ray.evaluate.report.html import FILE as REPORT
 from vlagents_ray.evaluate.report.html import write_report
 from vlagents_ray.evaluate.report.html.provenance import repeat
@@ -24,7 +26,8 @@ def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
 
     It holds results.db as it is now, `summary.json` and `report.html` computed from that, the settings as
     `config.yaml` (one for each folder, of merged results), the versions of all packages here as `packages.txt`, the
-    differences from the commits, and the trajectories, with which episodes are played again.
+    differences from the commits, and the trajectories, with which episodes are played again. The database names the
+    files that are in the bundle, so that its results can be merged with others.
 
     Args:
         folder: A folder of results, which may be written to meanwhile; nothing in it is changed.
@@ -46,7 +49,8 @@ def write_bundle(folder: Path, archive: Path, *, videos: bool = False) -> str:
             _copy_database(folder, stage)
             results = Results.load(stage)
             _link_files(folder, stage, results, videos=videos)
-            write_derived(results, videos=videos)
+            _name_what_is_there(stage)
+            write_derived(Results.load(stage), videos=videos)
             (stage / PACKAGES).write_text(pins(), encoding="utf-8")
             return pack(stage, archive, versions())
 
@@ -92,3 +96,12 @@ def _link_files(folder: Path, stage: Path, results: Results, *, videos: bool) ->
         source = inside(folder, path)
         if source.is_file():  # a folder that was copied without its videos can be bundled
             link_or_copy(source, stage / path)
+
+
+def _name_what_is_there(stage: Path) -> None:
+    """Leave out the names of files that the bundle does not have."""
+    with closing(sqlite3.connect(stage / DATABASE)) as db, db:
+        for key, videos, trajectory in db.execute("SELECT key, videos, trajectory FROM episodes").fetchall():
+            there = [path for path in json.loads(videos) if (stage / path).is_file()]
+            numbers = trajectory if trajectory is not None and (stage / trajectory).is_file() else None
+            db.execute("UPDATE episodes SET videos = ?, trajectory = ? WHERE key = ?", (canonical(there), numbers, key))
