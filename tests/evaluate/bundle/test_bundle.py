@@ -17,7 +17,9 @@ import pytest
 from eval_fakes import LINE
 from flat_config import flat_config
 from in_process_evaluation import play
+from typer.testing import CliRunner
 
+from vlagents_ray.cli.main import app
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.evaluate import Results
 from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
@@ -311,3 +313,23 @@ def test_an_evaluation_that_is_written_to_is_bundled_as_it_stands(line: Path, tm
         db.rollback()
         verify(tmp_path / "b.zip", into=tmp_path / "kept", replay=0)
     assert all(one.result.seconds < 99 for one in Results.load(tmp_path / "kept").cells[0].episodes)
+
+
+def test_the_commands_say_what_to_cite_and_end_with_1_if_something_differs(tabletop: Path, tmp_path: Path) -> None:
+    def run(*words: object) -> tuple[int, str]:
+        done = CliRunner().invoke(app, [*map(str, words)], env={"COLUMNS": "300"})
+        return done.exit_code, " ".join(done.output.split())
+
+    file = tmp_path / "b.zip"
+    code, said = run("bundle", tabletop, "--out", file)
+    digest = said.rpartition("sha256:")[2]
+    assert (code, len(digest)) == (0, 64)
+    code, said = run("verify", file, "--replay", 0, "--into", tmp_path / "kept")
+    assert code == 0
+    assert f"bundle sha256:{digest}: holds results: {tmp_path / 'kept'}" in said
+    code, said = run("verify", rewritten(file, tmp_path / "c.zip", {"summary.json": b"{}"}), "--replay", 0)
+    assert code == 1
+    assert f"bundle sha256:{digest}: is contradicted" in said
+    code, said = run("verify", file, "--most-gb", "0.000001")
+    assert code == 2
+    assert "allow more with --most-gb if you trust it" in said

@@ -83,9 +83,11 @@ def replay_actions(cell: CellResults, episode: Episode, trajectory: Trajectory) 
                 step = checked_step(obs, reward, terminated, truncated, info, contract, images=False)
             compared.add(number, step.obs)
             compared.add_outcome(number, step.reward, step.success)
-        return compared.result(env.describe())
+        with env_side("describe"):
+            return compared.result(env.describe())
     finally:
-        env.close()
+        with env_side("close"):
+            env.close()
 
 
 class _Comparison:

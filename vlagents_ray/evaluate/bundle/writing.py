@@ -6,6 +6,7 @@ import json
 import sqlite3
 import tempfile
 from contextlib import closing
+from glob import escape
 from pathlib import Path
 
 from vlagents_ray.evaluate.artifacts.provenance import versions
@@ -88,9 +89,9 @@ def _link_files(folder: Path, stage: Path, results: Results, *, videos: bool) ->
                 paths += one.videos
             if one.trajectory is not None:
                 paths.append(require_below(one.trajectory))
-                numbers = inside(folder, one.trajectory)
-                seen = sorted(numbers.parent.glob(f"{numbers.stem}_*.mp4")) if videos else []
-                paths += [str(path.relative_to(folder.resolve())) for path in seen]
+                numbers = folder / one.trajectory
+                seen = sorted(numbers.parent.glob(f"{escape(numbers.stem)}_*.mp4")) if videos else []
+                paths += [str(path.relative_to(folder)) for path in seen]
     paths += [f"{PROVENANCE}/{path.name}" for path in sorted((folder / PROVENANCE).glob("*.diff"))]
     for path in dict.fromkeys(paths):
         source = inside(folder, path)
