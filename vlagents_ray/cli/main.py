@@ -15,7 +15,14 @@ from vlagents_ray.cli.bench import bench
 from vlagents_ray.cli.cluster.command import down_command, up_command
 from vlagents_ray.cli.console import errors, fail, fresh, out, progress, table
 from vlagents_ray.cli.evaluation.command import evaluate_command
-from vlagents_ray.cli.evaluation.results import export_command, merge_command, replay_command, report_command
+from vlagents_ray.cli.evaluation.results import (
+    bundle_command,
+    export_command,
+    merge_command,
+    replay_command,
+    report_command,
+    verify_command,
+)
 from vlagents_ray.cli.keys import keys
 from vlagents_ray.cli.new import new
 from vlagents_ray.cli.options import Live, LiveAt, parse_list, read_run_file
@@ -64,6 +71,7 @@ def demo(
         run_evaluation(EvalConfig(policies=[policy], suites=[suite], workers=2, video="all", out=fresh(out_dir)))
 
 
+app.command("bundle")(bundle_command)
 app.command("up")(up_command)
 app.command("down")(down_command)
 app.command("eval")(evaluate_command)
@@ -73,6 +81,7 @@ app.command("replay")(replay_command)
 app.command("report")(report_command)
 app.command("robot")(robot_command)
 app.command("tune")(tune_command)
+app.command("verify")(verify_command)
 app.add_typer(bench, name="bench")
 app.add_typer(env, name="env")
 app.add_typer(keys, name="keys")

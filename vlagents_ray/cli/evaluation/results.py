@@ -1,4 +1,4 @@
-"""The commands that read a folder of results: `vlagents-ray report`, `export`, `merge` and `replay`."""
+"""The commands that read results: `vlagents-ray report`, `export`, `merge`, `bundle`, `verify` and `replay`."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import Annotated, Any
 
 import typer
 
-from vlagents_ray.cli.console import errors, fresh, out
+from vlagents_ray.cli.console import errors, fresh, out, table
 from vlagents_ray.cli.evaluation.open_loop import is_dataset, replay_dataset
-from vlagents_ray.cli.options import Address, Live, LiveAt, parse_list
+from vlagents_ray.cli.options import Address, Live, LiveAt, parse_list, parse_settings
 from vlagents_ray.errors import ConfigError
 
 
@@ -57,8 +57,14 @@ def report_command(
 
 def export_command(
     folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the results.")],
-    path: Annotated[Path, typer.Argument(metavar="PATH", help="File to write; of lerobot, a new folder.")],
-    to: Annotated[str, typer.Option(help="json, csv, parquet: a row an episode; lerobot: a dataset of what was seen.")],
+    path: Annotated[Path, typer.Argument(metavar="PATH", help="File to write; of lerobot and hub, a new folder.")],
+    to: Annotated[
+        str,
+        typer.Option(
+            help="json, csv, parquet: a row an episode; lerobot: a dataset of what was seen; hub: scores for a model's "
+            "repository; vla-eval: for its leaderboard."
+        ),
+    ],
     policy: Annotated[str | None, typer.Option(help="Only this one: NAME, or NAME@STEP in a sweep.")] = None,
     env: Annotated[str | None, typer.Option(help="Only this one.")] = None,
     cameras: Annotated[
@@ -76,11 +82,15 @@ def export_command(
     cut_idle: Annotated[
         bool, typer.Option("--cut-idle", help="lerobot: end each episode where nothing moves after it was solved.")
     ] = False,
+    settings: Annotated[
+        list[str],
+        typer.Option("--set", metavar="KEY=VALUE", help="hub: dataset=OWNER/NAME; vla-eval: curated_by=@handle, …"),
+    ] = [],  # noqa: B006 - typer reads it
 ) -> None:
-    """Write the episodes of an evaluation as JSON, CSV, Parquet or a LeRobotDataset v3.0."""
+    """Write the episodes of an evaluation as JSON, CSV, Parquet or a LeRobotDataset v3.0; or its scores, to publish."""
     from vlagents_ray.evaluate import Results
     from vlagents_ray.evaluate.artifacts.storage import storing
-    from vlagents_ray.evaluate.exports import EXPORTS
+    from vlagents_ray.evaluate.exports import EXPORTS, SCORES
 
     with errors():
         if to not in EXPORTS:
@@ -91,6 +101,9 @@ def export_command(
         if chosen and to != "lerobot":
             given = ", ".join(f"--{name.replace('_', '-')}" for name in chosen)
             raise ConfigError(f"{given}: got --to {to}, want --to lerobot, whose frames they choose")
+        if settings and to not in SCORES:
+            raise ConfigError(f"--set: got --to {to}, want one of {', '.join(SCORES)}")
+        chosen |= parse_settings(settings, "--set")
         results = Results.load(folder).only(policy, env)
         with storing(path.parent):
             number = EXPORTS[to](results, path, **chosen)
@@ -111,6 +124,53 @@ def merge_command(
 
     with errors():
         print_summary(out, merge(into, folders, keep_first=keep_first))
+
+
+def bundle_command(
+    folder: Annotated[Path, typer.Argument(metavar="OUT", help="Folder of the results.")],
+    file: Annotated[Path | None, typer.Option("--out", help="The file; default: OUT.bundle.zip beside OUT.")] = None,
+    videos: Annotated[bool, typer.Option("--videos", help="With its videos, which may be large.")] = False,
+) -> None:
+    """Write an evaluation as one file: database, report, settings, versions of packages, trajectories, digests."""
+    from vlagents_ray.evaluate.bundle import write_bundle
+
+    with errors():
+        path = file or folder.absolute().with_name(f"{folder.absolute().name}.bundle.zip")
+        digest = write_bundle(folder, path, videos=videos)
+    out.print(f"bundle: {path}, {path.stat().st_size / 1e6:.1f} MB\nto cite: sha256:{digest}")
+
+
+def verify_command(
+    bundle: Annotated[Path, typer.Argument(metavar="BUNDLE", help="A file that `vlagents-ray bundle` wrote.")],
+    replay: Annotated[
+        int, typer.Option(min=0, help="Play the recorded actions of so many episodes in their simulator.")
+    ] = 3,
+    into: Annotated[
+        Path | None, typer.Option(help="Keep its results in this new folder, to merge, export or replay them.")
+    ] = None,
+    trust: Annotated[
+        bool,
+        typer.Option("--trust", help="Make its environments also by 'module:Class' and with options that name files."),
+    ] = False,
+    most_gb: Annotated[float, typer.Option(min=0, help="Refuse a bundle that unpacks to more.")] = 16.0,
+) -> None:
+    """Check a bundle, also a stranger's: what is equal, what differs, what could not be checked.
+
+    Exit code 0 if nothing contradicts it, 1 if something does: a digest, the tables, a recording, an outcome of a
+    replay. Other versions of software here are named, and contradict nothing.
+    """
+    from vlagents_ray.evaluate.bundle import verify
+
+    with errors():
+        found = verify(bundle, into=into, replay=replay, trust=trust, most_bytes=int(most_gb * 1e9))
+        rows = table("what", "found", "detail", box=None)
+        for one in found.findings:
+            rows.add_row(one.subject, one.verdict, one.detail)
+        out.print(rows)
+        out.print(f"\nbundle sha256:{found.digest}: {'holds' if found.holds else 'is contradicted'}")
+        if into is not None:
+            out.print(f"results: {into}")
+    raise typer.Exit(not found.holds)
 
 
 def replay_command(

@@ -1,10 +1,34 @@
-"""Results for other programs: tables with one row for each episode, datasets with one row for each step."""
+"""Results for other programs: tables of episodes, datasets of their steps, and scores for the Hub and leaderboards."""
 
 from collections.abc import Callable
 
+from vlagents_ray.evaluate.exports.hub import to_hub
 from vlagents_ray.evaluate.exports.lerobot import to_lerobot
 from vlagents_ray.evaluate.exports.tables import COLUMNS, Column, rows, to_csv, to_json, to_parquet
+from vlagents_ray.evaluate.exports.vla_eval import to_vla_eval
 
-EXPORTS: dict[str, Callable[..., int]] = {"json": to_json, "csv": to_csv, "parquet": to_parquet, "lerobot": to_lerobot}
+EXPORTS: dict[str, Callable[..., int]] = {
+    "json": to_json,
+    "csv": to_csv,
+    "parquet": to_parquet,
+    "lerobot": to_lerobot,
+    "hub": to_hub,
+    "vla-eval": to_vla_eval,
+}
 
-__all__ = ["COLUMNS", "EXPORTS", "Column", "rows", "to_csv", "to_json", "to_lerobot", "to_parquet"]
+SCORES = ("hub", "vla-eval")
+"""The exports of scores, whose settings are given by name."""
+
+__all__ = [
+    "COLUMNS",
+    "EXPORTS",
+    "SCORES",
+    "Column",
+    "rows",
+    "to_csv",
+    "to_hub",
+    "to_json",
+    "to_lerobot",
+    "to_parquet",
+    "to_vla_eval",
+]

@@ -99,8 +99,15 @@ def insert(db: sqlite3.Connection, table: str, row: Mapping[str, Any]) -> None:
 def require_readable(out: Path, db: sqlite3.Connection) -> None:
     """Raise `ConfigError` for a results file of another version, or with other columns than this version has.
 
-    The names of columns in a file of somebody else may be any text, and `merge` inserts rows by them.
+    A file of somebody else may have any text as the names of columns, by which `merge` inserts rows, and views or
+    triggers, which would compute whatever they like when a table is read or written.
     """
+    begins = {"table": "CREATE TABLE", "index": "CREATE INDEX"}  # a virtual table is listed as a table, too
+    for kind, name, sql in db.execute("SELECT type, name, sql FROM sqlite_master WHERE sql IS NOT NULL"):
+        if kind not in begins or not str(sql).startswith(begins[kind]):
+            raise ConfigError(
+                f"{out / FILE}: got {name!r}, which is a {kind} that no evaluation makes: do not trust whoever made it"
+            )
     version = db.execute("PRAGMA user_version").fetchone()[0]
     if version != VERSION:
         raise ConfigError(

@@ -228,6 +228,7 @@ def reading(out: Path) -> Iterator[sqlite3.Connection]:
     try:
         with closing(read_only(out)) as db:
             require_readable(out, db)
+            db.execute("PRAGMA trusted_schema = OFF")  # the file may be a stranger's
             db.row_factory = sqlite3.Row
             db.execute("BEGIN")
             yield db

@@ -1,0 +1,335 @@
+"""A bundle: what is checked holds for an honest one, is contradicted by a changed one, and a hostile one is refused."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import sqlite3
+import stat
+import zipfile
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+from eval_fakes import LINE
+from flat_config import flat_config
+from in_process_evaluation import play
+from typer.testing import CliRunner
+
+from vlagents_ray.cli.main import app
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate import Results
+from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
+from vlagents_ray.evaluate.bundle import Verification, verify, write_bundle
+from vlagents_ray.evaluate.merge import merge
+from vlagents_ray.interface import Act, Agent, Obs
+
+Change = Callable[[Path], None]
+
+
+class Still(Agent):
+    """Lifts the gripper's target a little, always the same."""
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict[str, object]:
+        return {"checkpoint": "still", "weights": "sha256:5711"}
+
+    def act(self, obs: Obs) -> Act:
+        return Act(np.array([0.1, 0.0, 0.2, 1.0], np.float32))
+
+
+@pytest.fixture(scope="module")
+def tabletop(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two recorded episodes of the tabletop."""
+    out = tmp_path_factory.mktemp("tabletop") / "run"
+    options = {"max_steps": 8}
+    play(flat_config(envs=["tabletop"], env_options=options, episodes=2, record="all", video="all", out=out), Still)
+    return out
+
+
+@pytest.fixture(scope="module")
+def line(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three recorded episodes of an environment that is registered nowhere."""
+    out = tmp_path_factory.mktemp("line") / "run"
+    play(flat_config(envs=[LINE], episodes=3, record="all", video="none", out=out))
+    return out
+
+
+@pytest.fixture
+def changed(line: Path, tmp_path: Path) -> Callable[[Change], Path]:
+    """A bundle of a copy of `line` in which something was changed before it was written."""
+
+    def make(change: Change) -> Path:
+        shutil.copytree(line, tmp_path / "copy")
+        change(tmp_path / "copy")
+        write_bundle(tmp_path / "copy", tmp_path / "changed.zip")
+        return tmp_path / "changed.zip"
+
+    return make
+
+
+def verdicts(found: Verification) -> dict[str, str]:
+    return {one.subject: one.verdict for one in found.findings}
+
+
+def details(found: Verification, subject: str) -> str:
+    return next(one.detail for one in found.findings if one.subject == subject)
+
+
+def rewritten(bundle: Path, target: Path, changes: dict[str, bytes], *, honest: bool = False) -> Path:
+    """The bundle with other files; `honest` writes their digests into its manifest, as its author could."""
+    with zipfile.ZipFile(bundle) as source:
+        files = {name: source.read(name) for name in source.namelist()} | changes
+    if honest:
+        manifest = json.loads(files["bundle.json"])
+        manifest["files"] |= {
+            name: {"sha256": hashlib.sha256(text).hexdigest(), "size": len(text)} for name, text in changes.items()
+        }
+        files["bundle.json"] = json.dumps(manifest).encode()
+    with zipfile.ZipFile(target, "w") as out:
+        for name, text in files.items():
+            out.writestr(name, text)
+    return target
+
+
+@pytest.fixture(scope="module")
+def bundle(tabletop: Path) -> Path:
+    write_bundle(tabletop, tabletop.parent / "run.bundle.zip")
+    return tabletop.parent / "run.bundle.zip"
+
+
+def test_an_honest_bundle_holds_and_plays_again_to_the_bit(bundle: Path) -> None:
+    found = verify(bundle)
+    assert found.holds
+    equal = {name for name, verdict in verdicts(found).items() if verdict == "equal"}
+    files = {"digests", "database", "summary.json", "report.html", "config.yaml", "trajectories"}
+    assert equal >= files | {"packages", "versions", "replay of tabletop#0@0", "replay of tabletop#1@1"}
+    assert details(found, "replay of tabletop#1@1") == "8 actions, every state, reward and success to the bit"
+    assert details(found, "weights of policy") == "still, sha256:5711; a bundle holds no weights"
+
+
+def test_the_same_results_give_the_same_bytes_and_the_digest_stands_for_them(
+    bundle: Path, tmp_path: Path, tabletop: Path
+) -> None:
+    digest = write_bundle(tabletop, tmp_path / "again.zip")
+    assert (tmp_path / "again.zip").read_bytes() == bundle.read_bytes()
+    assert verify(bundle, replay=0).digest == digest
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["again.zip"]
+
+
+def test_videos_are_in_it_if_that_is_asked_for(bundle: Path, tabletop: Path, tmp_path: Path) -> None:
+    write_bundle(tabletop, tmp_path / "with.zip", videos=True)
+    assert verify(tmp_path / "with.zip", into=tmp_path / "kept", replay=0).holds
+    videos = sorted((tmp_path / "kept").rglob("*.mp4"))
+    assert len(videos) == 4  # of the report, and of what the policy saw
+    with zipfile.ZipFile(bundle) as file:
+        assert not [name for name in file.namelist() if name.endswith(".mp4")]
+
+
+def test_results_of_several_bundles_are_pooled(bundle: Path, line: Path, tmp_path: Path) -> None:
+    write_bundle(line, tmp_path / "line.zip")
+    for name, file in (("a", bundle), ("b", tmp_path / "line.zip")):
+        verify(file, into=tmp_path / name, replay=0)
+    assert merge(tmp_path / "all", [tmp_path / "a", tmp_path / "b"]).total.episodes == 5
+    with pytest.raises(ConfigError, match="is there already"):
+        verify(bundle, into=tmp_path / "a")
+
+
+def test_other_actions_than_were_executed_have_another_outcome(tabletop: Path, tmp_path: Path) -> None:
+    shutil.copytree(tabletop, tmp_path / "copy")
+    path = next((tmp_path / "copy").rglob("ep0000*.npz"))
+    recorded = Trajectory.load(path)
+    recorded.actions[3] += 0.25
+    path.write_bytes(recorded.to_bytes())
+    write_bundle(tmp_path / "copy", tmp_path / "changed.zip")
+    found = verify(tmp_path / "changed.zip")
+    assert not found.holds
+    assert "the recorded actions are not those of the table's digest" in details(found, "trajectories")
+    assert verdicts(found)["replay of tabletop#0@0"] == "other here"
+    assert "the numbers differ from step 4 of 8 on" in details(found, "replay of tabletop#0@0")
+
+
+def test_a_file_changed_afterwards_is_told_by_its_digest(bundle: Path, tmp_path: Path) -> None:
+    found = verify(rewritten(bundle, tmp_path / "b.zip", {"summary.json": b"{}"}), replay=0)
+    assert (found.holds, details(found, "digests")) == (False, "summary.json has another digest")
+
+
+def test_a_table_that_the_database_does_not_give_is_contradicted(bundle: Path, tmp_path: Path) -> None:
+    with zipfile.ZipFile(bundle) as file:
+        page, summary = file.read("report.html"), json.loads(file.read("summary.json"))
+    summary["totals"][0]["success_once"]["successes"] += 1
+    forged = {"summary.json": json.dumps(summary).encode(), "report.html": page.replace(b"episodes", b"successes")}
+    found = verify(rewritten(bundle, tmp_path / "b.zip", forged, honest=True), into=tmp_path / "kept", replay=0)
+    assert {name for name, verdict in verdicts(found).items() if verdict == "differs"} == {
+        "summary.json",
+        "report.html",
+    }
+    assert "totals.0.success_once.successes: 1, the database gives 0" in details(found, "summary.json")
+    assert (tmp_path / "kept/report.html").read_bytes() == page  # written here, not the stranger's
+
+
+@pytest.mark.parametrize(
+    ("sql", "subject"),
+    [
+        (
+            "UPDATE episodes SET success_once = 1, success_at_end = 1, first_success = 2 WHERE episode = 0",
+            "trajectories",
+        ),
+        ("UPDATE episodes SET episode_return = episode_return + 1", "trajectories"),
+        ("UPDATE episodes SET seed = seed + 100", "database"),
+        ("UPDATE cells SET settings = replace(settings, '\"execute\":null', '\"execute\":1')", "database"),
+    ],
+)
+def test_a_changed_database_contradicts_the_rest(changed: Callable[[Change], Path], sql: str, subject: str) -> None:
+    def change(folder: Path) -> None:
+        with closing(sqlite3.connect(folder / "results.db")) as db, db:
+            db.execute(sql)
+
+    found = verify(changed(change), replay=0)
+    assert verdicts(found)[subject] == "differs"
+
+
+def test_an_environment_that_is_not_registered_is_made_for_those_who_trust_the_bundle(
+    line: Path, tmp_path: Path
+) -> None:
+    write_bundle(line, tmp_path / "line.zip")
+    subject = f"replay of {LINE}#0@0"
+    assert details(verify(tmp_path / "line.zip"), subject).endswith(
+        "is no registered environment; --trust makes it, and runs its code"
+    )
+    assert verdicts(verify(tmp_path / "line.zip", trust=True))[subject] == "equal"
+
+
+@pytest.mark.parametrize("options", [{"assets": "../../etc"}, {"nested": {"a": 1}}, {"code": "os:system"}])
+def test_options_that_could_name_files_or_code_are_not_taken_from_a_stranger(
+    bundle: Path, tmp_path: Path, options: dict[str, object]
+) -> None:
+    verify(bundle, into=tmp_path / "run", replay=0)
+    with closing(sqlite3.connect(tmp_path / "run/results.db")) as db, db:
+        [settings] = db.execute("SELECT settings FROM cells").fetchone()
+        db.execute("UPDATE cells SET settings = ?", (json.dumps(json.loads(settings) | {"env_options": options}),))
+    write_bundle(tmp_path / "run", tmp_path / "b.zip")
+    assert "which could name files or code; --trust takes them" in details(
+        verify(tmp_path / "b.zip"), "replay of tabletop#0@0"
+    )
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../results.db",
+        "/tmp/results.db",
+        "videos/../../x.mp4",
+        "videos/a/.hidden.mp4",
+        "sitecustomize.py",
+        "videos\\a\\b.mp4",
+    ],
+)
+def test_a_path_that_no_bundle_has_is_refused_and_nothing_is_written(bundle: Path, tmp_path: Path, name: str) -> None:
+    hostile = rewritten(bundle, tmp_path / "b.zip", {name: b"x"}, honest=True)
+    with pytest.raises(ConfigError, match=r"got the file .*do not trust whoever made this bundle"):
+        verify(hostile, into=tmp_path / "deep" / "kept")
+    assert not list((tmp_path / "deep").iterdir())
+
+
+def test_links_duplicates_and_archives_that_unpack_to_too_much_are_refused(bundle: Path, tmp_path: Path) -> None:
+    link = zipfile.ZipInfo("videos/a/b.mp4")
+    link.external_attr = (stat.S_IFLNK | 0o777) << 16
+    for name, member, text, why in (
+        ("link", link, "/etc/passwd", "is a link or another special file"),
+        ("twice", zipfile.ZipInfo("summary.json"), "{}", "got 'summary.json' twice"),
+    ):
+        hostile = shutil.copy(bundle, tmp_path / f"{name}.zip")
+        with zipfile.ZipFile(hostile, "a") as file, pytest.MonkeyPatch.context() as patch:
+            patch.setattr(file, "_writecheck", lambda _member: None)  # it warns of duplicates
+            file.writestr(member, text)
+        with pytest.raises(ConfigError, match=why):
+            verify(hostile)
+    with pytest.raises(ConfigError, match=r"unpacks to \d+ bytes, want at most 1000; allow more with --most-gb"):
+        verify(bundle, most_bytes=1000)
+
+
+@pytest.mark.parametrize(
+    ("text", "why"), [(b"", "cannot be read as a bundle"), (b"PK\5\6" + 18 * b"\0", "has no bundle.json")]
+)
+def test_what_is_no_bundle_is_said_to_be_none(tmp_path: Path, text: bytes, why: str) -> None:
+    (tmp_path / "b.zip").write_bytes(text)
+    with pytest.raises(ConfigError, match=why):
+        verify(tmp_path / "b.zip")
+
+
+def test_half_a_bundle_is_refused(bundle: Path, tmp_path: Path) -> None:
+    with zipfile.ZipFile(bundle) as file:
+        database = file.getinfo("results.db")
+    text = bytearray(bundle.read_bytes())
+    text[database.header_offset + 60 : database.header_offset + 90] = bytes(30)
+    (tmp_path / "b.zip").write_bytes(text)
+    with pytest.raises(ConfigError, match=r"cannot be read as a bundle \(.*copy it again from its source"):
+        verify(tmp_path / "b.zip")
+
+
+def test_a_database_of_views_or_of_odd_values_is_refused(
+    changed: Callable[[Change], Path], bundle: Path, tmp_path: Path
+) -> None:
+    verify(bundle, into=tmp_path / "run", replay=0)
+    for sql, why in (
+        ("CREATE VIEW x AS SELECT 1", "got 'x', which is a view that no evaluation makes"),
+        ("UPDATE cells SET seeds = '[]'", "its database holds values that no evaluation writes"),
+        ("UPDATE runs SET config = '{\"policies\": 1}'", "its database holds values that no evaluation writes"),
+        ("UPDATE episodes SET trajectory = '../x.npz'", "want a path below the folder of results"),
+    ):
+        shutil.copy(tmp_path / "run/results.db", tmp_path / "other.db")
+        with closing(sqlite3.connect(tmp_path / "other.db")) as db, db:
+            db.execute(sql)
+        forged = {"results.db": (tmp_path / "other.db").read_bytes()}
+        with pytest.raises(ConfigError, match=why):
+            verify(rewritten(bundle, tmp_path / "b.zip", forged, honest=True), replay=0)
+
+
+def test_a_recording_that_states_more_than_it_has_is_refused(bundle: Path, tmp_path: Path) -> None:
+    with zipfile.ZipFile(bundle) as file:
+        name = next(one for one in file.namelist() if one.endswith(".npz"))
+    npz = tmp_path / "x.npz"
+    header = (
+        b"\x93NUMPY\x01\x00v\x00"
+        + b"{'descr': '<f4', 'fortran_order': False, 'shape': (9999999999999, 99999), }".ljust(117)
+        + b"\n"
+    )
+    with zipfile.ZipFile(npz, "w") as file:
+        file.writestr("actions.npy", header)
+        file.writestr("cameras.npy", header)
+    with pytest.raises(ConfigError, match=r"memory|cannot be read as a trajectory"):
+        verify(rewritten(bundle, tmp_path / "b.zip", {name: npz.read_bytes()}, honest=True))
+
+
+def test_an_evaluation_that_is_written_to_is_bundled_as_it_stands(line: Path, tmp_path: Path) -> None:
+    shutil.copytree(line, tmp_path / "run")
+    with closing(sqlite3.connect(tmp_path / "run/results.db")) as db:
+        db.execute("PRAGMA journal_mode = wal")
+        db.execute("UPDATE episodes SET seconds = 99")
+        write_bundle(tmp_path / "run", tmp_path / "b.zip")
+        db.rollback()
+        verify(tmp_path / "b.zip", into=tmp_path / "kept", replay=0)
+    assert all(one.result.seconds < 99 for one in Results.load(tmp_path / "kept").cells[0].episodes)
+
+
+def test_the_commands_say_what_to_cite_and_end_with_1_if_something_differs(tabletop: Path, tmp_path: Path) -> None:
+    def run(*words: object) -> tuple[int, str]:
+        done = CliRunner().invoke(app, [*map(str, words)], env={"COLUMNS": "300"})
+        return done.exit_code, " ".join(done.output.split())
+
+    file = tmp_path / "b.zip"
+    code, said = run("bundle", tabletop, "--out", file)
+    digest = said.rpartition("sha256:")[2]
+    assert (code, len(digest)) == (0, 64)
+    code, said = run("verify", file, "--replay", 0, "--into", tmp_path / "kept")
+    assert code == 0
+    assert f"bundle sha256:{digest}: holds results: {tmp_path / 'kept'}" in said
+    code, said = run("verify", rewritten(file, tmp_path / "c.zip", {"summary.json": b"{}"}), "--replay", 0)
+    assert code == 1
+    assert f"bundle sha256:{digest}: is contradicted" in said
+    code, said = run("verify", file, "--most-gb", "0.000001")
+    assert code == 2
+    assert "allow more with --most-gb if you trust it" in said

@@ -1,0 +1,207 @@
+"""The file of a bundle: a ZIP archive whose first member lists the others with their digests.
+
+An archive may come from a stranger. Its list of members is checked before one of them is read: every name is one that
+`pack` could have written, so that none leads out of the folder; no member is a link; the sizes are bounded, and no
+member yields more bytes than it states. Nothing is unpickled, and nothing of it is imported.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import stat
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.evaluate.artifacts.storage import PROVENANCE, TRAJECTORIES, VIDEOS, whole
+from vlagents_ray.evaluate.report.html import FILE as REPORT
+from vlagents_ray.evaluate.results.database import FILE as DATABASE
+from vlagents_ray.evaluate.results.summary import FILE as SUMMARY
+
+MANIFEST, PACKAGES, CONFIG = "bundle.json", "packages.txt", "config"
+MOST_BYTES = 16 * 10**9  # of all members, unpacked
+_MOST_MEMBERS = 200_000
+_MOST_MANIFEST = 64 * 2**20  # bytes
+_CHUNK = 2**20
+_PART = r"[\w@-][\w.@-]{0,200}"  # of a path, as `naming.plain` leaves names: it neither is nor begins with a dot
+_KNOWN = re.compile(
+    rf"{re.escape(MANIFEST)}|{re.escape(DATABASE)}|{re.escape(SUMMARY)}|{re.escape(REPORT)}|{re.escape(PACKAGES)}"
+    rf"|{CONFIG}(-[0-9]{{1,6}})?\.yaml|{PROVENANCE}/[0-9a-f]{{64}}\.diff"
+    rf"|{TRAJECTORIES}/({_PART}/){{1,3}}{_PART}\.(npz|mp4)|{VIDEOS}/({_PART}/){{1,3}}{_PART}\.mp4"
+)
+_BROKEN = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError, ValueError)
+_DISTRUST = "no `vlagents-ray bundle` writes that: do not trust whoever made this bundle"
+
+
+class FileDigest(BaseModel):
+    """A file of a bundle."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    sha256: str = Field(pattern="^[0-9a-f]{64}$")
+    size: int = Field(ge=0)  # bytes
+
+
+class Manifest(BaseModel):
+    """The content of `bundle.json`."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    format: Literal["vlagents-ray bundle"] = "vlagents-ray bundle"
+    version: Literal[1] = 1
+    written_by: dict[str, JsonValue]  # versions of Python, packages and code where the bundle was written
+    files: dict[str, FileDigest]  # all others, by their paths
+
+
+def digest_of(path: Path) -> FileDigest:
+    """Compute the SHA-256 and the size of a file."""
+    sha256, size = hashlib.sha256(), 0
+    with path.open("rb") as file:
+        while chunk := file.read(_CHUNK):
+            sha256.update(chunk)
+            size += len(chunk)
+    return FileDigest(sha256=sha256.hexdigest(), size=size)
+
+
+def pack(folder: Path, archive: Path, written_by: dict[str, JsonValue]) -> str:
+    """Write all files of `folder` into the bundle `archive`, whole or not at all; the same files give the same bytes.
+
+    Args:
+        folder: Holds what a bundle may hold, and nothing else.
+        archive: The file to write.
+        written_by: The versions here.
+
+    Returns:
+        The SHA-256 of the manifest, which stands for everything in the bundle.
+
+    Raises:
+        ConfigError: The folder has a file that a bundle may not hold.
+    """
+    paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    names = {path.relative_to(folder).as_posix(): path for path in paths}
+    if odd := [name for name in names if not _KNOWN.fullmatch(name) or name == MANIFEST]:
+        raise ConfigError(f"{folder}: got the files {odd[:5]}, which a bundle may not hold; rename or remove them")
+    manifest = Manifest(written_by=written_by, files={name: digest_of(path) for name, path in names.items()})
+    text = (manifest.model_dump_json(indent=1) + "\n").encode()
+    with whole(archive) as part, zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED) as file:
+        file.writestr(_member(MANIFEST), text, zipfile.ZIP_DEFLATED)
+        for name, path in names.items():
+            how = zipfile.ZIP_STORED if path.suffix in (".mp4", ".npz") else zipfile.ZIP_DEFLATED  # already compressed
+            with path.open("rb") as source, file.open(_member(name, how), "w", force_zip64=True) as target:
+                while chunk := source.read(_CHUNK):
+                    target.write(chunk)
+    return hashlib.sha256(text).hexdigest()
+
+
+def _member(name: str, how: int = zipfile.ZIP_DEFLATED) -> zipfile.ZipInfo:
+    member = zipfile.ZipInfo(name)  # of 1980: the time is no part of the results
+    member.compress_type, member.external_attr = how, (stat.S_IFREG | 0o644) << 16
+    return member
+
+
+def unpack(archive: Path, folder: Path, *, most_bytes: int = MOST_BYTES) -> tuple[Manifest, str, list[str]]:
+    """Write the files of a bundle into `folder`, without its manifest.
+
+    Args:
+        archive: The bundle.
+        folder: An empty folder.
+        most_bytes: The most bytes that all files may have together.
+
+    Returns:
+        The manifest, its SHA-256, and the differences between the manifest and the files, a sentence each.
+
+    Raises:
+        ConfigError: The file is no bundle, or is larger than allowed; nothing that it names leads out of `folder`.
+    """
+    with _opened(archive) as file:
+        members = _checked(archive, file, most_bytes)
+        manifest, sha256 = _manifest(archive, file, members.pop(MANIFEST, None))
+        found: dict[str, FileDigest] = {}
+        for name, member in members.items():
+            target = folder / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with file.open(member) as source, target.open("xb") as written:
+                found[name] = _copy(archive, source, written, member)
+    return manifest, sha256, _differences(manifest.files, found)
+
+
+@contextmanager
+def _opened(archive: Path) -> Iterator[zipfile.ZipFile]:
+    if not archive.is_file():
+        raise ConfigError(f"{archive}: got no file, want a bundle that `vlagents-ray bundle` wrote")
+    try:
+        with zipfile.ZipFile(archive) as file:
+            yield file
+    except ConfigError:
+        raise
+    except _BROKEN as error:
+        raise ConfigError(f"{archive}: cannot be read as a bundle ({error}); copy it again from its source") from error
+
+
+def _checked(archive: Path, file: zipfile.ZipFile, most_bytes: int) -> dict[str, zipfile.ZipInfo]:
+    """The members by their names, all of them checked as far as is possible without reading them."""
+    listed = file.infolist()
+    if len(listed) > _MOST_MEMBERS:
+        raise ConfigError(f"{archive}: got {len(listed)} files, want at most {_MOST_MEMBERS}; {_DISTRUST}")
+    members: dict[str, zipfile.ZipInfo] = {}
+    for member in listed:
+        name = member.orig_filename
+        kind = stat.S_IFMT(member.external_attr >> 16)
+        if not _KNOWN.fullmatch(name) or member.filename != name:
+            raise ConfigError(f"{archive}: got the file {name!r}, want those of a folder of results; {_DISTRUST}")
+        if name in members:
+            raise ConfigError(f"{archive}: got {name!r} twice; {_DISTRUST}")
+        if kind not in (0, stat.S_IFREG):
+            raise ConfigError(f"{archive}: {name!r} is a link or another special file; {_DISTRUST}")
+        if member.flag_bits & 0x1 or member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise ConfigError(f"{archive}: {name!r} is encrypted, or packed in another way than a bundle; {_DISTRUST}")
+        members[name] = member
+    if (total := sum(member.file_size for member in listed)) > most_bytes:
+        raise ConfigError(
+            f"{archive}: unpacks to {total} bytes, want at most {most_bytes}; allow more with --most-gb if you trust it"
+        )
+    return members
+
+
+def _manifest(archive: Path, file: zipfile.ZipFile, member: zipfile.ZipInfo | None) -> tuple[Manifest, str]:
+    if member is None:
+        raise ConfigError(f"{archive}: has no {MANIFEST}, want a bundle that `vlagents-ray bundle` wrote")
+    if member.file_size > _MOST_MANIFEST:
+        raise ConfigError(f"{archive}: {MANIFEST} has {member.file_size} bytes, want at most {_MOST_MANIFEST}")
+    with file.open(member) as opened:
+        text = opened.read(_MOST_MANIFEST + 1)
+    try:
+        return Manifest.model_validate_json(text), hashlib.sha256(text).hexdigest()
+    except ValidationError as error:
+        first = error.errors(include_url=False, include_input=False)[0]
+        where = ".".join(map(str, first["loc"]))
+        raise ConfigError(
+            f"{archive}: {MANIFEST} is not one of version 1: {where}: {first['msg']}; read it with the version of "
+            f"vlagents-ray that wrote it"
+        ) from error
+
+
+def _copy(archive: Path, source: IO[bytes], target: IO[bytes], member: zipfile.ZipInfo) -> FileDigest:
+    """Copy a member, and compute its digest on the way."""
+    sha256, size = hashlib.sha256(), 0
+    while chunk := source.read(_CHUNK):
+        size += len(chunk)
+        if size > member.file_size:
+            raise ConfigError(f"{archive}: {member.filename!r} has more bytes than it states; {_DISTRUST}")
+        sha256.update(chunk)
+        target.write(chunk)
+    return FileDigest(sha256=sha256.hexdigest(), size=size)
+
+
+def _differences(stated: dict[str, FileDigest], found: dict[str, FileDigest]) -> list[str]:
+    odd = [f"{name} is not in the bundle" for name in stated.keys() - found.keys()]
+    odd += [f"{name} is not in the manifest" for name in found.keys() - stated.keys()]
+    odd += [f"{name} has another digest" for name in stated.keys() & found.keys() if stated[name] != found[name]]
+    return sorted(odd)
