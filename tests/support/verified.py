@@ -24,6 +24,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 FAMILIES = ROOT / "tests" / "families"
 PAGES = ROOT / "docs" / "policies"
+PYTHON = "3.11"  # of this project's own environment
 BEGIN, END = "<!-- verified -->", "<!-- /verified -->"
 WHAT = {
     "parity": "acts as upstream's own code",
@@ -32,11 +33,12 @@ WHAT = {
     "loading": "refuses what cannot be loaded",
     "size": "has the published size",
 }
-# Of each family with a page: the file in requirements/, and the packages and checkouts whose versions matter.
+# Of each family with a page: the files in requirements/, and the packages and checkouts whose versions matter.
 RUN_WITH = {
     "arro": ("hf", ("transformers", "torch")),
     "diffusion_policy": ("diffusion_policy", ("DIFFUSION_POLICY_SRC", "diffusers", "torch")),
-    "lerobot": ("lerobot", ("lerobot", "transformers", "torch")),
+    "gr00t": ("lerobot06", ("lerobot", "transformers", "torch")),
+    "lerobot": ("lerobot lerobot06", ("lerobot", "transformers", "torch")),
     "octo": ("octo", ("OCTO_SRC", "jax", "flax")),
     "openpi": ("openpi", ("OPENPI_SRC", "jax", "flax", "torch")),
     "openvla": ("openvla", ("OPENVLA_SRC", "OPENVLA_OFT_SRC", "transformers", "torch")),
@@ -72,8 +74,14 @@ class VerifyingTests:
 
 
 def noted_in(family: str) -> Path:
-    """The file with the outcomes of a family's tests."""
-    return FAMILIES / family / "verified.json"
+    """The file with the outcomes of a family's tests in this Python."""
+    python = _python()
+    return FAMILIES / family / ("verified.json" if python == PYTHON else f"verified.python{python}.json")
+
+
+def notes(family: str) -> list[dict[str, Any]]:
+    """What is noted of a family, for each Python in which it was tested."""
+    return [json.loads(file.read_text()) for file in sorted((FAMILIES / family).glob("verified*.json"))]
 
 
 def marked(family: str) -> Iterator[tuple[str, str]]:
@@ -88,27 +96,27 @@ def marked(family: str) -> Iterator[tuple[str, str]]:
 def table(family: str) -> str:
     """The table of a family's page, in Markdown."""
     requirements, _ = RUN_WITH[family]
-    file = noted_in(family)
-    noted: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {"tests": {}}
-    ran = "They have not been run for this table."
-    if noted["tests"]:
-        versions = ", ".join(f"{name} {number}" for name, number in noted["versions"].items())
-        ran = f"They ran with Python {noted['python']}, {versions}, on {noted['device']}."
+    noted = [one for one in notes(family) if one["tests"]]
+    ran = (
+        "They have not been run for this table."
+        if not noted
+        else f"They ran with {'; and with '.join(map(_with, noted))}."
+    )
     rows = []
     for what, name in sorted(((what, name) for name, what in marked(family)), key=lambda one: list(WHAT).index(one[0])):
         file_name, _, test = name.partition("::test_")
-        rows.append(
-            f"| {WHAT[what]} | {test.replace('_', ' ')} | `{file_name}` | {_result(noted['tests'].get(name))} |"
-        )
+        results = " | ".join(_result(one["tests"].get(name)) for one in noted or [{"tests": {}}])
+        rows.append(f"| {WHAT[what]} | {test.replace('_', ' ')} | `{file_name}` | {results} |")
+    cases = [f"cases, Python {one['python']}" for one in noted] if len(noted) > 1 else ["cases"]
     return "\n".join(
         [
             f"These tests of `tests/families/{family}` use small random checkpoints. {ran}",
             "",
-            "| the policy … | test | in | cases |",
-            "|---|---|---|---|",
+            f"| the policy … | test | in | {' | '.join(cases)} |",
+            f"|---|---|---{'|---' * len(cases)}|",
             *rows,
             "",
-            f"`make verified FAMILIES={requirements}` runs them, and writes this table.",
+            f"`make verified FAMILIES={_quoted(requirements)}` runs them, and writes this table.",
         ]
     )
 
@@ -124,6 +132,19 @@ def main() -> None:
     for family in RUN_WITH:
         file = PAGES / f"{family}.md"
         file.write_text(with_table(file.read_text(), family))
+
+
+def _with(noted: dict[str, Any]) -> str:
+    versions = ", ".join(f"{name} {number}" for name, number in noted["versions"].items())
+    return f"Python {noted['python']}, {versions}, on {noted['device']}"
+
+
+def _quoted(words: str) -> str:
+    return f'"{words}"' if " " in words else words
+
+
+def _python() -> str:
+    return ".".join(platform.python_version_tuple()[:2])
 
 
 def _result(outcomes: dict[str, int] | None) -> str:
@@ -149,7 +170,7 @@ def _environment(family: str) -> dict[str, Any]:
     versions = {name: _version(name) for name in RUN_WITH[family][1]}
     torch = sys.modules.get("torch")
     device = torch.cuda.get_device_name() if torch is not None and torch.cuda.is_available() else "a CPU, not on a GPU"
-    return {"python": ".".join(platform.python_version_tuple()[:2]), "versions": versions, "device": device}
+    return {"python": _python(), "versions": versions, "device": device}
 
 
 if __name__ == "__main__":

@@ -188,13 +188,18 @@ def make(
     requirements: Annotated[Path, typer.Argument(help="A requirements file: requirements/lerobot.txt.")],
     into: Annotated[Path | None, typer.Option(help="Folder; default: .venv- and the file's name.")] = None,
     more: Annotated[list[Path], typer.Option("--with", help="A further requirements file, repeatable.")] = [],  # noqa: B006
-    python: Annotated[str | None, typer.Option(help="A version (3.12) or an interpreter; default: this one.")] = None,
+    python: Annotated[
+        str | None, typer.Option(help="A version or an interpreter; default: the file's, or this one.")
+    ] = None,
     light: Annotated[bool, typer.Option("--light", help="Without Ray, for a child process.")] = False,
+    cuda: Annotated[bool, typer.Option("--cuda", help="CUDA packages also without a GPU: several GB.")] = False,
 ) -> None:
     """Make a virtual environment with this vlagents-ray and a policy's requirements, and say how to use it."""
     from vlagents_ray.serve.python_env.create import make_environment
 
     folder = into or Path(f".venv-{requirements.stem}")
     with errors():
-        made = make_environment(requirements, folder, more=more, python=python, light=light, progress=progress)
+        made = make_environment(
+            requirements, folder, more=more, python=python, light=light, cuda=cuda, progress=progress
+        )
     out.print(f"ready; in a deployment file, under args:\n\nenvironment:\n  python: {made}")

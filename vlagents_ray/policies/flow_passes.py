@@ -7,7 +7,7 @@ The passes are functions of tensors, so that they can be compiled. The keys and 
 from __future__ import annotations
 
 import abc
-import inspect
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -24,7 +24,8 @@ class FlowPasses(abc.ABC):
         """Use the passes of a model of openpi, or of LeRobot, in their compiled form if there is one."""
         self.model = model
         self.adapters = Adapters()  # of the policy
-        self.attention_mask = inspect.getmodule(type(model)).make_att_2d_masks  # type: ignore[union-attr]
+        self.module = sys.modules[type(model).__module__]  # with the functions of its authors' own passes
+        self.attention_mask = self.module.make_att_2d_masks
         self._encode = compilation.core("encode", self.encode)
         self._velocity = compilation.core("velocity", self.velocity)
 
@@ -106,8 +107,10 @@ class Pi0Passes(FlowPasses):
             stated: Whether the model's `denoise_step` takes the state, which that of LeRobot's π0.5 does not.
         """
         self._stated = stated
-        model.paligemma_with_expert.paligemma.language_model.config._attn_implementation = "eager"
+        model.paligemma_with_expert.paligemma.model.language_model.config._attn_implementation = "eager"
         super().__init__(model, compilation)
+        own = getattr(model, "_prepare_attention_masks_4d", None)  # a function in newer versions of LeRobot
+        self._mask_4d = own or self.module.prepare_attention_masks_4d
 
     def encode(self, tokens: Any, mask: Any, cameras: Any, state: Any, *images: Any) -> tuple[Any, Any]:
         """Return keys and values, and which tokens are there; the state is not read."""
@@ -115,21 +118,34 @@ class Pi0Passes(FlowPasses):
 
         embedded, seen, causal = self.model.embed_prefix(list(images), list(cameras.unbind(1)), tokens, mask)
         _, cache = self.model.paligemma_with_expert.forward(
-            attention_mask=self.model._prepare_attention_masks_4d(self.attention_mask(seen, causal)),
+            attention_mask=self._mask_4d(self.attention_mask(seen, causal)),
             position_ids=seen.cumsum(1) - 1,
             inputs_embeds=[embedded, None],
             use_cache=True,
         )
-        return torch.stack([torch.stack(cache[number], 1) for number in range(len(cache))], 1), seen.long()
+        return torch.stack([torch.stack(layer, 1) for layer in layers_of(cache)], 1), seen.long()
 
     def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
         """Return the velocity (B, H, D)."""
-        from transformers import DynamicCache
-
-        cache = DynamicCache()  # of this step alone
-        for number, layer in enumerate(encoded.unbind(1)):
-            cache.update(layer[:, 0], layer[:, 1], number)
+        cache = cache_of(encoded.unbind(1))  # of this step alone
         stated = {"state": state} if self._stated else {}
         return self.model.denoise_step(
             prefix_pad_masks=seen.bool(), past_key_values=cache, x_t=actions, timestep=times, **stated
         )
+
+
+def layers_of(cache: Any) -> list[tuple[Any, Any]]:
+    """Return keys and values of each layer of a transformers `DynamicCache`; its versions differ in where they are."""
+    if hasattr(cache, "layers"):
+        return [(layer.keys, layer.values) for layer in cache.layers]
+    return [cache[number] for number in range(len(cache))]
+
+
+def cache_of(layers: Sequence[Any]) -> Any:
+    """Return a transformers `DynamicCache` with these keys and values, (B, 2, …) for each layer."""
+    from transformers import DynamicCache  # the compiler follows a statement, and not `require`
+
+    cache = DynamicCache()
+    for number, layer in enumerate(layers):
+        cache.update(layer[:, 0], layer[:, 1], number)
+    return cache

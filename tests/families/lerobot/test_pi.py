@@ -41,10 +41,9 @@ def shrunk() -> Iterator[pytest.MonkeyPatch]:
             modeling = importlib.import_module(f"lerobot.policies.{kind}.modeling_{kind}")
             size = modeling.GemmaConfig(width=32, depth=2, mlp_dim=64, num_heads=4, num_kv_heads=1, head_dim=16)
             patch.setattr(modeling, "get_gemma_config", lambda _, size=size: size)
-            for name, change in (
-                ("PaliGemmaForConditionalGeneration", _small_vision),
-                ("GemmaForCausalLM", _few_words),
-            ):
+            new = ("PaliGemmaForConditionalGenerationWithPiGemma", "PiGemmaForCausalLM")
+            names = new if tiny.NEW else ("PaliGemmaForConditionalGeneration", "GemmaForCausalLM")
+            for name, change in zip(names, (_small_vision, _few_words), strict=True):
                 made = getattr(modeling, name)
                 patch.setattr(modeling, name, lambda config, made=made, change=change: made(config=change(config)))
         yield patch
@@ -98,6 +97,44 @@ def test_flow_matching_and_its_guidance_are_theirs(kind: str, delay: int | None,
     chunk = theirs.policy.predict_action_chunk(theirs.see(view()), **given)
     ours = begun(policy).act(view(**info)).action
     np.testing.assert_allclose(ours, theirs.after(chunk)[0].detach().numpy(), atol=1e-4)
+
+
+@pytest.mark.skipif(not tiny.NEW, reason="LeRobot 0.4 has no relative actions")
+@pytest.mark.verifies("parity")
+def test_actions_relative_to_the_state_and_their_leftovers_are_theirs(
+    made: Callable[[str], Path], tmp_path: Path
+) -> None:
+    from lerobot.policies.rtc.relative import reanchor_relative_rtc_prefix
+
+    chunk = {"chunk_size": tiny.CHUNK, "n_action_steps": tiny.EXECUTED, "num_inference_steps": 3}
+    with local_tokenizer("pi0", made("pi0").parent / "tokenizer"):
+        sizes = {"dtype": "float32", "image_resolution": (56, 56)}
+        tiny.write(tmp_path, tiny.config_of("pi0", use_relative_actions=True, **sizes, **chunk))
+    policy, theirs = _loaded(tmp_path, execute=tiny.CHUNK), Theirs(tmp_path)
+    views = [view(1, **{SAMPLES: 2}), view(2)]
+    both = policy.act_batch(views, [begun(policy, 1), begun(policy, 2)])
+    for number, act in zip((1, 2), both, strict=True):
+        assert isinstance(act, Act)
+        np.testing.assert_allclose(act.action, begun(policy, number).act(view(number)).action, atol=ATOL)
+
+    plan = np.random.default_rng(5).uniform(-1, 1, (5, tiny.ACTION)).astype(np.float32)
+    theirs.policy.config.rtc_config = RTCConfig(enabled=True)
+    theirs.policy.init_rtc_processor()
+    seen = theirs.see(view())
+    steps = {type(step).__name__: step for step in theirs.before.steps}
+    left = reanchor_relative_rtc_prefix(
+        torch.from_numpy(plan),
+        torch.from_numpy(view().state["joints"]),
+        steps["RelativeActionsProcessorStep"],
+        steps["NormalizerProcessorStep"],
+        "cpu",
+    )
+    shape = (1, tiny.CHUNK, theirs.policy.config.max_action_dim)
+    noise = torch.from_numpy(draws_of(policy).standard_normal(shape, dtype=np.float32))
+    given = {"noise": noise, "prev_chunk_left_over": left[None], "inference_delay": 2}
+    wanted = theirs.after(theirs.policy.predict_action_chunk(seen, **given))[0].detach().numpy()
+    ours = begun(policy).act(view(**{LEFTOVER: plan, DELAY: 2})).action
+    np.testing.assert_allclose(ours, wanted, atol=1e-4)
 
 
 @pytest.mark.parametrize("kind", KINDS)

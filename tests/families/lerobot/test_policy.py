@@ -72,13 +72,14 @@ def test_the_samples_of_an_observation_of_x_vla_are_of_one_reading_of_it(
 ) -> None:
     policy, read = loaded("xvla"), list[int]()
     vlm = policy.model.kind.policy.model.vlm
-    look = vlm._encode_image
+    name = "get_image_features" if tiny.NEW else "_encode_image"
+    look = getattr(vlm, name)
 
     def counted(images: Any) -> Any:
         read.append(len(images))  # one camera
         return look(images)
 
-    monkeypatch.setattr(vlm, "_encode_image", counted)
+    monkeypatch.setattr(vlm, name, counted)
     views = [view(0, **{SAMPLES: 8}), view(1), view(2, **{SAMPLES: 3})]
     check_shared_readings(policy, views, begun, policy_types, ATOL)
     assert read == [3, 14]

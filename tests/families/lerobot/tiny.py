@@ -5,6 +5,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.metadata
 import io
 import os
 import sys
@@ -24,6 +25,7 @@ import torch
 from lerobot.policies.factory import get_policy_class
 from transformers import SmolVLMForConditionalGeneration
 
+from tests.families.lerobot import tiny06
 from vlagents_ray.bench.checkpoints import lerobot as recipes
 from vlagents_ray.bench.checkpoints.tokenizer import byte_level, fast_tokenizer
 
@@ -59,12 +61,14 @@ def full_act(**settings: Any) -> Any:
 def diffusion(**settings: Any) -> Any:
     small = {"down_dims": (16, 32), "diffusion_step_embed_dim": 16, "spatial_softmax_num_keypoints": 8}
     steps = {"horizon": CHUNK, "n_obs_steps": 2, "n_action_steps": EXECUTED, "num_train_timesteps": 10}
-    return config_of("diffusion", crop_shape=(56, 56), num_inference_steps=3, **small, **steps, **settings)
+    steps |= {"num_inference_steps": 3, "pretrained_backbone_weights": None}
+    return config_of("diffusion", crop_shape=(56, 56), **small, **steps, **settings)
 
 
 def vqbet(**settings: Any) -> Any:
     small = {"gpt_input_dim": 32, "gpt_output_dim": 32, "gpt_hidden_dim": 32, "gpt_n_layer": 1, "gpt_n_head": 2}
     codes = {"vqvae_n_embed": 8, "vqvae_embedding_dim": 16, "vqvae_enc_hidden_dim": 16, "bet_softmax_temperature": 5.0}
+    codes |= {"pretrained_backbone_weights": None}
     return config_of("vqbet", crop_shape=(56, 56), n_obs_steps=3, **small, **codes, **settings)
 
 
@@ -76,6 +80,11 @@ def tdmpc(**settings: Any) -> Any:
 
 def sac(**settings: Any) -> Any:
     return config_of("sac", latent_dim=8, shared_encoder=False, use_torch_compile=False, **settings)
+
+
+def gaussian_actor(**settings: Any) -> Any:
+    """SAC's actor in LeRobot 0.6."""
+    return config_of("gaussian_actor", latent_dim=8, shared_encoder=False, **settings)
 
 
 def smolvla(folder: Path, **settings: Any) -> Any:
@@ -141,18 +150,41 @@ def xvla(folder: Path, **settings: Any) -> Any:
     return config_of("xvla", **own, **sizes, **chunk, **images, **settings)
 
 
-KINDS: dict[str, Callable[..., Any]] = {
+def groot(folder: Path, **settings: Any) -> Any:
+    return config_of("groot", **{**tiny06.groot(folder), "n_action_steps": EXECUTED, **settings})
+
+
+def multi_task_dit(folder: Path, **settings: Any) -> Any:
+    return config_of("multi_task_dit", **{**tiny06.multi_task_dit(folder), "n_action_steps": EXECUTED, **settings})
+
+
+def dit_flow(folder: Path, **settings: Any) -> Any:
+    """The multi-task DiT by flow matching, with an encoder for each camera."""
+    own = {"objective": "flow_matching", "use_separate_rgb_encoder_per_camera": True}
+    return multi_task_dit(folder, **own, **settings)
+
+
+NEW = int(importlib.metadata.version("lerobot").split(".")[1]) >= 6  # whether this is LeRobot 0.6
+_MAKERS: dict[str, Callable[..., Any]] = {
     "act": act,
-    "ensemble": ensemble,
     "diffusion": diffusion,
+    "smolvla": smolvla,
+    "xvla": xvla,
+    "ensemble": ensemble,
     "vqbet": vqbet,
     "tdmpc": tdmpc,
     "sac": sac,
-    "smolvla": smolvla,
-    "xvla": xvla,
+    "gaussian_actor": gaussian_actor,
+    "groot": groot,
+    "multi_task_dit": multi_task_dit,
+    "dit_flow": dit_flow,
+    "full_act": full_act,
 }
-_MAKERS = {**KINDS, "full_act": full_act}
-_WITH_FILES = {"smolvla", "xvla"}  # of a tokenizer beside the checkpoint
+# What each kind is tried for, by version: those whose code differs, and all that the older one has.
+KINDS = ("act", "diffusion", "smolvla", "xvla", "ensemble", "vqbet", "tdmpc", "sac")
+if NEW:
+    KINDS = (*KINDS[:4], "gaussian_actor", "groot", "multi_task_dit", "dit_flow")
+_WITH_FILES = {"dit_flow", "groot", "multi_task_dit", "smolvla", "xvla"}  # of a tokenizer beside the checkpoint
 
 
 def make(folder: Path, kind: str = "act", **settings: Any) -> Path:
@@ -170,7 +202,8 @@ def write(folder: Path, config: Any) -> Path:
     if config.type == "vqbet":
         policy.vqbet.action_head.vqvae_model.discretized.fill_(True)
     policy.save_pretrained(folder)
-    recipes.write_processors(folder, config)
+    with tiny06.local_backbone(folder / "vlm") if config.type == "groot" else contextlib.nullcontext():
+        recipes.write_processors(folder, config)
     return folder
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.serve.python_env import create as making
-from vlagents_ray.serve.python_env.create import create, make_environment
+from vlagents_ray.serve.python_env.create import create, find_python, make_environment
 
 
 @pytest.fixture
@@ -69,6 +69,45 @@ def test_one_of_another_python_is_a_light_one(
     assert "Python 3.12 is not this one's 3.11: without Ray, for a child process" in said
 
 
+OWN = "{}.{}".format(*sys.version_info[:2])
+
+
+def interpreter(path: Path, says: str) -> Path:
+    """Something that is run as a Python, and says that."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f"#!/bin/sh\n{says}\n")
+    path.chmod(0o755)
+    return path
+
+
+class TestThePythonThatRequirementsName:
+    @pytest.fixture(autouse=True)
+    def places(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        for name, folder in (("PATH", "one:two"), ("PYENV_ROOT", "pyenv"), ("UV_PYTHON_INSTALL_DIR", "uv")):
+            monkeypatch.setenv(name, ":".join(f"{tmp_path}/{one}" for one in folder.split(":")))
+
+    def test_is_this_one_or_one_that_runs_and_is_that_version(self, tmp_path: Path) -> None:
+        assert find_python(OWN) == sys.executable
+        interpreter(tmp_path / "one" / "python3.97", "exit 127")  # as a shim of pyenv's without a version
+        in_uv = interpreter(tmp_path / "uv" / "cpython-3.97.0-linux" / "bin" / "python3.97", "echo 3.97")
+        assert find_python("3.97") == str(in_uv)
+        in_pyenv = interpreter(tmp_path / "pyenv" / "versions" / "3.97.2" / "bin" / "python3.97", "echo 3.97")
+        assert find_python("3.97") == str(in_pyenv)
+        on_path = interpreter(tmp_path / "two" / "python3.97", "echo 3.97")
+        assert find_python("3.97") == str(on_path)
+
+    def test_is_taken_unless_another_is_asked_for(
+        self, asked: list[str], requirements: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        requirements.write_text(f"# python: {OWN}\nsix==1.16.0\n")
+        assert make_environment(requirements, tmp_path / "env").is_file()
+        requirements.write_text("# python: 3.97\nsix==1.16.0\n")
+        assert make_environment(requirements, tmp_path / "other", python=sys.executable).is_file()
+        with pytest.raises(ConfigError, match=r"found no Python 3\.97.*python3\.97 on PATH.*--python"):
+            make_environment(requirements, tmp_path / "third")
+        assert not (tmp_path / "third").exists()
+
+
 def own_torch() -> str:
     return f"torch=={importlib.metadata.version('torch')}"
 
@@ -112,6 +151,8 @@ class TestWithoutAGpu:
             make_environment(requirements, tmp_path / "env")
         assert len(asked) == 1
         assert "--dry-run" in asked[0]
+        make_environment(requirements, tmp_path / "env", cuda=True)
+        assert "--dry-run" not in asked[-1]
 
 
 def test_with_a_gpu_nothing_is_replaced(

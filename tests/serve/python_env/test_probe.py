@@ -59,6 +59,13 @@ def test_requirements_are_read_from_their_file(tmp_path: Path) -> None:
     assert args(requirements=str(file)).requirements == ["six==1.16.0", "numpy<2", "pack @ file:///x#egg=pack"]
 
 
+def test_requirements_for_another_python_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "some.txt"
+    file.write_text("# python: 3.97\nsix==1.16.0\n")
+    with pytest.raises(ValidationError, match=r"wants Python 3\.97.*vlagents-ray env make"):
+        args(requirements=str(file))
+
+
 @pytest.mark.parametrize(
     ("environment", "said"),
     [

@@ -188,7 +188,7 @@ def _act(recipe: Recipe) -> Any:
 
 def _diffusion(recipe: Recipe) -> Any:
     small: dict[str, Any] = {"down_dims": (128, 256, 512)} if recipe.size == "small" else {}
-    return make_config("diffusion", features(("top", "wrist"), 96), **small)
+    return make_config("diffusion", features(("top", "wrist"), 96), pretrained_backbone_weights=None, **small)
 
 
 _CONFIGS: Mapping[str, Callable[[Recipe], Any]] = {

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import importlib.util
 import json
+import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,13 +16,16 @@ from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.accelerator import ensure_torchvision
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
-from vlagents_ray.policies.lerobot.policy_types import KINDS, REFUSED, Diffusion, Flow
+from vlagents_ray.policies.lerobot.kinds.diffusion import Diffusion
+from vlagents_ray.policies.lerobot.kinds.flow import Flow
+from vlagents_ray.policies.lerobot.policy_types import KINDS
 from vlagents_ray.policies.lerobot.processors import PIPELINES, require_known_steps
+from vlagents_ray.policies.lerobot.versions import is_new, other_version, refusal
 from vlagents_ray.registry import require
 
 WEIGHTS = "model.safetensors"
 TRAINED = "pretrained_model"  # LeRobot's folder of the checkpoint within that of a training step
-_PATCHED = {"pi0", "pi05", "pi0_fast"}  # they need openpi's changes to transformers
+_PATCHED = {"pi0", "pi05", "pi0_fast"}  # they need openpi's changes to transformers, in LeRobot 0.4
 _CHECK = "transformers.models.siglip.check"  # a module that these changes add
 
 
@@ -28,6 +34,7 @@ def find(config: LeRobotConfig) -> Path:
     folder = find_checkpoint(config.checkpoint, config.checkpoint_step)
     if (folder / TRAINED).is_dir():
         folder /= TRAINED
+    _require_no_nvidia(folder / "config.json")
     folder = find_checkpoint(str(folder.resolve()), needs=["config.json", WEIGHTS])
     missing = [name for name in PIPELINES if not (folder / name).is_file()]
     if missing:
@@ -46,8 +53,8 @@ def load(folder: Path, config: LeRobotConfig, device: Any) -> Any:
     """Load LeRobot's policy to the device, in evaluation mode, with every parameter from the checkpoint."""
     ensure_torchvision()
     factory = require("lerobot.policies.factory")
+    require_served(_type(folder), folder)
     settings = _settings(folder, config)
-    require_served(settings.type, folder)
     as_saved = _prepare(settings, config, device)
     try:
         saved = SavedTensors.of(folder / WEIGHTS)
@@ -56,11 +63,11 @@ def load(folder: Path, config: LeRobotConfig, device: Any) -> Any:
         raise
     except Exception as error:
         raise ConfigError(
-            f"checkpoint {folder}: LeRobot cannot load it as {settings.type!r} ({type(error).__name__}: {error}); is "
-            f"it complete, and of this version of LeRobot? Without a network, what it names on the hub has to be in "
-            f"the cache, or to be replaced by `overrides`"
+            f"checkpoint {folder}: LeRobot cannot load it as {settings.type!r} ({type(error).__name__}: {error}); "
+            f"is it complete? {other_version()}. Without a network, what it names on the hub has to be in the cache, "
+            f"or to be replaced by `overrides`"
         ) from error
-    require_loaded(policy, saved.renamed(lambda name: _as_loaded(policy, name)))
+    require_loaded(policy, _as_loaded(policy, saved))
     if config.dtype == "float32":
         policy.float()
     elif as_saved:
@@ -85,24 +92,25 @@ def _settings(folder: Path, config: LeRobotConfig) -> Any:
         raise
     except Exception as error:
         raise ConfigError(
-            f"checkpoint {folder}: config.json with overrides {config.overrides} is not LeRobot's "
-            f"({type(error).__name__}: {error}); the types it knows here: {sorted(base.get_known_choices())}"
+            f"checkpoint {folder}: config.json with overrides {config.overrides} is not LeRobot's ({_said(error)}); "
+            f"{other_version()}. The types it knows here: "
+            f"{sorted(base.get_known_choices())}"
         ) from error
 
 
 def require_served(name: str, folder: Path) -> None:
     """Raise `ConfigError` unless this environment can load LeRobot's policy of that type, saved in `folder`."""
-    if name in REFUSED:
-        raise ConfigError(f"checkpoint {folder}: is a {name!r}, which is not served here: {REFUSED[name]}")
-    if name in _PATCHED:
+    if reason := refusal(name):
+        raise ConfigError(f"checkpoint {folder}: is a {name!r}, which is not served here: {reason}")
+    if name in _PATCHED and not is_new():
         found = None
         with contextlib.suppress(ModuleNotFoundError):
             found = importlib.util.find_spec(_CHECK)
         if found is None:
             raise ConfigError(
                 f"checkpoint {folder}: LeRobot's {name!r} needs transformers with openpi's changes, which no release "
-                f"has; install the branch that LeRobot's page on {name} names into this environment, or serve the "
-                f"policy by 'openpi' or, for π0, by 'pi0'"
+                f"has; install the branch that LeRobot's page on {name} names into this environment, serve it with "
+                f"LeRobot 0.6.1, which does without (requirements/lerobot06.txt), by 'openpi' or, for π0, by 'pi0'"
             )
 
 
@@ -128,16 +136,64 @@ def _prepare(settings: Any, config: LeRobotConfig, device: Any) -> bool:
         raise ConfigError(f"dtype: got {config.dtype!r}, LeRobot's {settings.type!r} takes one of {choices}")
     if hasattr(settings, "dtype") and config.dtype != "auto":
         settings.dtype = config.dtype
+    if config.dtype == "float32" and hasattr(settings, "use_bf16"):
+        settings.use_bf16 = False  # GR00T would compute in bfloat16 all the same
     as_saved = bool(getattr(settings, "load_vlm_weights", False))
     if as_saved:
         settings.load_vlm_weights = False  # they would be downloaded in bfloat16, only to be replaced
     return as_saved
 
 
-def _as_loaded(policy: Any, name: str) -> str | None:
-    """Return LeRobot's name of a saved tensor, as checkpoints of openpi have older names."""
+def _said(error: BaseException | None) -> str:
+    """Return an error with those that it followed from, such as that of a config's own check."""
+    said = []
+    while error is not None:
+        said.append(f"{type(error).__name__}: {error}")
+        error = error.__cause__ or error.__context__
+    return ", from ".join(dict.fromkeys(said))
+
+
+def _require_no_nvidia(file: Path) -> None:
+    """Raise `ConfigError` for a checkpoint of NVIDIA's own GR00T code, which LeRobot takes only as a base."""
+    if file.is_file() and "gr00t" in str(_config(file).get("model_type", "")).lower():
+        raise ConfigError(
+            f"checkpoint {file.parent}: is one of NVIDIA's own GR00T code, want one that LeRobot saved; train it on "
+            f"with LeRobot 0.6 (lerobot-train --policy.type=groot --policy.base_model_path={file.parent}), or serve it "
+            f"by NVIDIA's own server: docs/policies/gr00t.md"
+        )
+
+
+def _type(folder: Path) -> str:
+    """Return the type of the policy in a checkpoint's config.json; empty if it states none."""
+    return str(_config(folder / "config.json").get("type", ""))
+
+
+def _config(file: Path) -> Mapping[str, Any]:
+    """Read a config.json, which need not be LeRobot's."""
+    try:
+        found = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise ConfigError(f"checkpoint {file.parent}: {file.name} is no JSON ({error}); copy it again") from error
+    return found if isinstance(found, dict) else {}
+
+
+def _as_loaded(policy: Any, saved: SavedTensors) -> SavedTensors | Mapping[str, Any]:
+    """Return the saved tensors by LeRobot's own names, as checkpoints of openpi and of LeRobot 0.4 have older ones."""
+    module = sys.modules[type(policy).__module__]
+    names = list(saved)
+    older = getattr(module, "_is_vendored_florence_state_dict", None)  # X-VLA's, in LeRobot 0.6
+    if older is not None and older(dict.fromkeys(names)):
+        renamed: Mapping[str, Any] = module._remap_vendored_florence_state_dict({name: saved[name] for name in names})
+        return renamed
+    return SavedTensors(
+        {new: functools.partial(saved.__getitem__, name) for name in names for new in _renamed(policy, name)}
+    )
+
+
+def _renamed(policy: Any, name: str) -> list[str]:
+    """Return LeRobot's names of a saved tensor; none if it leaves it out."""
     fix = getattr(policy, "_fix_pytorch_state_dict_keys", None)
-    if fix is not None:
-        name = next(iter(fix({name: None}, policy.config)), "")
-        name = name if not name or name.startswith("model.") else f"model.{name}"
-    return name or None
+    if fix is None:
+        return [name]
+    found = fix({name: require("torch").empty(0)}, policy.config)
+    return [new if new.startswith("model.") else f"model.{new}" for new in found]

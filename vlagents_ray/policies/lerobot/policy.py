@@ -29,12 +29,12 @@ from vlagents_ray.policies.base.model_inputs import (
 from vlagents_ray.policies.flow import OFFERED
 from vlagents_ray.policies.lerobot import checkpoint
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
+from vlagents_ray.policies.lerobot.kinds.flow import Flow
+from vlagents_ray.policies.lerobot.kinds.kind import Kind
 from vlagents_ray.policies.lerobot.policy_types import (
     KINDS,
     MASKING,
     RESIZING,
-    Flow,
-    Kind,
 )
 from vlagents_ray.policies.lerobot.processors import STATE, Processors, own_processors
 from vlagents_ray.registry import require
@@ -64,7 +64,7 @@ class LoadedLeRobot:
 
 
 class LeRobot(ModelPolicy):
-    """A policy that LeRobot 0.4.4 loads, by the `type` in its checkpoint."""
+    """A policy that the LeRobot of this environment loads, by the `type` in its checkpoint."""
 
     Config: ClassVar[type] = LeRobotConfig
     trainable = network = "model.kind.policy"
@@ -198,10 +198,7 @@ class LeRobot(ModelPolicy):
         """Compute the chunks of rows, (horizon, D) float32."""
         torch, model = require("torch"), self.model
         kind, settings = model.kind, model.kind.config
-        leftovers = [
-            None if row.leftover is None else model.own.get(row.adapter, model.processors).leftover(row.leftover)
-            for row in rows
-        ]
+        leftovers = [model.own.get(row.adapter, model.processors).leftover(row) for row in rows]
         device = torch.device(settings.device).type
         with torch.inference_mode(), torch.autocast(device, enabled=settings.use_amp):
             seen = [rows[i] for i in kind.observations(rows)]

@@ -15,6 +15,7 @@ from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base.model_code import CURE
 from vlagents_ray.policies.lerobot.config import LeRobotConfig
+from vlagents_ray.policies.lerobot.kinds.groot import groot_dataset, require_groot_statistics
 from vlagents_ray.policies.token_cache import cached_tokenizer
 from vlagents_ray.registry import require
 
@@ -22,7 +23,9 @@ PIPELINES = ("policy_preprocessor.json", "policy_postprocessor.json")
 STATE, ACTION = "observation.state", "action"
 _NAME = "tokenizer_name"  # a hub id, or a folder of the trainer's
 _DEVICE, _RENAME, _TOKENIZER = "device_processor", "rename_observations_processor", "tokenizer_processor"
+_GROOT_TOKENIZER = "groot_n1_7_vlm_encode_v1"
 _NORMALIZERS = ("normalizer_processor", "unnormalizer_processor")
+_ABSOLUTE = "AbsoluteActionsProcessorStep"  # of LeRobot 0.6: it adds the state to actions that are relative to it
 _STATE_IN_PROMPT = ("pi05", "pi0_fast")  # their prompts differ at each act
 _CONFIG = "config.json"
 # Settings of a policy, beside its cameras, that make another model of the same weights.
@@ -60,7 +63,7 @@ class Processors:
         overrides = {**own, **config.processors}
         trained = saved[0].get(_RENAME, {}).get("rename_map") or {}
         self.rename_map: dict[str, str] = dict(trained if config.rename_map is None else config.rename_map)
-        self.instructed = _TOKENIZER in saved[0]
+        self.instructed = bool({_TOKENIZER, _GROOT_TOKENIZER} & set(saved[0]))
         try:
             self._before, self._after = require("lerobot.policies.factory").make_pre_post_processors(
                 settings,
@@ -68,20 +71,28 @@ class Processors:
                 preprocessor_overrides={name: value for name, value in overrides.items() if name in saved[0]},
                 postprocessor_overrides={name: value for name, value in config.processors.items() if name in saved[1]},
             )
+            for step in self._before.steps:  # GR00T's loads its tokenizer when it is first used
+                getattr(step, "proc", None)
         except Exception as error:
             raise ConfigError(
                 f"checkpoint {folder}: its processors do not load ({type(error).__name__}: {error}); a tokenizer that "
-                f"is not here is replaced by processors: {{{_TOKENIZER}: {{tokenizer_name: …}}}}"
+                f"is not here is replaced by processors: {{{_TOKENIZER}: {{tokenizer_name: …}}}}, "
+                f"GR00T's by {{{_GROOT_TOKENIZER}: {{model_name: …}}}}"
             ) from error
         if settings.type not in _STATE_IN_PROMPT:
             self._keep_tokens()
+        self._groot = settings.type == "groot"
+        absolute = [step for step in self._after.steps if type(step).__name__ == _ABSOLUTE and step.enabled]
+        self._relative = absolute[0].relative_step if absolute else None  # which knows the states of the last batch
+        self.whole = self._groot or bool(absolute)  # whether actions are converted by chunks, and not row by row
         self._back = self._inverse()
 
     def statistics(self, key: str) -> dict[str, list[float]]:
         """Return the statistics of a feature of the dataset; empty if there are none."""
         for step in self._before.steps:
-            if found := getattr(step, "_tensor_stats", {}).get(key):
-                return {name: value.flatten().tolist() for name, value in found.items()}
+            of_step = getattr(step, "_tensor_stats", None) or getattr(step, "stats", None) or {}
+            if found := of_step.get(key):
+                return {name: require("torch").as_tensor(value).flatten().tolist() for name, value in found.items()}
         return {}
 
     def normalises(self, feature: Any) -> bool:
@@ -92,13 +103,16 @@ class Processors:
     def dataset(self) -> DatasetContract | None:
         """Return the contract of the dataset of the training; None if it has none."""
         numbers = self.statistics(STATISTICS).get(BYTES)
-        return None if numbers is None else DatasetContract.from_statistics(numbers)
+        return groot_dataset(self._before.steps) if numbers is None else DatasetContract.from_statistics(numbers)
 
     def require_statistics(self, settings: Any, inputs: Sequence[str]) -> None:
         """Raise `ConfigError` unless all `inputs`, and the actions, are normalised as the policy was trained.
 
         LeRobot passes features without statistics on unchanged.
         """
+        if self._groot:
+            require_groot_statistics(self._before.steps, self._after.steps, settings)
+            return
         features = {**settings.input_features, **settings.output_features}
         for pipeline, keys, file in ((self._before, inputs, PIPELINES[0]), (self._after, [ACTION], PIPELINES[1])):
             steps = [step for step in pipeline.steps if hasattr(step, "norm_map")]
@@ -133,16 +147,25 @@ class Processors:
 
     def actions(self, chunks: Any) -> np.ndarray:
         """Convert the policy's actions (B, T, D) to (B, T, D') float32, in the robot's units."""
+        if self.whole:
+            return np.asarray(self._after(chunks.float()).float().cpu())
         flat = self._after(chunks.float().flatten(0, 1))  # rows, as in LeRobot's own loop
         return np.asarray(flat.unflatten(0, chunks.shape[:2]).float().cpu())
 
-    def leftover(self, rows: np.ndarray) -> Any:
-        """Convert actions (H, D') back to the policy's units; None if that is not possible."""
-        return None if self._back is None else self._back(require("torch").from_numpy(rows))
+    def leftover(self, row: Row) -> Any:
+        """Convert the leftover actions of a row, (H, D'), to the policy's units; None if that is not possible."""
+        if self._back is None or row.leftover is None:
+            return None
+        rows = require("torch").from_numpy(row.leftover)
+        if self._relative is not None:  # to the state in which the chunk that is drawn begins
+            state = require("torch").from_numpy(row.frames[-1][STATE])
+            mask = self._relative._build_mask(rows.shape[-1])
+            rows = require("lerobot.processor").to_relative_actions(rows, state[None], mask)
+        return self._back(rows)
 
     def width(self, dim: int) -> int:
         """Return D', the number of values of the robot's actions, for a policy with `dim` of its own."""
-        return int(self._after(require("torch").zeros(1, dim)).shape[-1])
+        return dim if self.whole else int(self._after(require("torch").zeros(1, dim)).shape[-1])
 
     def _keep_tokens(self) -> None:
         """Have the tokens of instructions kept, where they do not depend on the others of a batch."""
@@ -166,7 +189,7 @@ class Processors:
                         features=step.features, norm_map=step.norm_map, stats=step.stats, eps=step.eps
                     )
                 )
-            elif not isinstance(step, processor.DeviceProcessorStep):
+            elif not (isinstance(step, processor.DeviceProcessorStep) or type(step).__name__ == _ABSOLUTE):
                 return None
         return processor.PolicyProcessorPipeline(
             steps=steps,
@@ -209,6 +232,7 @@ def own_processors(folder: Path, settings: Any, config: LeRobotConfig, base: Pro
     other = {
         "steps": own.steps != base.steps,
         f"settings of {odd}": bool(odd),
+        "actions relative to the state": own.whole,
         f"numbers {sizes[0]} of state and actions, not {sizes[1]}": sizes[0] != sizes[1],
         f"statistics of {sorted(changed - allowed)}": bool(changed - allowed),
     }

@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 import os
+import re
+import sys
 from pathlib import Path
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from vlagents_ray.ray_tools.runtime_env import require_no_secrets
+
+_PYTHON = re.compile(r"^# python: (3\.\d+)\s*$", re.MULTILINE)
+
+
+def python_wanted_by(requirements: Path) -> str | None:
+    """Return the Python minor version that a requirements file names in a line `# python: 3.12`; None without one."""
+    found = _PYTHON.search(requirements.read_text())
+    return None if found is None else found[1]
 
 
 class EnvironmentArgs(BaseModel):
@@ -46,6 +56,12 @@ class EnvironmentArgs(BaseModel):
         file = Path(requirements)
         if not file.is_file():
             raise ValueError(f"no such file: got {requirements!r}, want a requirements file or a list of requirements")
+        wanted, ours = python_wanted_by(file), "{}.{}".format(*sys.version_info[:2])
+        if wanted not in (None, ours):
+            raise ValueError(
+                f"{requirements} wants Python {wanted}, and Ray installs requirements for the cluster's, {ours}; make "
+                f"an environment, `vlagents-ray env make {requirements}`, and name its Python in `python` instead"
+            )
         lines = [line.partition(" #")[0].strip() for line in file.read_text().splitlines()]
         return [line for line in lines if line and not line.startswith("#")]
 

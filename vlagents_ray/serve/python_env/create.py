@@ -18,6 +18,7 @@ from pathlib import Path
 import vlagents_ray
 from vlagents_ray.errors import ConfigError, MissingDependency
 from vlagents_ray.policies.base import import_fixes
+from vlagents_ray.serve.config.python_env import python_wanted_by
 
 Progress = Callable[[str], None]
 
@@ -63,6 +64,27 @@ def create(folder: Path, python: str | None = None, progress: Progress = lambda 
     return found
 
 
+def find_python(version: str) -> str:
+    """Return the path of an interpreter of that minor version, such as "3.12".
+
+    It is this process's own, one on PATH, or one that pyenv or uv has installed for this user.
+
+    Raises:
+        ConfigError: There is none.
+    """
+    folders = [Path(folder) for folder in os.environ.get("PATH", "").split(os.pathsep) if folder]
+    pyenv = Path(os.environ.get("PYENV_ROOT") or Path.home() / ".pyenv") / "versions"
+    uv = Path(os.environ.get("UV_PYTHON_INSTALL_DIR") or Path.home() / ".local/share/uv/python")
+    installed = [*sorted(pyenv.glob(f"{version}.*/bin")), *sorted(uv.glob(f"cpython-{version}.*/bin"))]
+    for one in [Path(sys.executable), *(folder / f"python{version}" for folder in [*folders, *installed])]:
+        if os.access(one, os.X_OK) and _is(one, version):
+            return str(one)
+    raise ConfigError(
+        f"found no Python {version}, which the requirements want: looked for python{version} on PATH, in {pyenv} "
+        f"and in {uv}; install it (`uv python install {version}`), or name one: --python /path/to/python{version}"
+    )
+
+
 def install(python: Path, wanted: Sequence[str]) -> None:
     """Install `wanted`, arguments of `uv pip install`, for `python`; raise `ConfigError` with uv's output otherwise."""
     _uv(["pip", "install", "--quiet", "--python", str(python), *wanted])
@@ -75,6 +97,7 @@ def make_environment(
     more: Sequence[Path] = (),
     python: str | None = None,
     light: bool = False,
+    cuda: bool = False,
     progress: Progress = lambda _: None,
 ) -> Path:
     """Create an environment for a policy, with this same package in it.
@@ -86,21 +109,25 @@ def make_environment(
         requirements: The requirements file of the policy.
         folder: The folder of the environment.
         more: Further requirements files.
-        python: See `create`.
+        python: See `create`; by default that which the requirements name, `# python: 3.12`, if they name one.
         light: Whether to leave out Ray, for a child process; always so for another Python minor version, in which no
             replica can run.
+        cuda: Whether CUDA packages, which take several GB, may be installed without an NVIDIA GPU.
         progress: Gets a line about each step.
 
     Returns:
         The path of its Python.
 
     Raises:
-        ConfigError: A file does not exist, uv fails, or a CUDA build would be installed without an NVIDIA GPU.
+        ConfigError: A file or the Python does not exist, uv fails, or a CUDA build would be installed without an
+            NVIDIA GPU.
     """
     files = [requirements, *more]
     for file in files:
         if not file.is_file():
             raise ConfigError(f"no such file: got {str(file)!r}, want a requirements file")
+    if python is None and not python_in(folder).exists() and (version := python_wanted_by(requirements)) is not None:
+        python = find_python(version)
     made = create(folder, python, progress)
     if not light and _minor(made) != _minor(Path(sys.executable)):
         progress(
@@ -112,7 +139,8 @@ def make_environment(
         if not _has_gpu():
             for override in _overrides(requirements, Path(scratch)):
                 wanted += ["--override", str(override)]
-            _require_no_cuda(made, wanted)
+            if not cuda:
+                _require_no_cuda(made, wanted)
         progress(f"installing {_US} {importlib.metadata.version(_US)} and {requirements}")
         install(made, wanted)
     _install_import_fixes(made)
@@ -159,7 +187,7 @@ def _require_no_cuda(python: Path, wanted: Sequence[str]) -> None:
         raise ConfigError(
             f"stopped before downloading several GB: the requirements bring CUDA packages ({', '.join(found[:3])}, …), "
             f"but this machine shows no NVIDIA GPU; name CPU builds in a file NAME.cpu.txt beside NAME.txt, and where "
-            f"they are with PIP_FIND_LINKS or PIP_INDEX_URL"
+            f"they are with PIP_FIND_LINKS or PIP_INDEX_URL, or take these, --cuda: they run on a CPU, too"
         )
 
 
@@ -176,6 +204,12 @@ def _has_gpu() -> bool:
 
 def _minor(python: Path) -> str:
     return _said_by(python, _MINOR)
+
+
+def _is(python: Path, version: str) -> bool:
+    """Whether an interpreter runs and has that minor version; a shim of pyenv's may not run."""
+    done = subprocess.run([str(python), "-c", _MINOR], capture_output=True, text=True, check=False)  # noqa: S603
+    return done.returncode == 0 and done.stdout.strip() == version
 
 
 def _said_by(python: Path, program: str) -> str:

@@ -43,8 +43,9 @@ class RowDraws(TorchFunctionMode):  # type: ignore[misc]
         draw: Callable[..., Any] = {torch.randn: self._randn, torch.multinomial: self._multinomial}.get(func, func)
         return draw(*args, **(kwargs or {}))
 
-    def _randn(self, *size: Any, device: Any = None, dtype: Any = None) -> Any:
-        batch, *shape = size[0] if len(size) == 1 and not isinstance(size[0], int) else size
+    def _randn(self, *sizes: Any, size: Any = None, device: Any = None, dtype: Any = None, **_: Any) -> Any:
+        given = size or (sizes[0] if len(sizes) == 1 and not isinstance(sizes[0], int) else sizes)
+        batch, *shape = given
         each = batch // len(self._generators)
         rows = [torch.randn(each, *shape, generator=generator) for generator in self._generators]
         return torch.cat(rows).to(device=device, dtype=dtype)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Sequence
 from typing import Any
 
 from vlagents_ray.policies.compilation import Compilation
-from vlagents_ray.policies.flow_passes import FlowPasses
+from vlagents_ray.policies.flow_passes import FlowPasses, cache_of, layers_of
 from vlagents_ray.registry import require
 
 
@@ -17,6 +18,8 @@ class SmolVLAPasses(FlowPasses):
         """Use the passes of a `VLAFlowMatching`, which takes patches in place of images from here on, too."""
         super().__init__(model, compilation)
         self._vlm = model.vlm_with_expert.get_vlm_model()
+        # LeRobot 0.4 keeps keys and values by name, (B, L, heads, D), later ones in a cache of transformers.
+        self._by_name = "fill_kv_cache" in inspect.signature(model.vlm_with_expert.forward).parameters
         self._positions: dict[tuple[int, int], Any] = {}  # of the patches of an image, (L,), by its height and width
         self._embed_image = model.vlm_with_expert.embed_image
         model.vlm_with_expert.embed_image = self._embed
@@ -44,15 +47,21 @@ class SmolVLAPasses(FlowPasses):
             position_ids=seen.cumsum(1) - 1,
             inputs_embeds=[embedded, None],
             use_cache=True,
-            fill_kv_cache=True,
+            **({"fill_kv_cache": True} if self._by_name else {}),
         )
-        layers = [torch.stack([layer["key_states"], layer["value_states"]], 1) for layer in cache.values()]
-        return torch.stack(layers, 1), seen.long()
+        if self._by_name:
+            layers = [(layer["key_states"], layer["value_states"]) for layer in cache.values()]
+        else:
+            layers = layers_of(cache)
+        return torch.stack([torch.stack(layer, 1) for layer in layers], 1), seen.long()
 
     def velocity(self, encoded: Any, seen: Any, state: Any, actions: Any, times: Any) -> Any:
         """Return the velocity (B, H, D)."""
         layers = encoded.unbind(1)
-        cache = {i: {"key_states": layer[:, 0], "value_states": layer[:, 1]} for i, layer in enumerate(layers)}
+        if self._by_name:
+            cache = {i: {"key_states": layer[:, 0], "value_states": layer[:, 1]} for i, layer in enumerate(layers)}
+        else:
+            cache = cache_of(layers)
         return self.model.denoise_step(prefix_pad_masks=seen.bool(), past_key_values=cache, x_t=actions, timestep=times)
 
     def _embed(self, patches: Any) -> Any:

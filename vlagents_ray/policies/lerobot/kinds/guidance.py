@@ -1,4 +1,4 @@
-"""Real-time chunking as in LeRobot 0.4.4, for batches whose rows have different leftovers and delays.
+"""Real-time chunking as in LeRobot 0.4.4 and 0.6.1, for batches whose rows have different leftovers and delays.
 
 LeRobot's `RTCProcessor.denoise_step` has one delay for the whole batch. The velocity v of a row is corrected to
 v - g(t) * w * (leftover - x1), where x1 = x - t * v is the predicted end of the row, w is 1 for the rows that will have
