@@ -4,7 +4,7 @@
 #   make demo                                                       serve a policy, evaluate it, show the table
 #   make check                                                      lint, types, layers, quick tests: no Ray, torch, simulator
 #   make test [TEST_PROCESSES=2]                                    lint, types, layers, families, all tests
-#   make families [FAMILIES="lerobot lerobot06 hf rcs libero openvla …"]                 tests of model families, in .venv-NAME each
+#   make families [FAMILIES="lerobot lerobot06 hf rcs libero openvla …"]       tests of model families, in .venv-NAME each
 #   make verified [FAMILIES="lerobot hf"]                           what they verify, into the tables of docs/policies
 #   make docs                                                       the site of docs/, in build/docs, for a browser
 #   make bench                                                      measure, and write the figures of docs/measured.md again
@@ -43,13 +43,10 @@ NOT_QUICK := ray or server or hosts or sim or vulkan or torch or gpu or browser 
 # Environments of model families: requirements/NAME.txt, in $(VENV)-NAME. What is tested in each is in tests/families,
 # in folders of the family's name. Those whose code is on no package index want its source, too: OPENPI_SRC, OPENVLA_SRC,
 # OPENVLA_OFT_SRC, OCTO_SRC, DIFFUSION_POLICY_SRC, VJEPA2_SRC.
-# lerobot06 wants Python 3.12, and its torch, which no index has for that Python without CUDA, several GB.
-HAS_PYTHON_3_12 := $(shell for python in python3.12 $${PYENV_ROOT:-$$HOME/.pyenv}/versions/3.12.*/bin/python; do \
-	$$python -c 'import sys; sys.exit(sys.version_info[:2] != (3, 12))' 2>/dev/null && echo yes && break; done)
-FAMILIES ?= libero lerobot hf rcs $(if $(HAS_PYTHON_3_12),lerobot06)
+# lerobot06 wants Python 3.12, and TORCH_CUDA=1 where no index has a torch without CUDA for it: several GB.
+FAMILIES ?= libero lerobot hf rcs
 TESTED_IN_hf := pi0 arro vjepa2_ac
 TESTED_IN_lerobot06 := lerobot gr00t
-MADE_WITH_lerobot06 := --cuda
 TORCH_FROM := $(if $(TORCH_INDEX_URL),--index-url $(TORCH_INDEX_URL))
 
 setup: $(STAMP)
@@ -77,7 +74,6 @@ test: setup
 
 # Environments one after the other, as each installs this folder; then the tests of two at once.
 families:
-	@$(if $(HAS_PYTHON_3_12),,echo '== no Python 3.12 here: the tests of lerobot06 are left out')
 	@$(MAKE) --no-print-directory $(FAMILIES:%=$(VENV)-%/.installed)
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync $(FAMILIES:%=family-%)
 
@@ -97,7 +93,7 @@ verified:
 $(VENV)-%/.installed: requirements/%.txt requirements/testing.txt $(wildcard requirements/*.cpu.txt) $(VENV)/server.txt \
     vlagents_ray/policies/base/import_fixes.py
 	$(BIN)/vlagents-ray env make $< $(addprefix --with ,requirements/testing.txt $(wildcard requirements/$*.testing.txt)) \
-	  $(MADE_WITH_$*) --into $(VENV)-$*
+	  $(if $(TORCH_CUDA),--cuda) --into $(VENV)-$*
 	@touch $@
 
 # From the sources alone: nothing of what the reference describes is imported.
