@@ -1,5 +1,7 @@
 """A policy on a vlagents_ray server as a policy of LeRobot."""
 
+from __future__ import annotations
+
 import logging
 import threading
 from collections import deque
@@ -51,7 +53,7 @@ class VlagentsPolicy(PreTrainedPolicy):
     @classmethod
     def from_pretrained(
         cls, pretrained_name_or_path: str | Path | None = None, *, config: VlagentsConfig | None = None, **kwargs: Any
-    ) -> "VlagentsPolicy":
+    ) -> VlagentsPolicy:
         """Return the policy of a configuration; raises `ConfigError` for a checkpoint, which only a server loads."""
         if pretrained_name_or_path is not None or config is None:
             raise ConfigError(
@@ -95,7 +97,7 @@ class VlagentsPolicy(PreTrainedPolicy):
         raise ConfigError(TRAINING)
 
     @property
-    def _sessions(self) -> "_Sessions":
+    def _sessions(self) -> _Sessions:
         if not hasattr(self._threads, "sessions"):
             self._threads.sessions = _Sessions(self._robot)
         return cast(_Sessions, self._threads.sessions)
@@ -192,7 +194,7 @@ class _Sessions:
             self._agents = self.agent.sessions(size)
         tasks = self._instructions(batch, size)
         seeds = None if self._config.seed is None else [self._config.seed + self._begun + row for row in range(size)]
-        options = {} if self._config.checkpoint is None else {"checkpoint": self._config.checkpoint}
+        options: dict[str, Any] = {} if self._config.checkpoint is None else {"checkpoint": self._config.checkpoint}
         observations = [mapping.observation(batch, row) for row in range(size)]
         _successes(self.agent.reset_batch(observations, tasks, self._agents, seeds=seeds, **options))
         self._begun += size

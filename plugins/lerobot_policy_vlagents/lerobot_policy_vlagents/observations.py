@@ -1,5 +1,7 @@
 """Observations with LeRobot's names as those of the server's policy."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
