@@ -29,7 +29,7 @@ class MirrorRobot(Robot):
 
     @property
     def observation_features(self) -> dict[str, Any]:
-        return self.action_features | {camera: (SIDE, SIDE, 3) for camera in self.cameras}
+        return self.action_features | dict.fromkeys(self.cameras, (SIDE, SIDE, 3))
 
     @property
     def action_features(self) -> dict[str, Any]:
