@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 from lerobot.robots import Robot, RobotConfig
-from mirror_policy import CAMERA, SIDE
+from mirror_policy import CAMERA, SIDE, colour_of
 
 MOTORS = ("shoulder.pos", "elbow.pos", "gripper.pos")
 
@@ -37,7 +37,7 @@ class MirrorRobot(Robot):
 
     def get_observation(self) -> dict[str, Any]:
         self.images += 1
-        image = np.full((SIDE, SIDE, 3), self.images * 37 % 256, np.uint8)
+        image = np.full((SIDE, SIDE, 3), colour_of(self.images), np.uint8)
         return self.positions | dict.fromkeys(self.cameras, image)
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:

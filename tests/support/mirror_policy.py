@@ -19,16 +19,21 @@ CONTRACT = Contract(
 )
 
 
-def mirrored(state: np.ndarray, pixel: int, acts: int, instruction: str) -> np.ndarray:
+def colour_of(image: int) -> int:
+    """The bytes of the robot's image of that number, counted from 1."""
+    return image * 37 % 256
+
+
+def mirrored(state: np.ndarray, colour: int, acts: int, instruction: str) -> np.ndarray:
     """The chunk, (2, 3) float32, of a session's act of that number, counted from 1.
 
     Args:
         state: Two joints and the gripper, in [0, 1].
-        pixel: The first byte of the image.
+        colour: The bytes of the image.
     """
     shoulder, elbow, gripper = (float(number) for number in state)
     rows = [
-        [elbow + row, len(instruction) - shoulder / 2 + acts / 8, (gripper + pixel / 255) / 2] for row in range(ROWS)
+        [elbow + row, len(instruction) - shoulder / 2 + acts / 8, (gripper + colour / 255) / 2] for row in range(ROWS)
     ]
     return np.array(rows, np.float32)
 

@@ -29,7 +29,7 @@ def status(command: list[str], log: str) -> int:
     try:
         MAINS[command[0]]()
         code = 0
-    except BaseException:
+    except BaseException:  # noqa: BLE001 - printed as the interpreter does
         traceback.print_exc()
     finally:
         sys.stdout.flush()
