@@ -44,7 +44,7 @@ class MirrorPolicy(Agent):
     shared = ("begun",)
     contract = CONTRACT
 
-    def initialize(self) -> None:
+    def __init__(self) -> None:
         self.begun: list[tuple[str | None, object]] = []
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict[str, object]:
