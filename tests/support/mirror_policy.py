@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from vlagents_ray import Act, Agent, Obs
@@ -41,11 +43,8 @@ def mirrored(state: np.ndarray, colour: int, acts: int, instruction: str) -> np.
 class MirrorPolicy(Agent):
     """The policy; `begun` has the instruction and the seed of each episode."""
 
-    shared = ("begun",)
     contract = CONTRACT
-
-    def __init__(self) -> None:
-        self.begun: list[tuple[str | None, object]] = []
+    begun: ClassVar[list[tuple[str | None, object]]] = []  # by all sessions, which are copies
 
     def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict[str, object]:
         self.instruction, self.acts = instruction or "", 0

@@ -49,7 +49,6 @@ METADATA = {"policy": "mirror", "contract": CONTRACT.to_json(), "version": "0", 
 class Server:
     url: str
     key: str
-    policy: MirrorPolicy
 
 
 @dataclass(frozen=True)
@@ -63,14 +62,13 @@ class Ended:
 
 @pytest.fixture(scope="module")
 def server() -> Iterator[Server]:
-    policy = MirrorPolicy()
-    engine = Engine(policy)
+    engine = Engine(MirrorPolicy())
     engine.start()
     known = ChangingKeys()
     key = known.add("robot")
     inside = build_http_app(engine, lambda: METADATA, DEFAULT_LIMITS)
     with served(AccessMiddleware(inside, known.keys, "app")) as port:
-        yield Server(f"http://127.0.0.1:{port}", key, policy)
+        yield Server(f"http://127.0.0.1:{port}", key)
     engine.close()
 
 
@@ -125,7 +123,7 @@ def ended(server: Server, site: str, tmp_path_factory: pytest.TempPathFactory) -
 def test_lerobot_record_records_the_actions_of_the_servers_policy(server: Server, ended: dict[str, Ended]) -> None:
     done = ended["record"]
     assert done.status == 0, done.log
-    assert server.policy.begun[:2] == [(TASK, 7), (TASK, 8)]
+    assert MirrorPolicy.begun[:2] == [(TASK, 7), (TASK, 8)]
     dataset = RecordedDataset(done.folder / "recorded")
     plays = dataset.plays()
     assert len(plays) == 2
@@ -143,7 +141,7 @@ def test_lerobot_record_records_the_actions_of_the_servers_policy(server: Server
 def test_lerobot_eval_gives_each_environment_a_session_of_its_own(server: Server, ended: dict[str, Ended]) -> None:
     done = ended["eval"]
     assert done.status == 0, done.log
-    assert server.policy.begun[2:] == [(INSTRUCTION, None)] * 4
+    assert MirrorPolicy.begun[2:] == [(INSTRUCTION, None)] * 4
     [task] = json.loads((done.folder / "evaluated/eval_info.json").read_text())["per_task"]
     assert task["metrics"]["sum_rewards"] == [STEPS] * 4  # the environment rewards the actions of its own session
 
@@ -207,12 +205,12 @@ def test_an_episode_begins_after_a_reset_and_every_action_wants_an_observation_i
     server: Server, policy: Callable[..., VlagentsPolicy]
 ) -> None:
     made = policy(n_action_steps=1, seed=3)
-    server.policy.begun.clear()
+    MirrorPolicy.begun.clear()
     for acts in (1, 2):
         np.testing.assert_array_equal(made.select_action(batch(8))[0], expected(8, acts)[0])
     made.reset()
     np.testing.assert_array_equal(made.predict_action_chunk(batch(8, 7)), [expected(8), expected(7)])
-    assert server.policy.begun == [(TASK, 3), (TASK, 4), (TASK, 5)]
+    assert MirrorPolicy.begun == [(TASK, 3), (TASK, 4), (TASK, 5)]
 
 
 def test_threads_that_share_a_policy_have_sessions_of_their_own(policy: Callable[..., VlagentsPolicy]) -> None:
