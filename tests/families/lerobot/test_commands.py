@@ -58,6 +58,7 @@ class Ended:
     status: int
     log: str
     folder: Path  # of all commands
+    begun: list[tuple[str | None, object]]  # instructions and seeds of the episodes of all commands
 
 
 @pytest.fixture(scope="module")
@@ -108,6 +109,7 @@ def ended(server: Server, site: str, tmp_path_factory: pytest.TempPathFactory) -
             f"--policy.instruction={INSTRUCTION}", "--policy.rank=simulation",
         ],
     }  # fmt: skip
+    MirrorPolicy.begun.clear()
     done = subprocess.run(
         [sys.executable, Path(__file__).with_name("entry_points.py")],
         input="".join(f"{json.dumps(command)}\n" for command in commands.values()),
@@ -117,13 +119,13 @@ def ended(server: Server, site: str, tmp_path_factory: pytest.TempPathFactory) -
     assert done.returncode == 0, done.stderr
     logs = [(folder / f"{number}.log").read_text() for number in range(len(commands))]
     found = zip(map(int, done.stdout.split()), logs, strict=True)
-    return {name: Ended(*each, folder) for name, each in zip(commands, found, strict=True)}
+    return {name: Ended(*each, folder, list(MirrorPolicy.begun)) for name, each in zip(commands, found, strict=True)}
 
 
-def test_lerobot_record_records_the_actions_of_the_servers_policy(server: Server, ended: dict[str, Ended]) -> None:
+def test_lerobot_record_records_the_actions_of_the_servers_policy(ended: dict[str, Ended]) -> None:
     done = ended["record"]
     assert done.status == 0, done.log
-    assert MirrorPolicy.begun[:2] == [(TASK, 7), (TASK, 8)]
+    assert done.begun[:2] == [(TASK, 7), (TASK, 8)]
     dataset = RecordedDataset(done.folder / "recorded")
     plays = dataset.plays()
     assert len(plays) == 2
@@ -138,10 +140,10 @@ def test_lerobot_record_records_the_actions_of_the_servers_policy(server: Server
             np.testing.assert_array_equal(step.expected[0], chunk[step.frame % ROWS])
 
 
-def test_lerobot_eval_gives_each_environment_a_session_of_its_own(server: Server, ended: dict[str, Ended]) -> None:
+def test_lerobot_eval_gives_each_environment_a_session_of_its_own(ended: dict[str, Ended]) -> None:
     done = ended["eval"]
     assert done.status == 0, done.log
-    assert MirrorPolicy.begun[2:] == [(INSTRUCTION, None)] * 4
+    assert done.begun[2:] == [(INSTRUCTION, None)] * 4
     [task] = json.loads((done.folder / "evaluated/eval_info.json").read_text())["per_task"]
     assert task["metrics"]["sum_rewards"] == [STEPS] * 4  # the environment rewards the actions of its own session
 
