@@ -48,8 +48,8 @@ class ObservationMapping:
                 f"policy.cameras: got {unknown[0]!r}, want some of the cameras here, {sorted(robots)}"
                 f"{did_you_mean(unknown[0], robots)}"
             )
-        renamed = {robot: name for name, robot in config.cameras.items()}
-        known = {renamed.get(robot, robot): key for robot, key in robots.items()}
+        known = {name: key for name, key in robots.items() if name not in config.cameras.values()}
+        known |= {name: robots[robot] for name, robot in config.cameras.items()}
         wanted = None if policy is None else policy.cameras
         self.cameras = {name: key for name, key in known.items() if wanted is None or name in wanted}
         self.unused = sorted(_short(key) for key in set(robots.values()) - set(self.cameras.values()))

@@ -225,11 +225,14 @@ def test_threads_that_share_a_policy_have_sessions_of_their_own(policy: Callable
 
 def test_images_are_sent_as_the_bytes_that_the_camera_gave_and_states_by_their_names() -> None:
     image = np.random.default_rng(1).integers(0, 256, (SIDE, SIDE, 3), dtype=np.uint8)
-    frame = {"observation.images.left": image, "observation.state": np.arange(3, dtype=np.float32) / 4}
-    shapes = {"observation.images.left": (3, SIDE, SIDE), "observation.state": (3,)}
+    frame = {"observation.images.left": image, "observation.images.top": 255 - image}
+    frame["observation.state"] = np.arange(3, dtype=np.float32) / 4
+    images = dict.fromkeys(("observation.images.left", "observation.images.top"), (3, SIDE, SIDE))
+    shapes = images | {"observation.state": (3,)}
     config, names = VlagentsConfig(cameras={"top": "left"}), ["gripper", "joints_0", "joints_1"]
     mapping = ObservationMapping(config, CONTRACT, shapes, names)
     obs = mapping.observation(prepare_observation_for_inference(frame, torch.device("cpu")), 0)
+    assert (list(obs.cameras), mapping.unused) == (["top"], ["top"])  # the robot's own camera of that name is not sent
     np.testing.assert_array_equal(obs.cameras["top"], image)
     np.testing.assert_array_equal(obs.state["joints"], np.array([0.25, 0.5], np.float32))
     assert obs.gripper == 0.0
