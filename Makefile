@@ -118,7 +118,7 @@ type: $(TOOLS)/.installed
 
 clean:
 	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
-	find vlagents_ray benchmarks tests -type d -name __pycache__ -prune -exec rm -rf {} +
+	find vlagents_ray benchmarks plugins tests -type d -name __pycache__ -prune -exec rm -rf {} +
 
 # Installed once for each state of pyproject.toml, under the constraints of the torch that came first.
 $(STAMP): pyproject.toml $(CONSTRAINTS)

@@ -19,8 +19,10 @@ from vlagents_ray.dataset_contract import (
     angles_in,
     centre_between,
     centre_of,
+    divided_state,
     rotation_centre_of,
     rotation_vector_in,
+    state_parts,
 )
 from vlagents_ray.errors import ConfigError
 
@@ -182,3 +184,36 @@ def test_rotation_vectors_without_jumps_and_those_that_count_turns_stay_as_they_
     assert rotation_centre_of([np.linspace([2.0, 0, 0], [4.5, 0, 0], 60)]) is None, "as robosuite's, up to two pi"
     assert rotation_centre_of([np.array([[7.0, 0, 0], [0, 0, 0]])]) is None
     assert rotation_centre_of([np.zeros((0, 3))]) is None
+
+
+ARM = Contract(state={"joints": StateSpec(6, "rad")}, gripper=True)
+
+
+@pytest.mark.parametrize(
+    ("width", "policy", "chosen", "parts"),
+    [
+        (5, None, None, [("joints", 5)]),
+        (7, ARM, None, [("joints", 6), ("gripper", 1)]),
+        (7, ARM, ["gripper", "joints"], [("gripper", 1), ("joints", 6)]),
+        (9, replace(ARM, gripper=None), ["joints", "torques"], [("joints", 6), ("torques", 3)]),
+    ],
+)
+def test_a_state_is_divided_into_the_parts_of_the_policy(
+    width: int, policy: Contract | None, chosen: list[str] | None, parts: list[tuple[str, int]]
+) -> None:
+    assert state_parts(width, policy, chosen, option="--state a,b") == parts
+
+
+@pytest.mark.parametrize(
+    ("width", "chosen"), [(6, None), (8, None), (7, []), (9, ["joints", "a", "b"]), (6, ["joints", "a"])]
+)
+def test_a_state_of_another_width_names_the_option(width: int, chosen: list[str] | None) -> None:
+    with pytest.raises(ConfigError, match=f"got {width} numbers.*in their order: --state a,b"):
+        state_parts(width, ARM, chosen, option="--state a,b")
+
+
+def test_the_gripper_of_a_divided_state_is_a_number() -> None:
+    vectors = {"observation.state": np.arange(3, dtype=np.float32), "observation.environment_state": np.ones(2)}
+    parts = {"observation.state": [("gripper", 1), ("joints", 2)], "observation.environment_state": [("puck", 2)]}
+    state, gripper = divided_state(vectors, parts)
+    assert (gripper, {name: part.tolist() for name, part in state.items()}) == (0.0, {"joints": [1, 2], "puck": [1, 1]})

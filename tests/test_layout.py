@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
+import tomllib
+
 import vlagents_ray
 from vlagents_ray.registry import ENVS, POLICIES
 
@@ -91,3 +93,12 @@ def test_private_names_of_ray_are_in_one_module() -> None:
     users = {module for module, path in FILES.items() if _PRIVATE.search(path.read_text())}
     by_value = "vlagents_ray.serve.scaling.router"  # may import nothing of this package
     assert users == {"vlagents_ray.ray_tools.private", by_value}
+
+
+def test_a_plugin_asks_for_the_package_of_its_own_version() -> None:
+    root = PACKAGE.parent
+    ours = tomllib.loads((root / "pyproject.toml").read_text())["project"]["version"]
+    found = [tomllib.loads(path.read_text())["project"] for path in sorted(root.glob("plugins/*/pyproject.toml"))]
+    assert [project["name"] for project in found] == ["lerobot_policy_vlagents"]
+    assert {project["version"] for project in found} == {ours}
+    assert all(f"vlagents-ray>={ours}" in project["dependencies"] for project in found)

@@ -21,6 +21,7 @@ from vlagents_ray.errors import ConfigError, MalformedMessage
 INFO = "vlagents_ray"  # key in `info.json`
 STATISTICS, BYTES = "vlagents_ray_contract", "mean"  # keys in `stats.json`
 GRIPPER = "gripper"  # as a part of the state: `Obs.gripper`
+_JOINTS = "joints"  # part that `observation.state` is, if nothing else is known
 Centre = float | tuple[float, float, float]  # of an angle, or of a rotation vector, rad
 _TURN = 2 * math.pi
 _USUAL = {"joints": "rad", "xyzrpy": "m+rad"}
@@ -113,6 +114,72 @@ class DatasetContract:
         except ValueError as error:
             data = str(error)
         return cls.from_json(data)
+
+
+def state_parts(
+    width: int, policy: Contract | None, chosen: Sequence[str] | None = None, *, option: str
+) -> list[tuple[str, int]]:
+    """Divide `observation.state` of a dataset, or of a robot with LeRobot's names, into parts for a policy.
+
+    Args:
+        width: The number of values in `observation.state`.
+        policy: The policy's contract, with the sizes of its parts.
+        chosen: The parts in their order, "gripper" for `Obs.gripper`; by default those of the contract, or `joints`.
+        option: The option that sets `chosen`, with an example, for the message of the error.
+
+    Returns:
+        The parts in their order, each with its size.
+
+    Raises:
+        ConfigError: The sizes of the parts are unknown, or are not `width` together.
+    """
+    specs = dict((policy and policy.state) or {})
+    parts = list(chosen if chosen is not None else wanted_parts(policy) or [_JOINTS])
+    dims: dict[str, int | None] = {
+        part: 1 if part == GRIPPER else specs[part].dim if part in specs else None for part in parts
+    }
+    unknown = [part for part, dim in dims.items() if dim is None]
+    left = width - sum(dim or 0 for dim in dims.values())
+    if len(unknown) == 1:
+        dims[unknown[0]] = left
+    if left < (len(unknown) == 1) or len(unknown) > 1 or sum(dim or 0 for dim in dims.values()) != width:
+        raise ConfigError(
+            f"observation.state: got {width} numbers, want them divided into {parts} of the policy, of which the sizes "
+            f"are {dims}; name the parts in their order: {option}"
+        )
+    return [(part, dim or 0) for part, dim in dims.items()]
+
+
+def wanted_parts(policy: Contract | None) -> list[str]:
+    """Return the parts of the state that a policy's contract names, "gripper" for `Obs.gripper` last."""
+    if policy is None:
+        return []
+    return [*(policy.state or {}), *([GRIPPER] if policy.gripper else [])]
+
+
+def divided_state(
+    vectors: Mapping[str, np.ndarray], parts: Mapping[str, Sequence[tuple[str, int]]]
+) -> tuple[dict[str, np.ndarray], float | None]:
+    """Divide state vectors into parts.
+
+    Args:
+        vectors: Features such as `observation.state`, each (D,) float32.
+        parts: The parts in each of them and their sizes, as `state_parts` returns them.
+
+    Returns:
+        The parts for `Obs.state`, (size,) float32 each, and the value for `Obs.gripper`, or None if there is none.
+    """
+    state: dict[str, np.ndarray] = {}
+    gripper = None
+    for name, listed in parts.items():
+        place = 0
+        for part, dim in listed:
+            if part == GRIPPER and dim == 1:
+                gripper = float(vectors[name][place])
+            else:
+                state[part] = vectors[name][place : place + dim]
+            place += dim
+    return state, gripper
 
 
 def angles_in(part: str, unit: str | None, dim: int) -> range:

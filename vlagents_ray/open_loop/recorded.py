@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.dataset_contract import GRIPPER, INFO, DatasetContract
+from vlagents_ray.dataset_contract import INFO, DatasetContract, divided_state, state_parts
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.images import jpeg_png
 from vlagents_ray.interface import CAPTURED, Obs
@@ -24,7 +24,6 @@ from vlagents_ray.robot.episode import ACTION, ENVIRONMENT, IMAGES, STATE
 from vlagents_ray.serve.recording.episodes import CHUNK, ROWS, SESSION, TRACE
 
 _PICTURES = ("video", "image")  # dtypes
-_JOINTS = "joints"  # part that `observation.state` is, if nothing else is known
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +129,9 @@ class RecordedDataset:
             for name, camera in cameras.items():
                 image = next(videos[name]) if name in videos else _image(rows[name][i])
                 shown[camera] = self._cropped(image, camera)
-            state, gripper = _state_of({name: rows[name][i] for name in states}, states)
+            state, gripper = divided_state(
+                {name: np.atleast_1d(np.array(rows[name][i], np.float32)) for name in states}, states
+            )
             info = {}
             expected = actions[i:]
             if traced:
@@ -204,7 +205,7 @@ class RecordedDataset:
         if ENVIRONMENT in widths:
             found[ENVIRONMENT] = [(ENVIRONMENT.rpartition(".")[2], widths[ENVIRONMENT])]
         if STATE in widths:
-            found[STATE] = _parts_of(names.state, widths[STATE], policy)
+            found[STATE] = state_parts(widths[STATE], policy, names.state, option="--state joints,gripper")
         return found
 
     def _cropped(self, image: np.ndarray, camera: str) -> np.ndarray:
@@ -220,44 +221,8 @@ def find_datasets(folder: Path) -> list[Path]:
     return [path.parents[1] for pattern in ("", "*/") for path in sorted(folder.glob(f"{pattern}meta/info.json"))]
 
 
-def _parts_of(chosen: Sequence[str] | None, width: int, policy: Contract | None) -> list[tuple[str, int]]:
-    """Divide a state of `width` numbers into parts: those chosen, or those that the policy wants, or the joints."""
-    specs = dict((policy and policy.state) or {})
-    usual = [*specs, *([GRIPPER] if policy is not None and policy.gripper else [])]
-    parts = list(chosen if chosen is not None else usual or [_JOINTS])
-    dims: dict[str, int | None] = {
-        part: 1 if part == GRIPPER else specs[part].dim if part in specs else None for part in parts
-    }
-    unknown = [part for part, dim in dims.items() if dim is None]
-    left = width - sum(dim or 0 for dim in dims.values())
-    if len(unknown) == 1:
-        dims[unknown[0]] = left
-    if left < (len(unknown) == 1) or len(unknown) > 1 or sum(dim or 0 for dim in dims.values()) != width:
-        raise ConfigError(
-            f"observation.state: got {width} numbers, want them divided into {parts} of the policy, of which the sizes "
-            f"are {dims}; name the parts in their order: --state joints,gripper"
-        )
-    return [(part, dim or 0) for part, dim in dims.items()]
-
-
 def _dim(specs: Mapping[str, Any], part: str) -> int:
     return int(specs[part].dim or 0) if part in specs else 1
-
-
-def _state_of(
-    rows: Mapping[str, Any], states: Mapping[str, Sequence[tuple[str, int]]]
-) -> tuple[dict[str, np.ndarray], float | None]:
-    state: dict[str, np.ndarray] = {}
-    gripper = None
-    for name, parts in states.items():
-        values, place = np.atleast_1d(np.array(rows[name], np.float32)), 0
-        for part, dim in parts:
-            if part == GRIPPER and dim == 1:
-                gripper = float(values[place])
-            else:
-                state[part] = values[place : place + dim]
-            place += dim
-    return state, gripper
 
 
 def _image(value: Mapping[str, Any]) -> np.ndarray:

@@ -1,0 +1,85 @@
+"""The options `--policy.…` of the policy type `vlagents`."""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NoReturn
+
+from lerobot.configs.policies import PreTrainedConfig
+
+from vlagents_ray.errors import ConfigError
+
+TRAINING = (
+    "policy.type=vlagents: got a policy on a server, whose weights are not here; train with the type of the checkpoint "
+    "that the server loads, or push weights into the server (docs/weights.md)"
+)
+
+
+@PreTrainedConfig.register_subclass("vlagents")
+@dataclass
+class VlagentsConfig(PreTrainedConfig):
+    """The server, and what the policy's names for cameras and states are at this robot or environment."""
+
+    url: str = ""  # http(s)://HOST:PORT[/APP], as of `RemoteAgent`
+    cameras: dict[str, str] = field(default_factory=dict)  # policy's camera -> robot's, where the names differ
+    state: list[str] = field(default_factory=list)  # parts of the policy that `observation.state` is, in its order
+    instruction: str | None = None  # in place of the task of the dataset or the environment
+    n_action_steps: int | None = None  # rows of each chunk that are executed; None: all that the server returns
+    checkpoint: str | None = None  # one of those that the server offers; None: its own
+    seed: int | None = None  # of the first session's first episode; each further one has the next number
+    key_file: Path | None = None  # holds the API key; without it, VLAGENTS_RAY_API_KEY is the key
+    ca: Path | None = None  # https: PEM file of the server's authorities; None: the system's
+    certificate: list[Path] = field(default_factory=list)  # https: PEM files of the client's certificate and its key
+    transport: str = "auto"  # as of `RemoteAgent`
+    codec: str = "auto"  # of images, as of `RemoteAgent`: "jpeg", "lossless", "raw", …
+    rank: str = "robot"  # "simulation": robots of the same server go first
+    timeout_s: float = 30.0  # for a request; after it the command ends with an error
+    connect_timeout_s: float = 60.0  # for a server that is still loading
+    device: str | None = "cpu"  # where observations wait to be sent
+    push_to_hub: bool = False
+
+    def __post_init__(self) -> None:
+        """Check what can be checked without the server; raises `ConfigError`."""
+        super().__post_init__()
+        if self.n_obs_steps != 1:
+            raise ConfigError(f"policy.n_obs_steps: got {self.n_obs_steps}, want 1: the server keeps the history")
+        if self.n_action_steps is not None and self.n_action_steps < 1:
+            raise ConfigError(f"policy.n_action_steps: got {self.n_action_steps}, want 1 or more, or null for all")
+        if len(self.certificate) not in (0, 2):
+            raise ConfigError(
+                f"policy.certificate: got {len(self.certificate)} files, want two, as [cert.pem, key.pem]"
+            )
+
+    @property
+    def api_key(self) -> str | None:
+        """The API key in `key_file`; None if no file is set. Raises `ConfigError` if it cannot be read."""
+        if self.key_file is None:
+            return None
+        try:
+            return self.key_file.read_text().strip()
+        except OSError as error:
+            raise ConfigError(
+                f"policy.key_file: got {str(self.key_file)!r}, want a file with an API key ({error})"
+            ) from error
+
+    @property
+    def observation_delta_indices(self) -> None:
+        """None, as one observation is sent at a time."""
+
+    @property
+    def action_delta_indices(self) -> None:
+        """None, as nothing is trained here."""
+
+    @property
+    def reward_delta_indices(self) -> None:
+        """None, as nothing is trained here."""
+
+    def validate_features(self) -> None:
+        """Do nothing: the policy compares the features with the server's contract."""
+
+    def get_optimizer_preset(self) -> NoReturn:
+        """Refuse to train."""
+        raise ConfigError(TRAINING)
+
+    def get_scheduler_preset(self) -> Any:
+        """Return None, as nothing is trained here."""
+        return None

@@ -1,0 +1,245 @@
+"""A policy on a vlagents_ray server as a policy of LeRobot."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NoReturn, cast
+
+import numpy as np
+import torch
+from lerobot.policies.pretrained import PreTrainedPolicy
+
+from lerobot_policy_vlagents.configuration_vlagents import TRAINING, VlagentsConfig
+from lerobot_policy_vlagents.observations import (
+    ObservationMapping,
+    require_fit,
+    shapes_of_batch,
+    shapes_of_features,
+)
+from vlagents_ray import Act, Obs, RemoteAgent
+from vlagents_ray.errors import ConfigError, ContractMismatch, InvalidAction
+
+logger = logging.getLogger(__name__)
+
+
+class VlagentsPolicy(PreTrainedPolicy):
+    """A policy on a server. Each row of a batch, i.e. each robot or environment, is a session of its own."""
+
+    config_class, name = VlagentsConfig, "vlagents"
+
+    def __init__(self, config: VlagentsConfig, *, dataset_meta: Any = None, **_: Any) -> None:
+        """Connect to the server, and compare its policy with the features.
+
+        Args:
+            config: The options, and the features, which LeRobot's `make_policy` has set.
+            dataset_meta: The metadata of the dataset that is recorded, if there is one.
+
+        Raises:
+            ConfigError: An option is missing or wrong.
+            ContractMismatch: The policy needs what is not there, or returns other actions than are wanted.
+            PolicyUnavailable: The server was not ready within `connect_timeout_s`.
+        """
+        super().__init__(config)
+        self._robot = _Robot(config, dataset_meta)
+        # LeRobot's evaluation of several tasks at once calls one policy on several threads.
+        self._threads = threading.local()
+        self._threads.sessions = sessions = _Sessions(self._robot)
+        self._robot.check_features(sessions.agent)
+
+    @classmethod
+    def from_pretrained(
+        cls, pretrained_name_or_path: str | Path | None = None, *, config: VlagentsConfig | None = None, **kwargs: Any
+    ) -> VlagentsPolicy:
+        """Return the policy of a configuration; raises `ConfigError` for a checkpoint, which only a server loads."""
+        if pretrained_name_or_path is not None or config is None:
+            raise ConfigError(
+                f"policy.path: got {str(pretrained_name_or_path)!r}, want none with policy.type=vlagents: the server "
+                f"loads the checkpoint; --policy.checkpoint selects one of those that it offers"
+            )
+        return cls(config, **{key: value for key, value in kwargs.items() if key == "dataset_meta"})
+
+    def reset(self) -> None:
+        """Begin new episodes with the next observations."""
+        self._sessions.reset()
+
+    def select_action(self, batch: dict[str, Any], **_: Any) -> torch.Tensor:
+        """Return the next row of each session's chunk, (B, D) float32; a session whose chunk is over gets another.
+
+        Args:
+            batch: Images (B, C, H, W) in [0, 1], states (B, D), and the `task`, with LeRobot's names.
+        """
+        return torch.from_numpy(self._sessions.next_rows(batch))
+
+    def predict_action_chunk(self, batch: dict[str, Any], **_: Any) -> torch.Tensor:
+        """Return a new chunk of each session, (B, H, D) float32; `select_action` does not see it.
+
+        Args:
+            batch: As of `select_action`.
+        """
+        chunks = self._sessions.chunks(batch)
+        if len(lengths := {len(rows) for rows in chunks}) > 1:
+            raise InvalidAction(
+                f"predict_action_chunk: got chunks of {sorted(lengths)} rows, want one length; set a "
+                f"length in the server's deployment file, or use select_action"
+            )
+        return torch.from_numpy(np.stack(chunks))
+
+    def forward(self, batch: dict[str, Any]) -> NoReturn:
+        """Refuse to train."""
+        raise ConfigError(TRAINING)
+
+    def get_optim_params(self) -> NoReturn:
+        """Refuse to train."""
+        raise ConfigError(TRAINING)
+
+    @property
+    def _sessions(self) -> _Sessions:
+        if not hasattr(self._threads, "sessions"):
+            self._threads.sessions = _Sessions(self._robot)
+        return cast(_Sessions, self._threads.sessions)
+
+
+class _Robot:
+    """What LeRobot's command drives, robot or environments, as far as it says."""
+
+    def __init__(self, config: VlagentsConfig, dataset_meta: Any) -> None:
+        self.config = config
+        features = {} if dataset_meta is None else dataset_meta.features
+        self.names = _names(features.get("observation.state", {}).get("names"))
+        self.hz = None if dataset_meta is None else float(dataset_meta.fps)
+        action = config.action_feature
+        self.action_dim = None if action is None else int(action.shape[0])
+
+    def connect(self) -> RemoteAgent:
+        """Return a connection to the server, which is ready."""
+        config = self.config
+        if not config.url:
+            raise ConfigError("policy.url: got none, want the server's, as --policy.url=http://gpu-box:8000")
+        certificate = (config.certificate[0], config.certificate[1]) if config.certificate else None
+        agent = RemoteAgent(
+            config.url,
+            transport=cast(Any, config.transport),
+            timeout_s=config.timeout_s,
+            connect_timeout_s=config.connect_timeout_s,
+            codec=cast(Any, config.codec),
+            rank=cast(Any, config.rank),
+            api_key=config.api_key,
+            ca=config.ca,
+            certificate=certificate,
+        )
+        agent.initialize()
+        return agent
+
+    def check_features(self, agent: RemoteAgent) -> None:
+        """Compare the features that are known before the first observation; raises `ContractMismatch`."""
+        shapes = shapes_of_features(self.config.input_features or {})
+        if shapes:
+            self.mapping(agent, shapes)
+        rows = agent.contract.chunk if agent.contract else None
+        if rows is not None and (self.config.n_action_steps or 0) > rows:
+            raise ConfigError(
+                f"policy.n_action_steps: got {self.config.n_action_steps}, want at most {rows}, the rows "
+                f"of the server's chunks"
+            )
+
+    def mapping(self, agent: RemoteAgent, shapes: Mapping[str, Sequence[int]]) -> ObservationMapping:
+        """Return the mapping of observations of these shapes to the policy's; raises `ContractMismatch`."""
+        found = ObservationMapping(self.config, agent.contract, shapes, self.names)
+        require_fit(agent.contract, found.contract(self.action_dim, self.hz))
+        return found
+
+
+class _Sessions:
+    """The sessions of one thread: one for each row of its batches."""
+
+    def __init__(self, robot: _Robot) -> None:
+        self._robot, self._config = robot, robot.config
+        self.agent = robot.connect()
+        self._agents: list[RemoteAgent] = []
+        self._rows: list[deque[np.ndarray]] = []
+        self._mapping: ObservationMapping | None = None  # None: the next batch begins episodes
+        self._begun = 0  # episodes so far
+
+    def reset(self) -> None:
+        """Begin episodes with the next batch."""
+        self._mapping = None
+
+    def next_rows(self, batch: Mapping[str, Any]) -> np.ndarray:
+        """Return the next row of each session, (B, D) float32."""
+        self._begin_if_due(batch)
+        if empty := [row for row, rows in enumerate(self._rows) if not rows]:
+            for row, chunk in zip(empty, self._act(batch, empty), strict=True):
+                self._rows[row].extend(chunk[: self._config.n_action_steps])
+        return np.stack([rows.popleft() for rows in self._rows])
+
+    def chunks(self, batch: Mapping[str, Any]) -> list[np.ndarray]:
+        """Return a new chunk of each session, (H, D) float32 each."""
+        self._begin_if_due(batch)
+        return self._act(batch, range(len(self._agents)))
+
+    def _begin_if_due(self, batch: Mapping[str, Any]) -> None:
+        size = _size(batch)
+        if self._mapping is not None and size == len(self._agents):
+            return
+        mapping = self._robot.mapping(self.agent, shapes_of_batch(batch))
+        if mapping.unused and not self._begun:
+            logger.info("cameras that the policy does not take, and that are not sent: %s", mapping.unused)
+        if size != len(self._agents):
+            for agent in self._agents:
+                agent.close()
+            self._agents = self.agent.sessions(size)
+        tasks = self._instructions(batch, size)
+        seeds = None if self._config.seed is None else [self._config.seed + self._begun + row for row in range(size)]
+        options: dict[str, Any] = {} if self._config.checkpoint is None else {"checkpoint": self._config.checkpoint}
+        observations = [mapping.observation(batch, row) for row in range(size)]
+        _successes(self.agent.reset_batch(observations, tasks, self._agents, seeds=seeds, **options))
+        self._begun += size
+        self._rows = [deque() for _ in range(size)]
+        self._mapping = mapping
+
+    def _act(self, batch: Mapping[str, Any], rows: Sequence[int]) -> list[np.ndarray]:
+        mapping = cast(ObservationMapping, self._mapping)
+        observations: list[Obs] = [mapping.observation(batch, row) for row in rows]
+        acts = cast(list[Act], _successes(self.agent.act_batch(observations, [self._agents[row] for row in rows])))
+        chunks = [act.rows().astype(np.float32, copy=False) for act in acts]
+        want = self._robot.action_dim
+        if odd := [chunk.shape[1] for chunk in chunks if want not in (None, chunk.shape[1])]:
+            raise ContractMismatch(
+                f"action: got {odd[0]} numbers a row from the server, want {want} here; is this another robot's policy?"
+            )
+        return chunks
+
+    def _instructions(self, batch: Mapping[str, Any], size: int) -> list[str | None]:
+        task = batch.get("task") if self._config.instruction is None else self._config.instruction
+        tasks = [task] * size if isinstance(task, str) else list(task or [None] * size)
+        contract = self.agent.contract
+        if contract is not None and contract.instruction and not all(tasks):
+            raise ConfigError(
+                "task: got none, the policy needs an instruction; set --dataset.single_task, or --policy.instruction "
+                "where the environment has none"
+            )
+        return [one or None for one in tasks]
+
+
+def _size(batch: Mapping[str, Any]) -> int:
+    return next(
+        len(value) for key, value in batch.items() if key.startswith("observation.") and hasattr(value, "shape")
+    )
+
+
+def _names(names: Any) -> list[str]:
+    """Return the names of a feature's values, which a dataset lists, or maps from a group to a list."""
+    groups = names.values() if isinstance(names, Mapping) else [names or []]
+    return [str(name) for group in groups for name in group]
+
+
+def _successes(results: Sequence[Any]) -> list[Any]:
+    """Return the results if none of them is an exception; raise the first that is one."""
+    for result in results:
+        if isinstance(result, Exception):
+            raise result
+    return list(results)

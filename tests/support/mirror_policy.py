@@ -1,0 +1,57 @@
+"""A policy whose chunks are a known function of what it observed, so that a test can say what LeRobot should record."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+
+from vlagents_ray import Act, Agent, Obs
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+
+CAMERA, SIDE, HZ, ROWS = "top", 48, 20, 2
+CONTRACT = Contract(
+    cameras={CAMERA: CameraSpec(SIDE, SIDE)},
+    state={"joints": StateSpec(2, "rad")},
+    gripper=True,
+    instruction=True,
+    action=ActionSpec(dim=3, space="joint"),
+    control_hz=HZ,
+    chunk=ROWS,
+)
+
+
+def colour_of(image: int) -> int:
+    """The bytes of the robot's image of that number, counted from 1."""
+    return image * 37 % 256
+
+
+def mirrored(state: np.ndarray, colour: int, acts: int, instruction: str) -> np.ndarray:
+    """The chunk, (2, 3) float32, of a session's act of that number, counted from 1.
+
+    Args:
+        state: Two joints and the gripper, in [0, 1].
+        colour: The bytes of the image.
+    """
+    shoulder, elbow, gripper = (float(number) for number in state)
+    rows = [
+        [elbow + row, len(instruction) - shoulder / 2 + acts / 8, (gripper + colour / 255) / 2] for row in range(ROWS)
+    ]
+    return np.array(rows, np.float32)
+
+
+class MirrorPolicy(Agent):
+    """The policy; `begun` has the instruction and the seed of each episode."""
+
+    contract = CONTRACT
+    begun: ClassVar[list[tuple[str | None, object]]] = []  # by all sessions, which are copies
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict[str, object]:
+        self.instruction, self.acts = instruction or "", 0
+        self.begun.append((instruction, kwargs.get("seed")))
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        self.acts += 1
+        state = np.array([*obs.state["joints"], obs.gripper], np.float32)
+        return Act(mirrored(state, int(obs.cameras[CAMERA][0, 0, 0]), self.acts, self.instruction))
