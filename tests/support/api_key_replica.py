@@ -171,7 +171,7 @@ class KeyedReplica:
             each.open()
         self.engine.start()
         routes = dialect_routes(DialectArgs(**ALL), ReplicaContext(self.engine, lambda: METADATA, LIMITS))
-        view = ReplicaView(self.engine, "this", "here", lambda: METADATA | {"policy_version": None})
+        view = ReplicaView(self.engine, "this", "here", lambda: METADATA | {"policy_version": None, "weights": None})
         live = live_routes(Fleet(view), open_to_network=False)
         others = [*weights_routes(_Receiving(self), 30.0, open_to_network=False), *live]
         inside = build_http_app(self.engine, lambda: METADATA, LIMITS, dialects=routes, others=others)

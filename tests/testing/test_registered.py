@@ -12,17 +12,22 @@ from vlagents_ray.registry import names, policy_class
 from vlagents_ray.testing import check_agent, check_env
 
 # Registered names whose own test modules run the suites, because they need a simulator or a setting.
-CHECKED_ELSEWHERE = {"libero", "maniskill", "metaworld", "rcs", "duobench", "replay", "simpler"}
+CHECKED_ELSEWHERE = {
+    "libero", "maniskill", "metaworld", "rcs", "duobench", "simpler", "aloha", "hub",
+    "replay", "upstream",
+}  # fmt: skip
 ENV_NAMES = {
     "tabletop": ["tabletop"],
     "gymnasium": ["gymnasium/Pendulum-v1", "gymnasium/gym_pusht/PushT-v0"],
+    "pusht": ["pusht", "pusht/keypoints"],
 }
+SIMULATED = {"gymnasium", "pusht"}
 
 
 @pytest.mark.parametrize(
     "suite",
     [
-        pytest.param(name, marks=pytest.mark.sim) if name == "gymnasium" else name
+        pytest.param(name, marks=pytest.mark.sim) if name in SIMULATED else name
         for name in sorted(set(names("envs")) - CHECKED_ELSEWHERE)
     ],
 )
