@@ -42,12 +42,13 @@ def require_harmless(cell: CellResults) -> None:
     """Raise `ConfigError` unless making this environment runs no code but that of a registered one.
 
     A bundle may come from a stranger: "module:Class" would be imported, and an option that is a path or a nested value
-    could name files or code of this machine.
+    could name files or code of this machine. Whether code is trusted (`trust_remote_code`) is for nobody else to say.
     """
     if env_suite(cell.env) not in names("envs") or ":" in cell.env:
         raise ConfigError(f"{cell.env}: is no registered environment; --trust makes it, and runs its code")
     for kind in ("env_options", "reset_options"):
-        odd = {name: value for name, value in (cell.settings.get(kind) or {}).items() if not _is_plain(value)}
+        stated = cell.settings.get(kind) or {}
+        odd = {name: value for name, value in stated.items() if name.startswith("trust") or not _is_plain(value)}
         if odd:
             raise ConfigError(f"{cell.env}: got the {kind} {odd}, which could name files or code; --trust takes them")
 
