@@ -145,7 +145,7 @@ def test_an_evaluation_tells_while_it_runs_and_at_its_end(config: Config) -> Non
         f"{LINE}/episodes", f"{OTHER_LINE}/episodes", "total/episodes"
     ]  # fmt: skip
     assert Listener.finished == ["policy"]
-    assert {"code", "evaluation"} == Listener.begun[0].config.keys()
+    assert {"code", "evaluation", "served"} == Listener.begun[0].config.keys()
 
 
 def test_a_missing_package_is_said_before_anything_starts(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
