@@ -106,7 +106,7 @@ def test_acts_and_resets_say_which_adapter_it_was(tmp_path: Path) -> None:
     ids = policy.weights_id["adapters"]
     for name in ("stack", "pour"):
         info = begun(policy, 0).reset(at(0), None, adapter=name)
-        assert info == {"checkpoint": str(tmp_path / name), "weights": ids[name]}
+        assert info == {"checkpoint": str(tmp_path / name), "weights": ids[name], "revision": None}
         assert said[name]["fingerprint"] in ids[name]
     assert "weights" not in begun(policy, 0).reset(at(0), None)
     without = loaded(tmp_path, adapters=paths(tmp_path, "pour"))
