@@ -113,7 +113,7 @@ def test_a_mapping_gives_the_policys_names(open_lerobot) -> None:
         ({"lerobot_features": []}, "got list, dict, want dicts"),
         ({"lerobot_features": {f"observation.images.{n}": {"dtype": "image"} for n in range(17)}}, "17 cameras"),
         ({"policy_type": 3}, "policy_type: got 3, want text"),
-        ({"policy_type": print}, "names 'builtins' 'print'"),
+        ({"policy_type": len}, "names 'builtins' 'len'"),
     ],
 )
 def test_policy_instructions_that_do_not_fit_are_refused(open_lerobot, changes: dict, says: str) -> None:

@@ -222,7 +222,7 @@ class Text(str):
     ("value", "says"),
     [
         (Command(), "names 'posix' 'system'"),
-        (print, "names 'builtins' 'print'"),
+        (len, "names 'builtins' 'len'"),
         (np.load, "names 'numpy' 'load'"),
         (np.array(["text"]), "little-endian"),
         (np.array([None], object), "want the type of plain numbers"),
