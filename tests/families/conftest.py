@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import importlib.util
+from pathlib import Path
 
 import pytest
 from verified import VerifyingTests
@@ -14,6 +15,7 @@ from verified import VerifyingTests
 _NEEDS = {
     "arro": "transformers",
     "diffusion_policy": "diffusers",
+    "gr00t": "lerobot",
     "lerobot": "lerobot",
     "libero": "libero",
     "octo": "jax",
@@ -24,7 +26,8 @@ _NEEDS = {
     "vjepa2_ac": "transformers",
 }
 
-collect_ignore = [folder for folder, package in _NEEDS.items() if importlib.util.find_spec(package) is None]
+_FOLDERS = {test.parent.name for test in Path(__file__).parent.glob("*/test_*.py")}
+collect_ignore = [folder for folder in _FOLDERS if importlib.util.find_spec(_NEEDS[folder]) is None]
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
