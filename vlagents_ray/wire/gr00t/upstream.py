@@ -1,8 +1,9 @@
 """The client's side of GR00T's protocol: requests that are written, and replies that are read within bounds.
 
 The facts are those of `codec`: N1.5's clients send flat keys and get the action alone; those of N1.6 and newer send
-`{"observation": {...}, "options": None}` and get `[action, info]`. The observation is nested, or flat for servers that run
-with `--use-sim-policy-wrapper`. A server that marks its modalities with `__ModalityConfig__` reads arrays of `msgpack_numpy`.
+`{"observation": {...}, "options": None}` and get `[action, info]`. The observation is nested, or flat for servers that
+run with `--use-sim-policy-wrapper`. A server that marks its modalities with `__ModalityConfig__` reads arrays of
+`msgpack_numpy`.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ class GR00TClient(UpstreamClient):
 
     @property
     def is_open(self) -> bool:
-        return self._socket is not None
+        return self._socket is not None and not self._monitor.poll(0)
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
         zmq = self._zmq
@@ -62,7 +62,9 @@ class GR00TClient(UpstreamClient):
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
         is_flat = wire.is_flat(observations[0])
         try:
-            batched = wire.batch([wire.nested(one) for one in observations] if is_flat else observations, self._text_key)
+            batched = wire.batch(
+                [wire.nested(one) for one in observations] if is_flat else observations, self._text_key
+            )
         except ValueError as error:
             raise InvalidObservation(f"gr00t: {error}; all sessions of a deployment must send the same") from error
         named = wire.flat(batched) if self._flat or is_flat else batched
