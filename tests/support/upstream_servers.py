@@ -1,8 +1,8 @@
 """Servers of other systems, one process each, in the bytes of their own packers; none of our codecs is used.
 
-`python upstream_servers.py KIND PORT`; a kind is a protocol, and for GR00T also `gr00t sim`: with `Gr00tSimPolicyWrapper`,
-or `gr00t packed`: with the newest servers' arrays. What they answer depends on each bit of the observation, so that an
-action that equals `answer` was computed from the very observation. The formats are those of
+`python upstream_servers.py KIND PORT`; a kind is a protocol, and for GR00T also `gr00t sim`: with
+`Gr00tSimPolicyWrapper`, or `gr00t packed`: with the newest servers' arrays. What they answer depends on each bit of the
+observation, so that an action that equals `answer` was computed from the very observation. The formats are those of
 openpi_client.msgpack_numpy, gr00t/policy/server_client.py, json_numpy, and vla_eval.protocol.
 """
 
