@@ -1,8 +1,9 @@
 """Servers of other systems, one process each, in the bytes of their own packers; none of our codecs is used.
 
-`python upstream_servers.py PROTOCOL PORT`. What they answer depends on each bit of the observation, so that an action
-that equals `answer` was computed from the very observation. The formats are those of openpi_client.msgpack_numpy,
-gr00t/policy/server_client.py, json_numpy, and vla_eval.protocol.
+`python upstream_servers.py KIND PORT`; a kind is a protocol, and for GR00T also `gr00t sim`: with
+`Gr00tSimPolicyWrapper`, or `gr00t packed`: with the newest servers' arrays. What they answer depends on each bit of the
+observation, so that an action that equals `answer` was computed from the very observation. The formats are those of
+openpi_client.msgpack_numpy, gr00t/policy/server_client.py, json_numpy, and vla_eval.protocol.
 """
 
 from __future__ import annotations
@@ -134,14 +135,22 @@ def vla_eval(connection: Any) -> None:
             step += 1
 
 
-def gr00t(port: int) -> None:
+def gr00t(port: int, *variants: str) -> None:
+    packed = "packed" in variants
+
     def array(one: Any) -> Any:
+        if packed:
+            return {b"nd": True, b"type": one.dtype.str, b"kind": b"", b"shape": one.shape, b"data": one.tobytes()}
         file = io.BytesIO()
         np.save(file, one, allow_pickle=False)
         return {"__ndarray_class__": True, "as_npy": file.getvalue()}
 
     def node(one: dict) -> Any:
-        return np.load(io.BytesIO(one["as_npy"]), allow_pickle=False) if "__ndarray_class__" in one else one
+        if packed and b"nd" in one:
+            return np.frombuffer(one[b"data"], one[b"type"]).reshape(one[b"shape"])
+        if not packed and "__ndarray_class__" in one:
+            return np.load(io.BytesIO(one["as_npy"]), allow_pickle=False)
+        return one
 
     modalities = {
         "video": ([0], ["ego", "wrist"]),
@@ -157,7 +166,7 @@ def gr00t(port: int) -> None:
             if request["endpoint"] == "get_modality_config":
                 reply: Any = {
                     name: {
-                        "__ModalityConfig_class__": True,
+                        "__ModalityConfig__" if packed else "__ModalityConfig_class__": True,
                         "as_json": {"delta_indices": steps, "modality_keys": keys},
                     }
                     for name, (steps, keys) in modalities.items()
@@ -165,10 +174,25 @@ def gr00t(port: int) -> None:
             elif request["endpoint"] == "reset":
                 reply = {}
             else:
-                reply = [gr00t_actions(request["data"]["observation"]), {}]
+                observation = request["data"]["observation"]
+                if "sim" in variants:
+                    actions = gr00t_actions(gr00t_nested(observation))
+                    reply = [{f"action.{name}": array for name, array in actions.items()}, {}]
+                else:
+                    reply = [gr00t_actions(observation), {}]
         except ValueError as error:
             reply = {"error": str(error)}
         socket.send(msgpack.packb(reply, default=array))
+
+
+def gr00t_nested(observation: dict[str, Any]) -> dict[str, Any]:
+    """As `Gr00tSimPolicyWrapper` reads flat keys."""
+    key = "annotation.human.task_description"
+    named = {
+        kind: {name: observation[f"{kind}.{name}"] for name in names}
+        for kind, names in {"video": ("ego", "wrist"), "state": ("arm",)}.items()
+    }
+    return named | {"language": {key: [[text] for text in observation[key]]}}
 
 
 def gr00t_actions(observation: dict[str, Any]) -> dict[str, np.ndarray]:
@@ -214,9 +238,9 @@ class OpenVLA(BaseHTTPRequestHandler):
 
 
 @contextlib.contextmanager
-def upstream(protocol: str, port: int) -> Iterator[subprocess.Popen[bytes]]:
-    """A server of a protocol in a process of its own, which is killed at the end."""
-    process = subprocess.Popen([sys.executable, __file__, protocol, str(port)])
+def upstream(kind: str, port: int) -> Iterator[subprocess.Popen[bytes]]:
+    """A server of a kind in a process of its own, which is killed at the end."""
+    process = subprocess.Popen([sys.executable, __file__, kind, str(port)])
     try:
         yield process
     finally:
@@ -224,9 +248,10 @@ def upstream(protocol: str, port: int) -> Iterator[subprocess.Popen[bytes]]:
         process.wait()
 
 
-def _main(protocol: str, port: int) -> None:
+def _main(kind: str, port: int) -> None:
+    protocol, *variants = kind.split()
     if protocol == "gr00t":
-        gr00t(port)
+        gr00t(port, *variants)
     elif protocol == "openvla":
         ThreadingHTTPServer(("127.0.0.1", port), OpenVLA).serve_forever()
     else:

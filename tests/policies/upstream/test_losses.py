@@ -14,11 +14,13 @@ from eval_fakes import wait_for
 from in_process_evaluation import play
 from in_process_replicas import Replicas
 from upstream_servers import CLOSED, SLOW, answer, upstream
+from websockets.exceptions import ConnectionClosedError
 
 from vlagents_ray.errors import NoReplica, PolicyUnavailable, UnknownSession
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.interface import Obs
 from vlagents_ray.policies.upstream import Upstream
+from vlagents_ray.policies.upstream.clients import websocket
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.ports import free_port
 
@@ -26,8 +28,11 @@ PLAIN = {"state": {"position": "observation/state"}, "instruction": "prompt"}
 CAMERA = {"front": "observation/image"}
 
 
+SCHEMES = {"gr00t": "tcp", "openvla": "http"}
+
+
 def settings(*ports: int, protocol: str = "openpi", **more: Any) -> dict[str, Any]:
-    urls = [f"{'tcp' if protocol == 'gr00t' else 'ws'}://127.0.0.1:{port}" for port in ports]
+    urls = [f"{SCHEMES.get(protocol, 'ws')}://127.0.0.1:{port}" for port in ports]
     mapping = {} if protocol in ("vla_eval", "roboarena") else {"mapping": PLAIN}
     return {"protocol": protocol, "urls": urls, "connect_timeout_s": 60, **mapping, **more}
 
@@ -103,6 +108,54 @@ def test_a_batch_waits_for_the_only_upstream_to_return(opened: Open, start: Any)
     returning.start()
     require_right(agent, acting)
     returning.join()
+
+
+PIXELS = {
+    "openpi": {"cameras": CAMERA, **PLAIN},
+    "openvla": "openvla",
+    "gr00t": {
+        "cameras": {"front": "video/ego", "wrist": "video/wrist"},
+        "state": {"position": "state/arm"},
+        "action": {"arm": {"stop": 6}, "gripper": {"start": 6}},
+    },
+}
+
+
+@pytest.mark.parametrize("protocol", sorted(PIXELS))
+def test_connections_that_ended_while_nobody_acted_cost_a_row_nothing(opened: Open, start: Any, protocol: str) -> None:
+    port = free_port()
+    server = start(port, protocol)
+    agent = opened(port, protocol=protocol, mapping=PIXELS[protocol], connections=5, retry_s=60)
+    wait_for(lambda: len(agent._lanes._wait_ready(0)) == 5)
+    image = np.zeros((8, 8, 3), np.uint8)
+    obs = Obs({"front": image, "wrist": image}, state={"position": np.ones(1, np.float32)})
+    [session] = sessions(agent, 1)
+    [first] = agent.act_batch([obs], [session])
+    server.kill()
+    server.wait()
+    wait_for(lambda: not any(client.is_open for client in agent._lanes._clients))
+    start(port, protocol)
+    [again] = agent.act_batch([obs], [session])
+    np.testing.assert_array_equal(again.action, first.action)
+
+
+def test_a_connection_that_ends_in_its_handshake_is_tried_again(
+    opened: Open, start: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    port, refused = free_port(), []
+    start(port)
+    real = websocket.connect
+
+    def connect(*args: Any, **options: Any) -> Any:
+        if len(refused) < 2:
+            refused.append(port)
+            raise ConnectionClosedError(None, None)  # as when the upstream is killed in the meantime
+        return real(*args, **options)
+
+    monkeypatch.setattr(websocket, "connect", connect)
+    agent = opened(port)
+    assert len(refused) == 2
+    require_right(agent, sessions(agent, 1))
 
 
 def test_without_any_upstream_a_request_is_answered_as_for_a_lost_replica(opened: Open, start: Any) -> None:

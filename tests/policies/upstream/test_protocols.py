@@ -30,6 +30,12 @@ MAPPINGS: dict[str, Any] = {
     },
     "vla_eval": {"preset": "vla-eval", "state": {"joints": "states"}},
 }
+MAPPINGS["gr00t packed"] = MAPPINGS["gr00t"]
+MAPPINGS["gr00t sim"] = MAPPINGS["gr00t"] | {
+    "preset": "gr00t-n1.5",
+    "cameras": {"front": "video.ego", "wrist": "video.wrist"},
+    "state": {"joints": "state.arm"},
+}
 
 
 def libero(obs: Obs, text: str) -> dict[str, Any]:
@@ -67,6 +73,8 @@ DIRECT: dict[str, Callable[[Obs, str, int], np.ndarray]] = {
     "openpi-batch": lambda obs, text, _step: answer(libero(obs, text)),
     "roboarena": lambda obs, text, step: answer(droid(obs, text), step),
     "gr00t": lambda obs, text, _step: so100(obs, text),
+    "gr00t packed": lambda obs, text, _step: so100(obs, text),
+    "gr00t sim": lambda obs, text, _step: so100(obs, text),
     "openvla": lambda obs, text, _step: answer({"image": obs.cameras["front"], "instruction": text})[0],
     "vla_eval": lambda obs, text, step: answer(
         {
@@ -92,15 +100,16 @@ def seen(number: int) -> Obs:
 
 @pytest.fixture(scope="module", params=sorted(DIRECT))
 def served(request: pytest.FixtureRequest) -> Iterator[tuple[str, dict[str, Any]]]:
-    """A protocol, and the settings that name two servers of it."""
-    protocol, ports = request.param, [free_port(), free_port()]
+    """A kind of server, and the settings that name two of it."""
+    kind, ports = request.param, [free_port(), free_port()]
+    protocol = kind.partition(" ")[0]
     with ExitStack() as stack:
         for port in ports:
-            stack.enter_context(upstream(protocol, port))
+            stack.enter_context(upstream(kind, port))
         scheme = SCHEMES.get(protocol, "ws")
         urls = [f"{scheme}://127.0.0.1:{port}" for port in ports]
         settings = {"protocol": protocol, "urls": urls, "connect_timeout_s": 30}
-        yield protocol, settings | ({"mapping": MAPPINGS[protocol]} if protocol in MAPPINGS else {})
+        yield kind, settings | ({"mapping": MAPPINGS[kind]} if kind in MAPPINGS else {})
 
 
 @pytest.fixture

@@ -125,8 +125,12 @@ class Lanes:
         observations: Sequence[Mapping[str, Any]],
         results: list[Answer | Exception],
     ) -> None:
-        """Ask for shares over one connection until none is left, or until it is lost."""
+        """Ask for shares over one connection until none is left, or until it is lost; none is spent on an ended one."""
         while True:
+            if not client.is_open:
+                client.close()
+                self._lose(client, None)
+                return
             try:
                 share = work.popleft()
             except IndexError:
@@ -148,9 +152,6 @@ class Lanes:
                     work.extend(_Share(range(row, row + 1), share.attempts) for row in share.rows)
             for row, answer in zip(share.rows, answers, strict=True):
                 results[row] = answer
-            if not client.is_open:
-                self._lose(client, None)
-                return
 
     def _lose(self, client: UpstreamClient, reason: VLAgentsError | None) -> None:
         with self._changed:

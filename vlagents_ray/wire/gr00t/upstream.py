@@ -1,7 +1,9 @@
 """The client's side of GR00T's protocol: requests that are written, and replies that are read within bounds.
 
 The facts are those of `codec`: N1.5's clients send flat keys and get the action alone; those of N1.6 and newer send
-`{"observation": {...}, "options": None}` and get `[action, info]`.
+`{"observation": {...}, "options": None}` and get `[action, info]`. The observation is nested, or flat for servers that
+run with `--use-sim-policy-wrapper`. A server that marks its modalities with `__ModalityConfig__` reads arrays of
+`msgpack_numpy`.
 """
 
 from __future__ import annotations
@@ -19,6 +21,8 @@ from vlagents_ray.wire import msgpack
 from vlagents_ray.wire.gr00t import npy
 
 _KEYS_AT_MOST = 64
+_ARRAYS = ("video", "state")
+_PACKED = "__ModalityConfig__"  # older servers write `__ModalityConfig_class__`
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +31,20 @@ class Modality:
 
     keys: tuple[str, ...]
     steps: tuple[int, ...]
+
+
+def is_flat(observation: Mapping[str, Any]) -> bool:
+    """Return whether the keys of an observation are like `video.front`, and not `front` within `video`."""
+    return not any(kind in observation for kind in _ARRAYS)
+
+
+def nested(observation: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a flat observation as a nested one; what is no array of a camera or a state is its instruction."""
+    found: dict[str, Any] = {kind: {} for kind in (*_ARRAYS, "language")}
+    for key, value in observation.items():
+        kind, _, name = key.partition(".")
+        found[kind if kind in _ARRAYS else "language"][name if kind in _ARRAYS else key] = value
+    return found
 
 
 def batch(observations: Sequence[Mapping[str, Any]], text_key: str) -> dict[str, Any]:
@@ -43,7 +61,7 @@ def batch(observations: Sequence[Mapping[str, Any]], text_key: str) -> dict[str,
         ValueError: The observations have different keys or shapes, and cannot be one batch.
     """
     first = observations[0]
-    kinds = {kind: list(first.get(kind, {})) for kind in ("video", "state")}
+    kinds = {kind: list(first.get(kind, {})) for kind in _ARRAYS}
     if any(list(one.get(kind, {})) != names for one in observations for kind, names in kinds.items()):
         raise ValueError("the observations have different keys")
     joined: dict[str, Any] = {
@@ -55,15 +73,16 @@ def batch(observations: Sequence[Mapping[str, Any]], text_key: str) -> dict[str,
 
 
 def flat(batched: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a batch with N1.5's keys: `video.NAME`, `state.NAME`, and the instruction's own key with B texts."""
-    named = {f"{kind}.{name}": array for kind in ("video", "state") for name, array in batched[kind].items()}
+    """Return a batch with flat keys: `video.NAME`, `state.NAME`, and the instruction's own key with B texts."""
+    named = {f"{kind}.{name}": array for kind in _ARRAYS for name, array in batched[kind].items()}
     return named | {key: [text for [text] in texts] for key, texts in batched["language"].items()}
 
 
-def write(endpoint: str, data: Any, api_token: str | None) -> bytes:
-    """Return the message of a request; `data` is left out if it is None."""
+def write(endpoint: str, data: Any, api_token: str | None, *, packed: bool = False) -> bytes:
+    """Return the message of a request; `data` is left out if it is None; `packed` is that of `reads_packed`."""
+    array = npy.write_packed if packed else npy.write_npy
     message = {"endpoint": endpoint} | ({} if data is None else {"data": data})
-    return msgpack.pack(message | ({"api_token": api_token} if api_token else {}), npy.write_npy)
+    return msgpack.pack(message | ({"api_token": api_token} if api_token else {}), array)
 
 
 def read(payload: bytes, limits: Limits = DEFAULT_LIMITS) -> Any:
@@ -95,6 +114,11 @@ def read_actions(reply: Any, number: int) -> list[dict[str, np.ndarray]]:
         }
         for i in range(number)
     ]
+
+
+def reads_packed(reply: Any) -> bool:
+    """Return whether what `get_modality_config` answered is of a server that reads arrays of `msgpack_numpy`."""
+    return isinstance(reply, dict) and any(isinstance(one, dict) and _PACKED in one for one in reply.values())
 
 
 def read_modalities(reply: Any) -> dict[str, Modality]:

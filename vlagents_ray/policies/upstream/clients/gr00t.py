@@ -16,7 +16,10 @@ from vlagents_ray.wire.mapping.outgoing import Outgoing
 
 
 class GR00TClient(UpstreamClient):
-    """A client of N1.6 and newer, or of N1.5, whose modalities say so: their keys are like `video.front`."""
+    """A client of N1.6 and newer, or of N1.5, whose modalities say so: their keys are like `video.front`.
+
+    If the mapping's keys are like that, so are those of the observation, as `Gr00tSimPolicyWrapper` reads it.
+    """
 
     batches: ClassVar[bool] = True
     mapping: ClassVar[str | None] = "gr00t"
@@ -30,10 +33,11 @@ class GR00TClient(UpstreamClient):
         self._monitor: Any = None
         self._text_key = TEXT_KEY
         self._flat = False
+        self._packed = False
 
     @property
     def is_open(self) -> bool:
-        return self._socket is not None
+        return self._socket is not None and not self._monitor.poll(0)
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
         zmq = self._zmq
@@ -46,7 +50,7 @@ class GR00TClient(UpstreamClient):
         try:
             self._socket.connect(self.options.url)
             reply = self._call("get_modality_config", None, timeout_s)
-            self._flat = _is_flat(reply)
+            self._flat, self._packed = _is_flat(reply), wire.reads_packed(reply)
             modalities = wire.read_modalities(reply)
         except (zmq.ZMQError, VLAgentsError) as error:
             self.close()
@@ -56,11 +60,15 @@ class GR00TClient(UpstreamClient):
         return {name: {"keys": list(one.keys), "steps": list(one.steps)} for name, one in modalities.items()}
 
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
+        is_flat = wire.is_flat(observations[0])
         try:
-            batched = wire.batch(observations, self._text_key)
+            batched = wire.batch(
+                [wire.nested(one) for one in observations] if is_flat else observations, self._text_key
+            )
         except ValueError as error:
             raise InvalidObservation(f"gr00t: {error}; all sessions of a deployment must send the same") from error
-        data = wire.flat(batched) if self._flat else {"observation": batched, "options": None}
+        named = wire.flat(batched) if self._flat or is_flat else batched
+        data = named if self._flat else {"observation": named, "options": None}
         reply = self._call("get_action", data, self.options.timeout_s)
         return list(wire.read_actions(reply, len(observations)))
 
@@ -111,7 +119,7 @@ class GR00TClient(UpstreamClient):
         deadline = time.monotonic() + timeout_s
         try:
             self._wait(self._zmq.POLLOUT, deadline, "it takes no connection")
-            self._socket.send(wire.write(endpoint, data, self.options.key), self._zmq.NOBLOCK)
+            self._socket.send(wire.write(endpoint, data, self.options.key, packed=self._packed), self._zmq.NOBLOCK)
             self._wait(self._zmq.POLLIN, deadline, "no answer")
             payload = self._socket.recv(self._zmq.NOBLOCK)
         except self._zmq.ZMQError as error:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import http.client
+import select
 import socket
+import ssl
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 from urllib.parse import urlsplit
@@ -37,7 +39,14 @@ class OpenVLAClient(UpstreamClient):
 
     @property
     def is_open(self) -> bool:
-        return self._connection is not None
+        sock = self._connection.sock if self._connection is not None else None
+        if sock is None:
+            return False
+        if isinstance(sock, ssl.SSLSocket):
+            return True  # what can be read may be a ticket of TLS
+        ended = select.poll()  # uvicorn closes a connection that is idle for 5 s
+        ended.register(sock, select.POLLIN)
+        return not ended.poll(0)
 
     def connect(self, timeout_s: float) -> dict[str, Any]:
         secure = self._url.scheme == "https"

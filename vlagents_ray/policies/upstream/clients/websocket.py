@@ -8,6 +8,7 @@ import logging
 from typing import TYPE_CHECKING, Any
 
 from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidStatus
+from websockets.protocol import State
 from websockets.sync.client import connect
 
 from vlagents_ray.errors import ConnectionLost, PolicyUnavailable, Unauthorized
@@ -40,7 +41,7 @@ class UpstreamSocket:
     @property
     def is_open(self) -> bool:
         """Whether messages can be sent."""
-        return self._connection is not None
+        return self._connection is not None and self._connection.protocol.state is State.OPEN
 
     def open(self, timeout_s: float) -> None:
         """Connect; raises `PolicyUnavailable` if it cannot be reached, `Unauthorized` if it refuses the key."""
@@ -64,7 +65,7 @@ class UpstreamSocket:
                     f"variable with the right one in key_env"
                 ) from error
             raise PolicyUnavailable(f"upstream {url}: refused with HTTP {error.response.status_code}") from error
-        except (OSError, InvalidHandshake, TimeoutError) as error:
+        except (OSError, InvalidHandshake, ConnectionClosed, TimeoutError) as error:
             raise PolicyUnavailable(f"upstream {url}: cannot connect ({error}); is it running?") from error
 
     def send(self, message: bytes) -> None:
