@@ -45,9 +45,9 @@ ENVS: dict[str, str] = {
     "libero": "vlagents_ray.envs.libero:Libero",
     "simpler": "vlagents_ray.envs.simpler:Simpler",
     "aloha": "vlagents_ray.envs.aloha:Aloha",
-    "pusht": "vlagents_ray.envs.pusht:PushT",
+    "pusht": "vlagents_ray.envs.gymnasium.pusht:PushT",
     "gymnasium": "vlagents_ray.envs.gymnasium:Gymnasium",
-    "hub": "vlagents_ray.envs.hub:EnvHub",
+    "hub": "vlagents_ray.envs.gymnasium.hub:EnvHub",
     "rcs": "vlagents_ray.envs.rcs:Rcs",
     "duobench": "vlagents_ray.envs.rcs:DuoBench",
 }

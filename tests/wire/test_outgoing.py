@@ -31,6 +31,11 @@ def fitting(mapping: KeyMapping) -> Obs:
     return Obs({name.replace("*", "ego"): IMAGE for name in mapping.cameras}, gripper, state)
 
 
+def test_parts_whose_lengths_nothing_says_are_refused_before_anything_is_sent() -> None:
+    with pytest.raises(ConfigError, match=r"mapping.state.pose: got 2 parts without `stop`, want one at most"):
+        outgoing(state={"pose": ["a", "b"]})
+
+
 @pytest.mark.parametrize("name", sorted(set(PRESETS) - {"gr00t-n1.5"}))  # its client makes N1.5's keys
 def test_what_is_written_by_a_preset_is_read_by_it(name: str) -> None:
     mapping = read_mapping(name)

@@ -30,11 +30,19 @@ class Outgoing:
         mapping: The mapping.
         is_nested: Whether a key `a/b` is the key `b` within `a`, and not one key.
         text_key: What the `*` of the instruction's key stands for.
+
+    Raises:
+        ConfigError: A state has several parts without `stop`, of which nothing says how long each is.
     """
 
     mapping: KeyMapping
     is_nested: Callable[[str], bool] = lambda _key: True
     text_key: str = "task"
+
+    def __post_init__(self) -> None:
+        for name, parts in self.mapping.state.items():
+            if (open_ended := sum(part.stop is None for part in parts)) > 1:
+                raise ConfigError(f"mapping.state.{name}: got {open_ended} parts without `stop`, want one at most")
 
     def observation(self, obs: Obs, instruction: str | None) -> dict[str, Any]:
         """Return an observation as the other system's server reads it; its arrays may view those of `obs`.
@@ -189,8 +197,6 @@ def _width(parts: tuple[StateKey, ...]) -> int | None:
 def _split(name: str, vector: np.ndarray, keys: list[tuple[str, StateKey]]) -> list[tuple[str, StateKey, np.ndarray]]:
     """Return the parts of a state's vector; the last one without `stop` has what the others leave."""
     widths = [_width((part,)) for _, part in keys]
-    if widths.count(None) > 1:
-        raise ConfigError(f"mapping.state.{name}: got {widths.count(None)} parts without `stop`, want one at most")
     known = sum(width for width in widths if width is not None)
     if (vector.size < known) if None in widths else (vector.size != known):
         raise InvalidObservation(

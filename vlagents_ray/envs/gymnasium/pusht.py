@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from vlagents_ray.envs.base import require_known
-from vlagents_ray.envs.gymnasium import Gymnasium
+from vlagents_ray.envs.gymnasium.env import Gymnasium
 
 _ID = "gym_pusht/PushT-v0"
 # What is observed in each task: options of `Gymnasium`.

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from vlagents_ray.contract import Contract
-from vlagents_ray.envs.gymnasium import Gymnasium
+from vlagents_ray.envs.gymnasium.env import Gymnasium
 from vlagents_ray.envs.gymnasium.vector_rows import VectorRows
 from vlagents_ray.errors import ConfigError, EnvFailed, MissingDependency, UnknownEnv
 from vlagents_ray.registry import require
