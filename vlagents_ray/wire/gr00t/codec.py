@@ -101,10 +101,10 @@ def read_observations(data: Mapping[str, Any]) -> Observations:
     """Return the observations in the data of a `get_action`; raise `InvalidObservation` for wrong shapes."""
     paired = isinstance(data.get("observation"), dict)
     observation = data["observation"] if paired else data
-    flat = not any(isinstance(observation.get(kind), dict) for kind in _MODALITIES)
-    nested = _nested(observation) if flat else observation
-    video = _arrays(nested.get("video"), "video")
-    state = _arrays(nested.get("state"), "state")
+    flat = is_flat(observation)
+    named = nested(observation) if flat else observation
+    video = _arrays(named.get("video"), "video")
+    state = _arrays(named.get("state"), "state")
     axes = {array.ndim - usual for group, usual in ((video, 4), (state, 2)) for array in group.values()}
     if not axes or not axes <= {0, 1} or len(axes) != 1:
         shapes = {name: array.shape for name, array in list((video | state).items())[:8]}
@@ -114,7 +114,7 @@ def read_observations(data: Mapping[str, Any]) -> Observations:
     if len(sizes) != 1 or not 0 < min(sizes) <= _BATCH:
         raise InvalidObservation(f"observation: got batches of {sorted(sizes)}, want the same, 1 to {_BATCH}, in all")
     number = sizes.pop()
-    texts = _texts(nested.get("language"), number)
+    texts = _texts(named.get("language"), number)
     if not batched:
         video = {name: array[None] for name, array in video.items()}
         state = {name: array[None] for name, array in state.items()}
@@ -129,6 +129,23 @@ def read_observations(data: Mapping[str, Any]) -> Observations:
         for i in range(number)
     )
     return Observations(each, batched, flat, paired)
+
+
+def is_flat(observation: Mapping[str, Any]) -> bool:
+    """Return whether keys are like "video.front", and not "front" in a map "video"."""
+    return not any(isinstance(observation.get(kind), dict) for kind in _MODALITIES)
+
+
+def nested(flat: Mapping[str, Any]) -> dict[str, Any]:
+    """Return {"video": {"front": …}} for {"video.front": …}; keys other than video and state belong to the language."""
+    found: dict[str, Any] = {kind: {} for kind in _MODALITIES}
+    for key, value in flat.items():
+        kind, _, name = key.partition(".") if isinstance(key, str) else ("", "", "")
+        if kind in ("video", "state"):
+            found[kind][name] = value
+        else:
+            found["language"][key] = value
+    return found
 
 
 def newest(observation: Mapping[str, Any]) -> dict[str, Any]:
@@ -179,18 +196,6 @@ def _flat(modality: str, key: str) -> str:
 def pack(value: Any, *, packed: bool = False) -> bytes:
     """Return a message with `value`; `packed` writes arrays in the format of `msgpack_numpy`."""
     return msgpack.pack(value, npy.write_packed if packed else npy.write_npy)
-
-
-def _nested(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """Return {"video": {"front": …}} for {"video.front": …}; keys other than video and state belong to the language."""
-    nested: dict[str, Any] = {kind: {} for kind in _MODALITIES}
-    for key, value in flat.items():
-        kind, _, name = key.partition(".") if isinstance(key, str) else ("", "", "")
-        if kind in ("video", "state"):
-            nested[kind][name] = value
-        else:
-            nested["language"][key] = value
-    return nested
 
 
 def _arrays(group: Any, kind: str) -> dict[str, np.ndarray]:

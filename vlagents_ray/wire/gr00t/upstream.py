@@ -33,20 +33,6 @@ class Modality:
     steps: tuple[int, ...]
 
 
-def is_flat(observation: Mapping[str, Any]) -> bool:
-    """Return whether the keys of an observation are like `video.front`, and not `front` within `video`."""
-    return not any(kind in observation for kind in _ARRAYS)
-
-
-def nested(observation: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a flat observation as a nested one; what is no array of a camera or a state is its instruction."""
-    found: dict[str, Any] = {kind: {} for kind in (*_ARRAYS, "language")}
-    for key, value in observation.items():
-        kind, _, name = key.partition(".")
-        found[kind if kind in _ARRAYS else "language"][name if kind in _ARRAYS else key] = value
-    return found
-
-
 def batch(observations: Sequence[Mapping[str, Any]], text_key: str) -> dict[str, Any]:
     """Return observations of one moment each as one batch.
 

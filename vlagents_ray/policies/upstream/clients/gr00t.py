@@ -10,7 +10,7 @@ from vlagents_ray.errors import ConnectionLost, InvalidObservation, PolicyUnavai
 from vlagents_ray.policies.upstream.clients.base import Answer, ClientOptions, UpstreamClient
 from vlagents_ray.registry import require
 from vlagents_ray.wire.gr00t import upstream as wire
-from vlagents_ray.wire.gr00t.codec import TEXT_KEY
+from vlagents_ray.wire.gr00t.codec import TEXT_KEY, is_flat, nested
 from vlagents_ray.wire.mapping.key_paths import matches
 from vlagents_ray.wire.mapping.outgoing import Outgoing
 
@@ -60,14 +60,12 @@ class GR00TClient(UpstreamClient):
         return {name: {"keys": list(one.keys), "steps": list(one.steps)} for name, one in modalities.items()}
 
     def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
-        is_flat = wire.is_flat(observations[0])
+        flat = is_flat(observations[0])
         try:
-            batched = wire.batch(
-                [wire.nested(one) for one in observations] if is_flat else observations, self._text_key
-            )
+            batched = wire.batch([nested(one) for one in observations] if flat else observations, self._text_key)
         except ValueError as error:
             raise InvalidObservation(f"gr00t: {error}; all sessions of a deployment must send the same") from error
-        named = wire.flat(batched) if self._flat or is_flat else batched
+        named = wire.flat(batched) if self._flat or flat else batched
         data = named if self._flat else {"observation": named, "options": None}
         reply = self._call("get_action", data, self.options.timeout_s)
         return list(wire.read_actions(reply, len(observations)))
