@@ -62,6 +62,16 @@ def test_no_info_may_be_said_with_none() -> None:
     assert reply.act.info == {"policy": {"version": 1}}
 
 
+def test_sessions_to_which_a_policy_gives_one_info_have_each_their_own() -> None:
+    """What the server adds to one answer, such as a command to that robot, is in no other."""
+    shared = {"upstream_ms": 1.0}
+    (one, _), (other, _) = replied(Act(np.zeros(1), info=shared)), replied(Act(np.zeros(1), info=shared))
+    assert one.act is not None
+    assert other.act is not None
+    one.act.info["command"] = "stop"
+    assert other.act.info == shared == {"upstream_ms": 1.0}
+
+
 def test_nothing_of_what_is_too_large_is_copied_or_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(responses, "check_action", lambda *_: pytest.fail("looked at"))
     monkeypatch.setattr(np, "ascontiguousarray", lambda *_: pytest.fail("copied"))
