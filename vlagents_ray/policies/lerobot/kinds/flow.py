@@ -34,9 +34,8 @@ class Flow(Kind):
             self.passes: FlowPasses = SmolVLAPasses(model, compilation)
         else:
             self.passes = Pi0Passes(model, compilation, stated=policy.name == "pi0")
-        model.sample_actions = (
-            self.passes.sample
-        )  # which the policy calls between its own preparation of inputs and actions
+        # The policy calls it between its own preparation of inputs and actions.
+        model.sample_actions = self.passes.sample
 
     @property
     def flow_steps(self) -> int:
