@@ -72,14 +72,14 @@ def test_maniskill_is_solved_whatever_the_number_of_workers(ray_home: Path, tmp_
     for workers in ("1", "2"):
         out = tmp_path / workers
         done = evaluate(
-            ray_home, "maniskill/PushCube-v1", "maniskill/PickCube-v1", "--policy", "scripted", "--episodes", "2",
+            ray_home, "maniskill/PushCube-v1", "--policy", "scripted", "--episodes", "2",
             "--workers", workers, "--video", "none", "--out", str(out),
         )  # fmt: skip
         assert done.returncode == 0, done.stdout + done.stderr
-        for env in json.loads((out / "summary.json").read_text())["cells"]:
-            assert env["success_once"]["successes"] == 2, env
+        [cell] = json.loads((out / "summary.json").read_text())["cells"]
+        assert cell["success_once"]["successes"] == 2, cell
         found.append(rows(out))
-    assert len(found[0]) == 4
+    assert len(found[0]) == 2
     assert found[0] == found[1]
 
 

@@ -19,8 +19,8 @@ from vlagents_ray.client.transports.codec_selection import CodecName
 from vlagents_ray.client.transports.select import TransportName
 from vlagents_ray.serve.launch.server import Server
 
-# 10,000 in all; VLAGENTS_SESSIONS=N opens N by each transport
-SESSIONS: dict[TransportName, int] = {"shm": 6400, "websocket": 1200, "http": 1200, "handle": 600, "plasma": 600}
+# So many that a kilobyte or two of each shows; VLAGENTS_SESSIONS=N opens N by each transport
+SESSIONS: dict[TransportName, int] = {"shm": 2400, "websocket": 600, "http": 600, "handle": 300, "plasma": 300}
 MIB = 2**20
 ROUNDS = 4
 MOST = {"descriptors": 2, "threads": 2, "maps": 1, "own descriptors": 2, "own threads": 2}  # that may be left

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
 
@@ -221,12 +222,11 @@ def test_there_is_an_example_of_each_method() -> None:
 
 
 SMALL = {
-    "methods": ["bc", "rpd", "grpo"],
+    "methods": ["bc", "rpd"],  # what a learner of groups goes through is in test_tabletop_grpo.py
     "demonstrations": 8,
     "clone_steps": 300,
     "iterations": 2,
     "episodes": 8,
-    "groups": 4,
     "steps": 50,
     "evaluate_every": 2,
     "held_out": 6,
@@ -242,24 +242,40 @@ def folder() -> Iterator[Path]:
         yield folder
 
 
+@dataclass
+class WatchedRun:
+    """A run in which nothing was killed, and what its live page said meanwhile."""
+
+    table: dict[str, Any]
+    steps: set[int]  # that the curves have a point at
+    states: set[str]  # of the evaluation
+
+
 @pytest.fixture(scope="module")
-def undisturbed(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """The table of a run in which nothing was killed."""
+def undisturbed(folder: Path, tmp_path_factory: pytest.TempPathFactory) -> WatchedRun:
+    """A run that ends by itself, watched while it learns."""
     out = tmp_path_factory.mktemp("runs") / "whole"
-    with start_run(folder, out) as run:
+    page, seen, states = LivePage(), set[int](), set[str]()
+    with start_run(folder, out, "--live-at", page.address) as run:
+        while run.poll() is None:
+            seen |= set(page.steps())
+            states |= {page.evaluation().get("state", "")}
+            time.sleep(0.2)
         printed = ended(run, folder)
     assert "demonstrations: 8 of 8 episodes solved" in printed
+    assert f"live: {page.url}/live" in printed
     assert (out / "report.html").is_file()
     found = table(out)
-    # A learner of groups takes no step if each group has one outcome.
-    assert list(found)[:3] == ["bc@300", "rpd@400", "grpo@300"]
-    return found
+    assert list(found) == ["bc@300", "rpd@400"]
+    return WatchedRun(found, seen, states)
 
 
 @pytest.mark.server
 @pytest.mark.torch
 @pytest.mark.slow
-def test_a_killed_run_goes_on_to_the_same_table(folder: Path, undisturbed: dict[str, Any], tmp_path: Path) -> None:
+def test_a_killed_run_that_nobody_watches_goes_on_to_the_same_table(
+    folder: Path, undisturbed: WatchedRun, tmp_path: Path
+) -> None:
     out = tmp_path / "run"
     with start_run(folder, out) as run:
         wait_until_rpd_learns(run, out)
@@ -267,13 +283,13 @@ def test_a_killed_run_goes_on_to_the_same_table(folder: Path, undisturbed: dict[
     end(folder)
     with start_run(folder, out, "--resume") as run:
         assert "demonstrations:" not in ended(run, folder)
-    assert table(out) == undisturbed
+    assert table(out) == undisturbed.table
 
 
 @pytest.mark.server
 @pytest.mark.torch
 @pytest.mark.slow
-def test_killed_replicas_and_workers_change_nothing(folder: Path, undisturbed: dict[str, Any], tmp_path: Path) -> None:
+def test_killed_replicas_and_workers_change_nothing(folder: Path, undisturbed: WatchedRun, tmp_path: Path) -> None:
     out, pushed, killed = tmp_path / "run", tmp_path / "pushed", tmp_path / "killed"
     with start_run(folder, out, before=HELD.format(pushed=str(pushed), killed=str(killed))) as run:
         wait_for(lambda: pushed.exists() or run.poll() is not None, timeout_s=400)
@@ -282,25 +298,15 @@ def test_killed_replicas_and_workers_change_nothing(folder: Path, undisturbed: d
                 os.kill(pid, signal.SIGKILL)
         killed.touch()
         assert "once more, as the policy was restarted" in ended(run, folder)
-    assert table(out) == undisturbed
+    assert table(out) == undisturbed.table
 
 
 @pytest.mark.server
 @pytest.mark.torch
 @pytest.mark.slow
-def test_a_run_is_watched_while_it_learns_and_gets_the_same_table(
-    folder: Path, undisturbed: dict[str, Any], tmp_path: Path
-) -> None:
-    page, seen, states = LivePage(), set[int](), set[str]()
-    with start_run(folder, tmp_path / "run", "--live-at", page.address) as run:
-        while run.poll() is None:
-            seen |= set(page.steps())
-            states |= {page.evaluation().get("state", "")}
-            time.sleep(0.2)
-        assert f"live: {page.url}/live" in ended(run, folder)
-    assert table(tmp_path / "run") == undisturbed
-    assert {300, 400} <= seen  # those that are evaluated
-    assert "waiting" in states
+def test_a_run_is_watched_while_it_learns(undisturbed: WatchedRun) -> None:
+    assert {300, 400} <= undisturbed.steps  # those that are evaluated
+    assert "waiting" in undisturbed.states
 
 
 # A run that waits when the replica of `rpd` holds the weights of its second iteration, before episodes are played.
