@@ -27,8 +27,8 @@ from many import many
 from vlagents_ray.errors import InvalidInput, MalformedMessage, MessageTooLarge
 from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.messages import Limits
-from vlagents_ray.serve.dialects.lerobot import codec
 from vlagents_ray.serve.presets import read_mapping
+from vlagents_ray.wire.lerobot import codec
 
 LIMITS = Limits(body_bytes=2**20)
 MUTATED = int(os.environ.get("VLAGENTS_RAY_FUZZ", many(5000)))

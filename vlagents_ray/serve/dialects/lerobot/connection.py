@@ -16,9 +16,9 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.dialects.base import GatewayContext
 from vlagents_ray.serve.dialects.gateway_sessions import GatewaySessions
-from vlagents_ray.serve.dialects.lerobot import codec
-from vlagents_ray.serve.dialects.lerobot.codec import PolicyInstructions, RobotObservation
 from vlagents_ray.serve.engine.admission import MessageAdmission
+from vlagents_ray.wire.lerobot import codec
+from vlagents_ray.wire.lerobot.codec import PolicyInstructions, RobotObservation
 from vlagents_ray.wire.mapping.mapping import KeyMapping
 
 logger = logging.getLogger(__name__)

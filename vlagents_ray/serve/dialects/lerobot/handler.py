@@ -20,10 +20,10 @@ from vlagents_ray.registry import require
 from vlagents_ray.serve.config.dialects import KeylessPortConfig, MappingSetting
 from vlagents_ray.serve.dialects.base import GatewayContext, PortDialect
 from vlagents_ray.serve.dialects.gateway_clients import GatewayClients
-from vlagents_ray.serve.dialects.lerobot import codec, protobuf
 from vlagents_ray.serve.dialects.lerobot.connection import LeRobotConnection
-from vlagents_ray.serve.dialects.lerobot.protobuf import TransferState
 from vlagents_ray.serve.engine.admission import MessageAdmission
+from vlagents_ray.wire.lerobot import codec, protobuf
+from vlagents_ray.wire.lerobot.protobuf import TransferState
 
 logger = logging.getLogger(__name__)
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from vlagents_ray.errors import MalformedMessage
 from vlagents_ray.protocol.arrays import read_array
-from vlagents_ray.serve.dialects.lerobot.pickles import Call, Name, Reduced
+from vlagents_ray.wire.lerobot.pickles import Call, Name, Reduced
 
 
 class _Dtype(str):

@@ -19,8 +19,8 @@ from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageToo
 from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.protocol.observations import is_number
-from vlagents_ray.serve.dialects.lerobot.pickled_arrays import CALLS
-from vlagents_ray.serve.dialects.lerobot.pickles import Name, read_pickle
+from vlagents_ray.wire.lerobot.pickled_arrays import CALLS
+from vlagents_ray.wire.lerobot.pickles import Name, read_pickle
 
 _HELPERS = "lerobot.async_inference.helpers"
 _SETUP, _OBSERVATION = Name(_HELPERS, "RemotePolicyConfig"), Name(_HELPERS, "TimedObservation")

@@ -1,0 +1,1 @@
+"""LeRobot's asynchronous inference: its gRPC messages, and the pickles in them, which are read as data."""
