@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import subprocess
 import sys
 import threading
@@ -30,6 +31,11 @@ def descriptors() -> set[str]:
 def running_threads() -> set[threading.Thread]:
     """The threads that run now."""
     return set(threading.enumerate())
+
+
+def unpooled_threads() -> list[str]:
+    """Names of the threads outside of executors, whose pools grow when they must, up to a size."""
+    return [thread.name for thread in threading.enumerate() if not re.search(r"_\d+$", thread.name)]
 
 
 @pytest.hookimpl(tryfirst=True)

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import psutil
 from eval_fakes import ToZero, wait_for
+from process_resources import unpooled_threads
 from shared_cpu_memory import SharedCpuMemory
 
 from vlagents_ray import Act, Agent, Obs
@@ -170,7 +171,7 @@ class Accountant(Agent):
         process = psutil.Process()
         return {
             "descriptors": process.num_fds(),
-            "threads": process.num_threads(),
+            "threads": len(unpooled_threads()),
             "maps": Path("/proc/self/maps").read_text().count("memfd:vlagents-ray"),
             "resident": process.memory_info().rss,
         }
