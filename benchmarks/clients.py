@@ -1,7 +1,7 @@
 """Round trips of the clients in other languages beside those of the Python client, in turns at one server.
 
 Each client is a process of its own, and all send the same pixels as they are. The client in TypeScript is built before:
-`cd clients/typescript && npm ci && npm run build`.
+`cd clients/typescript && npm ci && npm run build`. The one in C++ is compiled here; it wants what its README.md names.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import shutil
+import subprocess
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -26,8 +27,10 @@ from vlagents_ray.interface import Obs
 from vlagents_ray.serve.launch.deployment_file import deployment
 from vlagents_ray.serve.launch.server import running_server
 
-TYPESCRIPT = Path(__file__).parents[1] / "clients" / "typescript"
+HERE, CLIENTS = Path(__file__).parent, Path(__file__).parents[1] / "clients"
+TYPESCRIPT = CLIENTS / "typescript"
 PYTHON = (OwnClient("websocket", "raw"), OwnClient("http", "raw"))
+CPP = "C++, websocket"
 NODE = {"Node.js, websocket": "websocket", "Node.js, http": "http"}
 
 
@@ -35,7 +38,7 @@ def measure_clients(url: str, calls: int, progress: Callable[[str], None] = lamb
     """Measure `calls` round trips of each client at the server of `url`.
 
     Raises:
-        ConfigError: Node.js is missing, or the client was not built.
+        ConfigError: Node.js or the compiler is missing, or the client in TypeScript was not built.
     """
     node = shutil.which("node")
     if node is None or not (TYPESCRIPT / "dist" / "index.js").exists():
@@ -46,13 +49,28 @@ def measure_clients(url: str, calls: int, progress: Callable[[str], None] = lamb
         drivers: dict[str, Driver] = {
             f"Python, {one.transport}": stack.enter_context(connected(one, url, "")) for one in PYTHON
         }
-        script = str(Path(__file__).with_name("node_client.mjs"))
+        drivers[CPP] = ProcessDriver(stack.enter_context(LineProcess(CPP, [_compiled(folder), url, str(folder)])))
+        script = str(HERE / "node_client.mjs")
         for name, transport in NODE.items():
             command = [node, script, str(TYPESCRIPT / "dist" / "index.js"), url, transport, str(folder)]
             drivers[name] = ProcessDriver(stack.enter_context(LineProcess(name, command)))
         for driver in drivers.values():
             driver.ready()
         return RoundTripsOfAll(tuple(in_turns(drivers, calls, progress).values()))
+
+
+def _compiled(folder: Path) -> str:
+    """Return the path of the C++ client, compiled as a release is."""
+    program = str(folder / "cpp_client")
+    command = ["c++", "-std=c++17", "-O2", f"-I{CLIENTS / 'cpp' / 'include'}", str(HERE / "cpp_client.cpp")]
+    try:
+        subprocess.run([*command, "-o", program, "-ljpeg", "-pthread"], check=True, capture_output=True, text=True)
+    except (FileNotFoundError, subprocess.CalledProcessError) as error:
+        said = getattr(error, "stderr", error)
+        raise ConfigError(
+            f"clients: want what {CLIENTS / 'cpp' / 'README.md'} installs; the compiler: {said}"
+        ) from error
+    return program
 
 
 def _save(obs: Obs, folder: Path) -> None:

@@ -11,11 +11,12 @@ from vlagents_ray.errors import ConfigError
 
 
 @pytest.mark.node
+@pytest.mark.compiler
 def test_all_clients_are_measured_in_turns() -> None:
     typescript_client.build()
     with client_servers() as urls:
         found = clients.measure_clients(urls["VLAGENTS_TEST_URL"], 20)
-    assert [trips.name for trips in found.ours] == ["Python, websocket", "Python, http", *clients.NODE]
+    assert [trips.name for trips in found.ours] == ["Python, websocket", "Python, http", clients.CPP, *clients.NODE]
     assert all(trips.rounds.shape == (1, 20) and trips.median > 0 for trips in found.ours)
 
 

@@ -64,7 +64,7 @@ class Driver {
     const std::string what = asked["do"];
     if (what == "decode") return decode(from_hex(asked["data"]));
     if (what == "reply") return reply(from_hex(asked["data"]));
-    if (what == "request") return to_hex(detail::encode_frame(request(asked)));
+    if (what == "request") return request(asked);
     if (what == "jpeg") return to_hex(detail::prepared(observation(asked["obs"]), asked["quality"]).cameras.at("front").data);
     if (what == "connect") return connect(asked);
     if (what == "metadata") return client_->metadata();
@@ -123,19 +123,34 @@ class Driver {
     const detail::Frame frame = detail::decode_frame(data);
     Json blobs = Json::array();
     for (const Bytes& blob : frame.blobs) blobs.push_back(to_hex(blob));
-    const detail::Frame again = detail::decode_frame(detail::encode_frame(frame));
+    const detail::Frame again = detail::decode_frame(encoded({frame.header, views(frame.blobs)}));
     return {{"header", frame.header},
             {"blobs", blobs},
             {"same", again.header == frame.header && again.blobs == frame.blobs},
             {"values", detail::resolved(frame.header, frame.blobs)}};
   }
 
+  static Bytes encoded(const detail::Request& request) {
+    Bytes data;
+    detail::encode_frame(request, data);
+    return data;
+  }
+
+  static std::vector<detail::View> views(const std::vector<Bytes>& blobs) {
+    std::vector<detail::View> found;
+    for (const Bytes& blob : blobs) found.push_back({blob.data(), blob.size()});
+    return found;
+  }
+
   // What `reset` and `act` send, but for what names the session and the request.
-  static detail::Frame request(const Json& asked) {
-    if (asked["op"] == "act") return detail::act_request(observation(asked["obs"]));
+  static Json request(const Json& asked) {
+    if (asked["op"] == "act") {
+      const Observation obs = observation(asked["obs"]);
+      return to_hex(encoded(detail::act_request(obs)));
+    }
     detail::Episode episode{observation(asked["obs"]), asked["instruction"], asked.value("kwargs", Json::object()), {}};
     for (const Json& each : asked.value("history", Json::array())) episode.later.push_back(observation(each));
-    return detail::reset_request(episode, asked.value("contract", Json()));
+    return to_hex(encoded(detail::reset_request(episode, asked.value("contract", Json()))));
   }
 
   // A reply as `act`, `reset` and `close` read it.

@@ -81,8 +81,8 @@ class Client {
     const std::lock_guard<std::mutex> guard(mutex_);
     if (!begun_) throw Error("not_reset", "call reset with the first observation and the instruction");
     const auto deadline = detail::Deadline::in(options_.timeout_s);
-    Observation sent = detail::prepared(obs, options_.jpeg_quality);
-    const detail::Frame request = detail::act_request(sent);
+    Observation sent = detail::prepared(obs, options_.jpeg_quality, std::exchange(spare_, {}));
+    const detail::Request request = detail::act_request(sent);
     bool resumed = false;
     if (!answers(deadline)) drop();
     if (connection_ == nullptr && !options_.resume)
@@ -118,9 +118,9 @@ class Client {
     try {
       const std::lock_guard<std::mutex> guard(mutex_);
       if (begun_ && connection_ != nullptr && !connection_->broken()) {
-        detail::Frame request;
+        detail::Request request;
         request.header["op"] = "close";
-        exchange(request, detail::Deadline::in(std::min(options_.timeout_s, 1.0)));
+        exchange(std::move(request), detail::Deadline::in(std::min(options_.timeout_s, 1.0)));
       }
     } catch (const std::exception&) {  // the session ends with the connection
     }
@@ -194,7 +194,7 @@ class Client {
     return connection_->more_than(before, deadline.within(std::min(life_s, deadline.left() / 4)));
   }
 
-  detail::Frame exchange(detail::Frame request, const detail::Deadline& deadline) {
+  detail::Frame exchange(detail::Request request, const detail::Deadline& deadline) {
     const std::string request_id = std::to_string(++requests_);
     const double left_s = deadline.left();
     if (left_s < 0.001) throw Error("deadline_exceeded", "no time was left to send the request");
@@ -238,9 +238,11 @@ class Client {
     episode_.later.push_back(std::move(obs));
     std::size_t bytes = detail::size_of(episode_.first);
     for (const Observation& each : episode_.later) bytes += detail::size_of(each);
-    for (; !episode_.later.empty() && (episode_.later.size() > kept_ || bytes > most_history);
-         episode_.later.pop_front())
+    while (!episode_.later.empty() && (episode_.later.size() > kept_ || bytes > most_history)) {
       bytes -= detail::size_of(episode_.later.front());
+      spare_ = std::move(episode_.later.front());
+      episode_.later.pop_front();
+    }
   }
 
   void drop() noexcept {
@@ -257,6 +259,7 @@ class Client {
   std::unique_ptr<detail::Connection> connection_;
   std::unique_ptr<detail::Connection> left_;  // a draining replica's, until the next one answers
   detail::Episode episode_;
+  Observation spare_;  // one that is no longer kept: the next one is written over it
   std::string session_;
   std::optional<std::string> step_;
   std::optional<std::uint64_t> silent_since_;  // messages received when a call was not answered at all

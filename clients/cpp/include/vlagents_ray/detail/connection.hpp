@@ -34,15 +34,14 @@ class Connection {
   }
 
   /// Send a request, and wait for the reply with its `request_id`. An error of the connection is thrown here.
-  Frame call(const Frame& request, const std::string& request_id, const Deadline& deadline) {
-    const Bytes message = encode_frame(request);
+  Frame call(const Request& request, const std::string& request_id, const Deadline& deadline) {
     {
       const std::lock_guard<std::mutex> guard(mutex_);
       if (failure_) throw *failure_;
       waiting_.emplace(request_id, std::nullopt);
     }
     try {
-      socket_.send(message, deadline);
+      socket_.send([&](Bytes& message) { encode_frame(request, message); }, deadline);
     } catch (const Error&) {
       const std::lock_guard<std::mutex> guard(mutex_);
       waiting_.erase(request_id);
@@ -60,7 +59,7 @@ class Connection {
   /// Ask the server for a sign of life that reaches neither a session nor the policy.
   void probe(const Deadline& deadline) {
     const char text[] = "VLA?\0\0\0";
-    socket_.send(Bytes(text, text + sizeof text), deadline);
+    socket_.send([&](Bytes& message) { message.insert(message.end(), text, text + sizeof text); }, deadline);
   }
 
   /// How many messages came so far.
@@ -107,15 +106,17 @@ class Connection {
 
   void deliver(Frame reply) {
     const auto request_id = text_at(reply.header, "request_id");
-    const std::lock_guard<std::mutex> guard(mutex_);
-    ++received_;
-    if (request_id) {
-      const auto found = waiting_.find(*request_id);
-      if (found != waiting_.end()) found->second = std::move(reply);  // else its call has given up
-    } else if (reply.header.contains("error")) {  // of no request that the server could read, or of the connection
-      for (auto& [_, waited] : waiting_) waited = reply;
+    {
+      const std::lock_guard<std::mutex> guard(mutex_);
+      ++received_;
+      if (request_id) {
+        const auto found = waiting_.find(*request_id);
+        if (found != waiting_.end()) found->second = std::move(reply);  // else its call has given up
+      } else if (reply.header.contains("error")) {  // of no request that the server could read, or of the connection
+        for (auto& [_, waited] : waiting_) waited = reply;
+      }
     }
-    changed_.notify_all();
+    changed_.notify_all();  // a call that wakes up finds the mutex free
   }
 
   void fail(Error error) noexcept {

@@ -23,9 +23,22 @@ namespace vlagents_ray::detail {
 constexpr std::uint8_t protocol_version = 1;
 constexpr std::size_t prefix_size = 8;
 
+/// A frame that was received.
 struct Frame {
   Json header = Json::object();
   std::vector<Bytes> blobs;
+};
+
+/// Bytes of an observation.
+struct View {
+  const std::uint8_t* data;
+  std::size_t size;
+};
+
+/// A frame that is to be sent. Its blobs are parts of observations that outlive it.
+struct Request {
+  Json header = Json::object();
+  std::vector<View> blobs;
 };
 
 /// An array of the wire.
@@ -37,21 +50,22 @@ struct Array {
 
 inline std::size_t padding(std::size_t at) { return (8 - at % 8) % 8; }
 
-inline Bytes encode_frame(const Frame& frame) {
-  Json header = frame.header;
+/// Append the frame to `data`.
+inline void encode_frame(const Request& request, Bytes& data) {
+  Json header = request.header;
   header["blobs"] = Json::array();
-  for (const Bytes& blob : frame.blobs) header["blobs"].push_back(blob.size());
+  for (const View& blob : request.blobs) header["blobs"].push_back(blob.size);
   const std::string text = dump_json(header);
   if (text.size() > std::numeric_limits<std::uint32_t>::max()) throw Error("too_large", "the header of a frame");
-  Bytes data{'V', 'L', 'A', protocol_version};
+  const std::size_t begin = data.size();
+  data.insert(data.end(), {'V', 'L', 'A', protocol_version});
   const auto length = static_cast<std::uint32_t>(text.size());
   for (int shift = 0; shift < 32; shift += 8) data.push_back(static_cast<std::uint8_t>(length >> shift));
   data.insert(data.end(), text.begin(), text.end());
-  for (const Bytes& blob : frame.blobs) {
-    data.resize(data.size() + padding(data.size()));
-    data.insert(data.end(), blob.begin(), blob.end());
+  for (const View& blob : request.blobs) {
+    data.resize(data.size() + padding(data.size() - begin));
+    data.insert(data.end(), blob.data, blob.data + blob.size);
   }
-  return data;
 }
 
 inline Frame decode_frame(const Bytes& data) {

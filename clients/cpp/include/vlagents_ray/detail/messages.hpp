@@ -6,6 +6,7 @@
 #include <cstdint>
 #include <cstring>
 #include <deque>
+#include <iterator>
 #include <random>
 #include <string>
 #include <utility>
@@ -17,30 +18,34 @@
 namespace vlagents_ray::detail {
 
 /// The observation with its raw images as JPEG files; as it is if `quality` is 0.
-inline Observation prepared(const Observation& obs, int quality) {
-  Observation copy = obs;
-  for (auto& [name, image] : copy.cameras) {
+/// @param spare an observation that nobody needs any more, whose memory is used again: fresh pages cost more than copying
+inline Observation prepared(const Observation& obs, int quality, Observation spare = {}) {
+  Observation copy = std::move(spare);
+  for (auto at = copy.cameras.begin(); at != copy.cameras.end();)
+    at = obs.cameras.count(at->first) == 0 ? copy.cameras.erase(at) : std::next(at);
+  for (const auto& [name, image] : obs.cameras) {
     if (image.data.empty() || (!image.is_file() && image.data.size() != image.height * image.width * 3))
       throw Error("invalid_input", "camera '" + name + "': want Image::rgb or Image::file");
-    if (!image.is_file() && quality > 0) image = encode_jpeg(image, quality);
+    copy.cameras[name] = !image.is_file() && quality > 0 ? encode_jpeg(image, quality) : image;
   }
+  copy.gripper = obs.gripper;
+  copy.state = obs.state;
+  copy.info = obs.info;
   return copy;
 }
 
 /// The observation as the JSON of a header; appends its images and states to `blobs`.
-inline Json encode_observation(const Observation& obs, std::vector<Bytes>& blobs) {
+inline Json encode_observation(const Observation& obs, std::vector<View>& blobs) {
   Json found = Json::object();
   for (const auto& [name, image] : obs.cameras) {
     const Json reference = image.is_file() ? Json::array({"img", blobs.size()})
                                            : Json::array({"nd", blobs.size(), "|u1", Json::array({image.height, image.width, 3})});
     found["cameras"][name]["$"] = reference;
-    blobs.push_back(image.data);
+    blobs.push_back({image.data.data(), image.data.size()});
   }
   for (const auto& [name, values] : obs.state) {
-    Bytes bytes(values.size() * sizeof(float));
-    if (!values.empty()) std::memcpy(bytes.data(), values.data(), bytes.size());
     found["state"][name]["$"] = Json::array({"nd", blobs.size(), "<f4", Json::array({values.size()})});
-    blobs.push_back(std::move(bytes));
+    blobs.push_back({reinterpret_cast<const std::uint8_t*>(values.data()), values.size() * sizeof(float)});
   }
   if (obs.gripper) {
     if (!std::isfinite(*obs.gripper)) throw Error("invalid_input", "gripper: got NaN or infinity, want a number from 0 to 1");
@@ -66,8 +71,8 @@ struct Episode {
   std::deque<Observation> later;  // those that were acted on since, oldest first
 };
 
-inline Frame reset_request(const Episode& episode, const Json& contract) {
-  Frame request;
+inline Request reset_request(const Episode& episode, const Json& contract) {
+  Request request;
   request.header["op"] = "reset";
   request.header["obs"] = encode_observation(episode.first, request.blobs);
   request.header["instruction"] = episode.instruction;
@@ -78,8 +83,8 @@ inline Frame reset_request(const Episode& episode, const Json& contract) {
   return request;
 }
 
-inline Frame act_request(const Observation& obs) {
-  Frame request;
+inline Request act_request(const Observation& obs) {
+  Request request;
   request.header["op"] = "act";
   request.header["obs"] = encode_observation(obs, request.blobs);
   return request;

@@ -89,11 +89,10 @@ class WebSocket {
   }
 
   /// Send one binary message, in one frame.
-  void send(const Bytes& message, const Deadline& deadline) {
-    if (message.size() > max_message)
-      throw Error("too_large", "got a message of " + std::to_string(message.size()) +
-                                   " bytes, want 16 MiB at most; send JPEG, or smaller images");
-    send_frame(binary, message.data(), message.size(), deadline);
+  /// @param append appends the message to the bytes that it is given
+  template <typename Append>
+  void send(Append&& append, const Deadline& deadline) {
+    send_frame(binary, append, deadline);
   }
 
   /// The next binary message. Pings are answered meanwhile. A close of the server's is "connection_lost", with its code.
@@ -118,7 +117,7 @@ class WebSocket {
         Bytes control;
         reader_.read(control, static_cast<std::size_t>(size), deadline);
         if (kind == close_) throw closed(control);
-        if (kind == ping) send_frame(pong, control.data(), control.size(), Deadline::in(pong_s));
+        if (kind == ping) send_control(pong, control, Deadline::in(pong_s));
         continue;
       }
       if (kind != (begun ? continuation : binary))
@@ -132,8 +131,7 @@ class WebSocket {
   /// Tell the server that nothing more comes, as far as that goes at once.
   void say_close() noexcept {
     try {
-      const std::uint8_t normal[] = {1000 >> 8, 1000 & 255};
-      send_frame(close_, normal, sizeof normal, Deadline::in(0.1));
+      send_control(close_, {1000 >> 8, 1000 & 255}, Deadline::in(0.1));
     } catch (const std::exception&) {  // the connection ends in any case
     }
   }
@@ -144,6 +142,7 @@ class WebSocket {
  private:
   enum Kind { continuation = 0, binary = 2, close_ = 8, ping = 9, pong = 10 };
   static constexpr double pong_s = 5.0;
+  static constexpr std::size_t most_head = 2 + 8 + 4;  // bytes before the message: kind, length and mask
 
   static Error refused(const std::string& what) { return Error("malformed", "WebSocket: got " + what); }
 
@@ -157,36 +156,45 @@ class WebSocket {
 
   void send_reply_to_close(const Bytes& payload) noexcept {
     try {
-      send_frame(close_, payload.data(), payload.size() < 2 ? 0 : 2, Deadline::in(0.1));
+      send_control(close_, Bytes(payload.begin(), payload.begin() + (payload.size() < 2 ? 0 : 2)), Deadline::in(0.1));
     } catch (const std::exception&) {  // the connection has ended in any case
     }
   }
 
-  void send_frame(Kind kind, const std::uint8_t* data, std::size_t size, const Deadline& deadline) {
-    const std::size_t bytes = size < 126 ? 0 : size < 65536 ? 2 : 8;
-    const std::size_t begin = 2 + bytes + 4;
-    Bytes frame(begin + size);
-    frame[0] = static_cast<std::uint8_t>(128 | kind);
-    frame[1] = static_cast<std::uint8_t>(128 | (bytes == 0 ? size : bytes == 2 ? 126 : 127));
-    for (std::size_t i = 0; i < bytes; ++i) frame[1 + bytes - i] = static_cast<std::uint8_t>(size >> (8 * i));
+  void send_control(Kind kind, const Bytes& payload, const Deadline& deadline) {
+    send_frame(kind, [&](Bytes& data) { data.insert(data.end(), payload.begin(), payload.end()); }, deadline);
+  }
+
+  template <typename Append>
+  void send_frame(Kind kind, Append&& append, const Deadline& deadline) {
     const std::lock_guard<std::mutex> guard(sending_);
     if (broken_) throw Error("connection_lost", "an earlier message was sent in part");
-    std::array<std::uint8_t, 4> mask{};
-    for (auto& byte : mask) byte = static_cast<std::uint8_t>(random_());
-    std::copy(mask.begin(), mask.end(), frame.begin() + static_cast<std::ptrdiff_t>(begin - mask.size()));
-    std::uint64_t wide = 0;  // the mask twice: pixels are masked eight bytes at a time
-    std::memcpy(&wide, mask.data(), 4);
-    std::memcpy(reinterpret_cast<std::uint8_t*>(&wide) + 4, mask.data(), 4);
+    frame_.assign(most_head, 0);
+    append(frame_);
+    const std::size_t size = frame_.size() - most_head;
+    if (size > max_message)
+      throw Error("too_large",
+                  "got a message of " + std::to_string(size) + " bytes, want 16 MiB at most; send JPEG, or smaller images");
+    const std::size_t bytes = size < 126 ? 0 : size < 65536 ? 2 : 8;
+    std::uint8_t* const payload = frame_.data() + most_head;
+    std::uint8_t* const mask = payload - 4;
+    std::uint8_t* const head = mask - bytes - 2;
+    head[0] = static_cast<std::uint8_t>(128 | kind);
+    head[1] = static_cast<std::uint8_t>(128 | (bytes == 0 ? size : bytes == 2 ? 126 : 127));
+    for (std::size_t i = 0; i < bytes; ++i) head[1 + bytes - i] = static_cast<std::uint8_t>(size >> (8 * i));
+    const std::uint32_t chosen = random_();
+    std::memcpy(mask, &chosen, 4);
+    const std::uint64_t wide = std::uint64_t{chosen} << 32 | chosen;  // pixels are masked eight bytes at a time
     std::size_t at = 0;
     for (; at + 8 <= size; at += 8) {
       std::uint64_t word = 0;
-      std::memcpy(&word, data + at, 8);
+      std::memcpy(&word, payload + at, 8);
       word ^= wide;
-      std::memcpy(frame.data() + begin + at, &word, 8);
+      std::memcpy(payload + at, &word, 8);
     }
-    for (; at < size; ++at) frame[begin + at] = static_cast<std::uint8_t>(data[at] ^ mask[at % 4]);
+    for (; at < size; ++at) payload[at] = static_cast<std::uint8_t>(payload[at] ^ mask[at % 4]);
     try {
-      socket_.send(frame.data(), frame.size(), deadline);
+      socket_.send(head, frame_.size() - static_cast<std::size_t>(head - frame_.data()), deadline);
     } catch (const Error&) {
       broken_ = true;  // what follows would be read as the rest of this message
       socket_.shut();
@@ -197,6 +205,7 @@ class WebSocket {
   Socket socket_;
   Reader reader_;
   std::mutex sending_;
+  Bytes frame_;                // what is sent, in memory that is used again
   std::random_device random_;  // masks must not be predictable
   bool broken_ = false;
 };
