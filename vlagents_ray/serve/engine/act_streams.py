@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 from vlagents_ray.errors import NotReset, PolicyFailed
-from vlagents_ray.interface import Act, Agent
+from vlagents_ray.interface import Act
 from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
 from vlagents_ray.serve.engine.responses import build_reply, timing
 from vlagents_ray.serve.models.loaded_model import LoadedModel
@@ -45,14 +45,9 @@ class ActStreams:
         """
         observations = [ticket.request.obs for ticket, _ in acting]
         agents = [session.agent for _, session in acting]
-        padding: list[Agent] = []
-        if self._batch_sizes:
-            with model.call("reset", "padding"):
-                padding = model.padding.sessions(len(acting))
-            observations += observations[-1:] * len(padding)
-            agents += padding
+        padding = model.pad(observations, agents) if self._batch_sizes else 0
         rows = len(observations)
-        padded: list[Act | Exception | None] = [None] * len(padding)  # the last results of the padding
+        padded: list[Act | Exception | None] = [None] * padding  # the last results of the padding
         waiting = dict(enumerate(acting))  # those that get further parts, by their place in the batch
         left_bytes = [self._reply_bytes] * len(acting)
         call = model.call("act_stream", rows if self._batch_sizes else None)
@@ -91,7 +86,7 @@ class ActStreams:
                             send(i, part)
             failure: Exception | None = None
         except Exception as error:  # noqa: BLE001 - becomes the replies
-            failure, padded = error, [error] * len(padding)
+            failure, padded = error, [error] * padding
         for i, (ticket, _) in list(waiting.items()):
             send(i, failure or self._unfinished(ticket))
         model.padding.check_results(padded)

@@ -309,12 +309,7 @@ class Engine:
         """Answer the act requests of sessions with one version of one model's weights."""
         observations = [ticket.request.obs for ticket, _ in acting]
         agents = [session.agent for _, session in acting]
-        padding: list[Agent] = []
-        if self._batch_sizes:
-            with model.call("reset", "padding"):
-                padding = model.padding.sessions(len(acting))
-            observations += observations[-1:] * len(padding)
-            agents += padding
+        padding = model.pad(observations, agents) if self._batch_sizes else 0
         rows = len(observations)
         call = model.call("act", rows if self._batch_sizes else None)
         try:

@@ -14,7 +14,7 @@ from typing import Any
 
 from vlagents_ray.contract import Contract, require_match
 from vlagents_ray.errors import UnknownSession
-from vlagents_ray.interface import Agent
+from vlagents_ray.interface import Agent, Obs
 from vlagents_ray.policies.base.checkpoint import used_checkpoints
 from vlagents_ray.policies.base.checkpoint_files import weights_of
 from vlagents_ray.policies.loading import loading_report
@@ -86,6 +86,14 @@ class LoadedModel:
         if call is None:
             call = self._calls_by_kind[op, kind] = PolicyCall(self.calls, op)
         return call
+
+    def pad(self, observations: list[Obs | None], agents: list[Agent | None]) -> int:
+        """Append rows that fill a batch up to the next size; return their number. On the policy's thread alone."""
+        with self.call("reset", "padding"):
+            padding = self.padding.sessions(len(agents))
+        observations += observations[-1:] * len(padding)
+        agents += padding
+        return len(padding)
 
     def close(self, wait_s: float = -1.0) -> None:
         """Close the agent after the running batch. Its memory is freed when no reference to it remains.
