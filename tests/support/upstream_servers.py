@@ -3,7 +3,8 @@
 `python upstream_servers.py KIND PORT`; a kind is a protocol, and for GR00T also `gr00t sim`: with
 `Gr00tSimPolicyWrapper`, or `gr00t packed`: with the newest servers' arrays. What they answer depends on each bit of the
 observation, so that an action that equals `answer` was computed from the very observation. The formats are those of
-openpi_client.msgpack_numpy, gr00t/policy/server_client.py, json_numpy, and vla_eval.protocol.
+openpi_client.msgpack_numpy, gr00t/policy/server_client.py, json_numpy, and vla_eval.protocol; LeRobot's is in
+lerobot_server.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ def _digest(value: Any) -> int:
     return zlib.crc32(repr(value).encode())
 
 
-def _obey(text: str) -> None:
+def obey(text: str) -> None:
     if text == SLOW:
         time.sleep(1.5)
     if text == BROKEN:
@@ -76,7 +77,7 @@ def openpi(connection: Any) -> None:
             return
         try:
             for one in observation.get("batch", [observation]):
-                _obey(one.get("prompt"))
+                obey(one.get("prompt"))
             if "batch" in observation:
                 actions = np.stack([answer(one) for one in observation["batch"]])
             else:
@@ -205,7 +206,7 @@ def gr00t_actions(observation: dict[str, Any]) -> dict[str, np.ndarray]:
         }
         for i in range(size)
     ]
-    _obey(texts[0][0])
+    obey(texts[0][0])
     actions = np.stack([answer(one) for one in each]).astype(np.float32)
     return {"arm": actions[..., :6], "gripper": actions[..., 6:]}
 
@@ -252,6 +253,10 @@ def _main(kind: str, port: int) -> None:
     protocol, *variants = kind.split()
     if protocol == "gr00t":
         gr00t(port, *variants)
+    elif protocol == "lerobot":
+        from lerobot_server import serve  # which only this kind waits for, and for gRPC
+
+        serve(port)
     elif protocol == "openvla":
         ThreadingHTTPServer(("127.0.0.1", port), OpenVLA).serve_forever()
     else:

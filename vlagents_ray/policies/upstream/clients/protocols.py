@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from vlagents_ray.policies.upstream.clients.base import UpstreamClient
 from vlagents_ray.policies.upstream.clients.gr00t import GR00TClient
+from vlagents_ray.policies.upstream.clients.lerobot import LeRobotClient
 from vlagents_ray.policies.upstream.clients.openpi import OpenPiBatchClient, OpenPiClient, RoboArenaClient
 from vlagents_ray.policies.upstream.clients.openvla import OpenVLAClient
 from vlagents_ray.policies.upstream.clients.vla_eval import VlaEvalClient
@@ -17,4 +18,5 @@ PROTOCOLS: dict[str, type[UpstreamClient]] = {
     "openvla": OpenVLAClient,
     "vla_eval": VlaEvalClient,
     "vlagents": VlagentsClient,
+    "lerobot": LeRobotClient,
 }
