@@ -30,7 +30,9 @@ class LoadedPolicy(BaseModel, extra="forbid"):
 class UpstreamConfig(BaseModel, extra="forbid"):
     """Where the other policy server is, how it is asked, and how long it is waited for."""
 
-    protocol: Literal["openpi", "openpi-batch", "roboarena", "gr00t", "openvla", "vla_eval", "vlagents", "lerobot"]
+    protocol: Literal[
+        "openpi", "openpi-batch", "roboarena", "gr00t", "openvla", "vla_eval", "vlagents", "lerobot", "xpolicylab"
+    ]
     urls: list[str] = Field(
         min_length=1,
         max_length=64,
@@ -49,7 +51,7 @@ class UpstreamConfig(BaseModel, extra="forbid"):
     sessions: Literal["none", "connection"] | None = Field(
         default=None,
         description="none: the model keeps nothing between two observations, and connections are shared; connection: a "
-        "session has a connection of its own, and is reset; default: connection for roboarena and vla_eval",
+        "session has a connection of its own, and is reset; default: connection for roboarena, vla_eval and xpolicylab",
     )
     connections: int = Field(
         default=1, ge=1, le=64, description="to each URL, over which a batch is spread too; for `sessions: none`"
@@ -92,7 +94,8 @@ class UpstreamConfig(BaseModel, extra="forbid"):
             raise ValueError(f"key_env: {self.protocol} has no place for a key; remove it")
         if self.mapping is None and self.client.mapping is None:
             raise ValueError(
-                f"mapping: {self.protocol} has none of its own; give a preset, such as openpi-libero, or an object"
+                f"mapping: {self.protocol} has none of its own; give an object, or a preset, such as openpi-libero for "
+                f"openpi"
             )
         if (self.lerobot is not None) is not (self.protocol == "lerobot"):
             want = "what the server loads" if self.lerobot is None else f"nothing for {self.protocol}"
@@ -103,6 +106,11 @@ class UpstreamConfig(BaseModel, extra="forbid"):
             raise ValueError(
                 f"{self.protocol}: its server has one client at a time, so that it takes one connection to each URL, "
                 "each URL once, and `sessions: none`; name more servers in urls instead"
+            )
+        if self.client.one_session and self.keeps_sessions and len(self.urls) > 1:
+            raise ValueError(
+                f"{self.protocol}: its server keeps one session, so that `sessions: connection` takes one URL; "
+                "set `sessions: none` if the model keeps nothing between two observations"
             )
         self.instructions()
         return self

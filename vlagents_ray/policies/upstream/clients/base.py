@@ -42,6 +42,8 @@ class UpstreamClient(abc.ABC):
     """Whether the upstream keeps a session for each connection, by default."""
     one_client: ClassVar[bool] = False
     """Whether the upstream keeps the state of one client, and takes one connection therefore."""
+    one_session: ClassVar[bool] = False
+    """Whether the upstream keeps the state of one session, whatever its connections."""
     mapping: ClassVar[str | None] = None
     """The preset that is used if the deployment states no mapping."""
     schemes: ClassVar[tuple[str, ...]] = ()

@@ -9,6 +9,7 @@ from vlagents_ray.policies.upstream.clients.openpi import OpenPiBatchClient, Ope
 from vlagents_ray.policies.upstream.clients.openvla import OpenVLAClient
 from vlagents_ray.policies.upstream.clients.vla_eval import VlaEvalClient
 from vlagents_ray.policies.upstream.clients.vlagents import VlagentsClient
+from vlagents_ray.policies.upstream.clients.xpolicylab import XPolicyLabClient
 
 PROTOCOLS: dict[str, type[UpstreamClient]] = {
     "openpi": OpenPiClient,
@@ -19,4 +20,5 @@ PROTOCOLS: dict[str, type[UpstreamClient]] = {
     "vla_eval": VlaEvalClient,
     "vlagents": VlagentsClient,
     "lerobot": LeRobotClient,
+    "xpolicylab": XPolicyLabClient,
 }
