@@ -11,7 +11,7 @@ from typing_extensions import Self
 from vlagents_ray.contract import Contract
 from vlagents_ray.errors import VLAgentsError
 from vlagents_ray.policies.upstream.clients.base import UpstreamClient
-from vlagents_ray.policies.upstream.clients.protocols import PROTOCOLS
+from vlagents_ray.policies.upstream.protocols import PROTOCOLS
 from vlagents_ray.wire.lerobot.codec import PolicyInstructions
 from vlagents_ray.wire.lerobot.upstream import features_of
 from vlagents_ray.wire.mapping.mapping import KeyMapping

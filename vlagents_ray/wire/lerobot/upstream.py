@@ -31,7 +31,7 @@ _ITEMS = 100_000  # opcodes of a chunk: a row has about fifty
 
 
 @dataclass(frozen=True, slots=True)
-class Chunk:
+class TimedChunk:
     """The actions that a server answers."""
 
     timestamp: float  # that of the observation, s since 1970
@@ -114,7 +114,7 @@ def write_observation(
     return write_record(OBSERVATION, fields)
 
 
-def read_chunk(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> Chunk:
+def read_chunk(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> TimedChunk:
     """Return the chunk in a pickle.
 
     Raises:
@@ -133,4 +133,4 @@ def read_chunk(data: Buffer, limits: Limits = DEFAULT_LIMITS) -> Chunk:
     timestamp, timestep = fields[0]["timestamp"], fields[0]["timestep"]
     if not is_number(timestamp) or not math.isfinite(timestamp) or type(timestep) is not int:
         raise MalformedMessage("actions: want a number as timestamp, and an integer as timestep")
-    return Chunk(float(timestamp), timestep, np.stack(rows))
+    return TimedChunk(float(timestamp), timestep, np.stack(rows))
