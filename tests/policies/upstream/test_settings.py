@@ -30,7 +30,7 @@ OPENPI: dict[str, Any] = {"protocol": "openpi", "urls": ["ws://127.0.0.1:9"], "m
         ({"urls": []}, "at least 1"),
         ({"urls": ["http://box:1"]}, "want ws://HOST:PORT or wss://HOST:PORT for openpi"),
         ({"urls": ["ws://me:secret@box:1"]}, "name it in key_env"),
-        ({"mapping": None}, "openpi has none of its own; give a preset, such as openpi-libero"),
+        ({"mapping": None}, "openpi has none of its own; give an object, or a preset"),
         ({"mapping": "openpi-libera"}, "openpi-libero"),
         ({"mapping": {"camera": {}}}, "unknown keys"),
         ({"contract": {"chunks": 3}}, "unknown keys"),

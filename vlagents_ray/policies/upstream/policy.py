@@ -59,8 +59,13 @@ class Upstream(Agent):
         if (name := self.config.key_env) is not None and not (key := os.environ.get(name)):
             raise ConfigError(f"key_env: the environment variable {name!r} is not set; set it where the replica runs")
 
+        config, instructions = self.config, self.config.instructions()
+
         def make(url: str) -> UpstreamClient:
-            return self.config.client(ClientOptions(url, self.config.timeout_s, key))
+            options = ClientOptions(
+                url, config.timeout_s, key, instructions=instructions, load_s=config.connect_timeout_s
+            )
+            return config.client(options)
 
         if self.config.keeps_sessions:
             self._sessions = SessionConnections(self.config.urls, make, self._check, self.config.retry_s)

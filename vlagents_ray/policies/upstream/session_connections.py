@@ -54,6 +54,9 @@ class SessionConnections:
             PolicyFailed: The upstream refuses the episode.
         """
         client = self._connected(self._retry_s)
+        if client.one_session:  # whose state the begin of this episode ends
+            for other in list(self._clients):
+                self.drop(other)
         try:
             client.begin()
         except BaseException:
@@ -90,7 +93,10 @@ class SessionConnections:
         with self._lock:
             client = self._clients.get(session)
         if client is None:
-            return UnknownSession("upstream: the session's connection is lost; reset it")
+            return UnknownSession(
+                "upstream: the session's connection is lost, or another session began at an upstream that keeps one; "
+                "reset it"
+            )
         try:
             [answer] = client.ask([observation])
         except ConnectionLost as error:

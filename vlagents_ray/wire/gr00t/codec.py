@@ -18,7 +18,7 @@ import numpy as np
 from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge
 from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.registry import require
-from vlagents_ray.wire import msgpack
+from vlagents_ray.wire import msgpack, msgpack_numpy
 from vlagents_ray.wire.gr00t import npy
 
 ENDPOINTS = ("get_action", "reset", "ping", "get_modality_config")
@@ -79,9 +79,9 @@ def read_request(payload: bytes | memoryview, limits: Limits) -> GR00TRequest:
         nonlocal packed
         if "__ndarray_class__" in node:
             return npy.read_npy(node.get("as_npy"), limits)
-        if b"nd" in node or "nd" in node:
+        if msgpack_numpy.is_packed(node):
             packed = True
-            return npy.read_packed(node)
+            return msgpack_numpy.read_packed(node)
         return node
 
     document = msgpack.unpack(payload, limits, array, text=limits.text)
@@ -195,7 +195,7 @@ def _flat(modality: str, key: str) -> str:
 
 def pack(value: Any, *, packed: bool = False) -> bytes:
     """Return a message with `value`; `packed` writes arrays in the format of `msgpack_numpy`."""
-    return msgpack.pack(value, npy.write_packed if packed else npy.write_npy)
+    return msgpack.pack(value, msgpack_numpy.write_packed if packed else npy.write_npy)
 
 
 def _arrays(group: Any, kind: str) -> dict[str, np.ndarray]:

@@ -1,4 +1,4 @@
-"""Arrays in the formats of GR00T's clients: .npy files, or maps of the package `msgpack_numpy`.
+"""Arrays in the format of most of GR00T's clients: .npy files.
 
 A file's header is matched, not evaluated, and must agree with the size of the content, so that no memory is allocated
 for a false shape. Arrays of text become lists; objects and structures are refused.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -55,36 +54,10 @@ def _read_texts(content: memoryview, dtype: str, shape: list[int], limits: Limit
         raise MalformedMessage("gr00t: an array of text that is none") from error
 
 
-def read_packed(node: Mapping[Any, Any]) -> np.ndarray:
-    """Return the array in a map of `msgpack_numpy` as a read-only view."""
-    found = {(key.decode(errors="replace") if isinstance(key, bytes) else key): item for key, item in node.items()}
-    dtype, shape, data = found.get("type"), found.get("shape"), found.get("data")
-    if not isinstance(data, bytes) or found.get("kind") not in (None, "", b""):
-        raise MalformedMessage("gr00t: nd: want bytes of a plain array")
-    dtype = dtype.decode(errors="replace") if isinstance(dtype, bytes) else dtype
-    if found["nd"] is not True:
-        shape = []
-    return read_array(data, dtype, list(shape) if isinstance(shape, (list, tuple)) else shape)
-
-
 def write_npy(value: Any) -> dict[str, Any]:
     """Return the map with an array as an .npy file, for msgpack."""
     if isinstance(value, (np.ndarray, np.generic)):
         file = io.BytesIO()
         np.save(file, np.asarray(value), allow_pickle=False)
         return {"__ndarray_class__": True, "as_npy": file.getvalue()}
-    raise TypeError(f"gr00t: cannot send {type(value).__name__}")
-
-
-def write_packed(value: Any) -> dict[bytes, Any]:
-    """Return the map with an array in the format of `msgpack_numpy`, for msgpack."""
-    if isinstance(value, (np.ndarray, np.generic)):
-        array = np.ascontiguousarray(value)
-        return {
-            b"nd": True,
-            b"type": array.dtype.str,
-            b"kind": b"",
-            b"shape": np.shape(value),
-            b"data": array.tobytes(),
-        }
     raise TypeError(f"gr00t: cannot send {type(value).__name__}")

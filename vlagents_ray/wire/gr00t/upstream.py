@@ -17,7 +17,7 @@ import numpy as np
 
 from vlagents_ray.errors import MalformedMessage
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
-from vlagents_ray.wire import msgpack
+from vlagents_ray.wire import msgpack, msgpack_numpy
 from vlagents_ray.wire.gr00t import npy
 
 _KEYS_AT_MOST = 64
@@ -66,7 +66,7 @@ def flat(batched: Mapping[str, Any]) -> dict[str, Any]:
 
 def write(endpoint: str, data: Any, api_token: str | None, *, packed: bool = False) -> bytes:
     """Return the message of a request; `data` is left out if it is None; `packed` is that of `reads_packed`."""
-    array = npy.write_packed if packed else npy.write_npy
+    array = msgpack_numpy.write_packed if packed else npy.write_npy
     message = {"endpoint": endpoint} | ({} if data is None else {"data": data})
     return msgpack.pack(message | ({"api_token": api_token} if api_token else {}), array)
 
@@ -77,7 +77,7 @@ def read(payload: bytes, limits: Limits = DEFAULT_LIMITS) -> Any:
     def array(node: dict[Any, Any]) -> Any:
         if "__ndarray_class__" in node:
             return npy.read_npy(node.get("as_npy"), limits)
-        return npy.read_packed(node) if b"nd" in node or "nd" in node else node
+        return msgpack_numpy.read_packed(node) if msgpack_numpy.is_packed(node) else node
 
     return msgpack.unpack(payload, limits, array)
 

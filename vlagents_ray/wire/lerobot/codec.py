@@ -16,34 +16,37 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, MissingCamera, MissingState
+from vlagents_ray.protocol.arrays import Buffer
 from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.protocol.observations import is_number
 from vlagents_ray.wire.lerobot.pickled_arrays import CALLS
-from vlagents_ray.wire.lerobot.pickles import Name, read_pickle
+from vlagents_ray.wire.lerobot.pickles import Name, fields_of, read_pickle
+from vlagents_ray.wire.lerobot.presets import IMAGES, STATE, TASK
+from vlagents_ray.wire.lerobot.written_pickles import text
 
-_HELPERS = "lerobot.async_inference.helpers"
-_SETUP, _OBSERVATION = Name(_HELPERS, "RemotePolicyConfig"), Name(_HELPERS, "TimedObservation")
+HELPERS = "lerobot.async_inference.helpers"
+SETUP, OBSERVATION = Name(HELPERS, "RemotePolicyConfig"), Name(HELPERS, "TimedObservation")
 _RECORDS: Mapping[Name, Sequence[str]] = {
-    _SETUP: (
+    SETUP: (
         "policy_type", "pretrained_name_or_path", "lerobot_features", "actions_per_chunk", "device", "rename_map",
     ),
-    _OBSERVATION: ("timestamp", "timestep", "observation", "must_go"),
+    OBSERVATION: ("timestamp", "timestep", "observation", "must_go"),
 }  # fmt: skip
-STATE, IMAGES, TASK = "observation.state", "observation.images.", "task"
 _STEPS = 2**31  # time steps fit into a pickle's plain integers
 _SHOWN = 40  # maximum number of a client's keys in an error, and of characters of each
 
 
 @dataclass(frozen=True, slots=True)
 class PolicyInstructions:
-    """What a client says of itself before its first observation."""
+    """What a client says of itself and of the policy before its first observation."""
 
     policy_type: str
     checkpoint: str  # the checkpoint that LeRobot's own server would load
     state: tuple[str, ...]  # names of the numbers of `observation.state`, in order
     cameras: tuple[str, ...]
     actions_per_chunk: int
+    device: str = "cpu"  # on which LeRobot's own server computes
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +59,7 @@ class RobotObservation:
     must_go: bool  # whether the client has no action left
 
 
-def read_instructions(data: bytes, limits: Limits) -> PolicyInstructions:
+def read_instructions(data: Buffer, limits: Limits) -> PolicyInstructions:
     """Return the policy instructions in a pickle.
 
     Raises:
@@ -64,7 +67,7 @@ def read_instructions(data: bytes, limits: Limits) -> PolicyInstructions:
         MessageTooLarge: It exceeds a limit.
         InvalidObservation: The robot's features are none of numbers and cameras, or are to be renamed.
     """
-    stated = _fields(data, limits, _SETUP)
+    stated = _fields(data, limits, SETUP)
     policy_type, checkpoint = (_text(stated, name) for name in ("policy_type", "pretrained_name_or_path"))
     rows, features, renames = (stated[name] for name in ("actions_per_chunk", "lerobot_features", "rename_map"))
     if type(rows) is not int or rows < 1:
@@ -94,15 +97,15 @@ def read_instructions(data: bytes, limits: Limits) -> PolicyInstructions:
     return PolicyInstructions(policy_type, checkpoint, state, cameras, rows)
 
 
-def read_observation(data: bytes, budget: Budget) -> RobotObservation:
+def read_observation(data: Buffer, budget: Budget) -> RobotObservation:
     """Return the observation in a pickle; its arrays view the pickle, and are counted in `budget`.
 
     Raises:
         MalformedMessage: The pickle has anything but an observation, see `pickles`.
         MessageTooLarge: It exceeds a limit.
     """
-    stated = _fields(data, budget.limits, _OBSERVATION)
-    timestamp, timestep, values, must_go = (stated[name] for name in _RECORDS[_OBSERVATION])
+    stated = _fields(data, budget.limits, OBSERVATION)
+    timestamp, timestep, values, must_go = (stated[name] for name in _RECORDS[OBSERVATION])
     if not is_number(timestamp) or not math.isfinite(timestamp):
         raise MalformedMessage(f"timestamp: got {_shown(timestamp)}, want a finite number")
     if type(timestep) is not int or not 0 <= timestep < _STEPS:
@@ -170,14 +173,14 @@ def write_chunk(rows: np.ndarray, timestamp: float, timestep: int, period_s: flo
     """
     if timestep + len(rows) > _STEPS:
         raise InvalidObservation(f"timestep: got {timestep}, which leaves no numbers for {len(rows)} actions")
-    parts = [b"\x80\x02", _global(0, _HELPERS, "TimedAction"), _global(1, "torch", "tensor"), b"]("]
+    parts = [b"\x80\x02", _global(0, HELPERS, "TimedAction"), _global(1, "torch", "tensor"), b"]("]
     for number, row in enumerate(rows):
         values = b"".join(b"G" + struct.pack(">d", value) for value in row.tolist())
         parts += [
             b"h\0)\x81}(",
-            _key("timestamp"), b"G", struct.pack(">d", timestamp + number * period_s),
-            _key("timestep"), b"J", struct.pack("<i", timestep + number),
-            _key("action"), b"h\1](", values, b"e\x85R",
+            text("timestamp"), b"G", struct.pack(">d", timestamp + number * period_s),
+            text("timestep"), b"J", struct.pack("<i", timestep + number),
+            text("action"), b"h\1](", values, b"e\x85R",
             b"ub",
         ]  # fmt: skip
     return b"".join([*parts, b"e."])
@@ -188,15 +191,8 @@ def _global(memo: int, module: str, name: str) -> bytes:
     return f"c{module}\n{name}\n".encode() + bytes([ord("q"), memo, ord("0")])
 
 
-def _key(name: str) -> bytes:
-    return b"X" + struct.pack("<I", len(name)) + name.encode()
-
-
-def _fields(data: bytes, limits: Limits, wanted: Name) -> dict[str, Any]:
-    record = read_pickle(data, limits, _RECORDS, CALLS)
-    if record.name != wanted or record.fields is None:
-        raise MalformedMessage(f"pickle: got a {record.name.name}, want a {wanted.name}")
-    return record.fields
+def _fields(data: Buffer, limits: Limits, wanted: Name) -> dict[str, Any]:
+    return fields_of(read_pickle(data, limits, _RECORDS, CALLS), wanted)
 
 
 def _text(stated: Mapping[str, Any], name: str) -> str:

@@ -16,6 +16,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from vlagents_ray.errors import MalformedMessage, MessageTooLarge
+from vlagents_ray.protocol.arrays import Buffer
 from vlagents_ray.protocol.messages import Limits
 
 _PROTOCOLS = (4, 5)
@@ -63,9 +64,9 @@ class _StackValue(NamedTuple):
 
 
 def read_pickle(
-    data: bytes, limits: Limits, records: Mapping[Name, Sequence[str]], calls: Mapping[Name, Call | None]
-) -> Record:
-    """Return the object of a data class that a pickle consists of.
+    data: Buffer, limits: Limits, records: Mapping[Name, Sequence[str]], calls: Mapping[Name, Call | None]
+) -> Any:
+    """Return the object that a pickle consists of; one of a data class may lack its fields.
 
     Args:
         data: The pickle. Arrays of the result view its memory.
@@ -80,11 +81,18 @@ def read_pickle(
     return _StackMachine(data, limits, records, calls).whole()
 
 
+def fields_of(value: Any, wanted: Name) -> dict[str, Any]:
+    """Return the fields of an object of a data class; raise `MalformedMessage` for anything else."""
+    if not isinstance(value, Record) or value.name != wanted or value.fields is None:
+        raise MalformedMessage(f"pickle: got {_kind(value)}, want a {wanted.name} with its fields")
+    return value.fields
+
+
 class _StackMachine:
     """A stack machine without calls."""
 
     def __init__(
-        self, data: bytes, limits: Limits, records: Mapping[Name, Sequence[str]], calls: Mapping[Name, Call | None]
+        self, data: Buffer, limits: Limits, records: Mapping[Name, Sequence[str]], calls: Mapping[Name, Call | None]
     ) -> None:
         self._data = memoryview(data)
         self._at = 0
@@ -96,7 +104,7 @@ class _StackMachine:
         self._below: list[list[_StackValue]] = []  # the stacks below each open mark
         self._memo: list[_StackValue] = []
 
-    def whole(self) -> Record:
+    def whole(self) -> Any:
         """Read the pickle to its end."""
         if self.take(1)[0] != _PROTO or self.take(1)[0] not in _PROTOCOLS:
             raise MalformedMessage(f"pickle: want one of protocol {_PROTOCOLS[0]} or {_PROTOCOLS[1]}")
@@ -106,11 +114,9 @@ class _StackMachine:
             if read is None:
                 raise MalformedMessage(f"pickle: got opcode {opcode:#04x}, which is not read here")
             read(self)
-        root = self.pop()
+        root = _finished(self.pop())
         if self._stack or self._below or self._at != len(self._data):
             raise MalformedMessage("pickle: more than one object in a message")
-        if not isinstance(root, Record) or root.fields is None:
-            raise MalformedMessage(f"pickle: got {_kind(root)}, want {[name.name for name in self._records]}")
         return root
 
     def take(self, length: int) -> memoryview:
@@ -121,10 +127,6 @@ class _StackMachine:
         found = self._data[self._at : end]
         self._at = end
         return found
-
-    def skip(self, length: int) -> None:
-        """Leave out the next bytes."""
-        self.take(length)
 
     def push(self, value: Any, depth: int = 0, items: int = 1) -> None:
         """Put a value onto the stack."""
@@ -308,7 +310,7 @@ def _fixed(value: Any) -> Callable[[_StackMachine], None]:
     return lambda reader: reader.push(value)
 
 
-_OPCODES: dict[int, Callable[[_StackMachine], None]] = {
+_OPCODES: dict[int, Callable[[_StackMachine], Any]] = {
     ord("N"): _fixed(None),
     0x88: _fixed(True),
     0x89: _fixed(False),
@@ -341,5 +343,5 @@ _OPCODES: dict[int, Callable[[_StackMachine], None]] = {
     ord("R"): _StackMachine.reduce,
     0x81: _StackMachine.new,
     ord("b"): _StackMachine.build,
-    0x95: lambda reader: reader.skip(_U8.size),  # a frame, whose length is of no use here
+    0x95: lambda reader: reader.take(_U8.size),  # a frame, whose length is of no use here
 }

@@ -12,8 +12,10 @@ from dataclasses import dataclass
 
 from vlagents_ray.errors import MalformedMessage
 
+SERVICE = "transport.AsyncInference"
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5  # types of a field
 _VARINT_BYTES = 10  # maximum length of a number
+_PART_BYTES = 2 * 2**20  # as LeRobot's own client sends; its server takes messages of 4 MiB
 
 
 class TransferState(enum.IntEnum):
@@ -46,24 +48,42 @@ def read_observation_part(message: bytes) -> ObservationPart:
         raise MalformedMessage(f"observation: got transfer state {number}, want 1, 2 or 3") from error
 
 
-def read_setup(message: bytes) -> bytes:
-    """Return the pickle in a `PolicySetup`; raise `MalformedMessage` if it is none."""
+def write_observation_parts(data: bytes) -> Iterator[bytes]:
+    """Yield the `Observation` messages of a pickled observation."""
+    for at in range(0, len(data), _PART_BYTES):
+        end = at + _PART_BYTES
+        state = TransferState.END if end >= len(data) else TransferState.MIDDLE if at else TransferState.BEGIN
+        yield bytes([1 << 3 | _VARINT, state, *_head(2, len(data[at:end]))]) + data[at:end]
+
+
+def read_data(message: bytes) -> memoryview | None:
+    """Return the pickle in a `PolicySetup` or an `Actions`; None if it has none."""
     for field, value in _fields(message):
         if field == 1 and isinstance(value, memoryview):
-            return bytes(value)
-    raise MalformedMessage("policy instructions: got none")
+            return value
+    return None
 
 
-def write_actions(data: bytes) -> bytes:
-    """Return an `Actions` with a pickle."""
-    size, length = bytearray(), len(data)
-    while length > 0x7F:
-        size.append(length & 0x7F | 0x80)
-        length >>= 7
-    return bytes([1 << 3 | _BYTES, *size, length]) + data
+def write_data(data: bytes) -> bytes:
+    """Return a `PolicySetup` or an `Actions` with a pickle."""
+    return _head(1, len(data)) + data
+
+
+def method(name: str) -> str:
+    """Return the path of a method of the service."""
+    return f"/{SERVICE}/{name}"
 
 
 EMPTY = b""  # an `Empty`, and an `Actions` without a pickle
+
+
+def _head(number: int, length: int) -> bytes:
+    """Return what precedes the bytes of a field."""
+    size = bytearray()
+    while length > 0x7F:
+        size.append(length & 0x7F | 0x80)
+        length >>= 7
+    return bytes([number << 3 | _BYTES, *size, length])
 
 
 def _fields(message: bytes) -> Iterator[tuple[int, int | memoryview]]:

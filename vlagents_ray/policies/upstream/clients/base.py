@@ -12,6 +12,7 @@ import numpy as np
 
 from vlagents_ray.errors import MalformedMessage, PolicyFailed
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
+from vlagents_ray.wire.lerobot.codec import PolicyInstructions
 from vlagents_ray.wire.mapping.outgoing import Outgoing
 
 logger = logging.getLogger(__name__)
@@ -28,6 +29,8 @@ class ClientOptions:
     timeout_s: float  # s: an answer that takes longer counts as lost
     key: str | None = field(default=None, repr=False)  # the upstream's API key
     limits: Limits = DEFAULT_LIMITS
+    instructions: PolicyInstructions | None = None  # of LeRobot's server: the checkpoint that it loads
+    load_s: float = 600.0  # s: for loading it
 
 
 class UpstreamClient(abc.ABC):
@@ -37,6 +40,10 @@ class UpstreamClient(abc.ABC):
     """Whether `ask` sends all observations in one message."""
     keeps_sessions: ClassVar[bool] = False
     """Whether the upstream keeps a session for each connection, by default."""
+    one_client: ClassVar[bool] = False
+    """Whether the upstream keeps the state of one client, and takes one connection therefore."""
+    one_session: ClassVar[bool] = False
+    """Whether the upstream keeps the state of one session, whatever its connections."""
     mapping: ClassVar[str | None] = None
     """The preset that is used if the deployment states no mapping."""
     schemes: ClassVar[tuple[str, ...]] = ()

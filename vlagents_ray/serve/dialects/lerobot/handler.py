@@ -23,11 +23,11 @@ from vlagents_ray.serve.dialects.gateway_clients import GatewayClients
 from vlagents_ray.serve.dialects.lerobot.connection import LeRobotConnection
 from vlagents_ray.serve.engine.admission import MessageAdmission
 from vlagents_ray.wire.lerobot import codec, protobuf
+from vlagents_ray.wire.lerobot.presets import PRESETS
 from vlagents_ray.wire.lerobot.protobuf import TransferState
 
 logger = logging.getLogger(__name__)
 
-_SERVICE = "transport.AsyncInference"
 _UPLOAD_S = 30.0  # maximum time of an observation, from its first part to its last
 _TICK_S = 0.5
 _END_S = 3.0
@@ -71,14 +71,7 @@ class LeRobotDialect(PortDialect):
     )
     scheme = "grpc"
     requires = ("grpc",)
-    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        # the names of LeRobot's datasets, which its own server makes of a robot's
-        "lerobot": {
-            "cameras": {"*": f"{codec.IMAGES}*"},
-            "state": {"joints": {"key": codec.STATE, "optional": True}},
-            "instruction": codec.TASK,
-        },
-    }
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = PRESETS
     config: LeRobotDialectConfig
 
     def __init__(self, name: str, config: LeRobotDialectConfig, context: GatewayContext) -> None:
@@ -97,7 +90,7 @@ class LeRobotDialect(PortDialect):
         most = _REQUESTS * self.context.sessions
         self._server = grpc.server(
             ThreadPoolExecutor(most, "lerobot-client"),
-            handlers=[grpc.method_handlers_generic_handler(_SERVICE, self._methods(grpc))],
+            handlers=[grpc.method_handlers_generic_handler(protobuf.SERVICE, self._methods(grpc))],
             options=[
                 ("grpc.so_reuseport", 0),  # another process could share the port otherwise
                 ("grpc.max_concurrent_streams", _REQUESTS),
@@ -164,7 +157,9 @@ class LeRobotDialect(PortDialect):
 
     def _set_up(self, message: bytes, context: Any) -> bytes:
         with self._client(context) as client:
-            client.set_up(codec.read_instructions(protobuf.read_setup(message), self.context.limits))
+            if (data := protobuf.read_data(message)) is None:
+                raise MalformedMessage("policy instructions: got none")
+            client.set_up(codec.read_instructions(data, self.context.limits))
         return protobuf.EMPTY
 
     def _observe(self, parts: Iterator[bytes], context: Any) -> bytes:
@@ -182,7 +177,7 @@ class LeRobotDialect(PortDialect):
     def _act(self, _: bytes, context: Any) -> bytes:
         with self._client(context) as client:
             actions = client.actions()
-        return protobuf.EMPTY if actions is None else protobuf.write_actions(actions)
+        return protobuf.EMPTY if actions is None else protobuf.write_data(actions)
 
     @contextlib.contextmanager
     def _client(self, context: Any) -> Iterator[LeRobotConnection]:

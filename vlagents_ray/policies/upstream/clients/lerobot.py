@@ -1,0 +1,121 @@
+"""A client of LeRobot's `policy_server`: its asynchronous inference over gRPC, asked for one chunk at a time."""
+
+from __future__ import annotations
+
+import random
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar
+from urllib.parse import urlsplit
+
+from vlagents_ray.errors import ConnectionLost, PolicyUnavailable, VLAgentsError
+from vlagents_ray.policies.upstream.clients.base import Answer, ClientOptions, UpstreamClient
+from vlagents_ray.registry import require
+from vlagents_ray.wire.lerobot import protobuf
+from vlagents_ray.wire.lerobot import upstream as wire
+
+_LOST = ("UNAVAILABLE", "DEADLINE_EXCEEDED", "CANCELLED")  # the other status codes are answers
+_OPTIONS = [
+    ("grpc.enable_retries", 0),  # a server that was restarted has no policy: it must get its instructions first
+    ("grpc.client_idle_timeout_ms", 2**31 - 1),
+    ("grpc.use_local_subchannel_pool", 1),
+    ("grpc.max_send_message_length", -1),
+]
+_FIRST_STEPS = 2**29  # a connection counts from a random one below: no other client's answer is taken for its own
+
+
+class LeRobotClient(UpstreamClient):
+    """A client that has the server load a checkpoint, and then sends an observation and takes its chunk.
+
+    The server keeps the newest observation of all its clients. Each of ours says `must_go`, without which the server
+    leaves out one that is similar to the last one; and the answer repeats its time and its number, which are compared.
+    """
+
+    one_client: ClassVar[bool] = True
+    mapping: ClassVar[str | None] = "lerobot"
+    schemes: ClassVar[tuple[str, ...]] = ("grpc",)
+    takes_key: ClassVar[bool] = False
+
+    def __init__(self, options: ClientOptions) -> None:
+        super().__init__(options)
+        self._grpc = require("grpc")
+        self._channel: Any = None
+        self._observe: Callable[..., bytes] | None = None
+        self._act: Callable[..., bytes] | None = None
+        self._ended = threading.Event()
+        self._step = 0
+
+    @staticmethod
+    def is_nested(key: str) -> bool:  # noqa: ARG004 - overrides
+        """Return False: an observation is one flat map."""
+        return False
+
+    @property
+    def is_open(self) -> bool:
+        return self._channel is not None and not self._ended.is_set()
+
+    def connect(self, timeout_s: float) -> dict[str, Any]:
+        instructions = self.options.instructions
+        if instructions is None:
+            raise ValueError("lerobot: want instructions among the options")
+        most = ("grpc.max_receive_message_length", self.options.limits.body_bytes)
+        channel = self._channel = self._grpc.insecure_channel(urlsplit(self.options.url).netloc, [*_OPTIONS, most])
+        unary = {name: channel.unary_unary(protobuf.method(name)) for name in ("Ready", "SendPolicyInstructions")}
+        self._observe = channel.stream_unary(protobuf.method("SendObservations"))
+        self._act = channel.unary_unary(protobuf.method("GetActions"))
+        self._ended = ended = threading.Event()
+
+        def watch(state: Any) -> None:
+            """Note that the connection ended: gRPC opens another one by itself, to a server without a policy."""
+            if state is not self._grpc.ChannelConnectivity.READY:
+                ended.set()
+
+        try:
+            self._call(unary["Ready"], protobuf.EMPTY, timeout_s)
+            channel.subscribe(watch)
+            setup = protobuf.write_data(wire.write_instructions(instructions))
+            self._call(unary["SendPolicyInstructions"], setup, self.options.load_s)
+        except ConnectionLost as error:
+            raise PolicyUnavailable(f"{error}; is it running?") from error
+        except VLAgentsError:
+            self.close()
+            raise
+        self._step = random.randrange(_FIRST_STEPS)
+        return {"policy_type": instructions.policy_type, "pretrained_name_or_path": instructions.checkpoint}
+
+    def ask(self, observations: Sequence[Mapping[str, Any]]) -> list[Answer]:
+        [observation] = observations
+        if self._observe is None or self._act is None or self.options.instructions is None:
+            raise ConnectionLost(f"upstream {self.options.url}: the connection is closed")
+        deadline, now, self._step = time.monotonic() + self.options.timeout_s, time.time(), self._step + 1
+        data = wire.write_observation(observation, self.options.instructions, now, self._step)
+        self._call(self._observe, protobuf.write_observation_parts(data), self.options.timeout_s)
+        reply = protobuf.read_data(self._call(self._act, protobuf.EMPTY, max(0.0, deadline - time.monotonic())))
+        if not reply and not self.is_open:
+            self.close()
+            raise ConnectionLost(f"upstream {self.options.url}: it was restarted, and has no policy yet")
+        if not reply:
+            raise self.failed("no actions: its own log says why, unless another client took them")
+        chunk = wire.read_chunk(reply, self.options.limits)
+        if (chunk.timestamp, chunk.timestep) != (now, self._step):
+            raise self.failed("the actions of another client's observation; it has one client at a time")
+        return [chunk.rows]
+
+    def close(self) -> None:
+        if self._channel is not None:
+            self._channel.close()
+            self._channel = self._observe = self._act = None
+
+    def _call(self, method: Callable[..., bytes], message: Any, timeout_s: float) -> bytes:
+        try:
+            return method(message, timeout=timeout_s)
+        except self._grpc.RpcError as error:
+            code, text = error.code().name, error.details()
+            if code not in _LOST:
+                raise self.failed(f"{code}: {text}") from error
+            self.close()
+            late = code == "DEADLINE_EXCEEDED"
+            raise ConnectionLost(
+                f"upstream {self.options.url}: {f'no answer within {timeout_s:.3g} s' if late else text}"
+            ) from error

@@ -1,0 +1,1 @@
+"""XPolicyLab's messages."""
