@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 import verified
@@ -23,6 +24,9 @@ def test_what_is_noted_is_of_tests_that_there_are(family: str) -> None:
     for noted in (one["tests"] for one in verified.notes(family)):
         assert noted.keys() <= tests.keys(), f"run `make verified FAMILIES={verified.RUN_WITH[family][0]}`"
         assert not any("failed" in outcomes for outcomes in noted.values())
+    for one in verified.notes(family):
+        skipped = {name for name, outcomes in one["tests"].items() if "skipped" in outcomes}
+        assert one.get("skipped", {}).keys() == skipped, "without a reason for each"
 
 
 def test_each_family_with_a_page_is_listed() -> None:
@@ -41,22 +45,30 @@ def test_a_test_that_is_new_or_gone_changes_the_table(tmp_path: Path, monkeypatc
                 "python": "3.11",
                 "versions": {"torch": "2"},
                 "device": "a CPU",
-                "tests": {"test_it.py::test_acts_are_theirs": {"passed": 2}},
+                "tests": {"test_it.py::test_acts_are_theirs": {"passed": 2, "skipped": 1}},
+                "skipped": {"test_it.py::test_acts_are_theirs": "no GPU"},
+                "left_out": {"test_more.py": "no simulator"},
             }
         )
     )
+    (file.parent / "test_more.py").write_text('@pytest.mark.verifies("parity")\ndef test_more(): ...\n')
     said = verified.table("pi0")
-    assert "| acts as upstream's own code | acts are theirs | `test_it.py` | 2 passed |" in said
+    assert "| acts as upstream's own code | acts are theirs | `test_it.py` | 2 passed, 1 skipped: no GPU |" in said
+    assert "| more | `test_more.py` | not run: no simulator |" in said
     assert "Python 3.11, torch 2, on a CPU." in said
     assert "other" not in said
     file.write_text(file.read_text().replace("acts_are_theirs", "acts_are_like_theirs"))
-    assert "| acts as upstream's own code | acts are like theirs | `test_it.py` | not run |" in verified.table("pi0")
+    assert "acts are like theirs | `test_it.py` | not run: it is newer than these results |" in verified.table("pi0")
 
 
 def test_outcomes_are_noted_by_family_and_test(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(verified, "FAMILIES", tmp_path)
     (tmp_path / "pi0").mkdir()
     plugin = verified.VerifyingTests()
+    conftest = ModuleType("conftest")
+    conftest.__file__ = str(tmp_path / "pi0" / "conftest.py")
+    conftest.LEFT_OUT = {"test_more.py": "no simulator"}  # type: ignore[attr-defined]
+    plugin.pytest_plugin_registered(conftest)
     for case, when, outcome in (
         ("a", "setup", "passed"),
         ("a", "call", "passed"),
@@ -68,7 +80,7 @@ def test_outcomes_are_noted_by_family_and_test(tmp_path: Path, monkeypatch: pyte
             ("", 0, ""),
             {},
             outcome,
-            None,
+            ("test_it.py", 1, "Skipped: no GPU") if outcome == "skipped" else None,
             when,
             user_properties=[("verifies", True)],
         )
@@ -76,4 +88,6 @@ def test_outcomes_are_noted_by_family_and_test(tmp_path: Path, monkeypatch: pyte
     plugin.pytest_sessionfinish()
     noted = json.loads(verified.noted_in("pi0").read_text())
     assert noted["tests"] == {"test_it.py::test_x": {"passed": 1, "failed": 1, "skipped": 1}}
+    assert noted["skipped"] == {"test_it.py::test_x": "no GPU"}
+    assert noted["left_out"] == {"test_more.py": "no simulator"}
     assert Counter(noted["versions"].keys()) == Counter(["transformers", "torch"])

@@ -118,9 +118,8 @@ class Agent:
     weights_id: dict[str, Any] | None = None
     """Optional: {"digest": …, "revision": …}, which identify the weights loaded by `initialize`, and more for metadata.
 
-    A server reports them, and an evaluation keeps results of different digests apart. If this is None, the server
-    computes a digest of the files that `initialize` found through
-    `vlagents_ray.policies.base.checkpoint.find_checkpoint`, as all model families here do.
+    A server reports them, and an evaluation keeps results of different digests apart. If this is None, the digest is
+    that of the files that `initialize` found by `vlagents_ray.policies.base.checkpoint.find_checkpoint`.
     """
 
     @classmethod
@@ -195,6 +194,11 @@ class Agent:
         """
         return None
 
+    @property
+    def continues_plans(self) -> bool:
+        """Whether a chunk goes on from the plan in `Obs.info` (`LEFTOVER`), which it ignores otherwise."""
+        return False
+
     def initialize(self) -> None:
         """Load the weights and everything else that takes long; called once in a replica, before any `reset`."""
 
@@ -206,8 +210,7 @@ class Agent:
         Args:
             obs: The first observation of the episode.
             instruction: The task in words; None if it has none.
-            kwargs: Options of the episode. `seed` (int) seeds the session's random generator; an evaluation also sends
-                `env`, the environment's name.
+            kwargs: Options: `seed` (int), of the session's random generator; from an evaluation also `env`, its name.
 
         Returns:
             Information about the episode, with values of the types that `Obs.info` may have; often empty.
@@ -236,8 +239,7 @@ class Agent:
 
         Returns:
             Anything that does not share memory with the observation. The agent, and what its sessions share, must not
-            be changed, and only that may be read which `initialize` and `reset` have set, and which no new weights
-            change.
+            be changed; read only what `initialize` and `reset` have set and what no new weights change.
         """
         return None
 
@@ -284,8 +286,7 @@ class Agent:
     def act_stream(self, obs: Obs) -> Generator[Act, None, None]:
         """Compute a chunk in parts, each as soon as its rows are known; by default, all in one part.
 
-        An agent whose first rows are known long before its last ones defines this or `act_batch_stream`, and
-        `act_parts`.
+        If the first rows are known long before the last ones, define this or `act_batch_stream`, and `act_parts`.
 
         Args:
             obs: The observation to act on, as in `act`.
@@ -326,8 +327,7 @@ class Agent:
     def check_health(self) -> None:
         """Raise an exception if this agent can never act again, e.g. after the loss of its GPU.
 
-        A server calls this every few seconds on the initialized agent, also while a batch runs, and replaces the
-        replica if it raises.
+        A server calls this every few seconds, also while a batch runs, and replaces the replica if it raises.
         """
 
     def close(self) -> None:

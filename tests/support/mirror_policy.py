@@ -1,15 +1,18 @@
-"""A policy whose chunks are a known function of what it observed, so that a test can say what LeRobot should record."""
+"""Policies whose chunks are a known function of what they got, so that a test can say what LeRobot should do."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
 
 from vlagents_ray import Act, Agent, Obs
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.interface import DELAY, LEFTOVER
 
 CAMERA, SIDE, HZ, ROWS = "top", 48, 20, 2
+COUNT = 1 / 1024  # exact, and small, so that a gripper can be there
 CONTRACT = Contract(
     cameras={CAMERA: CameraSpec(SIDE, SIDE)},
     state={"joints": StateSpec(2, "rad")},
@@ -55,3 +58,18 @@ class MirrorPolicy(Agent):
         self.acts += 1
         state = np.array([*obs.state["joints"], obs.gripper], np.float32)
         return Act(mirrored(state, int(obs.cameras[CAMERA][0, 0, 0]), self.acts, self.instruction))
+
+
+class CountingPolicy(Agent):
+    """A policy with real-time chunking, whose rows (n, n, n) go on counting in `COUNT` from the plan, else from 1."""
+
+    contract = replace(CONTRACT, chunk=40)
+    continues_plans = True
+    plans: ClassVar[list[tuple[np.ndarray, int]]] = []  # rows, (H, 3), and the delay of each act with a plan
+
+    def act(self, obs: Obs) -> Act:
+        plan = obs.info.get(LEFTOVER, np.zeros((0, 3), np.float32))
+        if len(plan):
+            self.plans.append((plan, obs.info[DELAY]))
+        first = plan[0, 0] / COUNT if len(plan) else 1
+        return Act(np.repeat(np.arange(first, first + 40, dtype=np.float32)[:, None] * COUNT, 3, axis=1))

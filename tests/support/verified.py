@@ -1,7 +1,8 @@
 """What the tests of a model family verify, for the family's page: `python tests/support/verified.py` writes all tables.
 
 A test states with `@pytest.mark.verifies("parity")` what it verifies. `pytest --verified tests/families/FAMILY` notes
-what became of these tests in `verified.json` of that folder, and `make verified` does both.
+what became of these tests in `verified.json` of that folder, and `make verified` does both. Why a test was skipped is
+in its report; why a file was left out is in `LEFT_OUT` of the folder's conftest.py, {file: reason}.
 """
 
 from __future__ import annotations
@@ -52,6 +53,12 @@ class VerifyingTests:
 
     def __init__(self) -> None:
         self._outcomes: dict[str, dict[str, Counter[str]]] = {}
+        self._skipped: dict[str, dict[str, str]] = {}  # why, by family and test
+        self._left_out: dict[str, dict[str, str]] = {}  # why, by family and file
+
+    def pytest_plugin_registered(self, plugin: Any) -> None:
+        if left_out := getattr(plugin, "LEFT_OUT", None):  # a conftest.py
+            self._left_out[Path(plugin.__file__).parent.name] = left_out
 
     def pytest_collection_modifyitems(self, items: list[pytest.Item]) -> None:
         for item in items:
@@ -66,10 +73,14 @@ class VerifyingTests:
             family = Path(file).parent.name
             name = f"{Path(file).name}::{test}"
             self._outcomes.setdefault(family, {}).setdefault(name, Counter())[report.outcome] += 1
+            if report.skipped and isinstance(report.longrepr, tuple):
+                self._skipped.setdefault(family, {})[name] = report.longrepr[2].removeprefix("Skipped: ")
 
     def pytest_sessionfinish(self) -> None:
         for family, tests in self._outcomes.items():
             noted = {**_environment(family), "tests": {name: dict(tests[name]) for name in sorted(tests)}}
+            noted["skipped"] = self._skipped.get(family, {})
+            noted["left_out"] = self._left_out.get(family, {})
             noted_in(family).write_text(json.dumps(noted, indent=2) + "\n")
 
 
@@ -105,7 +116,7 @@ def table(family: str) -> str:
     rows = []
     for what, name in sorted(((what, name) for name, what in marked(family)), key=lambda one: list(WHAT).index(one[0])):
         file_name, _, test = name.partition("::test_")
-        results = " | ".join(_result(one["tests"].get(name)) for one in noted or [{"tests": {}}])
+        results = " | ".join(_result(one, name) for one in noted) or "not run"
         rows.append(f"| {WHAT[what]} | {test.replace('_', ' ')} | `{file_name}` | {results} |")
     cases = [f"cases, Python {one['python']}" for one in noted] if len(noted) > 1 else ["cases"]
     return "\n".join(
@@ -147,10 +158,14 @@ def _python() -> str:
     return ".".join(platform.python_version_tuple()[:2])
 
 
-def _result(outcomes: dict[str, int] | None) -> str:
+def _result(noted: dict[str, Any], name: str) -> str:
+    """What became of a test, and why if it did not run."""
+    outcomes = noted["tests"].get(name)
     if outcomes is None:
-        return "not run"
-    return ", ".join(f"{number} {what}" for what, number in sorted(outcomes.items()))
+        file = name.partition("::")[0]
+        return f"not run: {noted.get('left_out', {}).get(file, 'it is newer than these results')}"
+    said = ", ".join(f"{number} {what}" for what, number in sorted(outcomes.items()))
+    return f"{said}: {noted['skipped'][name]}" if "skipped" in outcomes else said
 
 
 def _version(name: str) -> str:

@@ -174,11 +174,9 @@ class RemoteAgent(Agent):
     ) -> dict[str, Any]:
         """Begin an episode; `kwargs` are passed to the policy's `reset`.
 
-        `checkpoint` and `checkpoint_step` are not passed on: they select one of the checkpoints that the server offers
-        (`metadata["checkpoints"]`), and the returned info says which one it is.
-
-        With `contract`, the contract of the robot or the environment, the server first compares it with the policy's,
-        and raises `ContractMismatch` with every difference.
+        `checkpoint` and `checkpoint_step` are not passed on: they select one of `metadata["checkpoints"]`, which the
+        returned info names. With `contract`, that of the robot or the environment, the server first compares it with
+        the policy's, and raises `ContractMismatch` with every difference.
         """
         [info] = self.reset_batch([obs], [instruction], [self], contract=contract, **kwargs)
         if isinstance(info, Exception):
@@ -206,8 +204,7 @@ class RemoteAgent(Agent):
             kwargs: Options of the policy's `reset`, the same for all sessions.
 
         Returns:
-            What `reset` returns for each session, or the exception of a session that failed, which affects only that
-            session.
+            What `reset` returns for each session, or the exception of a session that failed, which affects it alone.
         """
         siblings = self._siblings(sessions)
         self._connection.open()
@@ -254,8 +251,7 @@ class RemoteAgent(Agent):
             agent.reset_batch(observations, ["pick up the cube"] * 16, envs)
             acts = agent.act_batch(observations, envs)
 
-        The server runs them in as few batches as its limit allows. An exception in place of an action affects only its
-        own session.
+        The server runs them in as few batches as its limit allows. An exception affects its own session alone.
         """
         begun = time.perf_counter()
         siblings = self._siblings(sessions)
@@ -272,6 +268,11 @@ class RemoteAgent(Agent):
         if self._session.episode is None:  # in an episode, only a call with a timeout may connect again
             self._connection.open()
         return self._connection.act_parts
+
+    @property
+    def continues_plans(self) -> bool:
+        """Whether the policy's chunks go on from the plan that is executed; see `Agent.continues_plans`."""
+        return bool((self.metadata or {}).get("continues_plans"))
 
     def act_stream(self, obs: Obs) -> Generator[Act, None, None]:
         """Yield the rows of the next chunk as they come; the last part is without `more`, and has the `timing`.

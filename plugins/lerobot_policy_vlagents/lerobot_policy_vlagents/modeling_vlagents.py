@@ -12,6 +12,7 @@ from typing import Any, NoReturn, cast
 import numpy as np
 import torch
 from lerobot.policies.pretrained import PreTrainedPolicy
+from lerobot.policies.rtc.configuration_rtc import RTCConfig
 
 from lerobot_policy_vlagents.configuration_vlagents import TRAINING, VlagentsConfig
 from lerobot_policy_vlagents.observations import (
@@ -22,7 +23,9 @@ from lerobot_policy_vlagents.observations import (
 )
 from vlagents_ray import Act, Obs, RemoteAgent
 from vlagents_ray.errors import ConfigError, ContractMismatch, InvalidAction
+from vlagents_ray.interface import DELAY, LEFTOVER
 
+_GUIDANCE = ("max_guidance_weight", "prefix_attention_schedule")  # of RTCConfig; the server has its own
 logger = logging.getLogger(__name__)
 
 
@@ -48,6 +51,7 @@ class VlagentsPolicy(PreTrainedPolicy):
         # LeRobot's evaluation of several tasks at once calls one policy on several threads.
         self._threads = threading.local()
         self._threads.sessions = sessions = _Sessions(self._robot)
+        self._of_all_threads: _Sessions | None = None  # with real-time chunking
         self._robot.check_features(sessions.agent)
 
     @classmethod
@@ -74,19 +78,55 @@ class VlagentsPolicy(PreTrainedPolicy):
         """
         return torch.from_numpy(self._sessions.next_rows(batch))
 
-    def predict_action_chunk(self, batch: dict[str, Any], **_: Any) -> torch.Tensor:
+    def predict_action_chunk(
+        self,
+        batch: dict[str, Any],
+        *,
+        inference_delay: int = 0,
+        prev_chunk_left_over: torch.Tensor | None = None,
+        **_: Any,
+    ) -> torch.Tensor:
         """Return a new chunk of each session, (B, H, D) float32; `select_action` does not see it.
 
         Args:
             batch: As of `select_action`.
+            inference_delay: Real-time chunking: the number of rows of the plan that will have been executed.
+            prev_chunk_left_over: Real-time chunking: the plan from this observation on, (H', D) or (B, H', D), which
+                LeRobot fills up with rows of zeros.
         """
-        chunks = self._sessions.chunks(batch)
+        rtc = getattr(self.config, "rtc_config", None)
+        left = prev_chunk_left_over if rtc is None or rtc.enabled else None
+        chunks = self._sessions.chunks(batch, _plans(left, inference_delay, _size(batch)))
         if len(lengths := {len(rows) for rows in chunks}) > 1:
             raise InvalidAction(
                 f"predict_action_chunk: got chunks of {sorted(lengths)} rows, want one length; set a "
                 f"length in the server's deployment file, or use select_action"
             )
         return torch.from_numpy(np.stack(chunks))
+
+    def supports_rtc(self) -> bool:
+        """Return True; raises `ConfigError` if the server's policy does not go on from the plan that is executed."""
+        if not self._sessions.agent.continues_plans:
+            raise ConfigError(
+                "inference.type: got rtc, and the server's policy ignores the plan that is executed, so that its "
+                "chunks would not fit together; use --inference.type=sync, serve a policy with real-time chunking and "
+                "`actions: chunk` (pi0, openpi, or smolvla, pi0 and pi05 of lerobot), or, to keep the robot moving "
+                "while another policy computes, drive it by vlagents_ray's own ChunkPlayer(agent, mode='async')"
+            )
+        return True
+
+    def init_rtc_processor(self) -> None:
+        """Let all threads share one session: LeRobot computes chunks on another one than that which calls `reset`.
+
+        LeRobot calls this once `config.rtc_config` is set. Raises `ConfigError` for settings that the server has.
+        """
+        wanted, usual = self.config.rtc_config, RTCConfig()
+        if changed := [name for name in _GUIDANCE if getattr(wanted, name) != getattr(usual, name)]:
+            raise ConfigError(
+                f"inference.rtc.{changed[0]}: got {getattr(wanted, changed[0])}, want none here: the server guides the "
+                f"chunks; set it in its deployment file (for lerobot: overrides: {{rtc_config: …}})"
+            )
+        self._of_all_threads = self._sessions
 
     def forward(self, batch: dict[str, Any]) -> NoReturn:
         """Refuse to train."""
@@ -98,6 +138,8 @@ class VlagentsPolicy(PreTrainedPolicy):
 
     @property
     def _sessions(self) -> _Sessions:
+        if self._of_all_threads is not None:
+            return self._of_all_threads
         if not hasattr(self._threads, "sessions"):
             self._threads.sessions = _Sessions(self._robot)
         return cast(_Sessions, self._threads.sessions)
@@ -161,12 +203,13 @@ class _Sessions:
         self.agent = robot.connect()
         self._agents: list[RemoteAgent] = []
         self._rows: list[deque[np.ndarray]] = []
-        self._mapping: ObservationMapping | None = None  # None: the next batch begins episodes
+        self._mapping: ObservationMapping | None = None  # None before the first episodes
+        self._due = True  # whether the next batch begins episodes
         self._begun = 0  # episodes so far
 
     def reset(self) -> None:
-        """Begin episodes with the next batch."""
-        self._mapping = None
+        """Begin episodes with the next batch; another thread may be in `chunks`."""
+        self._due = True
 
     def next_rows(self, batch: Mapping[str, Any]) -> np.ndarray:
         """Return the next row of each session, (B, D) float32."""
@@ -176,15 +219,25 @@ class _Sessions:
                 self._rows[row].extend(chunk[: self._config.n_action_steps])
         return np.stack([rows.popleft() for rows in self._rows])
 
-    def chunks(self, batch: Mapping[str, Any]) -> list[np.ndarray]:
-        """Return a new chunk of each session, (H, D) float32 each."""
-        self._begin_if_due(batch)
-        return self._act(batch, range(len(self._agents)))
+    def chunks(self, batch: Mapping[str, Any], plans: Sequence[dict[str, Any]]) -> list[np.ndarray]:
+        """Return a new chunk of each session, (H, D) float32 each, which goes on from its plan if it has one."""
+        begun = self._begin_if_due(batch)
+        return self._act(batch, range(len(self._agents)), () if begun else plans)
 
-    def _begin_if_due(self, batch: Mapping[str, Any]) -> None:
+    def _begin_if_due(self, batch: Mapping[str, Any]) -> bool:
+        """Begin episodes if they are due; returns whether they were."""
         size = _size(batch)
-        if self._mapping is not None and size == len(self._agents):
-            return
+        if not self._due and size == len(self._agents):
+            return False
+        self._due = False
+        try:
+            self._begin(batch, size)
+        except BaseException:
+            self._due = True
+            raise
+        return True
+
+    def _begin(self, batch: Mapping[str, Any], size: int) -> None:
         mapping = self._robot.mapping(self.agent, shapes_of_batch(batch))
         if mapping.unused and not self._begun:
             logger.info("cameras that the policy does not take, and that are not sent: %s", mapping.unused)
@@ -201,9 +254,13 @@ class _Sessions:
         self._rows = [deque() for _ in range(size)]
         self._mapping = mapping
 
-    def _act(self, batch: Mapping[str, Any], rows: Sequence[int]) -> list[np.ndarray]:
+    def _act(
+        self, batch: Mapping[str, Any], rows: Sequence[int], plans: Sequence[dict[str, Any]] = ()
+    ) -> list[np.ndarray]:
         mapping = cast(ObservationMapping, self._mapping)
         observations: list[Obs] = [mapping.observation(batch, row) for row in rows]
+        for obs, plan in zip(observations, plans, strict=False):
+            obs.info.update(plan)
         acts = cast(list[Act], _successes(self.agent.act_batch(observations, [self._agents[row] for row in rows])))
         chunks = [act.rows().astype(np.float32, copy=False) for act in acts]
         want = self._robot.action_dim
@@ -229,6 +286,20 @@ def _size(batch: Mapping[str, Any]) -> int:
     return next(
         len(value) for key, value in batch.items() if key.startswith("observation.") and hasattr(value, "shape")
     )
+
+
+def _plans(left: torch.Tensor | None, delay: int, size: int) -> list[dict[str, Any]]:
+    """Return the `Obs.info` of real-time chunking of each session; none without a plan.
+
+    LeRobot fills a plan up to its execution horizon with rows of zeros. Nothing is normalised here: they are actions.
+    """
+    if left is None:
+        return []
+    plans = []
+    for plan in left.detach().to("cpu", torch.float32).reshape(size, -1, left.shape[-1]).numpy():
+        rows = plan[: np.flatnonzero(plan.any(axis=1)).max(initial=-1) + 1]
+        plans.append({LEFTOVER: rows, DELAY: min(delay, len(rows))} if len(rows) else {})
+    return plans
 
 
 def _names(names: Any) -> list[str]:

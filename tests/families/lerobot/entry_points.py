@@ -3,10 +3,13 @@
 Importing LeRobot's commands takes ten seconds: `python entry_points.py` does it once for all lines of its input, each
 a command and its options as JSON, and prints the exit status of each. A command's output is in the file NUMBER.log.
 Options have no help, which draccus reads in the sources of all types of policies and robots for three seconds.
+A command's terminal is one on which the simulated robot's operator types.
 """
 
 from __future__ import annotations
 
+import importlib
+import importlib.util
 import json
 import os
 import sys
@@ -14,15 +17,22 @@ import traceback
 from collections.abc import Callable
 
 from draccus.wrappers import docstring
-from lerobot.scripts import lerobot_eval, lerobot_record
 
-MAINS: dict[str, Callable[[], None]] = {"lerobot-eval": lerobot_eval.main, "lerobot-record": lerobot_record.main}
+MAINS: dict[str, Callable[[], None]] = {
+    f"lerobot-{name}": importlib.import_module(f"lerobot.scripts.lerobot_{name}").main
+    for name in ("eval", "record", "rollout")
+    if importlib.util.find_spec(f"lerobot.scripts.lerobot_{name}") is not None
+}
 
 
 def status(command: list[str], log: str) -> int:
     """Run a command in a process of its own; its exit status."""
     if child := os.fork():
         return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    keyboard, terminal = os.openpty()
+    os.dup2(terminal, 0)
+    sys.stdin = open(0, closefd=False)  # noqa: SIM115 - as long as the process
+    os.environ["MIRROR_KEYBOARD"] = str(keyboard)
     with open(log, "w") as output:
         os.dup2(output.fileno(), 1)
         os.dup2(output.fileno(), 2)

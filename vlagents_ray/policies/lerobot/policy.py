@@ -77,6 +77,12 @@ class LeRobot(ModelPolicy):
         return None if self.model is None else self.model.contract
 
     @property
+    def continues_plans(self) -> bool:
+        loaded: LoadedLeRobot | None = self.model
+        flows = loaded is not None and isinstance(loaded.kind, Flow) and loaded.processors.invertible
+        return flows and self.config.actions == "chunk"
+
+    @property
     def history(self) -> int:
         return 1 if self.model is None else self.model.kind.steps
 

@@ -152,6 +152,11 @@ class Processors:
         flat = self._after(chunks.float().flatten(0, 1))  # rows, as in LeRobot's own loop
         return np.asarray(flat.unflatten(0, chunks.shape[:2]).float().cpu())
 
+    @property
+    def invertible(self) -> bool:
+        """Whether `leftover` converts actions back to the policy's units."""
+        return self._back is not None
+
     def leftover(self, row: Row) -> Any:
         """Convert the leftover actions of a row, (H, D'), to the policy's units; None if that is not possible."""
         if self._back is None or row.leftover is None:

@@ -86,6 +86,11 @@ class OpenPi(ModelPolicy):
             behaviour=self.offered(OFFERED if self.config.noise_level else ()),
         )
 
+    @property
+    def continues_plans(self) -> bool:
+        flows = self.model is not None and self.model.model.noise_shape is not None
+        return flows and self.config.actions == "chunk"
+
     def load(self) -> LoadedOpenPi:
         """Load the checkpoint by the config with which it was trained."""
         use_source("openpi", SOURCE, self.config.source_dir, within=FOLDERS)

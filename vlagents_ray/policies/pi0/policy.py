@@ -131,6 +131,10 @@ class Pi0(StreamingPolicy):
     def act_parts(self) -> Parts | None:
         return "approximate" if self.config.early_rows and self.config.actions == "chunk" else None
 
+    @property
+    def continues_plans(self) -> bool:
+        return self.config.actions == "chunk"
+
     def load(self) -> LoadedPi0:
         """Load the model with every parameter of the checkpoint, and its processor with all statistics."""
         path = find_checkpoint(

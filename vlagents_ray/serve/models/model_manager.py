@@ -49,6 +49,7 @@ class ModelManager:
     def __init__(self, source: Checkpoints, loader: Loader, sessions: SessionTable[LoadedModel]) -> None:
         """Manage models from `loader` for `sessions`; a model's sessions are closed when it is evicted at once."""
         self.act_parts: Parts | None = None  # whether that model gives chunks in parts
+        self.continues_plans = False  # whether that model's chunks go on from the plan that is executed
         self.contract: Contract | None = None  # contract of the deployment's own model that was loaded last
         self.weights: dict[str, Any] | None = None  # weights of the deployment's own model that was loaded last
         self.step = ""  # the step of a long first load, such as "compiling 4 rows (3 of 5)"
@@ -238,7 +239,7 @@ class ModelManager:
 
     def _set_own_model(self, model: LoadedModel) -> None:
         self.contract, self._fingerprint = model.contract, model.version[1]
-        self.act_parts = model.agent.act_parts
+        self.act_parts, self.continues_plans = model.agent.act_parts, model.agent.continues_plans
         self.weights = model.weights
 
     def _loop(self) -> None:

@@ -83,6 +83,10 @@ class ChildAgent(Agent):
     def act_parts(self) -> Parts | None:
         return self._child.act_parts
 
+    @property
+    def continues_plans(self) -> bool:
+        return self._child.continues_plans
+
     def act_stream(self, obs: Obs) -> Generator[Act, None, None]:
         """Yield the parts from the child, where the sessions of a batch take turns."""
         for reply in self._child.act_in_parts(Request("act", obs, session=self._session or "")):

@@ -115,6 +115,7 @@ def run() -> None:
             "contract": contract,
             "weights": models.weights,
             "act_parts": models.act_parts,
+            "continues_plans": models.continues_plans,
             "uncompiled": models.uncompiled,
         }
     )

@@ -45,6 +45,7 @@ class Child:
         self.contract: Contract | None = None  # contract of the policy, set by `start`
         self.weights: dict[str, Any] | None = None  # identity of the weights, set by `start`
         self.act_parts: Parts | None = None  # whether the policy gives chunks in parts, set by `start`
+        self.continues_plans = False  # whether the policy's chunks go on from a plan, set by `start`
         self.sessions: set[str] = set()  # names of the sessions in the child
         self._python = python
         self._settings = settings
@@ -83,6 +84,7 @@ class Child:
             raise
         self.contract = None if said["contract"] is None else Contract.from_json(said["contract"])
         self.weights, self.act_parts = said["weights"], said["act_parts"]
+        self.continues_plans = said["continues_plans"]
         threading.Thread(target=self._close_sessions, name="policy-process-sessions", daemon=True).start()
 
     def call(self, requests: Sequence[Request]) -> list[Reply]:

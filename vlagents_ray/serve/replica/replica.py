@@ -147,6 +147,7 @@ class PolicyReplica(EngineReplica, ReplicaWeights, ReplicaLive, ReplicaShadow, C
             "config": models.config,
             "contract": None if contract is None else contract.to_json(),
             "act_parts": models.act_parts,
+            "continues_plans": models.continues_plans,
             "protocol": PROTOCOL_VERSION,
             "version": importlib.metadata.version("vlagents-ray"),
             "code": None if self._code is None else self._code.to_json(),
