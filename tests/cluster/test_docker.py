@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 from dockerfile import instructions
 from typer.testing import CliRunner
 
@@ -156,6 +157,27 @@ def test_packages_lie_below_our_code(target: str) -> None:
     assert "code" not in copies[:-1]
     ours = [line.stage for line in LINES if line.word == "COPY" and line.text.startswith("vlagents_ray ")]
     assert ours == ["code"]
+
+
+def test_a_release_builds_targets_on_the_bases_digest() -> None:
+    job = yaml.safe_load((ROOT / ".github/workflows/release.yml").read_text())["jobs"]["images"]
+    assert set(job["strategy"]["matrix"]["target"]) <= set(TARGETS)
+    build = job["steps"][-1]["run"]
+    used = dict(re.findall(r'--build-arg (\w+)="([^"]*)"', build))
+    assert used["BASE"] == "$base@$digest"
+    assert set(used) == {"BASE", "VERSION", "REVISION"}
+    assert subprocess.run(["bash", "-n"], input=build, text=True, check=False).returncode == 0
+
+
+def test_the_page_names_every_target_and_all_that_is_written_to() -> None:
+    page = (ROOT / "docs/cluster/images.md").read_text()
+    rows = re.findall(r"^\| (`.*?) \|", page.partition("## How it runs")[0], re.MULTILINE)
+    assert sorted(name for row in rows for name in re.findall(r"`(\w+)`", row)) == sorted(TARGETS)
+    for path in json.loads(of("VOLUME", "system")[0]):
+        assert f"`{path}`" in page
+    shell = "\n".join(re.findall(r"```bash\n(.*?)```", page, re.DOTALL))
+    assert subprocess.run(["bash", "-n"], input=shell, text=True, check=False).returncode == 0
+    assert set(re.findall(r"--target (\w+)", shell)) <= set(TARGETS)
 
 
 def test_its_command_asks_for_keys(monkeypatch: pytest.MonkeyPatch) -> None:
