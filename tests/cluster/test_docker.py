@@ -22,6 +22,11 @@ DOCKERFILE = FOLDER / "Dockerfile"
 LINES = list(instructions(DOCKERFILE))
 STAGES = [line.stage for line in LINES if line.word == "FROM"]
 TARGETS = [line.stage for line in LINES if line.word == "LABEL" and line.stage != "system"] + STAGES[-1:]
+LOCKS = {  # of the stages that install
+    line.stage: found[1]
+    for line in LINES
+    if (found := re.search(r"source=(\S+/locks/[^,]+)", line.flags.get("mount", "")))
+}
 INSTALL = (FOLDER / "install.sh").read_text()
 SIMULATORS = re.findall(r'^(\w+) = \["vlagents-ray\[sim\]"', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
 FAMILIES = sorted(
@@ -34,9 +39,9 @@ def of(word: str, stage: str | None = None) -> list[str]:
 
 
 def copied() -> list[str]:
-    """What of the repository is copied into any stage."""
+    """What of the repository is copied into any stage, or mounted while a step runs."""
     here = [line.text.split()[:-1] for line in LINES if line.word == "COPY" and "from" not in line.flags]
-    return [path for paths in here for path in paths]
+    return [path for paths in here for path in paths] + list(LOCKS.values())
 
 
 def test_hadolint_finds_nothing() -> None:
@@ -53,9 +58,8 @@ def test_what_is_copied_exists_and_reaches_the_builder() -> None:
     assert copied()
     for path in copied():
         assert (ROOT / path).exists(), path
-        assert any(one == path or (path.endswith("/") and one.startswith(path)) for one in kept), path
-    for one in kept:
-        assert any(one == path or (path.endswith("/") and one.startswith(path)) for path in copied()), one
+        assert any(path == one or path.startswith(f"{one}/") for one in kept), path
+    assert all(any(path.startswith(one) for path in copied()) for one in kept)
 
 
 def test_other_stages_are_named_before_they_are_copied_from() -> None:
@@ -96,7 +100,16 @@ def test_torch_is_the_one_of_the_makefile() -> None:
     pinned = re.search(r"^TORCH \?= (\S+)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
     assert pinned is not None
     assert pinned[1] in (FOLDER / "torch.txt").read_text().splitlines()
-    assert INSTALL.count("--override docker/torch.txt") == INSTALL.count("--requirement pyproject.toml")
+
+
+def test_every_package_is_installed_by_its_hash_and_lies_where_its_lock_says() -> None:
+    assert 'uv pip install --python "$1" --require-hashes' in INSTALL
+    assert list(LOCKS) == [stage for stage in STAGES if stage.endswith("-packages")]
+    for stage, lock in LOCKS.items():
+        kind, _, name = Path(lock).stem.partition("-")
+        assert of("RUN", stage) == [f"./install.sh /opt/{kind}"]
+        assert stage == ("server-packages" if name == "sim" else f"{name}-packages")
+        assert re.search(r" for Python 3\.\d+ ", (ROOT / lock).read_text().partition("\n")[0])
 
 
 @pytest.mark.parametrize("run", [*of("RUN"), INSTALL], ids=range(len(of("RUN")) + 1))
@@ -123,8 +136,7 @@ def test_a_target_brings_its_own_packages_into_the_servers_environment_or_beside
         for line in [
             line for line in LINES if line.stage == stage and line.flags.get("from", "").endswith("-packages")
         ]:
-            [command] = of("RUN", line.flags["from"])
-            _, kind, name = command.split()
+            kind, _, name = Path(LOCKS[line.flags["from"]]).stem.partition("-")
             assert line.text.split() == [f"/opt/{kind}", f"/opt/{kind}"]
             environments[kind] = name
     in_server = target in SIMULATORS
