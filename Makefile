@@ -7,6 +7,10 @@
 #   make families [FAMILIES="lerobot lerobot06 hf rcs libero openvla …"]       tests of model families, in .venv-NAME each
 #   make verified [FAMILIES="lerobot hf"]                           what they verify, into the tables of docs/policies
 #   make docs                                                       the site of docs/, in build/docs, for a browser
+#   make extras                                                     resolve all extras, into the table of docs/install.md
+#   make locks                                                      resolve the images' packages, into cluster/docker/locks
+#   make dist                                                       what a release publishes, checked, in dist
+#   make sbom [LOCK=server-sim]                                     what an image installs and its licences, in build/sbom
 #   make bench                                                      measure, and write the figures of docs/measured.md again
 #
 # Torch comes from wherever pip looks (its settings, PIP_INDEX_URL, PIP_FIND_LINKS). TORCH_INDEX_URL names
@@ -16,7 +20,7 @@ SHELL := /bin/bash
 .SHELLFLAGS := -eu -o pipefail -c
 .DELETE_ON_ERROR:
 .DEFAULT_GOAL := setup
-.PHONY: setup demo bench check test families docs verified fmt lint type clean
+.PHONY: setup demo bench check test families docs verified extras locks dist sbom fmt lint type clean
 
 VENV ?= .venv
 TORCH ?= torch==2.13.0
@@ -100,6 +104,36 @@ $(VENV)-%/.installed: requirements/%.txt requirements/testing.txt $(wildcard req
 docs: $(VENV)-docs/.installed
 	@echo '== site of docs/, into build/docs'
 	NO_MKDOCS_2_WARNING=1 $(VENV)-docs/bin/mkdocs build --quiet --strict
+
+extras locks: $(TOOLS)/.installed
+	$(TOOLS)/bin/python tests/support/resolved.py $@
+
+# The same wheels again from the same commit. LeRobot's plug-in is a distribution of its own.
+PUBLISHING := build==1.6.1 twine==7.0.0 check-wheel-contents==0.6.3
+dist: export SOURCE_DATE_EPOCH := $(shell git log -1 --format=%ct 2>/dev/null || date +%s)
+dist:
+	@$(if $(PYTHON),,$(error $(NO_PYTHON)))
+	rm -rf dist build/publishing build/plugins && '$(PYTHON)' -m venv build/publishing
+	build/publishing/bin/pip install --quiet $(PUBLISHING)
+	build/publishing/bin/python -m build --outdir dist
+	build/publishing/bin/python -m build --outdir build/plugins plugins/lerobot_policy_vlagents
+	build/publishing/bin/twine check --strict dist/* build/plugins/*
+	for wheel in dist/*.whl build/plugins/*.whl; do build/publishing/bin/check-wheel-contents "$$wheel"; done
+
+# CycloneDX, which its own schema has accepted, and a table. Whoever reads them installs nothing else of this folder.
+LOCK ?= server-sim
+sbom:
+	@$(if $(PYTHON),,$(error $(NO_PYTHON)))
+	@echo '== installing $(LOCK) and this package into build/sbom'
+	rm -rf build/sbom && '$(PYTHON)' -m venv build/sbom/tools && '$(PYTHON)' -m venv --without-pip build/sbom/installed
+	build/sbom/tools/bin/pip install --quiet 'pip>=24.3' cyclonedx-bom==7.5.0 pip-licenses==5.5.5
+	build/sbom/tools/bin/pip --python build/sbom/installed/bin/python install --quiet --no-deps --require-hashes \
+	  --requirement cluster/docker/locks/$(LOCK).txt
+	build/sbom/tools/bin/pip --python build/sbom/installed/bin/python install --quiet --no-deps .
+	build/sbom/tools/bin/cyclonedx-py environment --spec-version 1.6 --output-reproducible --pyproject pyproject.toml \
+	  --output-file build/sbom/$(LOCK).cdx.json build/sbom/installed/bin/python
+	build/sbom/tools/bin/pip-licenses --python build/sbom/installed/bin/python --from mixed --format markdown \
+	  --output-file build/sbom/$(LOCK).licences.md
 
 fmt: $(TOOLS)/.installed
 	$(TOOLS)/bin/ruff check --fix .

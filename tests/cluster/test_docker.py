@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fnmatch
 import json
 import re
 import shutil
@@ -11,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
 from dockerfile import instructions
 from typer.testing import CliRunner
 
@@ -21,7 +21,17 @@ FOLDER = ROOT / "cluster" / "docker"
 DOCKERFILE = FOLDER / "Dockerfile"
 LINES = list(instructions(DOCKERFILE))
 STAGES = [line.stage for line in LINES if line.word == "FROM"]
-FAMILIES = sorted(file.stem for file in (ROOT / "requirements").glob("*.txt") if "." not in file.stem)
+TARGETS = [line.stage for line in LINES if line.word == "LABEL" and line.stage != "system"] + STAGES[-1:]
+LOCKS = {  # of the stages that install
+    line.stage: found[1]
+    for line in LINES
+    if (found := re.search(r"source=(\S+/locks/[^,]+)", line.flags.get("mount", "")))
+}
+INSTALL = (FOLDER / "install.sh").read_text()
+SIMULATORS = re.findall(r'^(\w+) = \["vlagents-ray\[sim\]"', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
+FAMILIES = sorted(
+    file.stem for file in (ROOT / "requirements").glob("*.txt") if "." not in file.stem and file.stem != "testing"
+)
 
 
 def of(word: str, stage: str | None = None) -> list[str]:
@@ -29,9 +39,9 @@ def of(word: str, stage: str | None = None) -> list[str]:
 
 
 def copied() -> list[str]:
-    """What of the repository is copied into any stage."""
+    """What of the repository is copied into any stage, or mounted while a step runs."""
     here = [line.text.split()[:-1] for line in LINES if line.word == "COPY" and "from" not in line.flags]
-    return [path for paths in here for path in paths]
+    return [path for paths in here for path in paths] + list(LOCKS.values())
 
 
 def test_hadolint_finds_nothing() -> None:
@@ -48,8 +58,8 @@ def test_what_is_copied_exists_and_reaches_the_builder() -> None:
     assert copied()
     for path in copied():
         assert (ROOT / path).exists(), path
-        assert any(fnmatch.fnmatch(path, one) for one in kept), path
-    assert set(kept) == set(copied())
+        assert any(path == one or path.startswith(f"{one}/") for one in kept), path
+    assert all(any(path.startswith(one) for path in copied()) for one in kept)
 
 
 def test_other_stages_are_named_before_they_are_copied_from() -> None:
@@ -68,55 +78,125 @@ def test_every_base_is_pinned_and_its_python_is_the_packages() -> None:
     assert {text.partition(" AS ")[0] for text in of("FROM")} <= {"${BASE}", "scratch", *STAGES}
 
 
+@pytest.mark.parametrize(
+    ("version", "base", "built"),
+    [
+        ("", "python:3.11.14-slim-bookworm", True),
+        ("0.1.0", "python:3.11.14-slim-bookworm@sha256:" + 64 * "0", True),
+        ("0.1.0", "python:3.11.14-slim-bookworm", False),
+    ],
+)
+def test_a_version_is_built_on_a_base_with_its_digest_alone(version: str, base: str, built: bool) -> None:
+    [step] = [run for run in of("RUN", "system") if "sha256" in run]
+    done = subprocess.run(
+        ["sh", "-c", step], env={"VERSION": version, "BASE": base}, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode == 0) is built
+    assert built or f"got {base}, want a base with its digest" in done.stderr
+    assert 'org.opencontainers.image.base.name="$BASE"' in of("LABEL", "system")[0]
+
+
 def test_torch_is_the_one_of_the_makefile() -> None:
     pinned = re.search(r"^TORCH \?= (\S+)$", (ROOT / "Makefile").read_text(), re.MULTILINE)
     assert pinned is not None
     assert pinned[1] in (FOLDER / "torch.txt").read_text().splitlines()
-    installs = [run for run in of("RUN") if "--requirement" in run]
-    assert len(installs) == 2
-    assert all("--override torch.txt" in run for run in installs)
 
 
-@pytest.mark.parametrize("run", of("RUN"), ids=range(len(of("RUN"))))
+def test_every_package_is_installed_by_its_hash_and_lies_where_its_lock_says() -> None:
+    assert 'uv pip install --python "$1" --require-hashes' in INSTALL
+    assert list(LOCKS) == [stage for stage in STAGES if stage.endswith("-packages")]
+    for stage, lock in LOCKS.items():
+        kind, _, name = Path(lock).stem.partition("-")
+        assert of("RUN", stage) == [f"./install.sh /opt/{kind}"]
+        assert stage == ("server-packages" if name == "sim" else f"{name}-packages")
+        assert re.search(r" for Python 3\.\d+ ", (ROOT / lock).read_text().partition("\n")[0])
+
+
+@pytest.mark.parametrize("run", [*of("RUN"), INSTALL], ids=range(len(of("RUN")) + 1))
 def test_a_step_is_shell(run: str) -> None:
     parsed = subprocess.run(["sh", "-n"], input=run, capture_output=True, text=True, check=False)
     assert parsed.returncode == 0, parsed.stderr
 
 
-@pytest.mark.parametrize("family", FAMILIES)
-def test_a_familys_packages_can_be_named(family: str) -> None:
-    [run] = [run for run in of("RUN", "family-packages") if "$FAMILY" in run]
-    [named] = re.findall(r'--requirement "(\S+)"', run)
-    assert (ROOT / named.replace("$FAMILY", family)).is_file()
+def chain(target: str) -> list[str]:
+    """The stages that a target is made of, from the last to its base."""
+    [base] = [text.partition(" AS ")[0] for text in of("FROM", target)]
+    return [target, *(chain(base) if base in STAGES else [])]
 
 
-def test_what_runs_is_no_root_and_says_how_it_is() -> None:
-    last = STAGES[-1]
-    assert of("USER", last) == ["1000:1000"]
-    assert LINES.index(next(line for line in LINES if line.word == "USER")) > max(
-        number for number, line in enumerate(LINES) if line.word in ("RUN", "COPY")
+def test_every_family_and_every_simulator_has_a_target_and_the_last_is_the_servers() -> None:
+    assert sorted(TARGETS) == sorted([*FAMILIES, *(set(SIMULATORS) - set(FAMILIES)), "server"])
+    assert STAGES[-1] == "server"
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_a_target_brings_its_own_packages_into_the_servers_environment_or_beside_it(target: str) -> None:
+    environments = {}
+    for stage in chain(target):
+        for line in [
+            line for line in LINES if line.stage == stage and line.flags.get("from", "").endswith("-packages")
+        ]:
+            kind, _, name = Path(LOCKS[line.flags["from"]]).stem.partition("-")
+            assert line.text.split() == [f"/opt/{kind}", f"/opt/{kind}"]
+            environments[kind] = name
+    in_server = target in SIMULATORS
+    assert environments == (
+        {"server": target} if in_server else {"server": "sim"} | ({} if target == "server" else {"family": target})
     )
-    [health] = of("HEALTHCHECK", last)
+    assert f"vlagents-ray-{target}" in "".join(of("LABEL", target)) or target == "server"
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_what_runs_is_no_root_and_owns_nothing_but_where_it_writes(target: str) -> None:
+    stages = [line for stage in reversed(chain(target)) for line in LINES if line.stage == stage]
+    assert [line.text for line in stages if line.word == "USER"] == ["1000:1000"]
+    after = stages[[line.word for line in stages].index("USER") :]
+    assert not [line for line in after if line.word in ("RUN", "ADD") or "chown" in line.flags]
+    assert json.loads(of("VOLUME", "system")[0]) == ["/tmp", "/home/robot", "/results"]
+
+
+def test_it_says_how_it_is() -> None:
+    [health] = of("HEALTHCHECK", "system")
     assert "http://127.0.0.1:8000/healthz" in health
-    assert json.loads(of("ENTRYPOINT", last)[0])[0] == "tini"
-    assert "tini wget" in of("RUN", last)[0]
+    assert json.loads(of("ENTRYPOINT", "system")[0])[0] == "tini"
+    assert "tini wget" in of("RUN", "system")[0]
 
 
-def test_packages_lie_below_our_code() -> None:
-    for stage in STAGES:
-        words = [line for line in LINES if line.stage == stage]
-        ours = [n for n, line in enumerate(words) if line.word == "COPY" and "vlagents_ray" in line.text]
-        installs = [n for n, line in enumerate(words) if "--requirement" in line.text]
-        assert all(install < our for install in installs for our in ours)
-    assert of("COPY", "wheel")[-1].startswith("vlagents_ray ")
-    assert not any("vlagents_ray" in text for stage in STAGES if stage != "wheel" for text in of("COPY", stage))
+@pytest.mark.parametrize("target", TARGETS)
+def test_packages_lie_below_our_code(target: str) -> None:
+    copies = [line.flags["from"] for line in LINES if line.stage == target and line.word == "COPY"]
+    assert copies[-1] == "code"
+    assert "code" not in copies[:-1]
+    ours = [line.stage for line in LINES if line.word == "COPY" and line.text.startswith("vlagents_ray ")]
+    assert ours == ["code"]
+
+
+def test_a_release_builds_targets_on_the_bases_digest() -> None:
+    job = yaml.safe_load((ROOT / ".github/workflows/release.yml").read_text())["jobs"]["images"]
+    assert set(job["strategy"]["matrix"]["target"]) <= set(TARGETS)
+    build = job["steps"][-1]["run"]
+    used = dict(re.findall(r'--build-arg (\w+)="([^"]*)"', build))
+    assert used["BASE"] == "$base@$digest"
+    assert set(used) == {"BASE", "VERSION", "REVISION"}
+    assert subprocess.run(["bash", "-n"], input=build, text=True, check=False).returncode == 0
+
+
+def test_the_page_names_every_target_and_all_that_is_written_to() -> None:
+    page = (ROOT / "docs/cluster/images.md").read_text()
+    rows = re.findall(r"^\| (`.*?) \|", page.partition("## How it runs")[0], re.MULTILINE)
+    assert sorted(name for row in rows for name in re.findall(r"`(\w+)`", row)) == sorted(TARGETS)
+    for path in json.loads(of("VOLUME", "system")[0]):
+        assert f"`{path}`" in page
+    shell = "\n".join(re.findall(r"```bash\n(.*?)```", page, re.DOTALL))
+    assert subprocess.run(["bash", "-n"], input=shell, text=True, check=False).returncode == 0
+    assert set(re.findall(r"--target (\w+)", shell)) <= set(TARGETS)
 
 
 def test_its_command_asks_for_keys(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "300")
     for variable in ("VLAGENTS_RAY_KEYS", "VLAGENTS_RAY_KEYS_FILE"):
         monkeypatch.delenv(variable, raising=False)
-    name, *words = json.loads(of("CMD", STAGES[-1])[0])
+    name, *words = json.loads(of("CMD", "system")[0])
     assert name == "vlagents-ray"
     result = CliRunner().invoke(app, words)
     assert result.exit_code != 0

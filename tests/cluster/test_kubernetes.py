@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import copy
+import ipaddress
+import json
 import re
 import shlex
 import subprocess
@@ -15,6 +17,7 @@ import pytest
 import yaml
 from cluster_pages import serve_runs
 from kuberay import FOLDER, PodMonitor, RayJob, RayService, check, documents, manifest
+from pod_security import forbidden
 from pydantic import ValidationError
 from readme_blocks import check_command
 from typer.testing import CliRunner
@@ -29,6 +32,7 @@ from vlagents_ray.serve.launch.deployment_file import listens_at, read_deploymen
 from vlagents_ray.serve.launch.haproxy import ROBOTS
 
 ROOT = Path(__file__).parents[2]
+DOCKERFILE = (ROOT / "cluster/docker/Dockerfile").read_text()
 SERVICE = RayService.model_validate(manifest("RayService", "policy"))
 JOB = RayJob.model_validate(manifest("RayJob", "evaluation"))
 PODS = {
@@ -141,7 +145,7 @@ def test_pods_find_the_settings_that_a_server_of_our_own_gives_haproxy() -> None
 
 @pytest.mark.parametrize("name", PODS)
 def test_a_pod_runs_as_the_images_user_and_gets_what_it_asks_for(name: str) -> None:
-    user = re.search(r"^USER (\d+):(\d+)$", (ROOT / "cluster/docker/Dockerfile").read_text(), re.MULTILINE)
+    user = re.search(r"^USER (\d+):(\d+)$", DOCKERFILE, re.MULTILINE)
     assert user is not None
     spec = PODS[name]["spec"]
     security = spec["securityContext"]
@@ -150,6 +154,167 @@ def test_a_pod_runs_as_the_images_user_and_gets_what_it_asks_for(name: str) -> N
     for container in spec["containers"]:
         assert container["resources"]["requests"] == container["resources"]["limits"]
         assert container["securityContext"]["capabilities"] == {"drop": ["ALL"]}
+
+
+def complete(name: str) -> dict[str, Any]:
+    """The spec of a pod, with the container that KubeRay adds to a head."""
+    spec = copy.deepcopy(PODS[name]["spec"])
+    if name.endswith("-head"):
+        cluster = (SERVICE if name.startswith("policy") else JOB).cluster
+        spec["containers"].append(cluster.autoscaler_options.container)
+    return spec
+
+
+@pytest.mark.parametrize("name", PODS)
+def test_a_pod_is_one_that_the_profile_restricted_lets_in(name: str) -> None:
+    assert forbidden(complete(name)) == []
+
+
+def without(field: str, value: Any = None) -> dict[str, Any]:
+    """A pod whose first container has no such field in its `securityContext`, or another value."""
+    spec = complete("policy-cpu")
+    security = spec["containers"][0]["securityContext"]
+    security.update({field: value}) if value is not None else security.pop(field)
+    return spec
+
+
+@pytest.mark.parametrize(
+    ("spec", "found"),
+    [
+        (without("allowPrivilegeEscalation"), ["ray-worker: allowPrivilegeEscalation"]),
+        (without("capabilities"), ["ray-worker: capabilities.drop"]),
+        (without("capabilities", {"drop": ["ALL"], "add": ["SYS_PTRACE"]}), ["ray-worker: capabilities.add"]),
+        (without("privileged", True), ["ray-worker: privileged"]),
+        (without("runAsUser", 0), ["ray-worker: runAsUser"]),
+        (without("runAsNonRoot", False), ["ray-worker: runAsNonRoot"]),
+        (without("seccompProfile", {"type": "Unconfined"}), ["ray-worker: seccompProfile"]),
+        (without("procMount", "Unmasked"), ["ray-worker: procMount"]),
+        (without("appArmorProfile", {"type": "Unconfined"}), ["ray-worker: appArmorProfile"]),
+        (without("seLinuxOptions", {"type": "spc_t"}), ["ray-worker: seLinuxOptions"]),
+        (complete("policy-cpu") | {"hostNetwork": True}, ["hostNetwork"]),
+        (complete("policy-cpu") | {"volumes": [{"name": "disk", "hostPath": {"path": "/"}}]}, ["volumes: disk"]),
+        (
+            {"containers": [{"name": "bare", "ports": [{"containerPort": 1, "hostPort": 1}]}]},
+            [
+                f"bare: {field}"
+                for field in (
+                    "allowPrivilegeEscalation",
+                    "capabilities.drop",
+                    "hostPort",
+                    "runAsNonRoot",
+                    "seccompProfile",
+                )
+            ],
+        ),
+    ],
+    ids=lambda value: value[0] if isinstance(value, list) else "",
+)
+def test_what_the_profile_forbids_is_found(spec: dict[str, Any], found: list[str]) -> None:
+    assert forbidden(spec) == found
+
+
+@pytest.mark.parametrize("name", PODS)
+def test_a_pods_root_is_read_only_and_it_writes_where_the_image_says(name: str) -> None:
+    [volumes] = re.findall(r"^VOLUME (.*)$", DOCKERFILE, re.MULTILINE)
+    spec = complete(name)
+    kinds = {volume["name"]: next(key for key in volume if key != "name") for volume in spec["volumes"]}
+    for container in spec["containers"]:
+        assert container["securityContext"]["readOnlyRootFilesystem"] is True
+        mounts = {mount["mountPath"]: mount for mount in container["volumeMounts"]}
+        written = {path for path, mount in mounts.items() if kinds[mount["name"]] == "emptyDir"}
+        assert written <= {*json.loads(volumes), "/dev/shm"}
+        if container["name"] in ("ray-head", "ray-worker"):
+            assert written == {"/tmp", "/home/robot", "/dev/shm"}
+
+
+@pytest.mark.parametrize("name", PODS)
+def test_the_autoscaler_alone_may_ask_kubernetes(name: str) -> None:
+    spec = complete(name)
+    assert spec["automountServiceAccountToken"] is False
+    with_token = {
+        container["name"]
+        for container in spec["containers"]
+        for mount in container["volumeMounts"]
+        if mount["mountPath"] == "/var/run/secrets/kubernetes.io/serviceaccount"
+    }
+    assert with_token == ({"autoscaler"} if name.endswith("-head") else set())
+
+
+def labels_of(name: str) -> dict[str, str]:
+    """With the one that KubeRay adds."""
+    kind = {"ray.io/node-type": "head" if name.endswith("-head") else "worker"} if name in RAY_PODS else {}
+    return PODS[name]["metadata"]["labels"] | kind
+
+
+def selected(selector: dict[str, Any]) -> set[str]:
+    """The pods that a selector of labels takes in."""
+    return {
+        name
+        for name in PODS
+        if selector.get("matchLabels", {}).items() <= labels_of(name).items()
+        and all(labels_of(name).get(one["key"]) in one["values"] for one in selector.get("matchExpressions", []))
+    }
+
+
+def test_a_budget_keeps_the_heads_and_the_last_worker_that_serves() -> None:
+    budgets = {one["metadata"]["name"]: one["spec"] for one in documents(FOLDER / "disruption.yaml")}
+    assert {name: selected(spec["selector"]) for name, spec in budgets.items()} == {
+        "policy-head": {"policy-head"},
+        "policy-workers": {"policy-cpu", "policy-gpu"},
+        "evaluation-head": {"evaluation-head"},
+    }
+    for spec in budgets.values():  # of pods whose owner has no scale, Kubernetes takes a number alone
+        assert spec["minAvailable"] == 1
+        assert "maxUnavailable" not in spec
+
+
+def leaves(name: str) -> list[dict[str, Any]]:
+    """The rules of all policies by which a pod may connect to others."""
+    policies = [one["spec"] for one in documents(FOLDER / "network.yaml")]
+    mine = [spec for spec in policies if name in selected(spec["podSelector"]) and "Egress" in spec["policyTypes"]]
+    assert mine, f"{name} reaches everything"
+    return [rule for spec in mine for rule in spec["egress"]]
+
+
+def reaches(name: str, address: str, port: int) -> bool:
+    """Whether a pod may connect to an address outside of the cluster's pods, by TCP."""
+    wanted = ipaddress.ip_address(address)
+    for rule in leaves(name):
+        blocks = [to["ipBlock"] for to in rule.get("to", []) if "ipBlock" in to]
+        inside = "to" not in rule or any(
+            wanted in ipaddress.ip_network(block["cidr"])
+            and not any(wanted in ipaddress.ip_network(one) for one in block.get("except", []))
+            for block in blocks
+        )
+        ports = rule.get("ports", [{"protocol": "TCP", "port": port}])
+        if inside and {"protocol": "TCP", "port": port} in ports:
+            return True
+    return False
+
+
+@pytest.mark.parametrize("name", PODS)
+def test_a_pod_reaches_its_own_names_and_public_weights_and_no_private_network(name: str) -> None:
+    assert reaches(name, "8.8.8.8", 443)
+    assert reaches(name, "2600::1", 443)
+    assert not reaches(name, "8.8.8.8", 80)
+    for private in ("10.0.0.1", "172.16.0.1", "192.168.0.1", "169.254.169.254", "fd00::1"):
+        assert reaches(name, private, 443) is name.endswith("-head"), private  # Kubernetes' API, for the autoscaler
+        assert not reaches(name, private, 80), private
+    to = [one for rule in leaves(name) for one in rule.get("to", [])]
+    others = {
+        pod
+        for one in to
+        if "namespaceSelector" not in one
+        for pod in selected(one.get("podSelector") or {"matchLabels": {"": ""}})
+    }
+    own = {pod for pod in PODS if labels_of(pod)["vlagents-ray/cluster"] == labels_of(name)["vlagents-ray/cluster"]}
+    assert others == (own if name.startswith("policy") else set(PODS))
+    assert {"protocol": "UDP", "port": 53} in [port for rule in leaves(name) for port in rule.get("ports", [])]
+
+
+def test_the_namespace_has_kubernetes_hold_pods_to_the_profile() -> None:
+    labels = manifest("Namespace", "robots")["metadata"]["labels"]
+    assert labels["pod-security.kubernetes.io/enforce"] == "restricted"
 
 
 @pytest.mark.parametrize("name", RAY_PODS)

@@ -27,7 +27,7 @@ def _pod(template: dict[str, Any]) -> dict[str, Any]:
 
 
 def _container(part: dict[str, Any]) -> dict[str, Any]:
-    _pod({"spec": {"containers": [{"name": "of-a-part", **part}]}})
+    _pod({"spec": {"containers": [part]}})
     return part
 
 
@@ -49,10 +49,21 @@ class AutoscalerOptions(_Closed):
     idle_timeout_seconds: int = Field(ge=0)
     resources: dict[str, Any]
     security_context: dict[str, Any]
+    volume_mounts: list[dict[str, Any]]
+
+    @property
+    def container(self) -> dict[str, Any]:
+        """What KubeRay adds to the head's pod."""
+        return {
+            "name": "autoscaler",
+            "resources": self.resources,
+            "securityContext": self.security_context,
+            "volumeMounts": self.volume_mounts,
+        }
 
     @model_validator(mode="after")
     def _as_of_a_container(self) -> AutoscalerOptions:
-        _container({"resources": self.resources, "securityContext": self.security_context})
+        _container(self.container)
         return self
 
 

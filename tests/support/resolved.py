@@ -1,0 +1,148 @@
+"""What uv resolves of pyproject.toml and requirements/: the table of docs/install.md, and the locks of the images.
+
+`python tests/support/resolved.py extras` writes the table again, `… locks` the locks, over the network.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import re
+import subprocess
+import sys
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import tomllib
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "install.md"
+LOCKS = ROOT / "cluster" / "docker" / "locks"
+TORCH = ROOT / "cluster" / "docker" / "torch.txt"
+FAMILIES = ROOT / "requirements"
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
+OF_DEVELOPMENT = {"check", "docs", "dev"}  # these are for Python 3.11 alone
+PYTHONS = ("3.10", "3.11", "3.12", "3.13")
+SERVER_PYTHON = "3.11"  # of the images
+PLATFORM = "x86_64-manylinux_2_36"  # Debian bookworm's
+BEGIN, END = "<!-- resolved {} -->", "<!-- /resolved -->"
+
+
+def direct(extra: str | None) -> list[str]:
+    """The requirements of an extra with those of the extras that it names, and of the install without one."""
+    found = list(PROJECT["dependencies"]) if extra is None else direct(None)
+    for text in EXTRAS[extra] if extra else []:
+        wanted = Requirement(text)
+        found += [one for name in wanted.extras for one in direct(name)] if wanted.name == PROJECT["name"] else [text]
+    return list(dict.fromkeys(found))
+
+
+def lines(file: Path) -> list[str]:
+    """The requirements in a file, without comments."""
+    kept = (line.partition(" #")[0].strip() for line in file.read_text().splitlines())
+    return [line for line in kept if line and not line.startswith("#")]
+
+
+def resolve(requirements: Sequence[str], python: str, *words: str) -> list[dict[str, Any]]:
+    """The packages, as in a `pylock.toml`: of each its `name`, `version`, and the `wheels` that fit the platform.
+
+    Raises:
+        subprocess.CalledProcessError: Nothing fits; `stderr` says why.
+    """
+    command = [sys.executable, "-m", "uv", "pip", "compile", "--quiet", "--no-config", "--format", "pylock.toml"]
+    command += ["--python-version", python, "--python-platform", PLATFORM, "--override", str(TORCH), *words, "-"]
+    done = subprocess.run(command, input="\n".join(requirements), capture_output=True, text=True, check=True)
+    return list(tomllib.loads(done.stdout)["packages"])
+
+
+# The table of docs/install.md.
+
+
+def extras() -> list[str | None]:
+    """Those with a row; None is the install without one."""
+    return [None, *(extra for extra in EXTRAS if extra not in OF_DEVELOPMENT)]
+
+
+def digest() -> str:
+    """Of all that the table depends on in this repository."""
+    wanted = [PYTHONS, {str(extra): direct(extra) for extra in extras()}, lines(TORCH)]
+    return hashlib.sha256(json.dumps(wanted).encode()).hexdigest()[:16]
+
+
+def cell(extra: str | None, python: str) -> str:
+    """How many packages come, and which of them have to be compiled, where no versions with wheels alone fit."""
+    found = "no"
+    for words in ([], ["--no-build"]):
+        with suppress(subprocess.CalledProcessError):
+            packages = resolve(direct(extra), python, *words)
+            built = ", ".join(f"`{package['name']}`" for package in packages if not package.get("wheels"))
+            found = f"{len(packages)}, builds {built}" if built else str(len(packages))
+            if not built:
+                break
+    return found
+
+
+def table() -> str:
+    with ThreadPoolExecutor(4) as pool:
+        rows = [(extra, [pool.submit(cell, extra, python) for python in PYTHONS]) for extra in extras()]
+        body = [[f"`{extra}`" if extra else "none", *(one.result() for one in cells)] for extra, cells in rows]
+    heads = [["extra", *(f"Python {python}" for python in PYTHONS)], ["---"] * (1 + len(PYTHONS))]
+    return "\n".join("| " + " | ".join(row) + " |" for row in [*heads, *body])
+
+
+def written(page: str) -> str:
+    """The table in the page, with its digest before it."""
+    found = re.search(f"{BEGIN.format('(.*)')}.*?{END}", page, re.DOTALL)
+    if found is None:
+        raise ValueError(f"{PAGE} has no {BEGIN.format('DIGEST')} … {END}")
+    return found[0]
+
+
+# The locks of the images.
+
+
+def locks() -> dict[str, tuple[str, list[str]]]:
+    """Of each lock's name the Python and the requirements."""
+    servers = ["serve", "sim", *(extra for extra in EXTRAS if f"{PROJECT['name']}[sim]" in EXTRAS[extra])]
+    families = sorted(file for file in FAMILIES.glob("*.txt") if "." not in file.stem and file.stem != "testing")
+    found = {f"server-{extra}": (SERVER_PYTHON, direct(extra)) for extra in servers}
+    for file in families:
+        python = re.match(r"# python: (\S+)", file.read_text())
+        found[f"family-{file.stem}"] = (python[1] if python else SERVER_PYTHON, [*direct("serve"), *lines(file)])
+    return found
+
+
+def lock(name: str) -> str:
+    """A requirements file of all packages, each with the digests of the files that fit an image."""
+    python, requirements = locks()[name]
+    text = [f"# {name}, for Python {python} on {PLATFORM}: `make locks` writes it."]
+    for package in resolve(requirements, python):
+        files = package.get("wheels") or [package["sdist"]]
+        hashes = sorted(f"--hash=sha256:{file['hashes']['sha256']}" for file in files)
+        text.append(" \\\n    ".join([f"{package['name']}=={package['version']}", *hashes]))
+    return "\n".join(text) + "\n"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("what", choices=["extras", "locks"])
+    if parser.parse_args().what == "extras":
+        page = PAGE.read_text()
+        PAGE.write_text(page.replace(written(page), f"{BEGIN.format(digest())}\n{table()}\n{END}"))
+        return
+    with ThreadPoolExecutor(4) as pool:
+        texts = dict(zip(locks(), pool.map(lock, locks()), strict=True))
+    for old in LOCKS.glob("*.txt"):
+        old.unlink()
+    for name, text in texts.items():
+        (LOCKS / f"{name}.txt").write_text(text)
+
+
+if __name__ == "__main__":
+    main()
