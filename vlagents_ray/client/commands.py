@@ -20,7 +20,7 @@ _REFUSAL = 200  # most characters of a refusal
 class Command:
     """A command from the live page."""
 
-    id: str  # by which the server knows the answer
+    id: str  # by which the server knows the answer; empty if the command is not the server's
     do: str  # one of `COMMANDS`
     text: str = ""  # of "instruct": the new instruction
     by: str = ""  # name of the key whose holder pressed the button; empty on a server without keys
@@ -85,6 +85,10 @@ class CommandInbox:
         else:
             self._answers[command.id] = f"{command.do}: not allowed here"
 
+    def put(self, do: str, text: str = "") -> None:
+        """Add a command that this machine gives by itself, such as an instruction that came on a topic of ROS."""
+        self._waiting.append(Command("", do, text))
+
     @property
     def waiting(self) -> list[Command]:
         """The commands that have come and were not obeyed yet, oldest first."""
@@ -94,14 +98,14 @@ class CommandInbox:
         """Let `operated` do what has come since the last call; return those commands that it did."""
         done = []
         while self._waiting:
-            command = self._waiting.popleft()
+            command, refused = self._waiting.popleft(), ""
             try:
                 _do(command, operated)
-            except VLAgentsError as refusal:
-                self._answers[command.id] = str(refusal)[:_REFUSAL]
-            else:
-                self._answers[command.id] = ""
                 done.append(command)
+            except VLAgentsError as refusal:
+                refused = str(refusal)[:_REFUSAL]
+            if command.id:
+                self._answers[command.id] = refused
         return done
 
 

@@ -22,10 +22,12 @@ from vlagents_ray.chunking.buffer import ENSEMBLE, MERGES
 from vlagents_ray.chunking.player import ChunkPlayer
 from vlagents_ray.client.agent import RemoteAgent
 from vlagents_ray.client.commands import CommandInbox
-from vlagents_ray.errors import VLAgentsError
+from vlagents_ray.contract import require_match
+from vlagents_ray.errors import ConfigError, VLAgentsError
 from vlagents_ray.robot.loop import LoopReport, Restart, Robot, import_class, run_loop
 from vlagents_ray.robot.pacing import empty_loop
 from vlagents_ray.robot.record import Recorder
+from vlagents_ray.robot.ros import RosRobot, read_settings
 from vlagents_ray.robot.safety import Guard, Watchdog, measured_state
 from vlagents_ray.robot.simulated import SimulatedRobot
 from vlagents_ray.robot.teleoperation import RemoteLeader
@@ -76,9 +78,13 @@ def _run(options: argparse.Namespace) -> LoopReport:
     make_robot = import_class("--robot", options.robot) if options.robot else None
     leader = import_class("--leader", options.leader)() if options.leader else None
     with contextlib.ExitStack() as stack:
-        commands = CommandInbox() if options.operate else None
+        topics = _topics(options, stack)
+        commands = CommandInbox() if options.operate or topics is not None else None
         agent = RemoteAgent(  # the player closes it
-            options.url, transport=options.transport, timeout_s=options.timeout_s, commands=commands
+            options.url,
+            transport=options.transport,
+            timeout_s=options.timeout_s,
+            commands=commands if options.operate else None,
         )
         agent.initialize()
         contract = agent.contract
@@ -86,7 +92,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
             measure = measured_state(options.measure)
             leader = stack.enter_context(RemoteLeader(agent, local=leader, step=options.step, measure=measure))
         stated = contract is not None and contract.action.relative is not None
-        if options.safe == "auto" and not options.robot and not stated:
+        if options.safe == "auto" and not options.robot and topics is None and not stated:
             options.safe = "hold"  # the simulated robot uses such actions as absolute targets
         player = stack.enter_context(
             ChunkPlayer(
@@ -104,7 +110,7 @@ def _run(options: argparse.Namespace) -> LoopReport:
             )
         )
         player.initialize()  # refuses settings that do not fit, before anything is timed or moves
-        robot: Robot = SimulatedRobot(contract) if make_robot is None else make_robot()
+        robot: Robot = topics or (SimulatedRobot(contract) if make_robot is None else make_robot())
         recorder = None
         if options.record:
             recorder = stack.enter_context(Recorder(options.record, options.hz, interventions=leader is not None))
@@ -115,7 +121,12 @@ def _run(options: argparse.Namespace) -> LoopReport:
             robot.stop()
             say(f"stopped by the watchdog: {reason}")
 
-        watchdog = Watchdog(stop, {"server": options.silent_s, "loop": hangs_s})
+        silent_s = {"server": options.silent_s, "loop": hangs_s}
+        watchdog = Watchdog(stop, silent_s if topics is None else {**topics.silent_s, **silent_s})
+        if topics is not None:
+            require_match(contract, topics.contract)
+            options.instruction = options.instruction or topics.first_instruction(say)
+            topics.watchdog, topics.commands = watchdog, commands
         stack.enter_context(_restarting(watchdog, say))
         if options.baseline > 0:
             say(_line(_HEADER))
@@ -155,6 +166,14 @@ def _run(options: argparse.Namespace) -> LoopReport:
     for viewer in viewers:
         say(viewer.report())
     return report
+
+
+def _topics(options: argparse.Namespace, stack: contextlib.ExitStack) -> RosRobot | None:
+    if options.ros is None:
+        return None
+    if options.robot is not None:
+        raise ConfigError("--robot: got one besides --ros, want one of them")
+    return stack.enter_context(RosRobot(read_settings(options.ros)))
 
 
 def _played(play: Callable[..., LoopReport], instruction: str | None, say: Callable[[str], None]) -> LoopReport:
@@ -251,6 +270,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar="MODULE:CLASS",
         help="your class of the robot, created without arguments; default: a simulated one",
     )
+    add("--ros", metavar="FILE", help="a robot behind topics of ROS 2, from this file; see docs/ros.md")
     add("--leader", metavar="MODULE:CLASS", help="your class of what a human moves the robot with, see Leader")
     add("--remote", action="store_true", help="let a human at the server's live page take over")
     add("--step", type=_number(above=True), help="what a remote human adds to a number of the action at a tick")

@@ -37,7 +37,8 @@ class Robot(Protocol):
     """The interface of a robot that the control loop drives.
 
     A simulated robot may have the attribute `simulated = True`: it starts again by itself after a stop (see `restart`
-    of `run_loop`).
+    of `run_loop`). A robot may have an attribute `holds`, the reason why it must not move now, such as a camera that
+    hangs: then it is stopped, and the loop goes on with a new observation as soon as it is None again.
     """
 
     def observe(self) -> Obs:
@@ -262,7 +263,8 @@ def _drive(
             report.done = act.done
             led = bool(act.info.get(INTERVENTION))
             reason = act.info.get(SAFE)
-            stop = operated.holds()  # before this tick counts as a sign of life: it may be late
+            # Before this tick counts as a sign of life: it may be late.
+            stop = operated.holds() or getattr(robot, "holds", None)
             if operated.over:
                 break
             if watchdog is not None:

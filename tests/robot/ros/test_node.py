@@ -1,0 +1,344 @@
+"""A robot behind topics: what is published while a policy drives it, and when something is lost."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import ros_arm
+import yaml
+from asgi_server import served
+from eval_fakes import wait_for
+from ros_arm import BEAT, CAMERA, COMMANDS, JOINTS, NAMES, SIDE, TOLD, RosArm, header
+from rosbridge_double import RosbridgeDouble, rosbridge_double
+
+import vlagents_ray.robot.__main__ as command
+from vlagents_ray import Act, ActionSpec, Agent, CameraSpec, ChunkPlayer, Contract, Obs, StateSpec
+from vlagents_ray.errors import ConfigError, InvalidAction
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
+from vlagents_ray.robot import CommandInbox, Guard, Watchdog, run_loop
+from vlagents_ray.robot.loop import LoopReport
+from vlagents_ray.robot.ros import RosRobot
+from vlagents_ray.robot.ros.settings import settings_from
+from vlagents_ray.robot.safety import measured_state
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.engine.engine import Engine
+
+STEP = 0.01
+MAX_STEP = 0.05
+FAR = 7.0  # rad; beyond the bounds
+
+
+class Ahead(Agent):
+    """Chunks of two rows that lead from the measured pose by STEP a row; FAR in each third chunk, if it is wild."""
+
+    shared = ("instructions", "seen")
+
+    def __init__(self, *, wild: bool = False) -> None:
+        self.wild = wild
+        self.acts = 0
+        self.instructions: deque[str | None] = deque()
+        self.seen: deque[Obs] = deque()
+
+    @property
+    def contract(self) -> Contract:
+        action = ActionSpec(dim=2, space="joint", delta=False, low=-3.0, high=3.0)
+        return Contract({"front": CameraSpec(SIDE, SIDE)}, {"joints": StateSpec(2)}, action=action)
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: object) -> dict[str, Any]:
+        self.instructions.append(instruction)
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        self.acts += 1
+        self.seen.append(obs)
+        rows = obs.state["joints"] + STEP * np.array([[1], [2]], np.float32)
+        if self.wild and self.acts % 3 == 0:
+            rows[1] = FAR
+        return Act(rows.astype(np.float32))
+
+
+class SeeingGuard(Guard):
+    """A guard that remembers what it has let pass, over all of its kind."""
+
+    passed: list[list[float]] = []  # noqa: RUF012 - a test empties it
+
+    def __call__(self, action: np.ndarray, last: np.ndarray | None = None) -> np.ndarray:
+        accepted = super().__call__(action, last)
+        self.passed.append(accepted.astype(np.float64).tolist())
+        return accepted
+
+
+@dataclass
+class Drive:
+    """A control loop in a thread."""
+
+    double: RosbridgeDouble
+    arm: RosArm
+    robot: RosRobot
+    watchdog: Watchdog
+    reports: list[LoopReport] = field(default_factory=list)
+    over: bool = False
+
+    @property
+    def commands(self) -> list[list[float]]:
+        return [message["data"] for message in self.double.on(COMMANDS)]
+
+    @property
+    def alive(self) -> bool:
+        beats = self.double.on(BEAT)
+        return bool(beats) and beats[-1]["data"]
+
+    def moves(self) -> None:
+        """Wait until commands have come since now."""
+        now = len(self.commands)
+        wait_for(lambda: len(self.commands) > now + 3)
+
+
+@contextlib.contextmanager
+def driving(agent: Agent, **more: Any) -> Iterator[Drive]:
+    with contextlib.ExitStack() as stack:
+        double = stack.enter_context(rosbridge_double())
+        arm = stack.enter_context(RosArm(double.publish, lambda: double.on(COMMANDS)))
+        settings = settings_from(ros_arm.settings(double.url, **more), "arm.yaml")
+        robot = stack.enter_context(RosRobot(settings))
+        watchdog = robot.watchdog = Watchdog(lambda _: robot.stop(), robot.silent_s)
+        guard = SeeingGuard(agent.contract, max_step=MAX_STEP, measure=measured_state("joints"))
+        player = stack.enter_context(ChunkPlayer(agent, mode="open_loop", check=guard, deadline_s=1.0, safe="hold"))
+        drive = Drive(double, arm, robot, watchdog)
+
+        def run() -> None:
+            drive.reports.append(run_loop(robot, player, hz=50, watchdog=watchdog, until=lambda: drive.over))
+
+        thread = threading.Thread(target=run)
+        thread.start()
+        try:
+            drive.moves()
+            yield drive
+        finally:
+            drive.over = True
+            thread.join()
+
+
+@contextlib.contextmanager
+def policy_server(agent: Agent) -> Iterator[str]:
+    """The URL of a server of a policy, without Ray."""
+    metadata = {"policy": "ahead", "protocol": PROTOCOL_VERSION, "contract": agent.contract.to_json(), "local": None}  # type: ignore[union-attr]
+    engine = Engine(agent)
+    engine.start()
+    try:
+        app = AccessMiddleware(build_http_app(engine, lambda: metadata, DEFAULT_LIMITS), None, "app")
+        with served(app) as port:
+            yield f"http://127.0.0.1:{port}"
+    finally:
+        engine.close()
+
+
+def test_the_command_drives_an_arm_from_its_topics_and_stops_it_where_it_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    agent = Ahead()
+    with policy_server(agent) as url, rosbridge_double() as double:
+        (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ros_arm.settings(double.url, instruction={"topic": TOLD})))
+        with RosArm(double.publish, lambda: double.on(COMMANDS)) as arm:
+            teller = threading.Timer(0.3, lambda: double.publish(TOLD, {"data": "stack the cups"}))
+            teller.start()
+            options = f"--ros {tmp_path / 'arm.yaml'} --hz 30 --seconds 1 --mode open_loop --baseline 0".split()
+            status = command.main([url, *options, "--measure", "joints", "--max-step", str(MAX_STEP)])
+            teller.join()
+    said = capsys.readouterr().out
+    assert status == 0, said
+    assert f"waiting for an instruction on {TOLD}" in said
+    assert list(agent.instructions) == ["stack the cups"]
+    obs = agent.seen[0]
+    assert obs.cameras["front"].shape == (SIDE, SIDE, 3)
+    np.testing.assert_array_equal(obs.state["joints"], [0, 0])
+    commands = [message["data"] for message in double.on(COMMANDS)]
+    assert len(commands) >= 20
+    assert np.abs(np.diff([[0.0, 0.0], *commands], axis=0)).max() <= MAX_STEP
+    assert commands[-1][0] > 0.05
+    assert commands[-1] in arm.poses  # it ends with a stop, at the measured pose
+    assert double.advertised == {COMMANDS: "std_msgs/msg/Float64MultiArray", BEAT: "std_msgs/msg/Bool"}
+    beats = [message["data"] for message in double.on(BEAT)]
+    assert beats.count(True) > 10
+    assert not beats[-1]
+
+
+def test_no_action_reaches_the_arm_that_the_guard_has_not_seen() -> None:
+    SeeingGuard.passed = []
+    agent = Ahead(wild=True)
+    with driving(agent) as drive:
+        wait_for(lambda: agent.acts > 20)
+    assert len(drive.commands) > 20
+    for one in drive.commands:
+        assert one in SeeingGuard.passed or one in drive.arm.poses  # a stop is where the arm is
+        assert FAR not in one
+    assert drive.reports[0].safe  # the wild rows were asked for, and refused
+    assert any("above the limit" in reason for reason in drive.reports[0].safe)
+
+
+def test_a_hanging_camera_holds_the_arm_still_until_it_goes_on() -> None:
+    with driving(Ahead(), max_age_s=0.3) as drive:
+        drive.arm.broken = {CAMERA}
+        wait_for(lambda: drive.robot.holds is not None)
+        assert drive.robot.holds == f"no new message of {CAMERA} for more than 0.3 s"
+        wait_for(lambda: not drive.alive)
+        still = len(drive.commands)
+        assert drive.commands[-1] in drive.arm.poses  # where it was measured
+        beats = len(drive.double.on(BEAT))
+        wait_for(lambda: len(drive.double.on(BEAT)) > beats + 5)  # the loop goes on
+        assert len(drive.commands) == still
+        assert not drive.watchdog.stopped
+        drive.arm.broken = set()
+        drive.moves()
+        wait_for(lambda: drive.alive)
+    assert f"no new message of {CAMERA} for more than 0.3 s" in drive.reports[0].safe
+
+
+def test_an_image_that_is_sent_again_and_again_is_as_old_as_its_time_stamp() -> None:
+    with driving(Ahead(), max_age_s=0.3) as drive:
+        frozen = {**drive.arm._image(), "header": header()}
+        drive.arm._image = lambda: frozen  # type: ignore[method-assign]
+        wait_for(lambda: drive.robot.holds is not None)
+
+
+def test_a_topic_that_is_silent_for_long_stops_the_arm_until_a_person_starts_it() -> None:
+    limits = {"topic": CAMERA, "max_age_s": 0.5, "silent_s": 1.0}
+    with driving(Ahead(), cameras={"front": limits}) as drive:
+        drive.arm.broken = {CAMERA}
+        wait_for(lambda: drive.watchdog.stopped)
+        assert drive.watchdog.barks[0].startswith(f"{CAMERA}: silent for")
+        assert not drive.watchdog.restart()  # it is still silent
+        still = len(drive.commands)
+        drive.arm.broken = set()
+        wait_for(lambda: drive.robot.holds is None and not drive.watchdog.silent)
+        beats = len(drive.double.on(BEAT))
+        wait_for(lambda: len(drive.double.on(BEAT)) > beats + 5)
+        assert len(drive.commands) <= still + 1
+        assert not drive.alive
+        assert drive.watchdog.restart()
+        drive.moves()
+
+
+def test_a_message_that_cannot_be_read_counts_as_not_sent() -> None:
+    with driving(Ahead(), max_age_s=0.3) as drive:
+        broken = {**drive.arm._image(), "encoding": "16UC1"}
+        drive.arm._image = lambda: {**broken, "header": header()}  # type: ignore[method-assign]
+        wait_for(lambda: drive.robot.holds is not None)
+
+
+def test_a_lost_rosbridge_holds_the_arm_and_tells_it_so_as_soon_as_it_is_back() -> None:
+    with driving(Ahead()) as drive:
+        drive.double.close()
+        wait_for(lambda: drive.robot.holds is not None)
+        sent = len(drive.commands)
+        drive.arm.joints = [0.5, -0.5]  # somebody moves it by hand meanwhile
+        drive.double.published = [one for one in drive.double.published if one.topic != COMMANDS]
+        drive.double.open()
+        drive.moves()
+        # First the stop where it is now, by hand or since; then commands that begin there.
+        assert sent > 0
+        assert drive.commands[0] == pytest.approx([0.5, -0.5])
+        assert np.abs(np.diff(drive.commands, axis=0)).max() <= MAX_STEP
+    assert "the connection to the rosbridge was lost" in drive.reports[0].safe
+
+
+def test_a_killed_server_stops_the_arm(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    server = contextlib.ExitStack()
+    url = server.enter_context(policy_server(Ahead()))
+    with server, rosbridge_double() as double:
+        (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ros_arm.settings(double.url)))
+        with RosArm(double.publish, lambda: double.on(COMMANDS)) as arm:
+            options = f"--ros {tmp_path / 'arm.yaml'} --hz 30 --seconds 3 --silent-s 0.5 --baseline 0".split()
+            status: list[int] = []
+            run = [url, *options, "--measure", "joints", "--max-step", str(MAX_STEP), "--timeout-s", "1"]
+            thread = threading.Thread(target=lambda: status.append(command.main(run)))
+            thread.start()
+            wait_for(lambda: len(double.on(COMMANDS)) > 5)
+            server.close()
+            wait_for(lambda: len(double.on(BEAT)) > 5 and not double.on(BEAT)[-1]["data"])
+            assert double.on(COMMANDS)[-1]["data"] in arm.poses
+            thread.join()
+    said = capsys.readouterr().out
+    assert "stopped by the watchdog: server: silent for" in said
+    assert status in ([1], [3])
+
+
+def test_a_new_instruction_begins_another_episode() -> None:
+    with rosbridge_double() as double, RosArm(double.publish, lambda: double.on(COMMANDS)):
+        settings = settings_from(ros_arm.settings(double.url, instruction={"topic": TOLD}), "arm.yaml")
+        agent = Ahead()
+        with RosRobot(settings) as robot, ChunkPlayer(agent, check=Guard(agent.contract)) as player:
+            double.publish(TOLD, {"data": "fold"})
+            assert robot.first_instruction(print) == "fold"
+            robot.commands = CommandInbox(allow=[])  # the live page may command nothing
+            said = [{"data": "fold"}, {"data": 3}, {"data": "unfold"}]
+            teller = threading.Timer(0.2, lambda: [double.publish(TOLD, one) for one in said])
+            teller.start()
+            report = run_loop(robot, player, hz=50, instruction=robot.instruction, commands=robot.commands)
+            teller.join()
+    assert report.next_instruction == "unfold"
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (
+            {"cameras": {"front": {"topic": "/elsewhere"}}},
+            r"no message of \['/elsewhere'\] within 0.3 s.*ros2 topic list",
+        ),
+        ({"state": {"joints": {"topic": JOINTS, "names": [*NAMES, "wrist"]}}}, "/joint_states: .*'wrist' is missing"),
+        ({"state": {"joints": {"topic": JOINTS}}}, "stop: got 'joints' with 3 numbers, want 2"),
+    ],
+)
+def test_topics_that_do_not_fit_are_an_error_before_anything_moves(change: dict[str, Any], said: str) -> None:
+    with rosbridge_double() as double, RosArm(double.publish, lambda: double.on(COMMANDS)):
+        settings = settings_from(ros_arm.settings(double.url, ready_s=0.3, **change), "arm.yaml")
+        with pytest.raises(ConfigError, match=said), RosRobot(settings):
+            pass
+        assert double.on(COMMANDS) == []
+
+
+@pytest.mark.parametrize(("ago_s", "said"), [(3600, "3.6e[+]03 s ago"), (-3600, "3.6e[+]03 s ahead")])
+def test_clocks_that_differ_are_an_error_with_the_cure(ago_s: int, said: str) -> None:
+    with rosbridge_double() as double, RosArm(double.publish, lambda: double.on(COMMANDS)) as arm:
+        real = arm._image
+
+        def image() -> dict[str, Any]:
+            found = real()
+            found["header"]["stamp"]["sec"] -= ago_s
+            return found
+
+        arm._image = image  # type: ignore[method-assign]
+        plain = ros_arm.settings(double.url)
+        with pytest.raises(ConfigError, match=f"{said}.*clock: arrival"), RosRobot(settings_from(plain, "arm.yaml")):
+            pass
+        with RosRobot(settings_from({**plain, "clock": "arrival"}, "arm.yaml")) as robot:
+            robot.observe()
+            assert robot.holds is None
+
+
+def test_a_policy_for_another_robot_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with policy_server(Ahead()) as url, rosbridge_double() as double:
+        with RosArm(double.publish, lambda: double.on(COMMANDS)):
+            cameras = {"cameras": {"top": {"topic": CAMERA}}}
+            (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ros_arm.settings(double.url, **cameras)))
+            assert command.main([url, "--ros", str(tmp_path / "arm.yaml"), "--baseline", "0"]) == 2
+        assert double.on(COMMANDS) == []
+    assert "camera 'front': the policy needs it, the env gives ['top']" in capsys.readouterr().err
+
+
+def test_an_action_of_another_length_is_not_published() -> None:
+    with rosbridge_double() as double, RosArm(double.publish, lambda: double.on(COMMANDS)):
+        settings = settings_from(ros_arm.settings(double.url), "arm.yaml")
+        with RosRobot(settings) as robot, pytest.raises(InvalidAction, match=r"want \(2,\)"):
+            robot.apply(np.zeros(3, np.float32))
+        assert double.on(COMMANDS) == []

@@ -1,0 +1,89 @@
+"""A file of topics: what it may state, and the errors that say what to write instead."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.robot.ros import read_settings
+from vlagents_ray.robot.ros.settings import settings_from
+
+EXAMPLES = Path(__file__).parents[3] / "examples/ros"
+ARM: dict[str, Any] = {
+    "link": "ws://arm-pc:9090",
+    "cameras": {"front": {"topic": "/camera/image_raw"}},
+    "state": {"joints": {"topic": "/joint_states", "names": ["a", "b"]}},
+    "actions": [
+        {"topic": "/arm/commands", "type": "std_msgs/msg/Float64MultiArray", "numbers": 2, "stop": "joints"},
+    ],
+}
+
+
+@pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.yaml")), ids=lambda file: file.stem)
+def test_the_examples_are_read(file: Path) -> None:
+    assert read_settings(file).dim >= 1
+
+
+def test_types_and_limits_have_defaults(tmp_path: Path) -> None:
+    (tmp_path / "arm.yaml").write_text(yaml.safe_dump(ARM))
+    settings = read_settings(tmp_path / "arm.yaml")
+    assert settings.cameras["front"].type == "sensor_msgs/msg/Image"
+    assert settings.state["joints"].type == "sensor_msgs/msg/JointState"
+    assert settings.state["joints"].names == ("a", "b")
+    assert (settings.max_age_of(settings.cameras["front"]), settings.silent_of(settings.cameras["front"])) == (0.3, 1.0)
+    assert settings.dim == 2
+
+
+def test_the_numbers_of_an_action_go_to_the_topics_in_their_order() -> None:
+    actions = [
+        {"topic": "/t", "type": "trajectory_msgs/msg/JointTrajectory", "names": ["a", "b"], "stop": "joints"},
+        {"topic": "/g", "type": "sensor_msgs/msg/JointState", "names": ["finger"], "stop": "nothing"},
+        {"topic": "/v", "type": "geometry_msgs/msg/Twist", "fields": ["linear.x", "angular.z"]},
+    ]
+    assert settings_from({**ARM, "actions": actions}, "f").dim == 5
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"link": "tcp://x"}, "link: got 'tcp://x', want 'ros2', or a rosbridge"),
+        ({"lnik": "ros2"}, "did you mean 'link'"),
+        ({"cameras": {"front": {"topic": "/c", "tpye": "x"}}}, "cameras.front: .*did you mean 'type'"),
+        ({"cameras": {"front": {"topic": "/c", "type": "sensor_msgs/msg/PointCloud2"}}}, "front: type: got .*want one"),
+        ({"cameras": {"front": "/camera"}}, "cameras.front: got str, want keys"),
+        ({"cameras": {"front": {"topic": 3}}}, "topic: got 3, want str"),
+        ({"state": {"joints": {"topic": "/j", "names": "a"}}}, "names: got 'a', want a list"),
+        ({"state": {"joints": {"topic": "/j", "names": [1]}}}, r"names: got \[1\], want a list of names"),
+        ({"state": {"joints": {"topic": "/j", "values": "torque"}}}, "values: got 'torque', want one of"),
+        ({"state": {"joints": {"topic": "/camera/image_raw"}}}, "and elsewhere as sensor_msgs/msg/Image"),
+        ({"cameras": {}, "state": {}}, "got no camera, state or gripper"),
+        ({"actions": []}, "actions: got none"),
+        ({"actions": {"topic": "/a"}}, "want a list of topics"),
+        ({"actions": [{**ARM["actions"][0], "stop": ""}]}, "want what stops /arm/commands: 'zeros' where"),
+        ({"actions": [{**ARM["actions"][0], "stop": "joint"}]}, "stop: got 'joint', want one of .*'joints'"),
+        ({"actions": [{**ARM["actions"][0], "numbers": 0}]}, "without numbers, want numbers"),
+        ({"actions": [{**ARM["actions"][0], "type": "std_msgs/msg/String"}]}, "type: got 'std_msgs/msg/String'"),
+        ({"actions": [{"topic": "/v", "type": "geometry_msgs/msg/Twist", "fields": ["linear.w"]}]}, "fields: got"),
+        ({"gripper": {"topic": "/joint_states"}}, "want `open` and `closed`"),
+        ({"max_age_s": 0}, "max_age_s: got 0, want above 0"),
+        ({"max_age_s": float("nan")}, "max_age_s: got nan, want above 0"),
+        ({"heartbeat": {"topic": "/h", "hz": -1}}, "heartbeat: hz: got -1, want above 0"),
+        ({"clock": "sim"}, "clock: got 'sim', want one of"),
+        ({"compression": "zip"}, "compression: got 'zip'"),
+    ],
+)
+def test_a_wrong_setting_is_an_error_that_names_it_and_the_cure(change: dict[str, Any], said: str) -> None:
+    with pytest.raises(ConfigError, match=said) as error:
+        settings_from({**ARM, **change}, "arm.yaml")
+    assert str(error.value).startswith("arm.yaml")
+
+
+def test_a_file_that_cannot_be_read_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "broken.yaml").write_text("a: [")
+    for name in ("broken.yaml", "missing.yaml"):
+        with pytest.raises(ConfigError, match=name):
+            read_settings(tmp_path / name)

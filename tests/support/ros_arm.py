@@ -1,0 +1,84 @@
+"""An arm with a camera behind topics, as a thread that plays its driver: at 30 Hz it publishes, and obeys commands."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+CAMERA, JOINTS, COMMANDS, BEAT, TOLD = "/camera/image_raw", "/joint_states", "/arm/commands", "/alive", "/instruction"
+NAMES = ["shoulder", "elbow"]
+SIDE = 32
+HZ = 30.0
+
+
+def settings(link: str, **more: Any) -> dict[str, Any]:
+    """The file of its topics, with limits for a busy machine."""
+    return {
+        "link": link,
+        "cameras": {"front": {"topic": CAMERA}},
+        "state": {"joints": {"topic": JOINTS, "names": NAMES}},
+        "actions": [
+            {"topic": COMMANDS, "type": "std_msgs/msg/Float64MultiArray", "numbers": 2, "stop": "joints"},
+        ],
+        "heartbeat": {"topic": BEAT, "hz": 50.0},
+        "max_age_s": 1.0,
+        "silent_s": 60.0,
+        **more,
+    }
+
+
+class RosArm(threading.Thread):
+    """The arm; its joints are at once where a command wants them.
+
+    Args:
+        publish: Publishes a message on a topic.
+        commands: Returns the commands that have come so far.
+    """
+
+    def __init__(
+        self, publish: Callable[[str, dict[str, Any]], None], commands: Callable[[], list[dict[str, Any]]]
+    ) -> None:
+        super().__init__(name="arm")
+        self.joints = [0.0, 0.0]
+        self.poses: list[list[float]] = []  # all that it has been in
+        self.broken: set[str] = set()  # topics that it does not publish on
+        self.images = 0
+        self._publish, self._commands = publish, commands
+        self._over = threading.Event()
+
+    def __enter__(self) -> RosArm:
+        self.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._over.set()
+        self.join()
+
+    def run(self) -> None:
+        while not self._over.wait(1 / HZ):
+            if came := self._commands():
+                self.joints = list(came[-1]["data"])
+            self.poses.append(self.joints)
+            for topic, message in ((JOINTS, self._state()), (CAMERA, self._image())):
+                if topic not in self.broken:
+                    self._publish(topic, message)
+
+    def _state(self) -> dict[str, Any]:
+        # In another order than the policy's, with a joint that it does not know.
+        numbers = np.array([0.5, self.joints[1], self.joints[0]])
+        return {"header": header(), "name": ["gripper", "elbow", "shoulder"], "position": numbers}
+
+    def _image(self) -> dict[str, Any]:
+        self.images += 1
+        pixels = np.full((SIDE, SIDE, 3), self.images % 256, np.uint8)
+        said = {"height": SIDE, "width": SIDE, "encoding": "bgr8", "is_bigendian": 0, "step": 3 * SIDE}
+        return {"header": header(), **said, "data": pixels.tobytes()}
+
+
+def header() -> dict[str, Any]:
+    now = time.time_ns()
+    return {"stamp": {"sec": now // 10**9, "nanosec": now % 10**9}, "frame_id": "arm"}

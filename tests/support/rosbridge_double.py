@@ -1,0 +1,167 @@
+"""A rosbridge server without ROS, written from the protocol's specification, version 2.
+
+It is compared with the real one in tests/robot/ros: with a recording of what that sends, and by the same tests against
+both. Topics exist in this process alone: a test publishes with `publish`, and reads what clients published.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import math
+import struct
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.server import Server, ServerConnection, serve
+
+from vlagents_ray.images.jpeg_png import encode_png
+
+_TYPED = {np.dtype("<f8"): 86, np.dtype("<f4"): 85, np.dtype("<u2"): 69}
+
+
+@dataclass
+class Published:
+    """What a client has published."""
+
+    at: float  # s of `time.monotonic`
+    topic: str
+    message: dict[str, Any]
+
+
+@dataclass
+class RosbridgeDouble:
+    port: int = 0
+    published: list[Published] = field(default_factory=list)
+    advertised: dict[str, str] = field(default_factory=dict)
+    subscribed: dict[str, str] = field(default_factory=dict)
+    _asked: dict[ServerConnection, dict[str, str]] = field(default_factory=lambda: defaultdict(dict))
+    _server: Server | None = None
+    _thread: threading.Thread | None = None
+
+    @property
+    def url(self) -> str:
+        return f"ws://127.0.0.1:{self.port}"
+
+    def on(self, topic: str) -> list[dict[str, Any]]:
+        """The messages that clients have published on a topic."""
+        return [one.message for one in list(self.published) if one.topic == topic]
+
+    def publish(self, topic: str, message: dict[str, Any]) -> None:
+        """Send a message to those who have subscribed to its topic."""
+        for socket, asked in list(self._asked.items()):
+            if topic in asked:
+                with contextlib.suppress(ConnectionClosed, OSError):
+                    socket.send(encoded({"op": "publish", "topic": topic, "msg": message}, asked[topic]))
+
+    def open(self) -> None:
+        """Listen, at the same port as before if it was open before."""
+        self._server = serve(self._handle, "127.0.0.1", self.port, compression=None, close_timeout=0.5)
+        self.port = self._server.socket.getsockname()[1]
+        self._thread = threading.Thread(target=self._server.serve_forever)
+        self._thread.start()
+
+    def close(self) -> None:
+        """End all connections, and listen no more."""
+        server, thread, self._thread = self._server, self._thread, None
+        if server is None or thread is None:
+            return
+        server.shutdown()
+        for socket in list(self._asked):
+            with contextlib.suppress(OSError):
+                socket.socket.shutdown(2)
+        thread.join()
+
+    def _handle(self, socket: ServerConnection) -> None:
+        asked = self._asked[socket]
+        try:
+            for frame in socket:
+                self._do(json.loads(frame), asked, socket)
+        except (ConnectionClosed, OSError):
+            pass
+        finally:
+            self._asked.pop(socket, None)
+
+    def _do(self, message: dict[str, Any], asked: dict[str, str], socket: ServerConnection) -> None:
+        match message["op"]:
+            case "subscribe":
+                self.subscribed[message["topic"]] = message["type"]
+                asked[message["topic"]] = message.get("compression", "none")
+            case "unsubscribe":
+                asked.pop(message["topic"], None)
+            case "advertise":
+                self.advertised[message["topic"]] = message["type"]
+            case "publish":
+                self.published.append(Published(time.monotonic(), message["topic"], message["msg"]))
+            case "unadvertise":
+                self.advertised.pop(message["topic"], None)
+            case other:
+                status = {"op": "status", "level": "error", "msg": f"Unknown operation: {other}."}
+                socket.send(json.dumps(status))
+
+
+@contextlib.contextmanager
+def rosbridge_double() -> Iterator[RosbridgeDouble]:
+    double = RosbridgeDouble()
+    double.open()
+    try:
+        yield double
+    finally:
+        double.close()
+
+
+def encoded(message: dict[str, Any], compression: str) -> str | bytes:
+    """A message as a client asked for it."""
+    if compression == "cbor":
+        return cbor(message)
+    text = json.dumps(_plain(message))
+    if compression != "png":
+        return text
+    data = text.encode()
+    side = math.ceil(math.sqrt(len(data) / 3))
+    pixels = np.frombuffer(data.ljust(side * side * 3, b"\n"), np.uint8).reshape(side, side, 3)
+    return json.dumps({"op": "png", "data": base64.b64encode(encode_png(pixels)).decode()})
+
+
+def _plain(value: Any) -> Any:
+    """JSON's values of a message: bytes in base64, numbers that are not finite as null."""
+    if isinstance(value, dict):
+        return {name: _plain(one) for name, one in value.items()}
+    if isinstance(value, (bytes, bytearray)):
+        return base64.b64encode(value).decode()
+    if isinstance(value, (list, np.ndarray)):
+        return [_plain(one) for one in (value.tolist() if isinstance(value, np.ndarray) else value)]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def cbor(value: Any) -> bytes:
+    """A value in CBOR (RFC 8949), with typed arrays for numpy's."""
+    if value is None or isinstance(value, bool):
+        return bytes([{False: 0xF4, True: 0xF5, None: 0xF6}[value]])
+    if isinstance(value, int):
+        return _head(0, value) if value >= 0 else _head(1, -1 - value)
+    if isinstance(value, float):
+        return b"\xfb" + struct.pack(">d", value)
+    if isinstance(value, str):
+        return _head(3, len(value.encode())) + value.encode()
+    if isinstance(value, (bytes, bytearray)):
+        return _head(2, len(value)) + bytes(value)
+    if isinstance(value, np.ndarray):
+        return _head(6, _TYPED[value.dtype]) + cbor(value.tobytes())
+    if isinstance(value, list):
+        return _head(4, len(value)) + b"".join(map(cbor, value))
+    return _head(5, len(value)) + b"".join(cbor(name) + cbor(one) for name, one in value.items())
+
+
+def _head(kind: int, count: int) -> bytes:
+    if count < 24:
+        return bytes([kind << 5 | count])
+    low = next(low for low in range(4) if count < 1 << (8 << low))
+    return bytes([kind << 5 | 24 + low]) + count.to_bytes(1 << low, "big")

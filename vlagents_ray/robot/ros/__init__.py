@@ -1,0 +1,6 @@
+"""A robot behind topics of ROS 2, through rclpy or through a rosbridge; see docs/ros.md."""
+
+from vlagents_ray.robot.ros.robot import RosRobot
+from vlagents_ray.robot.ros.settings import RosSettings, read_settings
+
+__all__ = ["RosRobot", "RosSettings", "read_settings"]

@@ -1,0 +1,275 @@
+"""ROS 2 messages to numbers, images and words, and actions to messages; nothing here needs ROS.
+
+A message that comes in is a mapping, as rosbridge sends it, or an object with the same fields, as rclpy gives it. One
+that goes out is a mapping of its fields. The fields and their units are those of ROS 2's packages `sensor_msgs`,
+`geometry_msgs`, `std_msgs` and `trajectory_msgs`.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import math
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal
+
+import numpy as np
+
+from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge, MissingState
+from vlagents_ray.images.jpeg_png import MAX_PIXELS, decode
+
+Values = Literal["position", "velocity", "effort"]
+PoseRotation = Literal["quat_xyzw", "quat_wxyz", "euler_xyz", "none"]
+# Bytes of a pixel by encoding; see `sensor_msgs/image_encodings.hpp`.
+_PIXEL = {"rgb8": 3, "bgr8": 3, "rgba8": 4, "bgra8": 4, "mono8": 1, "mono16": 2}
+TWIST = ("linear.x", "linear.y", "linear.z", "angular.x", "angular.y", "angular.z")
+
+
+def field(message: Any, path: str) -> Any:
+    """Return a field of a message, "header.stamp.sec".
+
+    Raises:
+        MalformedMessage: The message has no such field.
+    """
+    for name in path.split("."):
+        try:
+            message = message[name] if isinstance(message, Mapping) else getattr(message, name)
+        except (KeyError, AttributeError) as error:
+            raise MalformedMessage(
+                f"message: got one without {path!r}, want a field of this name; is the topic's type right?"
+            ) from error
+    return message
+
+
+def stamp(message: Any) -> float | None:
+    """Return the time in a message's header, s since 1970; None if it has no header, or one that nobody filled in."""
+    try:
+        sec, nanosec = field(message, "header.stamp.sec"), field(message, "header.stamp.nanosec")
+    except MalformedMessage:
+        return None
+    return (_whole("header.stamp.sec", sec) + _whole("header.stamp.nanosec", nanosec) * 1e-9) or None
+
+
+def image(message: Any) -> np.ndarray:
+    """Return the pixels of a `sensor_msgs/msg/Image`.
+
+    Args:
+        message: The message. Its rows may be longer than the pixels need (`step`). Of "mono16" the upper 8 bits count.
+
+    Returns:
+        The image, (H, W, 3) uint8 RGB, in memory of its own.
+
+    Raises:
+        InvalidObservation: The encoding is not one of colours or greys.
+        MalformedMessage: The data do not have the size that the fields declare.
+        MessageTooLarge: It has more pixels than 4096 x 4096.
+    """
+    encoding = field(message, "encoding")
+    if not isinstance(encoding, str) or encoding not in _PIXEL:
+        raise InvalidObservation(
+            f"image: got the encoding {encoding!r:.40}, want one of {list(_PIXEL)}; "
+            f"have the camera's driver publish rgb8, and take no topic of depth for a camera"
+        )
+    height, width, step = (_whole(name, field(message, name)) for name in ("height", "width", "step"))
+    data = _bytes("image", field(message, "data"))
+    if not (height > 0 and width > 0):
+        raise MalformedMessage(f"image: got {height} rows of {width} pixels, want some; is the camera on?")
+    if height * width > MAX_PIXELS:
+        raise MessageTooLarge(f"image: got {height} x {width} pixels, want at most {MAX_PIXELS}")
+    used = width * _PIXEL[encoding]
+    if step < used or len(data) < step * height:
+        raise MalformedMessage(
+            f"image: got {len(data)} bytes in rows of {step}, want {height} rows of {used} or more for {width} pixels "
+            f"of {encoding}"
+        )
+    rows = np.frombuffer(data, np.uint8, step * height).reshape(height, step)[:, :used]
+    pixels = rows.reshape(height, width, _PIXEL[encoding])
+    if encoding == "mono16":
+        pixels = pixels[..., :1] if field(message, "is_bigendian") else pixels[..., 1:]
+    if encoding.startswith("mono"):
+        return np.repeat(pixels, 3, axis=2)
+    return (pixels[..., 2::-1] if encoding.startswith("bgr") else pixels[..., :3]).copy()
+
+
+def compressed_image(message: Any) -> np.ndarray:
+    """Return the pixels of a `sensor_msgs/msg/CompressedImage` that holds a JPEG or PNG file.
+
+    Returns:
+        The image, (H, W, 3) uint8 RGB.
+
+    Raises:
+        MalformedMessage: The data are not a complete JPEG or PNG file.
+        MessageTooLarge: It has more pixels than 4096 x 4096.
+        MissingDependency: A PNG file came, and Pillow is not installed.
+    """
+    return decode(_bytes("image", field(message, "data")))
+
+
+def joints(message: Any, names: Sequence[str] = (), values: Values = "position") -> np.ndarray:
+    """Return numbers of joints of a `sensor_msgs/msg/JointState`, by name, in whatever order they came.
+
+    Args:
+        message: The message.
+        names: The joints in the order wanted; all of them in the message's order, if empty.
+        values: The field to read: positions (rad or m), velocities or efforts.
+
+    Returns:
+        The numbers, (len(names),) float32.
+
+    Raises:
+        MissingState: The message lacks one of the joints.
+        MalformedMessage: It has not as many numbers as names, or numbers that are not finite.
+    """
+    came = field(message, "name")
+    if not isinstance(came, Sequence) or not all(isinstance(name, str) for name in came):
+        raise MalformedMessage(f"name: got {came!r:.80}, want a list of names; is the topic's type right?")
+    numbers = _numbers(values, field(message, values))
+    if len(numbers) != len(came):
+        raise MalformedMessage(
+            f"joint state: got {len(numbers)} numbers in {values!r} for {len(came)} names, want as many"
+        )
+    place = {name: i for i, name in enumerate(came)}
+    for name in names:
+        if name not in place:
+            raise MissingState(name, came)
+    return _finite(values, numbers[[place[name] for name in names]] if names else numbers)
+
+
+def pose(message: Any, rotation: PoseRotation = "quat_xyzw") -> np.ndarray:
+    """Return the numbers of a `geometry_msgs/msg/Pose` or `PoseStamped`.
+
+    Args:
+        message: The message.
+        rotation: How the rotation is written after the position: "quat_xyzw" or "quat_wxyz" (of unit length),
+            "euler_xyz" (roll, pitch and yaw about fixed axes, rad), or "none".
+
+    Returns:
+        Position (m) and rotation, (7,), (6,) or (3,) float32.
+
+    Raises:
+        MalformedMessage: A number is not finite, or the quaternion has no length.
+    """
+    at = field(message, "pose") if _has(message, "pose") else message
+    position = _numbers("pose", [field(at, f"position.{axis}") for axis in "xyz"])
+    if rotation == "none":
+        return _finite("pose", position)
+    quaternion = _numbers("pose", [field(at, f"orientation.{axis}") for axis in "xyzw"])
+    length = float(np.linalg.norm(quaternion))
+    if not length > 1e-6:
+        raise MalformedMessage(
+            f"pose: got the quaternion {quaternion.tolist()}, want one of unit length; has nobody filled it in?"
+        )
+    quaternion = quaternion / length
+    if rotation == "quat_wxyz":
+        quaternion = quaternion[[3, 0, 1, 2]]
+    turn = _euler_xyz(*quaternion.tolist()) if rotation == "euler_xyz" else quaternion
+    return _finite("pose", np.concatenate([position, turn]))
+
+
+def numbers(message: Any) -> np.ndarray:
+    """Return the numbers of a `std_msgs/msg/Float64MultiArray`, `Float32MultiArray`, `Float64` or `Float32`.
+
+    Returns:
+        The numbers, flat, (D,) float32.
+
+    Raises:
+        MalformedMessage: A number is not finite.
+    """
+    data = field(message, "data")
+    return _finite("data", _numbers("data", [data] if isinstance(data, (int, float)) else data))
+
+
+def text(message: Any) -> str:
+    """Return the words of a `std_msgs/msg/String`."""
+    data = field(message, "data")
+    if not isinstance(data, str):
+        raise MalformedMessage(f"data: got {type(data).__name__}, want a string; is the topic's type right?")
+    return data
+
+
+def float64_multi_array(row: np.ndarray) -> dict[str, Any]:
+    """Return a `std_msgs/msg/Float64MultiArray` of numbers, (D,)."""
+    return {"layout": {"dim": [], "data_offset": 0}, "data": row.astype(np.float64).tolist()}
+
+
+def joint_state(row: np.ndarray, names: Sequence[str], values: Values = "position") -> dict[str, Any]:
+    """Return a `sensor_msgs/msg/JointState` that commands joints, (D,) in the order of `names`."""
+    return {"header": _header(), "name": list(names), values: row.astype(np.float64).tolist()}
+
+
+def twist(row: np.ndarray, fields: Sequence[str] = TWIST) -> dict[str, Any]:
+    """Return a `geometry_msgs/msg/Twist` with numbers at these of its fields, m/s and rad/s; the others are 0."""
+    message: dict[str, Any] = {part: dict.fromkeys("xyz", 0.0) for part in ("linear", "angular")}
+    for path, number in zip(fields, row.astype(np.float64).tolist(), strict=True):
+        part, axis = path.split(".")
+        message[part][axis] = number
+    return message
+
+
+def joint_trajectory(row: np.ndarray, names: Sequence[str], reach_s: float) -> dict[str, Any]:
+    """Return a `trajectory_msgs/msg/JointTrajectory` of one point.
+
+    Args:
+        row: The positions, (D,) in the order of `names`.
+        names: The joints.
+        reach_s: The time in which the arm is to reach them, from when the controller gets the message, s.
+    """
+    nanoseconds = round(reach_s * 1e9)
+    point = {
+        "positions": row.astype(np.float64).tolist(),
+        "time_from_start": {"sec": nanoseconds // 10**9, "nanosec": nanoseconds % 10**9},
+    }
+    now = {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}  # as controllers read a stamp of zero
+    return {"header": now, "joint_names": list(names), "points": [point]}
+
+
+def _header() -> dict[str, Any]:
+    now = time.time_ns()
+    return {"stamp": {"sec": now // 10**9, "nanosec": now % 10**9}, "frame_id": ""}
+
+
+def _has(message: Any, name: str) -> bool:
+    return name in message if isinstance(message, Mapping) else hasattr(message, name)
+
+
+def _whole(name: str, value: Any) -> int:
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise MalformedMessage(f"{name}: got {value!r}, want a whole number; is the topic's type right?")
+    return value
+
+
+def _bytes(name: str, value: Any) -> bytes | memoryview:
+    """Return an array of uint8: rclpy gives an array, CBOR bytes, JSON base64 or, from some servers, a list."""
+    try:
+        if isinstance(value, str):
+            return base64.b64decode(value, validate=True)
+        return bytes(value) if isinstance(value, (list, tuple)) else memoryview(value).cast("B")
+    except (binascii.Error, TypeError, ValueError) as error:
+        raise MalformedMessage(f"{name}: got data that are no bytes ({error}), want an array of uint8") from error
+
+
+def _numbers(name: str, values: Any) -> np.ndarray:
+    try:
+        found = np.asarray(values if isinstance(values, np.ndarray) else list(values), np.float64)
+    except (TypeError, ValueError) as error:
+        raise MalformedMessage(f"{name}: got {values!r:.80}, want an array of numbers") from error
+    if found.ndim != 1:
+        raise MalformedMessage(f"{name}: got an array of shape {found.shape}, want (D,)")
+    return found
+
+
+def _finite(name: str, values: np.ndarray) -> np.ndarray:
+    """Return numbers as float32; rosbridge writes those that are not finite as null, which numpy reads as NaN."""
+    with np.errstate(over="ignore"):
+        found = values.astype(np.float32)
+    if not np.isfinite(found).all():
+        raise MalformedMessage(f"{name}: got {values.tolist()}, want finite numbers; is the sensor broken?")
+    return found
+
+
+def _euler_xyz(x: float, y: float, z: float, w: float) -> np.ndarray:
+    roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch = math.asin(min(1.0, max(-1.0, 2 * (w * y - z * x))))
+    yaw = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return np.array([roll, pitch, yaw])

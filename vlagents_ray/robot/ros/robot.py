@@ -1,0 +1,291 @@
+"""A robot behind topics of ROS 2."""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+
+from vlagents_ray.chunking.capture_clock import SKEW_S
+from vlagents_ray.client.commands import CommandInbox
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.errors import ConfigError, InvalidAction, VLAgentsError
+from vlagents_ray.interface import CAPTURED, Obs
+from vlagents_ray.robot.ros import messages
+from vlagents_ray.robot.ros.reader import TopicReader
+from vlagents_ray.robot.ros.ros2 import Ros2
+from vlagents_ray.robot.ros.rosbridge import Rosbridge
+from vlagents_ray.robot.ros.settings import (
+    ARRAY,
+    BOOL,
+    JOINT_STATE,
+    NOTHING,
+    ROS2,
+    TWIST_TYPE,
+    ZEROS,
+    ActionTopic,
+    InputTopic,
+    RosSettings,
+)
+from vlagents_ray.robot.safety import Watchdog
+
+logger = logging.getLogger(__name__)
+_POLL_S = 0.01
+
+
+class Link(Protocol):
+    """A way to the topics: `Ros2` or `Rosbridge`."""
+
+    name: str
+
+    @property
+    def up(self) -> bool: ...
+
+    @property
+    def connections(self) -> int: ...
+
+    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None], *, sensor: bool) -> None: ...
+
+    def advertise(self, topic: str, kind: str) -> None: ...
+
+    def open(self) -> None: ...
+
+    def publish(self, topic: str, message: dict[str, Any]) -> bool: ...
+
+    def close(self) -> None: ...
+
+
+class RosRobot:
+    """A `Robot` whose cameras, state and actions are topics.
+
+    An observation has the newest message of each topic, and the time of the oldest of them as `captured_at`. While one
+    is older than its `max_age_s`, or the link is lost, `holds` says so: the control loop then stops the robot and goes
+    on by itself. After `silent_s` without a new message the watchdog stops it.
+
+    Use it as a context manager: that connects, and waits for the first message of each topic.
+
+    Args:
+        settings: The topics.
+        link: The way to them; by default what the settings name.
+    """
+
+    def __init__(self, settings: RosSettings, link: Link | None = None) -> None:
+        self.settings = settings
+        self.holds: str | None = None
+        self.watchdog: Watchdog | None = None
+        """The watchdog of the control loop, with `silent_s` among its sources."""
+        self.instruction: str | None = None  # the newest on its topic
+        self.commands: CommandInbox | None = None
+        """The commands of the control loop, which a new instruction on its topic is added to."""
+        self._link: Link = link or (Ros2() if settings.link == ROS2 else Rosbridge(settings.link, settings.compression))
+        by_stamp = settings.clock == "stamp"
+        self._readers = {id(reading): TopicReader(reading, by_stamp) for reading in settings.sensors}
+        self._beat_at = -math.inf
+        self._connections = 0
+        self._lost_at = -math.inf  # s of `time.monotonic`
+        self._stop_unsent = False
+        for topic, kind, sensor in self._topics():
+            self._link.subscribe(topic, kind, self._taker(topic), sensor=sensor)
+        for command in settings.actions:
+            self._link.advertise(command.topic, command.type)
+        if settings.heartbeat is not None:
+            self._link.advertise(settings.heartbeat.topic, BOOL)
+
+    def __enter__(self) -> RosRobot:
+        self._link.open()
+        self._connections = self._link.connections
+        try:
+            self._wait_for_messages()
+            self._require_poses()
+        except BaseException:
+            self._link.close()
+            raise
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._beat(alive=False)
+        self._link.close()
+
+    @property
+    def silent_s(self) -> dict[str, float]:
+        """The sources for a `Watchdog`: each topic, and how long it may be without a new message, s."""
+        limits: dict[str, float] = {}
+        for reading in self.settings.sensors:
+            limit = self.settings.silent_of(reading)
+            limits[reading.topic] = min(limit, limits.get(reading.topic, limit))
+        return limits
+
+    @property
+    def contract(self) -> Contract:
+        """What the topics provide and take, by the messages that have come."""
+        cameras = {name: self._value(one) for name, one in self.settings.cameras.items()}
+        state = {name: self._value(one) for name, one in self.settings.state.items()}
+        return Contract(
+            cameras={name: CameraSpec(*image.shape[:2]) for name, image in cameras.items()},
+            state={name: StateSpec(len(part)) for name, part in state.items()},
+            gripper=self.settings.gripper is not None,
+            action=ActionSpec(dim=self.settings.dim),
+        )
+
+    def first_instruction(self, say: Callable[[str], None]) -> str | None:
+        """Wait for the first instruction on its topic, if there is one; what is waited for is printed with `say`."""
+        told = self.settings.instruction
+        if told is not None and self.instruction is None:
+            say(f"waiting for an instruction on {told.topic}")
+        while told is not None and self.instruction is None:
+            time.sleep(_POLL_S)
+        return self.instruction
+
+    def observe(self) -> Obs:
+        """Return the newest message of each topic; also publishes the heartbeat."""
+        for reader in self._readers.values():
+            reader.refresh()
+        self._hold_if_old()
+        self._beat(alive=True)
+        gripper = self.settings.gripper
+        return Obs(
+            {name: self._value(one) for name, one in self.settings.cameras.items()},
+            None if gripper is None else self._value(gripper),
+            {name: self._value(one) for name, one in self.settings.state.items()},
+            {CAPTURED: min(reader.captured_at for reader in self._readers.values())},
+        )
+
+    def apply(self, action: np.ndarray) -> None:
+        """Publish an action.
+
+        Raises:
+            InvalidAction: It has another number of values than the topics take.
+        """
+        if action.shape != (self.settings.dim,):
+            raise InvalidAction(f"action: got {action.shape}, want ({self.settings.dim},), as the topics take")
+        first = 0
+        for command in self.settings.actions:
+            self._publish(command, action[first : first + command.dim])
+            first += command.dim
+
+    def stop(self) -> None:
+        """Publish what stops the robot, on each topic: zeros, or the measured pose if that is not old."""
+        self._stop_unsent = not self._link.up  # then it is sent when the link is back
+        for command in self.settings.actions:
+            row = self._stop_row(command)
+            if row is not None:
+                self._publish(command, row)
+
+    def _stop_row(self, command: ActionTopic) -> np.ndarray | None:
+        if command.stop == NOTHING:
+            return None
+        if command.stop in ("", ZEROS):
+            return np.zeros(command.dim, np.float32)
+        reading = self.settings.state[command.stop]
+        reader = self._readers[id(reading)]
+        if reader.age_s > self.settings.max_age_of(reading):
+            logger.warning("%s: not told where to stop, as %s is old", command.topic, reading.topic)
+            return None
+        row: np.ndarray = reader.value
+        return row
+
+    def _publish(self, command: ActionTopic, row: np.ndarray) -> None:
+        if command.type == ARRAY:
+            message = messages.float64_multi_array(row)
+        elif command.type == JOINT_STATE:
+            message = messages.joint_state(row, command.names, command.values)
+        elif command.type == TWIST_TYPE:
+            message = messages.twist(row, command.fields)
+        else:
+            message = messages.joint_trajectory(row, command.names, command.reach_s)
+        self._link.publish(command.topic, message)
+
+    def _hold_if_old(self) -> None:
+        up, connections = self._link.up, self._link.connections
+        if not up or connections != self._connections:  # or it was lost between two ticks
+            self._connections, self._lost_at = connections, time.monotonic()
+        since_s = time.monotonic() - self._lost_at
+        before = any(reader.age_s >= since_s for reader in self._readers.values())  # from before the loss
+        self.holds = f"the connection to the {self._link.name} was lost" if before else None
+        for reading in self.settings.sensors:
+            reader = self._readers[id(reading)]
+            limit = self.settings.max_age_of(reading)
+            if reader.age_s > limit:
+                self.holds = self.holds or f"no new message of {reading.topic} for more than {limit:g} s"
+            if self.watchdog is not None and reader.age_s < math.inf:
+                self.watchdog.heard(reading.topic, reader.age_s)
+        if self._stop_unsent and self.holds is None:
+            self.stop()
+
+    def _beat(self, *, alive: bool) -> None:
+        beat, now = self.settings.heartbeat, time.monotonic()
+        if beat is None or (alive and now - self._beat_at < 1 / beat.hz):
+            return
+        self._beat_at = now
+        stopped = self.watchdog is not None and self.watchdog.stopped
+        self._link.publish(beat.topic, {"data": alive and not stopped and self.holds is None})
+
+    def _value(self, reading: InputTopic) -> Any:
+        return self._readers[id(reading)].value
+
+    def _topics(self) -> list[tuple[str, str, bool]]:
+        sensors = {one.topic: (one.topic, one.type, True) for one in self.settings.sensors}
+        told = self.settings.instruction
+        return [*sensors.values(), *([(told.topic, told.type, False)] if told else [])]
+
+    def _taker(self, topic: str) -> Callable[[Any], None]:
+        told = self.settings.instruction
+        if told is not None and told.topic == topic:
+            return self._take_instruction
+        readers = [self._readers[id(one)] for one in self.settings.sensors if one.topic == topic]
+
+        def take(message: Any) -> None:
+            for reader in readers:
+                reader.take(message)
+
+        return take
+
+    def _take_instruction(self, message: Any) -> None:
+        try:
+            text = messages.text(message)
+        except VLAgentsError as error:
+            logger.warning("instruction: left out: %s", error)
+            return
+        if text != self.instruction:  # which may be published again and again
+            self.instruction = text
+            if self.commands is not None:
+                self.commands.put("instruct", text)
+
+    def _wait_for_messages(self) -> None:
+        deadline = time.monotonic() + self.settings.ready_s
+        while True:
+            for reader in self._readers.values():
+                reader.refresh()
+            missing = sorted({one.topic for one in self._readers.values() if one.value is None})
+            if not missing:
+                break
+            if time.monotonic() > deadline:
+                raise ConfigError(
+                    f"{self.settings.link}: got no message of {missing} within {self.settings.ready_s:g} s, want one "
+                    f"of each; compare names and types with `ros2 topic list --show-types`"
+                )
+            time.sleep(_POLL_S)
+        for reading in self.settings.sensors:
+            self._require_clock(self._readers[id(reading)], self.settings.silent_of(reading))
+
+    def _require_poses(self) -> None:
+        for command in self.settings.actions:
+            pose = self.settings.state.get(command.stop)
+            if pose is not None and self._value(pose).shape != (command.dim,):
+                raise ConfigError(
+                    f"{command.topic}: stop: got {command.stop!r} with {len(self._value(pose))} numbers, want "
+                    f"{command.dim}, as the topic takes; name a part of the state with these, in this order"
+                )
+
+    def _require_clock(self, reader: TopicReader, limit_s: float) -> None:
+        ago_s = time.time() - reader.captured_at
+        if not -SKEW_S <= ago_s <= limit_s:
+            when = f"{abs(ago_s):.3g} s {'ahead' if ago_s < 0 else 'ago'}"
+            raise ConfigError(
+                f"{reader.topic}: got a message with the time stamp of {when}, want one of now; "
+                f"synchronize the clocks of both machines, or count from the arrival: `clock: arrival`"
+            )

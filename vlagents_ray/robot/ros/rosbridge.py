@@ -1,0 +1,222 @@
+"""ROS topics through a rosbridge: version 2 of its protocol, over a WebSocket.
+
+The protocol is specified in ROSBRIDGE_PROTOCOL.md of https://github.com/RobotWebTools/rosbridge_suite.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import json
+import logging
+import struct
+import threading
+from collections.abc import Callable
+from socket import SHUT_RDWR, SO_SNDTIMEO, SOL_SOCKET
+from typing import Any
+
+from websockets.exceptions import ConnectionClosed, WebSocketException
+from websockets.sync.client import ClientConnection, connect
+
+from vlagents_ray.errors import ConnectionLost, MalformedMessage, VLAgentsError
+from vlagents_ray.images.jpeg_png import decode as decode_image
+from vlagents_ray.robot.ros import cbor
+
+logger = logging.getLogger(__name__)
+_OPEN_S = 5.0
+_AGAIN_S = 0.5
+_SILENT_S = 2.0
+# The kernel's limit of a send, which websockets has none for: a dead link would hold up the control loop for minutes.
+_SEND_LIMIT = struct.pack("@ll", 0, 200_000)
+_LARGEST = 64 << 20  # bytes of a frame; a 4K image in base64 has 34 million
+
+
+class Rosbridge:
+    """A link to ROS that needs no ROS here. A thread receives, and connects again if the connection is lost.
+
+    Args:
+        url: The server, "ws://arm-pc:9090".
+        compression: What messages are asked for in: "cbor", whose images need no base64; "png" or "none" (JSON).
+    """
+
+    name = "rosbridge"
+
+    def __init__(self, url: str, compression: str = "cbor") -> None:
+        self._url, self._compression = url, compression
+        self._take: dict[str, Callable[[Any], None]] = {}
+        self._types: dict[str, str] = {}
+        self._outlets: dict[str, str] = {}
+        self._socket: ClientConnection | None = None
+        self._open = contextlib.ExitStack()
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+        self.connections = 0  # since `open`
+
+    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None], *, sensor: bool) -> None:
+        """Have messages of a topic given to `take`, on the link's thread; before `open`.
+
+        Args:
+            topic: The topic.
+            kind: Its type, "sensor_msgs/msg/Image".
+            take: Gets each message.
+            sensor: Whether the topic is a sensor's; the server chooses the quality of service by itself.
+        """
+        self._take[topic], self._types[topic] = take, kind
+
+    def advertise(self, topic: str, kind: str) -> None:
+        """Say that messages of this type will be published; before `open`."""
+        self._outlets[topic] = kind
+
+    def open(self) -> None:
+        """Connect.
+
+        Raises:
+            ConnectionLost: The server cannot be reached.
+        """
+        self._connect()
+        self._thread = threading.Thread(target=self._run, name="vlagents-ray-rosbridge", daemon=True)
+        self._thread.start()
+
+    @property
+    def up(self) -> bool:
+        """Whether the connection stands, as far as is known here."""
+        return self._socket is not None
+
+    def publish(self, topic: str, message: dict[str, Any]) -> bool:
+        """Publish a message.
+
+        Returns:
+            Whether it was sent; not if the connection is lost.
+        """
+        socket = self._socket
+        if socket is None:
+            return False
+        try:
+            socket.send(json.dumps({"op": "publish", "topic": topic, "msg": message}, allow_nan=False))
+        except (WebSocketException, OSError):
+            self._lose(socket)
+            return False
+        return True
+
+    def close(self) -> None:
+        """Close the connection, and end the thread."""
+        self._closing.set()
+        socket, self._socket = self._socket, None
+        if socket is not None:
+            socket.close()  # with the closing handshake, so that what was sent last arrives
+        if self._thread is not None:
+            self._thread.join()
+        self._open.close()
+
+    def _connect(self) -> None:
+        self._open.close()  # the connection before
+        try:
+            opening = connect(self._url, compression=None, max_size=_LARGEST, open_timeout=_OPEN_S, close_timeout=1)
+            socket = self._open.enter_context(opening)
+            socket.socket.setsockopt(SOL_SOCKET, SO_SNDTIMEO, _SEND_LIMIT)
+            for topic, kind in self._outlets.items():
+                socket.send(json.dumps({"op": "advertise", "topic": topic, "type": kind}))
+            for topic, kind in self._types.items():
+                request = {"op": "subscribe", "topic": topic, "type": kind, "compression": self._compression}
+                # The newest message alone, as it replaces what a slow link has not carried yet.
+                socket.send(json.dumps({**request, "queue_length": 1}))
+        except (WebSocketException, OSError, TimeoutError) as error:
+            raise ConnectionLost(
+                f"{self._url}: cannot connect ({error}); does a rosbridge_server run there? "
+                f"`ros2 launch rosbridge_server rosbridge_websocket_launch.xml` starts one"
+            ) from error
+        self._socket = socket
+        self.connections += 1
+
+    def _run(self) -> None:
+        while not self._closing.is_set():
+            socket = self._socket
+            if socket is None:
+                self._reconnect()
+                continue
+            try:
+                self._receive(socket.recv(_SILENT_S))
+            except TimeoutError:
+                self._probe(socket)
+            except (ConnectionClosed, OSError):
+                self._lose(socket)
+
+    def _probe(self, socket: ClientConnection) -> None:
+        """Lose a connection whose other end is gone without a word, as after a power cut."""
+        try:
+            if not socket.ping().wait(_SILENT_S):
+                self._lose(socket)
+        except (ConnectionClosed, OSError):
+            self._lose(socket)
+
+    def _reconnect(self) -> None:
+        try:
+            self._connect()
+        except ConnectionLost:
+            self._closing.wait(_AGAIN_S)
+            return
+        if self._closing.is_set() and (socket := self._socket) is not None:
+            self._lose(socket)  # as `close` may have looked before it was connected
+            return
+        logger.warning("%s: connected again", self._url)
+
+    def _lose(self, socket: ClientConnection) -> None:
+        """Use a connection no more; without the closing handshake, in which a dead peer would be waited for."""
+        if self._socket is socket:
+            self._socket = None
+            if not self._closing.is_set():
+                logger.warning("%s: the connection is lost", self._url)
+        with contextlib.suppress(OSError):
+            socket.socket.shutdown(SHUT_RDWR)
+
+    def _receive(self, frame: str | bytes) -> None:
+        try:
+            came = decoded(frame)
+        except VLAgentsError as error:
+            logger.warning("%s: sent what is left out: %s", self._url, error)
+            return
+        if came.get("op") == "publish":
+            take = self._take.get(str(came.get("topic")))
+            if take is not None:
+                take(came.get("msg"))
+        elif came.get("op") == "status":
+            logger.warning("%s: %s: %s", self._url, came.get("level"), came.get("msg"))
+
+
+def decoded(frame: str | bytes) -> dict[str, Any]:
+    """Decode a message of the protocol.
+
+    Args:
+        frame: What came over the WebSocket: JSON as text, CBOR as bytes; JSON may hold a PNG with JSON inside.
+
+    Returns:
+        The message, with its operation as "op".
+
+    Raises:
+        MalformedMessage: The frame cannot be decoded.
+        MissingDependency: It is PNG, and Pillow is not installed.
+    """
+    message = cbor.decode(frame) if isinstance(frame, bytes) else _json(frame)
+    if isinstance(message, dict) and message.get("op") == "png":
+        message = _json(_inside(message.get("data")))
+    if not isinstance(message, dict):
+        raise MalformedMessage(f"rosbridge: got {type(message).__name__}, want an object with `op`")
+    return message
+
+
+def _json(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise MalformedMessage(f"rosbridge: got {text[:40]!r}, want JSON ({error})") from error
+
+
+def _inside(data: Any) -> str:
+    """Return the JSON whose bytes are the pixels of a PNG file."""
+    try:
+        file = base64.b64decode(data, validate=True)
+        return decode_image(file).tobytes().decode()  # JSON allows the line feeds at its end
+    except (TypeError, ValueError) as error:
+        if isinstance(error, MalformedMessage):
+            raise
+        raise MalformedMessage(f"rosbridge: got a PNG message that does not hold JSON ({error})") from error

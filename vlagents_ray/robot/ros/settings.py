@@ -1,0 +1,236 @@
+"""The file that says which topics of ROS 2 a robot's cameras, state and actions are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any, get_args
+
+from vlagents_ray.errors import ConfigError
+from vlagents_ray.registry import require
+from vlagents_ray.robot.ros.messages import TWIST, PoseRotation, Values
+from vlagents_ray.settings import require_arguments
+
+ROS2 = "ros2"
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+JOINT_STATE, STRING, BOOL = "sensor_msgs/msg/JointState", "std_msgs/msg/String", "std_msgs/msg/Bool"
+POSES = ("geometry_msgs/msg/Pose", "geometry_msgs/msg/PoseStamped")
+NUMBERS = tuple(f"std_msgs/msg/{name}" for name in ("Float64MultiArray", "Float32MultiArray", "Float64", "Float32"))
+ARRAY, TWIST_TYPE, TRAJECTORY = NUMBERS[0], "geometry_msgs/msg/Twist", "trajectory_msgs/msg/JointTrajectory"
+ZEROS, NOTHING = "zeros", "nothing"
+
+
+@dataclass(frozen=True)
+class InputTopic:
+    """A topic that a part of the observation is read from."""
+
+    topic: str
+    type: str = ""  # "sensor_msgs/msg/Image"; "" is that of its place in the file
+    names: tuple[str, ...] = ()  # joints of a JointState, in the policy's order; all of them, if empty
+    values: Values = "position"  # field of a JointState
+    rotation: PoseRotation = "quat_xyzw"  # how the rotation of a pose is written
+    open: float | None = None  # of the gripper: the number where it is open
+    closed: float | None = None
+    max_age_s: float | None = None  # without a newer message the robot holds still; None: the file's
+    silent_s: float | None = None  # without a newer message the robot is stopped; None: the file's
+
+
+@dataclass(frozen=True)
+class ActionTopic:
+    """A topic that numbers of an action are published on."""
+
+    topic: str
+    type: str
+    stop: str = ""  # what is published to stop: the part of the state with the measured pose, "zeros" or "nothing"
+    numbers: int | None = None  # how many numbers a Float64MultiArray takes
+    names: tuple[str, ...] = ()  # joints of a JointState or JointTrajectory
+    values: Values = "position"  # field of a JointState
+    fields: tuple[str, ...] = TWIST  # of a Twist
+    reach_s: float = 0.1  # time in which the point of a JointTrajectory is to be reached
+
+    @property
+    def dim(self) -> int:
+        """How many numbers of an action it takes."""
+        if self.type == ARRAY:
+            return self.numbers or 0
+        return len(self.fields) if self.type == TWIST_TYPE else len(self.names)
+
+
+@dataclass(frozen=True)
+class HeartbeatTopic:
+    """A `std_msgs/msg/Bool` that says that the control loop runs, and whether it may move the robot."""
+
+    topic: str
+    hz: float = 10.0
+
+
+@dataclass(frozen=True)
+class RosSettings:
+    """All of the file; see docs/ros.md."""
+
+    link: str  # "ros2", or the address of a rosbridge: "ws://arm-pc:9090"
+    actions: tuple[ActionTopic, ...]  # together they take the numbers of an action, in this order
+    cameras: Mapping[str, InputTopic] = field(default_factory=dict)
+    state: Mapping[str, InputTopic] = field(default_factory=dict)
+    gripper: InputTopic | None = None
+    instruction: InputTopic | None = None
+    heartbeat: HeartbeatTopic | None = None
+    max_age_s: float = 0.3
+    silent_s: float = 1.0
+    clock: str = "stamp"  # whether a message's age counts from its header's time stamp, or from its arrival ("arrival")
+    ready_s: float = 10.0  # how long the first message of each topic is waited for
+    compression: str = "cbor"  # of a rosbridge: "cbor", "png" or "none"
+
+    @property
+    def sensors(self) -> list[InputTopic]:
+        """The readings that must not be old."""
+        return [*self.cameras.values(), *self.state.values(), *([self.gripper] if self.gripper else [])]
+
+    @property
+    def dim(self) -> int:
+        """How many numbers an action has."""
+        return sum(command.dim for command in self.actions)
+
+    def max_age_of(self, reading: InputTopic) -> float:
+        """After how long without a newer message the robot holds still, s."""
+        return self.max_age_s if reading.max_age_s is None else reading.max_age_s
+
+    def silent_of(self, reading: InputTopic) -> float:
+        """After how long without a newer message the robot is stopped, s."""
+        return self.silent_s if reading.silent_s is None else reading.silent_s
+
+
+def read_settings(file: Path | str) -> RosSettings:
+    """Read a file of topics.
+
+    Args:
+        file: A YAML file, as docs/ros.md explains it.
+
+    Raises:
+        ConfigError: It cannot be read, or a setting is unknown, missing or has a wrong value.
+        MissingDependency: PyYAML is not installed.
+    """
+    yaml = require("yaml", extra="ros")
+    try:
+        stated = yaml.safe_load(Path(file).read_text())
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise ConfigError(f"{file}: cannot be read as a file of ROS topics ({error})") from error
+    return settings_from(stated, str(file))
+
+
+def settings_from(stated: Any, where: str) -> RosSettings:
+    """Check what a file states, and return it.
+
+    Args:
+        stated: The decoded document.
+        where: The file's name, for the messages.
+
+    Raises:
+        ConfigError: A setting is unknown, missing or has a wrong value.
+    """
+    top = dict(_mapping(stated, where))
+    for part, kind in (("cameras", IMAGE), ("state", JOINT_STATE)):
+        named = _mapping(top.get(part) or {}, f"{where}: {part}")
+        top[part] = {str(name): _reading(one, f"{where}: {part}.{name}", kind) for name, one in named.items()}
+    for part, kind in (("gripper", JOINT_STATE), ("instruction", STRING)):
+        if top.get(part) is not None:
+            top[part] = _reading(top[part], f"{where}: {part}", kind)
+    if top.get("heartbeat") is not None:
+        top["heartbeat"] = _made(HeartbeatTopic, top["heartbeat"], f"{where}: heartbeat")
+    actions = top.get("actions") or []
+    if not isinstance(actions, list):
+        raise ConfigError(f"{where}: actions: got {type(actions).__name__}, want a list of topics")
+    top["actions"] = tuple(_made(ActionTopic, one, f"{where}: actions[{i}]") for i, one in enumerate(actions))
+    settings: RosSettings = _made(RosSettings, top, where)
+    _check(settings, where)
+    return settings
+
+
+def _check(settings: RosSettings, where: str) -> None:
+    readings = [
+        *((f"cameras.{name}", one, (IMAGE, COMPRESSED)) for name, one in settings.cameras.items()),
+        *((f"state.{name}", one, (JOINT_STATE, *POSES, *NUMBERS)) for name, one in settings.state.items()),
+        *((name, one, (JOINT_STATE, *NUMBERS)) for name, one in (("gripper", settings.gripper),) if one is not None),
+        *((name, one, (STRING,)) for name, one in (("instruction", settings.instruction),) if one is not None),
+    ]
+    for name, reading, types in readings:
+        _one_of(f"{where}: {name}: type", reading.type, types)
+        _one_of(f"{where}: {name}: values", reading.values, get_args(Values))
+        _one_of(f"{where}: {name}: rotation", reading.rotation, get_args(PoseRotation))
+    types_of: dict[str, str] = {}
+    for name, reading, _ in readings:
+        if types_of.setdefault(reading.topic, reading.type) != reading.type:
+            raise ConfigError(
+                f"{where}: {name}: got {reading.topic} as {reading.type}, and elsewhere as {types_of[reading.topic]}"
+            )
+    if not settings.sensors:
+        raise ConfigError(f"{where}: got no camera, state or gripper, want one, by whose age the robot is stopped")
+    if not settings.actions:
+        raise ConfigError(f"{where}: actions: got none, want the topics that command the robot")
+    gripper = settings.gripper
+    if gripper is not None and (gripper.open is None or gripper.closed is None or gripper.open == gripper.closed):
+        raise ConfigError(f"{where}: gripper: got no two numbers, want `open` and `closed` as the topic gives them")
+    for i, command in enumerate(settings.actions):
+        _check_command(command, settings, f"{where}: actions[{i}]")
+    limits = [(name, getattr(settings, name)) for name in ("max_age_s", "silent_s", "ready_s")]
+    limits += [(f"{name}: {key}", getattr(one, key)) for name, one, _ in readings for key in ("max_age_s", "silent_s")]
+    limits += [("heartbeat: hz", settings.heartbeat.hz)] if settings.heartbeat else []
+    for name, limit in limits:
+        if limit is not None and not limit > 0:
+            raise ConfigError(f"{where}: {name}: got {limit}, want above 0")
+    _one_of(f"{where}: clock", settings.clock, ("stamp", "arrival"))
+    _one_of(f"{where}: compression", settings.compression, ("cbor", "png", "none"))
+    if settings.link != ROS2 and not settings.link.startswith(("ws://", "wss://")):
+        raise ConfigError(f"{where}: link: got {settings.link!r}, want 'ros2', or a rosbridge as 'ws://arm-pc:9090'")
+
+
+def _check_command(command: ActionTopic, settings: RosSettings, where: str) -> None:
+    _one_of(f"{where}: type", command.type, (ARRAY, JOINT_STATE, TWIST_TYPE, TRAJECTORY))
+    _one_of(f"{where}: values", command.values, get_args(Values))
+    for name in command.fields:
+        _one_of(f"{where}: fields", name, TWIST)
+    if command.dim < 1:
+        wants = "numbers, how many it takes" if command.type == ARRAY else "names, those of the joints"
+        raise ConfigError(f"{where}: got a {command.type} without numbers, want {wants}")
+    if command.type == TRAJECTORY and not command.reach_s > 0:
+        raise ConfigError(f"{where}: reach_s: got {command.reach_s}, want above 0")
+    if not command.stop and command.type != TWIST_TYPE:
+        raise ConfigError(
+            f"{where}: stop: got none, want what stops {command.topic}: {ZEROS!r} where numbers are velocities or "
+            f"deltas, a part of the state with the measured pose where they are targets, or {NOTHING!r} where the "
+            f"controller stays at its last target and that is right"
+        )
+    if command.stop and command.stop not in (ZEROS, NOTHING):
+        _one_of(f"{where}: stop", command.stop, (ZEROS, NOTHING, *settings.state))
+
+
+def _reading(stated: Any, where: str, kind: str) -> InputTopic:
+    reading: InputTopic = _made(InputTopic, {"type": kind, **_mapping(stated, where)}, where)
+    return reading
+
+
+def _made(kind: type[Any], stated: Any, where: str) -> Any:
+    given = dict(_mapping(stated, where))
+    for one in fields(kind):
+        value = given.get(one.name)
+        if isinstance(value, list) and one.name in ("names", "fields"):
+            if not all(isinstance(name, str) for name in value):
+                raise ConfigError(f"{where}: {one.name}: got {value!r}, want a list of names")
+            given[one.name] = tuple(value)
+    require_arguments(where, kind, given)
+    for name in ("names", "fields"):
+        if not isinstance(given.get(name, ()), tuple):
+            raise ConfigError(f"{where}: {name}: got {given[name]!r}, want a list of names")
+    return kind(**given)
+
+
+def _mapping(stated: Any, where: str) -> Mapping[str, Any]:
+    if not isinstance(stated, Mapping):
+        raise ConfigError(f"{where}: got {type(stated).__name__}, want keys with values; see docs/ros.md")
+    return stated
+
+
+def _one_of(what: str, got: object, want: tuple[object, ...]) -> None:
+    if got not in want:
+        raise ConfigError(f"{what}: got {got!r}, want one of {list(want)}")
