@@ -155,7 +155,7 @@ class WebSocketTransport:
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
         """Send one frame and return its replies; replies to earlier requests that timed out are discarded."""
         deadline = time.monotonic() + timeout_s
-        codec = self._codec.codec_for(requests[0].obs, lambda probe: self._probe(probe, timeout_s), STREAM_BYTES)
+        codec = self._codec.codec_for(requests[0].obs, lambda probe: self._probe(probe, timeout_s), STREAM_BYTES, timeout_s)
         pieces = request_parts(requests, codec)
         if (size := sum(map(len, pieces))) > STREAM_BYTES:  # the server would only close the connection
             raise MessageTooLarge(
