@@ -172,7 +172,13 @@ class CodecChoice:
         self._size = 0  # bytes of the images for which the codec was chosen
 
     def connected(self, *, near: bool) -> None:
-        """Note whether the server is known to be on this machine; called for each new connection."""
+        """Note a new connection, and whether the server is known to be on this machine.
+
+        A choice of JPEG or PNG stays, so that a robot acts again at once. Raw pixels are for fast links, on which another
+        measurement takes no time.
+        """
+        if near != self._near or self.codec == RAW:
+            self.forget()
         self._near = near
 
     def codec_for(
@@ -206,6 +212,6 @@ class CodecChoice:
         return self.codec or RAW
 
     def forget(self) -> None:
-        """Forget the choice as the connection is gone: the next connection is measured again."""
+        """Forget the choice: the next connection is measured again."""
         if self._candidates:
             self.link, self.codec, self._size = None, None, 0
