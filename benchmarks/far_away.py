@@ -75,21 +75,37 @@ def robot(host: Host, url: str) -> Iterator[LineProcess]:
 
 
 def run(
-    arm: LineProcess, link: FarLink, conditions: Conditions, mode: str, seconds: float, cut_s: float = 0.0
+    arm: LineProcess,
+    link: FarLink,
+    conditions: Conditions,
+    cut_s: float = 0.0,
+    cut_after_s: float = _CUT_AFTER_S,
+    *,
+    seconds: float,
+    **how: Any,
 ) -> tuple[dict[str, Any], float | None]:
     """Let the robot act over the link, which is cut for a while.
+
+    Args:
+        arm: The robot's process.
+        link: The link.
+        conditions: What the link does.
+        cut_s: How long it is cut; 0: not at all.
+        cut_after_s: When it is cut.
+        seconds: The length of the run.
+        how: Further arguments of `benchmarks.far_robot.drive`.
 
     Returns:
         What the robot says, and when the cut ended, s of `time.monotonic`; None if there was none.
     """
     link.set(conditions)
-    arm.send(json.dumps({"mode": mode, "seconds": seconds}))
+    arm.send(json.dumps({"seconds": seconds, **how}))
     begun = arm.read(_START_S)
     if begun != "begun":
         raise ConfigError(f"the robot: got {begun!r}, want that it begins")
     healed = None
     if cut_s:
-        time.sleep(_CUT_AFTER_S)
+        time.sleep(cut_after_s)
         link.set(Conditions(cut=True))
         time.sleep(cut_s)
         link.set(conditions)
@@ -138,7 +154,7 @@ def measure(
     congestion: str,
     say: Callable[[str], None] = lambda _: None,
 ) -> list[Row]:
-    """Let each mode drive the robot over a clean link, a long one, one that also loses packets, and one that is also cut."""
+    """Let each mode drive the robot over a clean link, a long one, a long one that loses packets, and that one cut."""
     rate = f"{mbit:g} Mbit/s"
     links = {
         f"clean, {rate}": (Conditions(mbit=mbit), 0.0),
@@ -147,13 +163,16 @@ def measure(
         f"{delay_ms:g} ms, {100 * loss:g} % lost, cut for {cut_s:g} s": (Conditions(delay_ms, loss, mbit), cut_s),
     }
     rows = []
-    with hosts(2) as [cloud, home], FarLink(cloud, home, congestion) as link:
-        with served(cloud), robot(home, f"http://{link.address}:{_PORT}") as arm:
-            for name, (conditions, cut) in links.items():
-                for mode in modes:
-                    found, healed = run(arm, link, conditions, mode, seconds + cut, cut)
-                    rows.append(row(name, mode, found, healed))
-                    say(f"{name}, {mode}: {rows[-1]}")
+    with (
+        hosts(2) as [cloud, home],
+        FarLink(cloud, home, congestion) as link,
+        served(cloud),
+        robot(home, f"http://{link.address}:{_PORT}") as arm,
+    ):
+        for (name, (conditions, cut)), mode in itertools.product(links.items(), modes):
+            found, healed = run(arm, link, conditions, cut, seconds=seconds + cut, mode=mode)
+            rows.append(row(name, mode, found, healed))
+            say(f"{name}, {mode}: {rows[-1]}")
     return rows
 
 
@@ -167,7 +186,7 @@ def main(
     congestion: Annotated[str, typer.Option(help="TCP's congestion control: cubic, bbr.")] = "cubic",
     json_file: Json = None,
 ) -> None:
-    """What a robot does whose policy is far away: over a clean link, a long one, one that loses, one that is cut."""
+    """What a robot does whose policy is far away: over a clean link, a long one, one that loses packets or is cut."""
     with errors():
         chosen = modes.split(",")
         if unknown := sorted(set(chosen) - set(MODES)):

@@ -27,7 +27,7 @@ from vlagents_ray.robot.simulated import SimulatedRobot
 
 HZ = 30.0
 CHUNK = 50  # rows: 1.7 s
-TIMEOUT_S = 2.0  # of a request
+RESET_S, ACT_S = 10.0, 2.0  # how long either may take
 MAX_AGE_S = 3.0  # of the observation of an action that is executed
 SILENCE_S = 2.0  # after which the watchdog stops the robot
 MAX_STEP = 0.2  # of the guard
@@ -53,8 +53,9 @@ class FarConfig(BaseModel, extra="forbid"):
 class FarPolicy(Agent):
     """Moves along a sine, with chunks that do not quite agree with each other, as those of a real policy.
 
-    Rows are (position, tick of the observation that the row was computed from, observations that came twice). With real-time
-    chunking a chunk begins with the rows that will have been executed, and leaves them gradually.
+    A row is the position, the tick of the observation that it was computed from, and the number of observations that
+    came twice. With real-time chunking a chunk begins with the rows that will have been executed, and leaves them
+    gradually.
     """
 
     Config: ClassVar[type] = FarConfig
@@ -103,6 +104,9 @@ class Ticks:
     age_ticks: list[int] = field(default_factory=list)  # of the observation behind each executed action of the policy
     step: list[float] = field(default_factory=list)  # how far each of them is from the one before
     twice: int = 0  # observations that the policy saw twice in one session
+    resumed: list[int] = field(
+        default_factory=list
+    )  # numbers of the chunks before which the session had to begin again
 
 
 class FarRobot(SimulatedRobot):
@@ -143,18 +147,25 @@ class NotingPlayer(ChunkPlayer):
         act = super().act(obs)
         if SAFE not in act.info:
             self.robot.note(act)
+            if act.info.get("resumed") and act.info["chunk"] not in self.robot.ticks.resumed:
+                self.robot.ticks.resumed.append(act.info["chunk"])
         return act
 
 
-def drive(url: str, mode: str, seconds: float, began: Callable[[], object] = lambda: None) -> dict[str, Any]:
-    """Let the policy drive the robot for so long, and return what came of it."""
-    with RemoteAgent(url, timeout_s=TIMEOUT_S) as agent:
+def drive(
+    url: str, mode: str, seconds: float, *, recovers: bool = False, began: Callable[[], object] = lambda: None
+) -> dict[str, Any]:
+    """Let the policy drive the robot for so long, and return what came of it.
+
+    With `recovers`, the run ends sooner: as soon as the policy has driven for a second since a stop.
+    """
+    with RemoteAgent(url, timeout_s=RESET_S) as agent:
         robot = FarRobot(agent.contract)
         low, high = np.array([-1.1, 0, 0]), np.array([1.1, 1e6, 1e6])
         guard = Guard(agent.contract, low=low, high=high, max_step=np.array([MAX_STEP, 1e6, 1e6]))
         watchdog = Watchdog(lambda _: robot.stop(), {"server": SILENCE_S, "loop": 1.0})
         player = NotingPlayer(
-            agent, deadline_s=0, safe="hold", max_age_s=MAX_AGE_S, check=guard, timeout_s=TIMEOUT_S, **MODES[mode]
+            agent, deadline_s=0, safe="hold", max_age_s=MAX_AGE_S, check=guard, timeout_s=ACT_S, **MODES[mode]
         )
         player.robot = robot
         ends = float("inf")
@@ -164,9 +175,10 @@ def drive(url: str, mode: str, seconds: float, began: Callable[[], object] = lam
             if ends == float("inf"):
                 ends = time.monotonic() + seconds
                 began()
-            return time.monotonic() >= ends
+            recovered = recovers and bool(watchdog.barks) and all(robot.ticks.acted[-round(HZ) :])
+            return recovered or time.monotonic() >= ends
 
-        report = run_loop(robot, player, hz=HZ, instruction="go round", watchdog=watchdog, until=until)
+        report = run_loop(robot, player, hz=HZ, instruction="go round", watchdog=watchdog, until=until, real_time=True)
         found = {
             "ticks": asdict(robot.ticks),
             "missed": report.jitter["missed"],

@@ -151,9 +151,9 @@ def coding_cost(cameras: Sequence[np.ndarray], codec: ImageCodec) -> tuple[int, 
 class CodecChoice:
     """The codec of one session's cameras: the one that the user asks for, or the fastest over the link.
 
-    "auto" takes the fastest of JPEG, PNG and raw; "exact" the faster of PNG and raw. Within a machine it is raw without a
-    measurement, unless a message of so many bytes is refused. To a server so far away that measuring would take much of
-    a request's time, it is JPEG, or PNG, without one.
+    "auto" takes the fastest of JPEG, PNG and raw; "exact" the faster of PNG and raw. Within a machine it is raw without
+    a measurement, unless a message of so many bytes is refused. To a server so far away that measuring would take much
+    of a request's time, it is JPEG, or PNG, without one.
     """
 
     def __init__(self, requested: CodecName | ImageCodec) -> None:
@@ -174,8 +174,8 @@ class CodecChoice:
     def connected(self, *, near: bool) -> None:
         """Note a new connection, and whether the server is known to be on this machine.
 
-        A choice of JPEG or PNG stays, so that a robot acts again at once. Raw pixels are for fast links, on which another
-        measurement takes no time.
+        A choice of JPEG or PNG stays, so that a robot acts again at once. Raw pixels are for fast links, on which
+        another measurement takes no time.
         """
         if near != self._near or self.codec == RAW:
             self.forget()

@@ -130,8 +130,9 @@ class Stream:
     def close(self) -> None:
         """Close the connection, so that the server notices.
 
-        What a server did not answer is of no use to it any more. The kernel would keep sending that for minutes where the
-        link is lost, and the server would act on it, and hold the sessions until then; a reset ends both.
+        A message that was not answered in time is of no use any more. Over a lost link the kernel would keep sending it
+        for minutes, and the server would act on it and hold the sessions until then; a reset of the connection ends
+        both.
         """
         with contextlib.suppress(OSError):
             if self._silent:

@@ -116,9 +116,7 @@ class HttpTransport:
             "content-type": CONTENT_TYPE,
             "accept": CONTENT_TYPE,
         }
-        codec = self._codec.codec_for(
-            requests[0].obs, lambda probe: self._probe(probe, timeout_s), timeout_s=timeout_s
-        )
+        codec = self._codec.codec_for(requests[0].obs, lambda probe: self._probe(probe, timeout_s), timeout_s=timeout_s)
         frame = encode_requests(requests, codec)
         status, kind, body = self._exchange("POST", f"/v1/{requests[0].op}", frame, headers, timeout_s)
         if status == 200:
