@@ -436,6 +436,60 @@ def test_a_replica_that_has_fallen_silent_is_left(
     agent.close()
 
 
+def test_a_call_that_connects_again_too_late_sends_nothing_and_the_next_one_has_the_connection(
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch, clock: Clock
+) -> None:
+    served = replicas(2)
+    agent = served.agent(timeout_s=2.0)
+    agent.reset(obs(1), "stack")
+    connect, connected = InProcess.connect, []
+
+    def slowly(self: InProcess, timeout_s: float) -> Any:
+        clock.now += 3.0
+        connected.append(timeout_s)
+        return connect(self, timeout_s)
+
+    monkeypatch.setattr(InProcess, "connect", slowly)
+    served.dead.add(0)
+    agent._connection.timeout_s = 2.0
+    agent._connection._must_reconnect = True
+    sent = len(served.frames)
+    with pytest.raises(DeadlineExceeded, match="too late"):
+        agent.act(obs(2))
+    assert len(served.frames) == sent
+    assert agent.act(obs(3)).info["resumed"]
+    assert len(connected) == 1
+    agent.close()
+
+
+@pytest.mark.parametrize("waits", [False, True])
+def test_a_server_that_has_just_answered_is_not_left_for_the_silence_before_that(
+    waits: bool, replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch, clock: Clock
+) -> None:
+    """It was: the first late answer on a new connection, which is slow to begin with, threw that away, too."""
+    served = replicas(1)
+    agent = served.agent(timeout_s=2.0)
+    agent.reset(obs(1), "stack")
+    late, lost = DeadlineExceeded("no answer"), ConnectionLost("gone")
+    errors: list[Exception] = [late, late, lost, late] if waits else [late, lost, late]
+    call = InProcess.call
+
+    def failing(self: InProcess, requests: Any, timeout_s: float) -> Any:
+        if not errors:
+            return call(self, requests, 30.0)
+        clock.now += 2.0
+        raise errors.pop(0)
+
+    monkeypatch.setattr(InProcess, "call", failing)
+    agent._connection.timeout_s = 2.0
+    for _ in range(len(errors)):
+        with pytest.raises((DeadlineExceeded, ConnectionLost)):
+            agent.act(obs(2))
+    assert agent.act(obs(3)).action[-1] == 3
+    assert agent.reconnects == 1
+    agent.close()
+
+
 def test_a_replica_that_is_only_slow_keeps_the_session_or_gives_it_on(
     replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch, clock: Clock
 ) -> None:

@@ -109,6 +109,7 @@ class Connection:
         self.contract = None if contract is None else Contract.from_json(contract)
         self.act_parts = metadata.get("act_parts")
         self.codec.connected(near=_is_near(self.url, metadata))
+        self._silent, self._silent_since = False, None  # also where the transport is still the same
         self.metadata = metadata
 
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
@@ -118,6 +119,9 @@ class Connection:
             if self._must_reconnect:
                 self.open(timeout_s)
                 timeout_s -= time.monotonic() - begun
+                if timeout_s <= 0:  # nothing is sent; the next call has the new connection
+                    late = DeadlineExceeded(f"{self.url}: connected again, but too late for this call")
+                    return [Reply(request.request_id, error=late) for request in requests]
             left_s = max(1e-3, timeout_s)
             server_deadline_ms = (left_s - min(_TRANSPORT_SHARE * left_s, _TRANSPORT_S)) * 1e3
             for request in requests:
@@ -177,6 +181,7 @@ class Connection:
         if not self.users:
             self._close_old_transport()
             self.transport.close()
+            self.codec.forget()  # the next connection may be over another link
             self.metadata, self._must_reconnect, self._asked_to_move = None, False, False
 
     def _close_old_transport(self) -> None:

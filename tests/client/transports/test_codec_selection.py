@@ -55,6 +55,7 @@ class Simulated:
 def test_bandwidth_is_found_in_bounded_time(round_trip_s: float, bandwidth: float) -> None:
     link = Simulated(round_trip_s, bandwidth)
     found = measure(link.send, lambda: link.now)
+    assert found is not None
     assert found.round_trip_s == pytest.approx(round_trip_s, rel=0.5)  # a few bytes take their time on a slow link
     assert found.bandwidth == pytest.approx(bandwidth, rel=0.1)
     one_probe_s = 16_384 / bandwidth + round_trip_s
@@ -90,12 +91,16 @@ def test_a_slow_link_carries_few_bytes() -> None:
 
 def test_a_burst_that_passes_at_once_does_not_hide_the_bandwidth() -> None:
     link = Simulated(2e-4, 12.5e6, burst=64 * 1024)
-    assert measure(link.send, lambda: link.now).bandwidth == pytest.approx(12.5e6, rel=0.5)
+    found = measure(link.send, lambda: link.now)
+    assert found is not None
+    assert found.bandwidth == pytest.approx(12.5e6, rel=0.5)
 
 
 def test_a_server_that_takes_little_is_measured_with_little() -> None:
     link = Simulated(2e-4, 125e6, limit=100_000)
-    assert measure(link.send, lambda: link.now).bandwidth == pytest.approx(125e6, rel=0.2)
+    found = measure(link.send, lambda: link.now)
+    assert found is not None
+    assert found.bandwidth == pytest.approx(125e6, rel=0.2)
 
 
 @pytest.mark.parametrize(
@@ -133,6 +138,39 @@ def test_images_beyond_the_default_limits_are_left_to_the_server() -> None:
     link = Simulated(2e-4, 1.25e6)
     assert huge[0].size > 3 * DEFAULT_LIMITS.pixels
     assert fastest(huge, CANDIDATES, LinkSpeed(2e-4, 1.25e6), link.send) != RAW
+
+
+def test_a_request_over_a_long_way_is_not_late_because_the_way_was_measured() -> None:
+    link = Simulated(0.16, 2.5e6)
+    assert measure(link.send, lambda: link.now, within_s=0.5) is None
+    assert link.now == pytest.approx(2 * 0.16, rel=0.01)
+    sent: list[bytes] = []
+
+    def slowly(message: bytes) -> None:
+        sent.append(message)
+        time.sleep(0.03)
+
+    for requested, chosen in (("auto", JPEG), ("exact", LOSSLESS)):
+        choice = CodecChoice(requested)  # type: ignore[arg-type]
+        sent.clear()
+        assert choice.codec_for(OBS, slowly, timeout_s=1.0) == chosen
+        assert choice.codec_for(OBS, slowly, timeout_s=1.0) == chosen
+        assert (choice.link, len(sent)) == (None, 2)
+
+
+def test_a_new_connection_is_measured_again_only_where_that_takes_no_time() -> None:
+    sent: list[bytes] = []
+    for chosen, again in ((JPEG, False), (LOSSLESS, False), (RAW, True)):
+        choice = CodecChoice("auto")
+        choice.codec_for(OBS, sent.append)
+        choice.codec = chosen
+        sent.clear()
+        choice.connected(near=False)
+        assert (choice.codec is None) == again
+        choice.codec_for(OBS, sent.append)
+        assert bool(sent) == again
+        choice.connected(near=True)  # another replica, on this machine
+        assert choice.codec is None
 
 
 def test_the_choice_stands_until_images_change_much_or_the_connection_is_new() -> None:

@@ -12,7 +12,7 @@ from http import HTTPStatus
 from urllib.parse import SplitResult, urlsplit
 
 import pytest
-from websockets.exceptions import ConnectionClosed
+from websockets.exceptions import ConnectionClosed, ConnectionClosedError, ConnectionClosedOK
 from websockets.http11 import Request, Response
 from websockets.server import ServerProtocol
 from websockets.sync.server import ServerConnection, serve
@@ -84,6 +84,35 @@ def test_a_server_that_closes_after_an_answer_is_noticed_by_the_next_request(str
     with pytest.raises((ConnectionClosed, OSError)):  # noqa: PT012 - by whichever hears of it
         stream.send(b"answer first", 5)
         stream.recv(30)
+
+
+@pytest.mark.parametrize("answered", [True, False])
+def test_a_server_that_does_not_answer_is_left_by_a_reset_so_that_it_holds_nothing_any_longer(answered: bool) -> None:
+    ends: queue.SimpleQueue[ConnectionClosed] = queue.SimpleQueue()
+
+    def listen(connection: ServerConnection) -> None:
+        try:
+            connection.recv()
+            if answered:
+                connection.send(b"here")
+            connection.recv()
+        except ConnectionClosed as end:
+            ends.put(end)
+
+    with serve(listen, "127.0.0.1", 0) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        stream = Stream(urlsplit("http://127.0.0.1"), server.socket.getsockname()[1], "/", 5)
+        stream.send(b"hello", 5)
+        if answered:
+            assert stream.recv(30) == b"here"
+        else:
+            with pytest.raises(TimeoutError):
+                stream.recv(0.01)
+        stream.close()
+        assert isinstance(ends.get(timeout=30), ConnectionClosedOK if answered else ConnectionClosedError)
+        server.shutdown()
+        thread.join()
 
 
 def test_the_key_is_in_no_log(base: SplitResult, caplog: pytest.LogCaptureFixture) -> None:

@@ -84,6 +84,11 @@ def first_timeout_s(timeout_s: float) -> float:
     return min(_ANSWER_S, timeout_s / 3)
 
 
+def left_s(deadline: float) -> float:
+    """Return the time until a deadline, s of `time.monotonic`; at least 1 ms, as 0 means no limit to some calls."""
+    return max(1e-3, deadline - time.monotonic())
+
+
 def no_parts(name: str) -> MalformedMessage:
     """Return the error for a part of a reply from a server that sends whole chunks over this transport."""
     return MalformedMessage(f"{name}: got a part of a chunk, want a whole one")

@@ -27,6 +27,7 @@ _GROWTH = 4
 _SIZES = tuple(16 * 1024 * _GROWTH**n for n in range(4))  # bytes; 1 MiB is a common limit of proxies for one request
 _MIN_PROBE_S = 0.005  # s; a shorter probe measures no bandwidth: links let a burst pass before they slow down
 _MIN_PROBE_TRIPS = 5  # round trips; nor does a probe that takes less than these
+_SHARE = 0.25  # of the time of a request, which measuring may take; where it would take longer, nothing is measured
 _RATE_WAIT_S = 1.0  # most s to wait for the rate limit of a key
 _REPEATS = 3  # of the largest probe; the best one counts, since TCP's window is still growing in the first
 _CODINGS = 5  # times that a codec is tried on the images; the fastest one counts, since the machine may be busy
@@ -47,11 +48,16 @@ class LinkSpeed:
         return self.round_trip_s + size / self.bandwidth
 
 
-def measure(send: Send, clock: Callable[[], float] = time.perf_counter) -> LinkSpeed:
+def measure(
+    send: Send, clock: Callable[[], float] = time.perf_counter, within_s: float = float("inf")
+) -> LinkSpeed | None:
     """Measure the link over which `send` carries probes.
 
     Takes 0.15 s at most where a round trip is short, else ten round trips and one probe. Probes grow only while the
     last one was too short to measure, so a slow link carries few bytes.
+
+    Returns:
+        The speed; None, after two round trips, if ten of them take longer than `within_s`.
     """
 
     def seconds(size: int) -> float:
@@ -62,7 +68,10 @@ def measure(send: Send, clock: Callable[[], float] = time.perf_counter) -> LinkS
 
     seconds(LEAST_BYTES)
     begun = clock()
-    round_trip_s = min(seconds(LEAST_BYTES) for _ in range(_LATENCY_PROBES - 1))
+    round_trip_s = seconds(LEAST_BYTES)
+    if _ROUND_TRIPS * round_trip_s > within_s:
+        return None
+    round_trip_s = min(round_trip_s, *(seconds(LEAST_BYTES) for _ in range(_LATENCY_PROBES - 2)))
     end = begun + max(_BUDGET_S, _ROUND_TRIPS * round_trip_s)
     sent, taken_s = LEAST_BYTES, round_trip_s
     with contextlib.suppress(MessageTooLarge):  # the server's limit: what was measured by then is used
@@ -142,8 +151,9 @@ def coding_cost(cameras: Sequence[np.ndarray], codec: ImageCodec) -> tuple[int, 
 class CodecChoice:
     """The codec of one session's cameras: the one that the user asks for, or the fastest over the link.
 
-    "auto" takes the fastest of JPEG, PNG and raw; "exact" the faster of PNG and raw. Within a machine
-    it is raw without a measurement, unless a message of so many bytes is refused.
+    "auto" takes the fastest of JPEG, PNG and raw; "exact" the faster of PNG and raw. Within a machine it is raw without
+    a measurement, unless a message of so many bytes is refused. To a server so far away that measuring would take much
+    of a request's time, it is JPEG, or PNG, without one.
     """
 
     def __init__(self, requested: CodecName | ImageCodec) -> None:
@@ -162,11 +172,26 @@ class CodecChoice:
         self._size = 0  # bytes of the images for which the codec was chosen
 
     def connected(self, *, near: bool) -> None:
-        """Note whether the server is known to be on this machine; called for each new connection."""
+        """Note a new connection, and whether the server is known to be on this machine.
+
+        A choice of JPEG or PNG stays, so that a robot acts again at once. Raw pixels are for fast links, on which
+        another measurement takes no time.
+        """
+        if near != self._near or self.codec == RAW:
+            self.forget()
         self._near = near
 
-    def codec_for(self, obs: Obs | None, send: Send, most_bytes: float = float("inf")) -> ImageCodec:
-        """Return the codec for an observation; probes are sent only if it has yet to be chosen."""
+    def codec_for(
+        self, obs: Obs | None, send: Send, most_bytes: float = float("inf"), timeout_s: float = float("inf")
+    ) -> ImageCodec:
+        """Return the codec for an observation; probes are sent only if it has yet to be chosen.
+
+        Args:
+            obs: The observation of the request.
+            send: Sends a probe and waits for the answer.
+            most_bytes: The largest message.
+            timeout_s: How long the request may take, probes included.
+        """
         if not self._candidates or obs is None:
             return self.codec or RAW
         size = sum(image.nbytes for image in obs.cameras.values())
@@ -175,8 +200,11 @@ class CodecChoice:
                 if self._near and _passes(size, send, most_bytes):
                     self.codec = RAW
                 else:
-                    self.link = self.link or measure(send)
-                    self.codec = fastest(list(obs.cameras.values()), self._candidates, self.link, send, most_bytes)
+                    self.link = link = self.link or measure(send, within_s=_SHARE * timeout_s)
+                    cameras = list(obs.cameras.values())
+                    self.codec = self._candidates[0]
+                    if link is not None:
+                        self.codec = fastest(cameras, self._candidates, link, send, most_bytes)
             except TooManyRequests as error:  # probes count as requests: the key's rate is too low to measure by
                 self.codec = RAW if self._near else self._candidates[0]
                 time.sleep(min(error.retry_after_s, _RATE_WAIT_S))  # the request that follows counts, too
@@ -184,6 +212,6 @@ class CodecChoice:
         return self.codec or RAW
 
     def forget(self) -> None:
-        """Forget the choice as the connection is gone: the next connection is measured again."""
+        """Forget the choice: the next connection is measured again."""
         if self._candidates:
             self.link, self.codec, self._size = None, None, 0

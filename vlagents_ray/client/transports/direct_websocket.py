@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import secrets
 import socket
+import struct
 import time
 from collections.abc import Mapping, Sequence
 from urllib.parse import SplitResult
@@ -74,6 +75,7 @@ class Stream:
         self._messages: list[bytes] = []
         self._frames = _FrameMemory()
         self._read_memory = memoryview(bytearray(_READ_BYTES))
+        self._silent = False  # whether the server did not answer, or not take, the last message in time
         self._socket = socket.create_connection((host, port), timeout_s)
         try:
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -104,6 +106,7 @@ class Stream:
             self._socket.settimeout(_left(time.monotonic() + timeout_s))
             self._socket.sendall(self._frames.frame(pieces))
         except TimeoutError as error:
+            self._silent = True
             raise ConnectionAbortedError(f"the server took no message within {timeout_s:g} s") from error
 
     def recv(self, timeout_s: float) -> bytes:
@@ -114,15 +117,27 @@ class Stream:
             TimeoutError: No message came within `timeout_s`.
         """
         deadline = time.monotonic() + timeout_s
-        while not self._messages:
-            self._check_open()
-            self._read(deadline)
+        try:
+            while not self._messages:
+                self._check_open()
+                self._read(deadline)
+        except TimeoutError:
+            self._silent = True
+            raise
+        self._silent = False
         return self._messages.pop(0)
 
     def close(self) -> None:
-        """Close the connection, so that the server notices."""
+        """Close the connection, so that the server notices.
+
+        A message that was not answered in time is of no use any more. Over a lost link the kernel would keep sending it
+        for minutes, and the server would act on it and hold the sessions until then; a reset of the connection ends
+        both.
+        """
         with contextlib.suppress(OSError):
-            if self._protocol.state is State.OPEN:
+            if self._silent:
+                self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            elif self._protocol.state is State.OPEN:
                 self._protocol.send_close()
                 self._flush(time.monotonic() + 1.0)
         self._socket.close()

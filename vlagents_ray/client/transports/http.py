@@ -116,7 +116,7 @@ class HttpTransport:
             "content-type": CONTENT_TYPE,
             "accept": CONTENT_TYPE,
         }
-        codec = self._codec.codec_for(requests[0].obs, lambda probe: self._probe(probe, timeout_s))
+        codec = self._codec.codec_for(requests[0].obs, lambda probe: self._probe(probe, timeout_s), timeout_s=timeout_s)
         frame = encode_requests(requests, codec)
         status, kind, body = self._exchange("POST", f"/v1/{requests[0].op}", frame, headers, timeout_s)
         if status == 200:
@@ -135,11 +135,7 @@ class HttpTransport:
             raise refusal(status, kind, body)
 
     def close(self) -> None:
-        """Close the connection; the next one may reach another replica over another link."""
-        self._codec.forget()
-        self._close_connection()
-
-    def _close_connection(self) -> None:
+        """Close the connection; the next one may reach another replica."""
         if self._connection is not None:
             self._connection.close()
             self._connection = None
@@ -153,18 +149,18 @@ class HttpTransport:
             answer = connection.getresponse()
             return answer.status, answer.headers.get("content-type", ""), answer.read()
         except TimeoutError as error:
-            self._close_connection()
+            self.close()
             raise DeadlineExceeded(f"{self._url.geturl()}: no answer within {timeout_s:g} s") from error
         except ssl.SSLError as error:  # with TLS 1.3, the server checks the client's certificate only now
-            self._close_connection()
+            self.close()
             raise tls_failure(self._url.geturl(), error) from error
         except (OSError, http.client.HTTPException) as error:
-            self._close_connection()
+            self.close()
             raise ConnectionLost(f"{self._url.geturl()}: {type(error).__name__}: {error}") from error
 
     def _open(self, timeout_s: float) -> http.client.HTTPConnection:
         if self._connection is not None and _closed_by_peer(self._connection.sock):
-            self._close_connection()
+            self.close()
         if self._connection is None:
             host, port = self._url.hostname or "", self._url.port
             context = self._credentials.context(self._url.geturl())

@@ -20,7 +20,7 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidSta
 from websockets.sync.client import connect
 
 from vlagents_ray.client.credentials import ANONYMOUS, WEBSOCKET_LOG, Credentials, tls_failure
-from vlagents_ray.client.transports.base import first_timeout_s, is_answer
+from vlagents_ray.client.transports.base import first_timeout_s, is_answer, left_s
 from vlagents_ray.client.transports.codec_selection import CodecChoice
 from vlagents_ray.client.transports.direct_websocket import Stream
 from vlagents_ray.client.transports.http import HttpTransport, http_url, refusal
@@ -155,16 +155,18 @@ class WebSocketTransport:
     def call(self, requests: Sequence[Request], timeout_s: float) -> list[Reply]:
         """Send one frame and return its replies; replies to earlier requests that timed out are discarded."""
         deadline = time.monotonic() + timeout_s
-        codec = self._codec.codec_for(requests[0].obs, lambda probe: self._probe(probe, timeout_s), STREAM_BYTES)
+        codec = self._codec.codec_for(
+            requests[0].obs, lambda probe: self._probe(probe, left_s(deadline)), STREAM_BYTES, timeout_s
+        )
         pieces = request_parts(requests, codec)
         if (size := sum(map(len, pieces))) > STREAM_BYTES:  # the server would only close the connection
             raise MessageTooLarge(
                 f"{self._url}: got {size} bytes, the limit of a WebSocket message is {STREAM_BYTES}; "
                 f"send JPEG, or use transport='http'"
             )
-        connection = self._stream(timeout_s)
+        connection = self._stream(left_s(deadline))
         try:
-            connection.send_pieces(pieces, timeout_s)
+            connection.send_pieces(pieces, left_s(deadline))
             return _await(connection, requests, deadline)
         except (ConnectionClosed, OSError) as error:
             raise self._failure(error, timeout_s) from error
@@ -203,7 +205,6 @@ class WebSocketTransport:
 
     def close(self) -> None:
         """Close the connection, and with it its sessions."""
-        self._codec.forget()
         if self._socket is not None:
             self._socket.close()
             self._socket = None

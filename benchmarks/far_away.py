@@ -1,0 +1,221 @@
+"""How a robot fares whose policy is far away: `python -m benchmarks.far_away`.
+
+A server and a robot on two hosts of this machine (`benchmarks.hosts`), and between them a link that delays, loses and
+is cut (`benchmarks.far_link`). Each way to execute chunks drives the robot over each link. Wants Linux and root.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from benchmarks.far_link import Conditions, FarLink
+from benchmarks.far_robot import HZ, MODES
+from benchmarks.hosts import Host, hosts
+from vlagents_ray.bench.line_process import LineProcess, our_environment
+from vlagents_ray.cli.bench import Json
+from vlagents_ray.cli.console import errors, out, progress, save, table
+from vlagents_ray.errors import ConfigError
+
+_PORT = 8000
+_START_S = 180.0
+_END_S = 60.0
+_CUT_AFTER_S = 6.0
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """How one mode fared over one link."""
+
+    link: str
+    mode: str
+    period_error_p50_ms: float  # how far the time between two ticks is from the period
+    period_error_p99_ms: float
+    acted: float  # share of the ticks with an action of the policy
+    longest_without_s: float
+    spells: int  # stretches of ticks without an action of the policy
+    spell_p50_s: float
+    age_p50_ms: float  # of the observation behind the executed actions of the policy
+    age_p99_ms: float
+    step_p99: float  # how far consecutive actions of the policy are from each other
+    stops: int  # by the watchdog
+    reconnects: int
+    twice: int  # observations that the policy saw twice in one session
+    recovered_s: float | None  # from the end of the cut to the next action of the policy
+    transport: str
+    codec: str
+
+
+@contextlib.contextmanager
+def served(host: Host, port: int = _PORT) -> Iterator[None]:
+    """Serve the policy on a host, with a Ray of its own."""
+    command = host.command([sys.executable, "-m", "benchmarks.far_server", str(port)])
+    environment = our_environment() | {"RAY_USAGE_STATS_ENABLED": "0"}
+    with LineProcess("the server", command, environment, end_s=_END_S) as process:
+        process.read(_START_S)
+        yield
+
+
+@contextlib.contextmanager
+def robot(host: Host, url: str) -> Iterator[LineProcess]:
+    """Start the robot's process on a host."""
+    command = host.command([sys.executable, "-m", "benchmarks.far_robot", url])
+    with LineProcess("the robot", command, our_environment()) as process:
+        process.read(_START_S)
+        yield process
+
+
+def run(
+    arm: LineProcess,
+    link: FarLink,
+    conditions: Conditions,
+    cut_s: float = 0.0,
+    cut_after_s: float = _CUT_AFTER_S,
+    *,
+    seconds: float,
+    **how: Any,
+) -> tuple[dict[str, Any], float | None]:
+    """Let the robot act over the link, which is cut for a while.
+
+    Args:
+        arm: The robot's process.
+        link: The link.
+        conditions: What the link does.
+        cut_s: How long it is cut; 0: not at all.
+        cut_after_s: When it is cut.
+        seconds: The length of the run.
+        how: Further arguments of `benchmarks.far_robot.drive`.
+
+    Returns:
+        What the robot says, and when the cut ended, s of `time.monotonic`; None if there was none.
+    """
+    link.set(conditions)
+    arm.send(json.dumps({"seconds": seconds, **how}))
+    begun = arm.read(_START_S)
+    if begun != "begun":
+        raise ConfigError(f"the robot: got {begun!r}, want that it begins")
+    healed = None
+    if cut_s:
+        time.sleep(cut_after_s)
+        link.set(Conditions(cut=True))
+        time.sleep(cut_s)
+        link.set(conditions)
+        healed = time.monotonic()
+    found: dict[str, Any] = arm.read(seconds + _START_S)
+    return found, healed
+
+
+def row(link: str, mode: str, found: dict[str, Any], healed: float | None) -> Row:
+    """Compute what a run of the robot shows."""
+    ticks = found["ticks"]
+    at = np.array(ticks["at_s"][1:])
+    acted = np.array(ticks["acted"][1:])
+    error_ms = np.abs(np.diff(at) - 1 / HZ) * 1e3
+    lengths = [len(list(group)) / HZ for one, group in itertools.groupby(acted) if not one]
+    age_ms = np.array(ticks["age_ticks"]) * 1e3 / HZ
+    after = at[acted & (at > healed)] if healed is not None else at[:0]
+    return Row(
+        link=link,
+        mode=mode,
+        period_error_p50_ms=float(np.median(error_ms)),
+        period_error_p99_ms=float(np.quantile(error_ms, 0.99)),
+        acted=float(acted.mean()),
+        longest_without_s=max(lengths, default=0.0),
+        spells=len(lengths),
+        spell_p50_s=float(np.median(lengths)) if lengths else 0.0,
+        age_p50_ms=float(np.median(age_ms)),
+        age_p99_ms=float(np.quantile(age_ms, 0.99)),
+        step_p99=float(np.quantile(ticks["step"], 0.99)),
+        stops=len(found["barks"]),
+        reconnects=found["reconnects"],
+        twice=ticks["twice"],
+        recovered_s=float(after[0] - healed) if healed is not None and len(after) else None,
+        transport=found["transport"],
+        codec=found["codec"],
+    )
+
+
+def measure(
+    delay_ms: float,
+    loss: float,
+    mbit: float,
+    cut_s: float,
+    seconds: float,
+    modes: Sequence[str],
+    congestion: str,
+    say: Callable[[str], None] = lambda _: None,
+) -> list[Row]:
+    """Let each mode drive the robot over a clean link, a long one, a long one that loses packets, and that one cut."""
+    rate = f"{mbit:g} Mbit/s"
+    links = {
+        f"clean, {rate}": (Conditions(mbit=mbit), 0.0),
+        f"{delay_ms:g} ms each way": (Conditions(delay_ms, 0.0, mbit), 0.0),
+        f"{delay_ms:g} ms, {100 * loss:g} % lost": (Conditions(delay_ms, loss, mbit), 0.0),
+        f"{delay_ms:g} ms, {100 * loss:g} % lost, cut for {cut_s:g} s": (Conditions(delay_ms, loss, mbit), cut_s),
+    }
+    rows = []
+    with (
+        hosts(2) as [cloud, home],
+        FarLink(cloud, home, congestion) as link,
+        served(cloud),
+        robot(home, f"http://{link.address}:{_PORT}") as arm,
+    ):
+        for (name, (conditions, cut)), mode in itertools.product(links.items(), modes):
+            found, healed = run(arm, link, conditions, cut, seconds=seconds + cut, mode=mode)
+            rows.append(row(name, mode, found, healed))
+            say(f"{name}, {mode}: {rows[-1]}")
+    return rows
+
+
+def main(
+    delay_ms: Annotated[float, typer.Option(min=0, help="Of the link, each way.")] = 80.0,
+    loss: Annotated[float, typer.Option(min=0, max=0.5, help="Share of the packets, each way.")] = 0.02,
+    mbit: Annotated[float, typer.Option(min=0.1, help="What the link carries each way, Mbit/s.")] = 20.0,
+    cut_s: Annotated[float, typer.Option(min=0.1, help="How long the link is cut.")] = 10.0,
+    seconds: Annotated[float, typer.Option(min=8, help="Of each run, beside the cut.")] = 20.0,
+    modes: Annotated[str, typer.Option(help="Which ones, with commas; default: all.")] = ",".join(MODES),
+    congestion: Annotated[str, typer.Option(help="TCP's congestion control: cubic, bbr.")] = "cubic",
+    json_file: Json = None,
+) -> None:
+    """What a robot does whose policy is far away: over a clean link, a long one, one that loses packets or is cut."""
+    with errors():
+        chosen = modes.split(",")
+        if unknown := sorted(set(chosen) - set(MODES)):
+            raise ConfigError(f"--modes: got {unknown}, want some of {list(MODES)}")
+        rows = measure(delay_ms, loss, mbit, cut_s, seconds, chosen, congestion, progress)
+    shown = table(
+        "link", "mode", "period error p50/p99", "acted", "longest without", "spells (median)", "age p50/p99", "step p99",
+        "stops", "recovered",
+    )  # fmt: skip
+    for one in rows:
+        shown.add_row(*_shown(one))
+    out.print(shown)
+    save({"congestion": congestion, "rows": [asdict(one) for one in rows]}, json_file)
+
+
+def _shown(one: Row) -> tuple[str, ...]:
+    return (
+        one.link,
+        one.mode,
+        f"{one.period_error_p50_ms:.1f} / {one.period_error_p99_ms:.1f} ms",
+        f"{one.acted:.0%}",
+        f"{one.longest_without_s:.1f} s",
+        f"{one.spells} ({one.spell_p50_s:.2f} s)",
+        f"{one.age_p50_ms:.0f} / {one.age_p99_ms:.0f} ms",
+        f"{one.step_p99:.3f}",
+        f"{one.stops}",
+        "" if one.recovered_s is None else f"{one.recovered_s:.1f} s",
+    )
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,209 @@
+"""A robot far from its policy, which writes down each tick: `python -m benchmarks.far_robot URL`; and that policy.
+
+Each line that the process reads is a run, {"mode": "async", "seconds": 20}. It answers with a line when the loop
+begins, and one with what came of it when it is over.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, ClassVar
+
+import numpy as np
+from pydantic import BaseModel, Field
+
+from vlagents_ray.bench.peers.peer import die_with_parent, own_stdout
+from vlagents_ray.chunking.player import ChunkPlayer
+from vlagents_ray.client.agent import RemoteAgent
+from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
+from vlagents_ray.interface import DELAY, LEFTOVER, SAFE, Act, Agent, Obs
+from vlagents_ray.robot.loop import run_loop
+from vlagents_ray.robot.safety import Guard, Watchdog
+from vlagents_ray.robot.simulated import SimulatedRobot
+
+HZ = 30.0
+CHUNK = 50  # rows: 1.7 s
+RESET_S, ACT_S = 10.0, 2.0  # how long either may take
+MAX_AGE_S = 3.0  # of the observation of an action that is executed
+SILENCE_S = 2.0  # after which the watchdog stops the robot
+MAX_STEP = 0.2  # of the guard
+_TURN = 2 * np.pi / (4 * HZ)  # of the path in a tick: one round takes 4 s
+_SWAY = 0.03  # how far the paths of two chunks lie apart
+_IMAGE = 224  # px
+# The player's options in each mode. With a deadline of 0, no tick waits for the network.
+MODES: Mapping[str, Mapping[str, Any]] = {
+    "single actions": {"mode": "open_loop", "horizon": 1},
+    "open loop": {"mode": "open_loop"},
+    "ensemble": {"mode": "ensemble"},
+    "async": {"mode": "async"},
+    "RTC": {"mode": "async", "real_time_chunking": True},
+}
+
+
+class FarConfig(BaseModel, extra="forbid"):
+    """How long the policy computes."""
+
+    ms: float = Field(default=60.0, ge=0, description="time that a batch takes")
+
+
+class FarPolicy(Agent):
+    """Moves along a sine, with chunks that do not quite agree with each other, as those of a real policy.
+
+    A row is the position, the tick of the observation that it was computed from, and the number of observations that
+    came twice. With real-time chunking a chunk begins with the rows that will have been executed, and leaves them
+    gradually.
+    """
+
+    Config: ClassVar[type] = FarConfig
+    shared: ClassVar[tuple[str, ...]] = ("config",)
+
+    def __init__(self, config: FarConfig | None = None) -> None:
+        self.config = config or FarConfig()
+        self._seen: set[int] = set()
+        self._twice = 0
+        self._random = np.random.default_rng(0)
+
+    @property
+    def contract(self) -> Contract:
+        cameras = dict.fromkeys(("front", "wrist"), CameraSpec(_IMAGE, _IMAGE))
+        state = {"ticks": StateSpec(2)}
+        return Contract(cameras=cameras, state=state, action=ActionSpec(dim=3, delta=False), chunk=CHUNK)
+
+    def reset(self, obs: Obs, instruction: str | None = None, **kwargs: Any) -> dict[str, Any]:
+        """Forget what was seen."""
+        self._seen, self._twice = set(), 0
+        return {}
+
+    def act(self, obs: Obs) -> Act:
+        """Return a chunk, (50, 3) float32."""
+        time.sleep(self.config.ms / 1e3)
+        tick, executed = (int(number) for number in obs.state["ticks"])
+        self._twice += tick in self._seen
+        self._seen.add(tick)
+        path = np.sin(_TURN * (executed + np.arange(CHUNK))) + self._random.uniform(-_SWAY, _SWAY)
+        rows = np.stack([path, np.full(CHUNK, tick), np.full(CHUNK, self._twice)], -1).astype(np.float32)
+        before = obs.info.get(LEFTOVER)
+        if before is not None:
+            n, frozen = min(CHUNK, len(before)), int(obs.info[DELAY])
+            ours = np.clip((np.arange(n) - frozen + 1) / max(1, n - frozen), 0, 1).astype(np.float32)
+            rows[:n, 0] = ours * rows[:n, 0] + (1 - ours) * before[:n, 0]
+            rows[:frozen] = before[:frozen]
+        return Act(rows)
+
+
+@dataclass(slots=True)
+class Ticks:
+    """What happened at each tick of a run. The first one is the reset's observation."""
+
+    at_s: list[float] = field(default_factory=list)  # of `time.monotonic`, when it began
+    acted: list[bool] = field(default_factory=list)  # whether the policy's action was executed
+    age_ticks: list[int] = field(default_factory=list)  # of the observation behind each executed action of the policy
+    step: list[float] = field(default_factory=list)  # how far each of them is from the one before
+    twice: int = 0  # observations that the policy saw twice in one session
+    resumed: list[int] = field(
+        default_factory=list
+    )  # numbers of the chunks before which the session had to begin again
+
+
+class FarRobot(SimulatedRobot):
+    """A simulated robot that counts its ticks and what it executes."""
+
+    def __init__(self, contract: Contract | None) -> None:
+        super().__init__(contract)
+        self.ticks = Ticks()
+        self._before: float | None = None
+
+    def observe(self) -> Obs:
+        """Begin a tick."""
+        obs = super().observe()
+        obs.state["ticks"] = np.array([len(self.ticks.at_s), sum(self.ticks.acted)], np.float32)
+        self.ticks.at_s.append(time.monotonic())
+        self.ticks.acted.append(False)
+        return obs
+
+    def note(self, act: Act) -> None:
+        """Note an action of the policy that is about to be executed."""
+        ticks = self.ticks
+        ticks.acted[-1] = True
+        position, tick, twice = (float(number) for number in act.action)
+        ticks.age_ticks.append(len(ticks.at_s) - 1 - int(tick))
+        ticks.twice = int(twice)
+        if self._before is not None:
+            ticks.step.append(abs(position - self._before))
+        self._before = position
+
+
+class NotingPlayer(ChunkPlayer):
+    """A chunk player that tells the robot which actions are the policy's."""
+
+    robot: FarRobot
+
+    def act(self, obs: Obs) -> Act:
+        """Return the action of this tick."""
+        act = super().act(obs)
+        if SAFE not in act.info:
+            self.robot.note(act)
+            if act.info.get("resumed") and act.info["chunk"] not in self.robot.ticks.resumed:
+                self.robot.ticks.resumed.append(act.info["chunk"])
+        return act
+
+
+def drive(
+    url: str, mode: str, seconds: float, *, recovers: bool = False, began: Callable[[], object] = lambda: None
+) -> dict[str, Any]:
+    """Let the policy drive the robot for so long, and return what came of it.
+
+    With `recovers`, the run ends sooner: as soon as the policy has driven for a second since a stop.
+    """
+    with RemoteAgent(url, timeout_s=RESET_S) as agent:
+        robot = FarRobot(agent.contract)
+        low, high = np.array([-1.1, 0, 0]), np.array([1.1, 1e6, 1e6])
+        guard = Guard(agent.contract, low=low, high=high, max_step=np.array([MAX_STEP, 1e6, 1e6]))
+        watchdog = Watchdog(lambda _: robot.stop(), {"server": SILENCE_S, "loop": 1.0})
+        player = NotingPlayer(
+            agent, deadline_s=0, safe="hold", max_age_s=MAX_AGE_S, check=guard, timeout_s=ACT_S, **MODES[mode]
+        )
+        player.robot = robot
+        ends = float("inf")
+
+        def until() -> bool:
+            nonlocal ends
+            if ends == float("inf"):
+                ends = time.monotonic() + seconds
+                began()
+            recovered = recovers and bool(watchdog.barks) and all(robot.ticks.acted[-round(HZ) :])
+            return recovered or time.monotonic() >= ends
+
+        report = run_loop(robot, player, hz=HZ, instruction="go round", watchdog=watchdog, until=until, real_time=True)
+        found = {
+            "ticks": asdict(robot.ticks),
+            "missed": report.jitter["missed"],
+            "safe": report.safe,
+            "barks": report.barks,
+            "transport": agent.transport,
+            "codec": str(agent.codec),
+            "reconnects": agent.reconnects,
+        }
+        player.close()
+    return found
+
+
+def main() -> None:
+    """Run the process."""
+    die_with_parent()
+    out = own_stdout()
+
+    def say(line: Any) -> None:
+        print(json.dumps(line), file=out, flush=True)
+
+    say("ready")
+    for line in sys.stdin:
+        say(drive(sys.argv[1], **json.loads(line), began=lambda: say("begun")))
+
+
+if __name__ == "__main__":
+    main()

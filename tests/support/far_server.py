@@ -1,0 +1,51 @@
+"""The policy of `benchmarks.far_robot` behind HTTP and a replica's own WebSocket port, without Ray.
+
+`python far_server.py PORT` prints a line when it serves, and answers each line that it reads with how many sessions it
+holds, and how many it has opened. It ends with its standard input.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import threading
+from dataclasses import asdict
+
+import uvicorn
+
+from benchmarks.far_robot import FarConfig, FarPolicy
+from vlagents_ray.bench.peers.peer import die_with_parent, own_stdout
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.endpoints.websocket import WebSocketServer
+from vlagents_ray.serve.engine.engine import Engine
+from vlagents_ray.serve.ports import EVERYWHERE
+
+
+def main() -> None:
+    die_with_parent()
+    out = own_stdout()
+    engine = Engine(FarPolicy(FarConfig(ms=30)))
+    stream = WebSocketServer(engine, DEFAULT_LIMITS, EVERYWHERE, None, NoKey.OPEN)
+    stream.open()
+    engine.start()
+    metadata = {"policy": "far", "version": "0", "protocol": PROTOCOL_VERSION, "stream": asdict(stream.address)}
+    assert engine.contract is not None
+    metadata["contract"] = engine.contract.to_json()
+    app = AccessMiddleware(build_http_app(engine, lambda: metadata, DEFAULT_LIMITS), None, "far")
+    server = uvicorn.Server(uvicorn.Config(app, host=EVERYWHERE, port=int(sys.argv[1]), log_level="warning"))
+    serving = threading.Thread(target=server.run, daemon=True)
+    serving.start()
+    print(json.dumps("ready"), file=out, flush=True)  # who comes before uvicorn has started asks again
+    for _ in sys.stdin:
+        print(json.dumps([len(engine.sessions), engine.sessions.opened]), file=out, flush=True)
+    server.should_exit = True
+    serving.join(10)
+    stream.close()
+    engine.close()
+
+
+if __name__ == "__main__":
+    main()
