@@ -33,7 +33,7 @@ NOT_RUN = {
     "vlagents-ray up": "tests/integration/test_warm_cluster.py runs it with free ports",
     "vlagents-ray down": "tests/integration/test_warm_cluster.py runs it",
     "vlagents-ray robot --env tabletop --teleop keyboard": "tests/cli/test_robot.py types its keys",
-    "vlagents-ray serve my_policies:Reach --set gain=0.3": "test_served_pages.py serves it",
+    "vlagents-ray serve my_policies:Reach --set gain=0.3": "test_served_pages.py serves examples/own_policy.py so",
     "vlagents-ray bench report": "minutes of measuring",
     "vlagents-ray env make requirements/hf.txt --into .venv-hf": "it downloads packages",
     "vlagents-ray env make requirements/libero.txt": "it downloads packages",

@@ -4,19 +4,35 @@ from __future__ import annotations
 
 import contextlib
 import re
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from page_commands import DOCS, PAGES, TUTORIALS
-from readme_blocks import DOCUMENTED_HOST, Block, blocks, checkout, run
+from example_files import EXAMPLES, code_of
+from page_commands import PAGES, TUTORIALS
+from readme_blocks import DOCUMENTED_HOST, ROOT, Block, blocks, checkout, run
 from serve_command import serving
 
 pytestmark = [pytest.mark.server, pytest.mark.slow]
 
 _SERVED = [
     (page, block) for page in PAGES if page not in TUTORIALS for block in blocks(page.read_text()) if block.server
+]
+# Those of examples/ that ask a server, as their first lines say; the random policy's actions are refused by the guard.
+_SERVED += [
+    (EXAMPLES / "curl.sh", Block("bash", 1, "bash examples/curl.sh http://gpu-box:8000 picture.jpg >said", "noop")),
+    (
+        EXAMPLES / "robot_loop.py",
+        Block(
+            "bash",
+            1,
+            "python examples/robot_loop.py http://gpu-box:8000 >said\ngrep 'refused, .* than max_step allows' said",
+            "random",
+        ),
+    ),
+    (EXAMPLES / "tour.ipynb", code_of(EXAMPLES / "tour.ipynb", "scripted")),
 ]
 # One server after the other, and first the one that is still there from the tutorials.
 SERVED = sorted(_SERVED, key=lambda one: (one[1].server != "noop", str(one[1].server)))
@@ -41,42 +57,30 @@ def host_of(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[[str 
         yield host
 
 
-ENV_OF_ONES_OWN = """
-from vlagents_ray.envs.tabletop import Tabletop
-
-
-class MyEnv(Tabletop):
-    pass
-"""
-
-
-def test_modules_of_ones_own_are_served_and_evaluated_from_their_folder(tmp_path: Path) -> None:
-    policy = next(block for block in blocks((DOCS / "own_policy.md").read_text()) if block.not_run is None)
-    (tmp_path / "my_policies.py").write_text(policy.source.replace("ActionSpec(dim=3)", "ActionSpec(dim=4)"))
-    (tmp_path / "my_policies.py").write_text(
-        (tmp_path / "my_policies.py").read_text().replace("Act(action", "Act(np.append(action, 1)")
-    )
-    (tmp_path / "my_envs.py").write_text(ENV_OF_ONES_OWN)
-    log = tmp_path / "log"
-    with serving("my_policies:Reach", log, None, "--set", "gain=0.3", cwd=tmp_path) as host:
+def test_modules_of_ones_own_are_served_evaluated_and_trained_from_their_folder(tmp_path: Path) -> None:
+    folder, log = tmp_path / "examples", tmp_path / "log"
+    shutil.copytree(EXAMPLES, folder, ignore=shutil.ignore_patterns("runs"))
+    with serving("own_policy:Servo", log, None, "--set", "camera_turn=120", cwd=folder) as host:
         said = log.read_text()
         url = f"http://{host}"
-        wanted = f"vlagents-ray eval my_envs:MyEnv --policy {url} --episodes 2 --workers 2 --out runs/own"
-        run(Block("bash", 1, wanted), tmp_path, host)
+        evaluation = f"vlagents-ray eval own_env:CraneEnv --policy {url} --episodes 2 --workers 2 --out runs/own"
+        run(Block("bash", 1, f"{evaluation}\npython rl_loop.py {url} >learned"), folder, host)
+        learned = re.findall(r"^servo@\d+: (\d+)%", (folder / "learned").read_text(), re.MULTILINE)
+        assert (learned[0], int(learned[-1]) > 50) == ("0", True)
         deadline = time.monotonic() + 60
         while "Ctrl-C stops" not in said and time.monotonic() < deadline:
             time.sleep(0.2)
             said = log.read_text()
     assert [line for line in said.splitlines() if not line.startswith("log of Ray, ")] == [
-        f"serving Reach at {url}",
-        "  policy: my_policies:Reach (gain=0.3)",
+        f"serving Servo at {url}",
+        "  policy: own_policy:Servo (camera_turn=120)",
         f"  how to talk to it: {url}/docs",
         f"  what it does now: {url}/live",
         f"Ray programs of yours on this machine: vlagents_ray.join('{url}')",
         "Ctrl-C stops",
     ]
     [kept] = re.findall(r"^log of Ray, Serve and HAProxy: (.*)$", said, re.MULTILINE)
-    assert "Adding 1 replica to Deployment(name='Policy', app='Reach')" in Path(kept).read_text()
+    assert "Adding 1 replica to Deployment(name='Policy', app='Servo')" in Path(kept).read_text()
     Path(kept).unlink()
 
 
@@ -90,6 +94,7 @@ def test_a_tutorial_works_from_top_to_bottom(page: Path, host_of: Callable[[str 
 @pytest.mark.parametrize(("page", "block"), [pytest.param(*one, id=f"{one[0].stem}-{one[1]}") for one in SERVED])
 def test_a_block_works(page: Path, block: Block, host_of: Callable[[str | None], str], tmp_path: Path) -> None:
     checkout(tmp_path)
+    shutil.copy(ROOT / "clients/golden/gray.jpg", tmp_path / "picture.jpg")
     run(block, tmp_path, host_of(block.server), page=page.stem)
 
 

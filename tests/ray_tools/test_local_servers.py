@@ -69,6 +69,6 @@ def test_of_several_servers_one_is_named_by_its_url_or_its_application(
         with pytest.raises(ConfigError, match=r"got 'act', want the URL or an application .*8000 \(noop\)"):
             join("act")
         monkeypatch.setenv("RAY_AUTH_MODE", "disabled")  # so that it says which one it found, and goes no further
-        for name in ("pi0", "http://127.0.0.1:8001", "http://127.0.0.1:8001/"):
+        for name in ("pi0", "http://127.0.0.1:8001", "http://127.0.0.1:8001/", "http://localhost:8001"):
             with pytest.raises(ConfigError, match=r"RAY_AUTH_MODE=disabled: the Ray of http://127\.0\.0\.1:8001 wants"):
                 join(name)

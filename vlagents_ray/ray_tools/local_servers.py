@@ -111,7 +111,8 @@ def local_servers() -> list[LocalServer]:
 def _chosen(wanted: str | None) -> tuple[LocalServer, dict[str, str]]:
     """Return the server that `wanted` names, and the environment of its Ray's daemon."""
     found = list(_found())
-    fitting = [one for one in found if wanted is None or wanted.rstrip("/") == one[0].url or wanted in one[0].apps]
+    url = None if wanted is None else wanted.rstrip("/").replace("://localhost:", "://127.0.0.1:")
+    fitting = [one for one in found if wanted is None or url == one[0].url or wanted in one[0].apps]
     if len(fitting) == 1:
         return fitting[0]
     there = ", ".join(sorted(f"{one.url} ({', '.join(one.apps)})" for one, _ in found))

@@ -43,10 +43,11 @@ TINY = ["dim_model=32", "n_heads=2", "dim_feedforward=64", "n_encoder_layers=1",
 
 
 def documented(command: str) -> list[list[str]]:
-    """The words of each such command on the page about training, without the command itself."""
-    page = (Path(__file__).parents[3] / "docs/training.md").read_text()
-    found = re.findall(rf"^{re.escape(command)} ((?:.*\\\n)*.*)$", page, re.MULTILINE)
-    return [shlex.split(words.replace("\\\n", " ")) for words in found]
+    """The words of each such command on the page about training, then in its example, without the command itself."""
+    root = Path(__file__).parents[3]
+    text = "".join((root / name).read_text() for name in ("docs/training.md", "examples/train_and_watch.sh"))
+    found = re.findall(rf"^{re.escape(command)} ((?:.*\\\n)*.*)$", text, re.MULTILINE)
+    return [shlex.split(re.sub(r" >.*", "", words.replace("\\\n", " "))) for words in found]
 
 
 def train(dataset: Path, out: Path, route: int = IMAGES) -> Path:
@@ -109,7 +110,8 @@ def test_a_policy_of_lerobots_own_command_is_served_without_settings(policy: LeR
 
 @pytest.mark.parametrize("route", [IMAGES, STATE_ALONE])
 def test_the_documented_commands_lead_from_recordings_to_a_policy_that_acts(route: int, tmp_path: Path) -> None:
-    record, *watched = documented("vlagents-ray eval")
+    record, *evaluations = documented("vlagents-ray eval")
+    watched = [words for words in evaluations if "--watch" in words]
     task, options = record[0], settings_of(record, "--env-set")
     run = flat_config(envs=[task], env_options=options, episodes=2, record="all", video="none", out=tmp_path / "run")
     play(run, Scripted)

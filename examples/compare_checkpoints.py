@@ -1,0 +1,56 @@
+"""Compare two checkpoints: is the later one better, or was it luck?
+
+Both play the same episodes, so that those count which only one of them solves. `python compare_checkpoints.py` plays
+2 x 40 episodes in this process, in seconds, and prints the difference with its interval and McNemar's test, for each
+environment and for all. The checkpoints are made up: an expert whose hand drifts less, the longer its training lasted.
+
+With checkpoints of yours, served, `vlagents-ray eval` plays them, and the same lines compare them:
+docs/tutorials/checkpoints.md leads there. `vlagents-ray merge` puts results of different runs into one folder.
+"""
+
+import numpy as np
+
+from vlagents_ray import Act
+from vlagents_ray.evaluate import EvalConfig, Results, compare, evaluate
+from vlagents_ray.policies.scripted import Scripted
+
+ENVS = ["tabletop/lift", "tabletop/slide"]
+
+
+class Trainee(Scripted):
+    """Stands for a policy with checkpoints."""
+
+    def reset(self, obs, instruction, checkpoint_step=0, seed=0, **kwargs):
+        """Begin an episode as that checkpoint; its drift depends on the seed of the episode alone."""
+        drift = 0.35 * 0.5 ** (checkpoint_step / 5000)  # per action
+        self.drift = np.random.default_rng(seed).normal(0, drift, 3).astype(np.float32)
+        return super().reset(obs, instruction, **kwargs)
+
+    def act(self, obs):
+        """Return the expert's action with the drift, (4,)."""
+        action = super().act(obs).action.copy()
+        action[:3] = np.clip(action[:3] + self.drift, -1, 1)
+        return Act(action)
+
+
+def main():
+    """Play, and compare."""
+    plan = EvalConfig(
+        policies=[{"name": "trainee", "steps": [2000, 8000]}],
+        suites=[{"name": env, "envs": [env], "episodes": 20} for env in ENVS],
+        out="runs/compared",
+        video="none",
+    )
+    evaluate(plan, agent_factory=Trainee, in_process=True)
+
+    results = Results.load(plan.out)
+    found = compare(results, "trainee@8000", "trainee@2000")
+    for line in (*found.suites, found.total):
+        low, high = line.interval
+        pairs = line.pairs
+        print(f"{line.suite}: {pairs.total} pairs; only the later solved {pairs.only_a}, only the other {pairs.only_b}")
+        print(f"  difference of the rates: {low:+.0%} to {high:+.0%} with 95 % confidence, p = {line.adjusted:.2g}")
+
+
+if __name__ == "__main__":
+    main()

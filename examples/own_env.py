@@ -1,0 +1,88 @@
+"""Wrap a simulator of your own, so that policies are evaluated in it.
+
+`Crane` stands for the simulator: it has its own units, colours and habits, and knows nothing of this project.
+`CraneEnv` is what you write. `python own_env.py` checks it, in the folder of this file, and
+`vlagents-ray eval own_env:CraneEnv --policy NAME --out runs/crane` evaluates a policy in it; own_policy.py is one that
+works. `vlagents-ray new env NAME` writes a skeleton with its test.
+"""
+
+import numpy as np
+
+from vlagents_ray import ActionSpec, CameraSpec, Contract, Obs, StateSpec
+from vlagents_ray.envs import EvalEnv
+from vlagents_ray.envs.base import one_row
+from vlagents_ray.testing import check_env
+
+
+class Crane:
+    """A hook over a floor of 1 x 1 m, seen by a camera that somebody mounted turned around its own axis."""
+
+    def load(self, seed, camera_turn):
+        self.hook, self.mark = np.random.default_rng(seed).uniform(-450, 450, (2, 2))  # mm
+        turn = np.deg2rad(camera_turn)
+        self._to_picture = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]) / 1500
+
+    def drive(self, dx, dy):  # mm
+        self.hook = np.clip(self.hook + np.array([dx, dy]), -500, 500)
+
+    def photo(self, side):  # (side, side, 3) uint8, BGR
+        photo = np.full((side, side, 3), 90, np.uint8)
+        for place, colour, size in ((self.mark, (0, 255, 0), 3), (self.hook, (0, 0, 255), 2)):
+            x, y = ((self._to_picture @ place + 0.5) * side).astype(int)
+            photo[max(y - size, 0) : y + size, max(x - size, 0) : x + size] = colour
+        return photo
+
+
+class CraneEnv(EvalEnv):
+    """The hook has to come within 5 cm of the mark."""
+
+    max_steps = 40  # after which an episode is cut off
+    STEP_MM = 80  # that an action of 1 moves the hook by
+
+    def __init__(self, side=96, camera_turn=120):  # px, degrees: `--env-set camera_turn=0`
+        self.crane, self.side, self.camera_turn = Crane(), side, camera_turn
+
+    @property
+    def contract(self):
+        """What the environment gives and takes: a policy that does not fit is refused before the first step."""
+        return Contract(
+            cameras={"front": CameraSpec(self.side, self.side)},
+            state={"xy": StateSpec(2, "m")},
+            instruction=True,
+            action=ActionSpec(dim=2, space="ee_position", delta=True, low=-1.0, high=1.0),
+            control_hz=5.0,
+        )
+
+    @property
+    def instruction(self):
+        return "move the hook to the mark"
+
+    def reset(self, *, seed, options=None):
+        """Begin the episode of this seed: it is the same whatever was played before, in any process."""
+        self.crane.load(seed, self.camera_turn)
+        self.steps = 0
+        return self._observe(), {}
+
+    def step(self, act):
+        """Take one action, (2,); the rows of a chunk come one after the other."""
+        before = self._distance()
+        self.crane.drive(*(self.STEP_MM * np.clip(one_row(act, self.contract), -1, 1)))
+        self.steps += 1
+        success = self._distance() < 0.05
+        # Terminated: it cannot go on. Truncated: it was cut off. Success is neither, and is counted.
+        return self._observe(), before - self._distance(), success, self.steps >= self.max_steps, {"success": success}
+
+    def close(self):
+        """Free the simulator."""
+
+    def _distance(self):
+        return float(np.linalg.norm(self.crane.hook - self.crane.mark)) / 1000  # m
+
+    def _observe(self):
+        picture = self.crane.photo(self.side)[..., ::-1].copy()  # RGB, in new arrays each time
+        return Obs(cameras={"front": picture}, state={"xy": (self.crane.hook / 1000).astype(np.float32)})
+
+
+if __name__ == "__main__":
+    check_env(CraneEnv())  # raises what is wrong with it
+    print("CraneEnv keeps its contract")

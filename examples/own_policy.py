@@ -1,0 +1,78 @@
+"""Serve a policy of your own.
+
+`Servo` looks for the red hook and the green mark in the picture of own_env.py, and moves the hook towards the mark;
+your model takes the place of its 2 x 2 weights. In the folder of this file,
+
+    python own_policy.py                                        checks it, and plays 20 episodes without a server
+    vlagents-ray serve own_policy:Servo --set camera_turn=120   serves it to robots, simulators and evaluations
+    vlagents-ray eval own_env:CraneEnv --policy http://localhost:8000 --out runs/crane
+
+`vlagents-ray new policy NAME` writes a skeleton with its test and its deployment file.
+"""
+
+import numpy as np
+from pydantic import BaseModel, Field
+from rich.console import Console
+
+from vlagents_ray import Act, ActionSpec, Agent, CameraSpec, Contract
+from vlagents_ray.envs import make_env
+from vlagents_ray.errors import InvalidObservation
+from vlagents_ray.evaluate import EvalConfig, evaluate, print_summary
+from vlagents_ray.testing import check_agent
+
+
+class ServoConfig(BaseModel, extra="forbid"):
+    """The settings: `--set camera_turn=120`, or `config:` in a deployment file. What is misspelled is refused."""
+
+    camera_turn: float = Field(default=0.0, description="degrees by which the camera is mounted turned")
+
+
+def offset(picture):
+    """From the hook to the mark in a picture, (H, W, 3) uint8 RGB: (2,) in picture widths, x to the right, y down."""
+    red, green = picture[..., 0] > 200, picture[..., 1] > 200
+    if not (red.any() and green.any()):
+        raise InvalidObservation("camera 'front': got a picture without a red hook and a green mark, want both in it")
+    hook, mark = (np.argwhere(colour).mean(axis=0)[::-1] for colour in (red, green))
+    return (mark - hook) / picture.shape[1]
+
+
+class Servo(Agent):
+    """Moves the hook along the offset in the picture, turned back by how the camera is mounted."""
+
+    Config = ServoConfig
+    trainable = "weights"  # rl_loop.py gives it new ones while it is served
+
+    def __init__(self, config=None):
+        self.config = config or ServoConfig()
+
+    @property
+    def contract(self):
+        """What the policy needs and gives; a robot or an environment that does not fit is told the difference."""
+        return Contract(cameras={"front": CameraSpec()}, action=ActionSpec(dim=2, space="ee_position", delta=True))
+
+    def initialize(self):
+        """Load the weights, once in a replica."""
+        turn = np.deg2rad(self.config.camera_turn)
+        back = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
+        self.weights = {"gain": (10 * back).astype(np.float32)}  # (2, 2), actions per picture width
+
+    def reset(self, obs, instruction, spread=0.0, seed=0, **kwargs):
+        """Begin an episode, on a copy of the policy that belongs to this session alone; its options are a client's."""
+        self.spread, self.rng = spread, np.random.default_rng(seed)  # of a learner's exploration
+        return {}
+
+    def act_batch(self, obs, sessions):
+        """Answer all sessions that wait in one forward pass: `sessions[i]` is the copy that `obs[i]` belongs to."""
+        seen = np.stack([offset(one.cameras["front"]) for one in obs])  # (B, 2)
+        actions = seen @ self.weights["gain"].T
+        tried = [session.rng.normal(0, session.spread, 2) if session.spread else 0.0 for session in sessions]
+        return [Act((action + noise).astype(np.float32)) for action, noise in zip(actions, tried, strict=True)]
+
+
+if __name__ == "__main__":
+    env = "own_env:CraneEnv"
+    with make_env(env) as crane:
+        check_agent(Servo(), obs=crane.reset(seed=0)[0])  # raises what is wrong with it
+    plan = EvalConfig(policies=[{"name": "servo"}], suites=[{"envs": [env], "episodes": 20}], out="runs/servo")
+    summary = evaluate(plan, agent_factory=lambda: Servo(ServoConfig(camera_turn=120)), in_process=True)
+    print_summary(Console(), summary)

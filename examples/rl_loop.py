@@ -1,0 +1,72 @@
+"""Reinforcement learning with the server in the loop: a policy that does not know how its camera is mounted finds out.
+
+The policy of own_policy.py acts in a server, workers play episodes in own_env.py with it, and this program learns from
+their transitions (REINFORCE) and pushes new weights. In the folder of this file, in two terminals:
+
+    vlagents-ray serve own_policy:Servo
+    python rl_loop.py http://localhost:8000
+
+It needs the extra 'learn'. `vlagents-ray learn tabletop` is the same loop around a torch policy that sees images and
+reads words, with cloning, PPO, a teacher and GRPO: docs/tutorials/learn.md.
+"""
+
+import sys
+
+import numpy as np
+from own_policy import Servo, offset
+
+from vlagents_ray import join
+from vlagents_ray.evaluate import EvalConfig
+from vlagents_ray.learn import Publisher, Rollouts, TrainingEvaluation, arrays
+
+ENV = "own_env:CraneEnv"
+SPREAD = 0.5  # of the actions: standard deviation of what is tried
+ITERATIONS, EPISODES, RATE = 4, 32, 80.0
+
+
+class Learner:
+    """Trains a policy's gain towards the actions that brought the hook nearer than others did."""
+
+    def __init__(self):
+        self.policy = Servo()
+        self.policy.initialize()
+
+    def improve(self, columns):
+        """Take a step along the policy gradient.
+
+        Args:
+            columns: Of T transitions: cameras.front (T, H, W, 3) uint8, action (T, 2), reward (T,), the metres gained.
+        """
+        gain = self.policy.weights["gain"]
+        seen = np.stack([offset(picture) for picture in columns["cameras.front"]])  # (T, 2)
+        tried = (columns["action"] - seen @ gain.T) / SPREAD**2  # (T, 2), gradients of the log-probabilities
+        reward = columns["reward"]
+        better = (reward - reward.mean()) / reward.std()  # (T,)
+        gradient = (better[:, None] * tried).T @ seen / len(seen)
+        self.policy.load_parameters({"gain": (gain + RATE * gradient).astype(np.float32)})
+
+
+def main(url):
+    """Learn for some iterations, and evaluate before and after on episodes that are not trained on."""
+    join(url, log_to_driver=False)  # so that the workers run in the server's Ray, beside the policy
+    learner = Learner()
+    held_out = {"envs": [ENV], "episodes": 20, "seeds": [10_000]}
+    plan = EvalConfig(policies=[{"name": "servo"}], suites=[held_out], out="runs/rl", video="none")
+    evaluation = TrainingEvaluation(learner.policy, plan)  # in this process; or of the URL, by workers
+    exploring = {"policy_options": {"spread": SPREAD}}
+    with Publisher(url) as weights, Rollouts(ENV, url, workers=2, num_envs=4, **exploring) as rollouts:
+        for iteration in range(ITERATIONS + 1):
+            version = weights.push(learner.policy.parameters(), allow_same=True)
+            if iteration in (0, ITERATIONS):
+                rate = evaluation.play(version).totals[-1].success_once
+                print(f"servo@{version}: {rate} of the held-out episodes")
+            if iteration < ITERATIONS:
+                rollouts.version = version
+                columns = arrays(rollouts.collect(EPISODES))
+                print(f"servo@{version}: {columns['reward'].mean() * 100:+.1f} cm a step while it explores")
+                learner.improve(columns)
+    print("the curve: runs/rl/report.html")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

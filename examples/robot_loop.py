@@ -1,0 +1,43 @@
+"""A robot's loop: a steady rate, a guard that sees every action before the arm does, and a watchdog for silence.
+
+The arm is simulated, and the policy is one that no arm should trust: it draws joint targets at random. So the guard
+refuses what is too far away, and the arm holds its pose at those ticks. In two terminals:
+
+    vlagents-ray serve random --set chunk=10 --set low=-0.3 --set high=0.3
+    python robot_loop.py http://localhost:8000
+
+docs/tutorials/robot.md leads to your own arm, docs/control_loop.md explains chunks, modes and safe actions.
+"""
+
+import sys
+
+from vlagents_ray import ChunkPlayer, RemoteAgent
+from vlagents_ray.robot import Guard, Watchdog, run_loop
+from vlagents_ray.robot.simulated import SimulatedRobot
+
+
+def main(url):
+    """Drive the arm for two seconds at 50 Hz, and print how that went."""
+    arm = SimulatedRobot()  # of yours: observe() -> Obs, apply(action), stop()
+    agent = RemoteAgent(url, timeout_s=5)
+    guard = Guard(
+        agent.contract,
+        low=-1.0,  # rad, of every joint; the stricter of these and the contract's
+        high=1.0,
+        max_step=0.5,  # rad, from one action to the next
+        measure=lambda obs: obs.state["joints"],  # where the arm is, for the first action and after a stop
+    )
+    # Stops the arm when the server owes an answer for 1 s, or the loop does not come round for 0.2 s.
+    watchdog = Watchdog(lambda _reason: arm.stop(), {"server": 1.0, "loop": 0.2})
+    # In "async" the next chunk is asked for while the last one is executed, so that no tick waits for the network.
+    with ChunkPlayer(agent, mode="async", safe="hold", check=guard) as player:
+        report = run_loop(arm, player, hz=50, seconds=2, instruction="stack the cups", watchdog=watchdog)
+    refused = {reason: ticks for reason, ticks in report.safe.items() if reason.startswith("action")}
+    print(f"{sum(refused.values())} of {report.jitter['ticks']} actions refused, such as:", next(iter(refused), "none"))
+    print(f"{report.safe_ticks} ticks with the safe action for this or another reason")
+    print(f"punctual within 2 ms: {report.jitter['on_time']:.1%} of the ticks")
+    print(f"watchdog: {report.barks or 'never barked'}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])

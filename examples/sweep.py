@@ -1,0 +1,43 @@
+"""Evaluate a sweep: how far may a camera be turned from where it was calibrated, and how noisy may the actions be?
+
+Two policies differ in an option of their resets, and five suites in an option of the environment: ten cells, all
+on the same seeds. `python sweep.py`, in the folder of this file, plays them in this process, in seconds, with the
+policy and the environment of own_policy.py and own_env.py; if it is interrupted, it goes on.
+
+As a file, the same plan is played by `vlagents-ray eval FILE` with a served policy and many workers:
+evaluations/sweep.yaml sweeps over the checkpoints of a training run, evaluations/realtime.yaml over latencies.
+"""
+
+from itertools import groupby
+
+from own_policy import Servo, ServoConfig
+
+from vlagents_ray.evaluate import EvalConfig, evaluate
+
+CALIBRATED = 120  # degrees
+TURNS, SPREADS = (0, 30, 60, 90, 120), (0.0, 1.0)  # degrees; standard deviation of each action
+
+
+def main():
+    """Play what has no result yet, and print a row for each policy."""
+    plan = EvalConfig(
+        policies=[{"name": f"spread {spread}", "options": {"spread": spread}} for spread in SPREADS],
+        suites=[
+            {"name": f"{turn}°", "envs": ["own_env:CraneEnv"], "env_options": {"camera_turn": CALIBRATED + turn}}
+            for turn in TURNS
+        ],
+        out="runs/sweep",
+        video="none",
+        resume=True,
+    )
+    summary = evaluate(plan, agent_factory=lambda: Servo(ServoConfig(camera_turn=CALIBRATED)), in_process=True)
+    print("success, 95 % interval".ljust(24), *(f"{turn}°".ljust(15) for turn in TURNS))
+    for policy, group in groupby(summary.cells, lambda cell: cell.contender):
+        cells = list(group)
+        print(policy.ljust(24), *(str(cell.success_once).ljust(15) for cell in cells))
+        print("".ljust(24), *(f"{cell.mean_steps:.1f} steps".ljust(15) for cell in cells))
+    print("with curves, and policies compared pairwise: runs/sweep/report.html")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,65 @@
+"""Use a model that another system's server runs: `policy: upstream`.
+
+Here that server is openpi's: `theirs` speaks its protocol in a few lines, in place of `scripts/serve_policy.py` in a
+checkout of openpi. The policy `upstream` asks it, and an evaluation plays with the policy. `python upstream.py` does
+both in this process. With the real server at ws://gpu-box:9000,
+
+    python upstream.py ws://gpu-box:9000                 plays the same episodes with its model, if its keys are these
+    vlagents-ray serve deployments/upstream.yaml         puts batches, sessions, keys and the live page before it
+
+docs/policies/upstream.md has the other protocols (GR00T, OpenVLA, RoboArena, vla-eval, vlagents) and their keys.
+"""
+
+import contextlib
+import sys
+import threading
+
+import msgpack
+import numpy as np
+from rich.console import Console
+from websockets.sync.server import serve
+
+from vlagents_ray.evaluate import EvalConfig, evaluate, print_summary
+from vlagents_ray.policies.upstream import Upstream
+
+MAPPING = {  # our names on the left; on the right, where the server looks for them
+    "cameras": {"front": "observation/image"},
+    "state": {"xyzrpy": "observation/state"},
+    "instruction": "prompt",
+}
+
+
+@contextlib.contextmanager
+def theirs():
+    """Run a server that speaks openpi's protocol; its model moves the hand to the middle of the table."""
+
+    def answer(connection):
+        connection.send(msgpack.packb({"robot": "example"}))  # who it is
+        for message in connection:
+            observation = msgpack.unpackb(message)
+            pose = np.frombuffer(observation["observation/state"][b"data"], np.float32)  # (6,), m and rad
+            actions = np.tile(np.append(-0.5 * pose[:3], 1).astype(np.float32), (10, 1))  # (10, 4), a chunk
+            array = {b"__ndarray__": True, b"data": actions.tobytes(), b"dtype": "<f4", b"shape": actions.shape}
+            connection.send(msgpack.packb({"actions": array}))
+
+    with serve(answer, "127.0.0.1", 0, max_size=None) as server:
+        thread = threading.Thread(target=server.serve_forever)
+        thread.start()
+        try:
+            yield "ws://{}:{}".format(*server.socket.getsockname())
+        finally:
+            server.shutdown()
+            thread.join()
+
+
+def main(url):
+    """Evaluate the model behind a server of openpi."""
+    config = {"protocol": "openpi", "urls": [url], "mapping": MAPPING, "contract": {"action": {"dim": 4}, "chunk": 10}}
+    suite = {"envs": ["tabletop/lift"], "episodes": 3}
+    plan = EvalConfig(policies=[{"name": "theirs"}], suites=[suite], out="runs/upstream", video="none")
+    print_summary(Console(), evaluate(plan, agent_factory=lambda: Upstream.from_config(config), in_process=True))
+
+
+if __name__ == "__main__":
+    with contextlib.nullcontext(sys.argv[1]) if len(sys.argv) > 1 else theirs() as server:
+        main(server)

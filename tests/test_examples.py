@@ -1,0 +1,91 @@
+"""The examples work that need no server; those that do are run by test_served_pages.py."""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+import runpy
+import shutil
+import sys
+from pathlib import Path
+
+import pytest
+from example_files import EXAMPLES, code_of
+
+INDEX = (EXAMPLES / "README.md").read_text()
+FILES = sorted(path for path in EXAMPLES.iterdir() if path.suffix in (".py", ".sh", ".ipynb"))
+
+
+@pytest.fixture
+def reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the folder, in which a script finds those beside it."""
+    folder = tmp_path / "examples"
+    shutil.copytree(EXAMPLES, folder, ignore=shutil.ignore_patterns("runs"))
+    monkeypatch.chdir(folder)
+    monkeypatch.syspath_prepend(folder)
+    return folder
+
+
+def said(name: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> str:
+    """What a script prints."""
+    monkeypatch.setattr(sys, "argv", [name])
+    before = set(sys.modules)
+    try:
+        runpy.run_path(str(folder / name), run_name="__main__")
+    finally:
+        for module in set(sys.modules) - before:
+            if Path(getattr(sys.modules[module], "__file__", None) or "/").parent == folder:
+                del sys.modules[module]  # the next test has a copy of its own
+    return capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("name", "last"),
+    [
+        ("own_env.py", "CraneEnv keeps its contract"),
+        ("own_policy.py", r"own_env:CraneEnv +20/20 +100% \[84, 100\]"),
+        ("upstream.py", r"tabletop/lift +3/3"),
+    ],
+)
+def test_a_script_does_what_it_says(
+    name: str, last: str, reader: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert re.search(last, said(name, reader, monkeypatch, capsys))
+
+
+def test_the_sweep_shows_where_the_policy_fails(
+    reader: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = said("sweep.py", reader, monkeypatch, capsys)
+    rates = {line.split("  ")[0]: re.findall(r"(\d+)%", line) for line in out.splitlines() if line.startswith("spread")}
+    assert list(rates) == ["spread 0.0", "spread 1.0"]
+    assert {(each[0], each[-1]) for each in rates.values()} == {("100", "0")}
+
+
+def test_the_later_checkpoint_is_shown_to_be_better(
+    reader: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    *_, total, difference = said("compare_checkpoints.py", reader, monkeypatch, capsys).splitlines()
+    assert total.startswith("all: 40 pairs")
+    low, p = re.search(r"rates: \+(\d+)% to .*, p = (\S+)", difference).groups()  # type: ignore[union-attr]
+    assert int(low) > 0
+    assert float(p) < 0.05
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
+def test_an_example_is_short_and_says_how_to_run_it(path: Path) -> None:
+    text = path.read_text()
+    if path.suffix == ".ipynb":
+        first = "".join(json.loads(text)["cells"][0]["source"])
+        compile(code_of(path).source, path.name, "exec")
+    else:
+        assert len(text.splitlines()) < 100
+        first = ast.get_docstring(ast.parse(text)) or "" if path.suffix == ".py" else text.partition("set -euo")[0]
+    assert path.name in first
+
+
+def test_the_index_has_each_example_and_no_other() -> None:
+    linked = set(re.findall(r"\]\(([^)]+)\)", INDEX))
+    assert {path.name for path in FILES} <= linked
+    assert {link for link in linked if not (EXAMPLES / link).exists()} == set()
