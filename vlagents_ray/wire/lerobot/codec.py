@@ -20,7 +20,7 @@ from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.protocol.observations import is_number
 from vlagents_ray.wire.lerobot.pickled_arrays import CALLS
-from vlagents_ray.wire.lerobot.pickles import Name, read_pickle
+from vlagents_ray.wire.lerobot.pickles import Name, Record, read_pickle
 
 _HELPERS = "lerobot.async_inference.helpers"
 _SETUP, _OBSERVATION = Name(_HELPERS, "RemotePolicyConfig"), Name(_HELPERS, "TimedObservation")
@@ -194,8 +194,9 @@ def _key(name: str) -> bytes:
 
 def _fields(data: bytes, limits: Limits, wanted: Name) -> dict[str, Any]:
     record = read_pickle(data, limits, _RECORDS, CALLS)
-    if record.name != wanted or record.fields is None:
-        raise MalformedMessage(f"pickle: got a {record.name.name}, want a {wanted.name}")
+    if not isinstance(record, Record) or record.name != wanted or record.fields is None:
+        got = record.name.name if isinstance(record, Record) else type(record).__name__
+        raise MalformedMessage(f"pickle: got {got}, want {wanted.name}")
     return record.fields
 
 

@@ -64,8 +64,8 @@ class _StackValue(NamedTuple):
 
 def read_pickle(
     data: bytes, limits: Limits, records: Mapping[Name, Sequence[str]], calls: Mapping[Name, Call | None]
-) -> Record:
-    """Return the object of a data class that a pickle consists of.
+) -> Any:
+    """Return the value that a pickle consists of: a `Record`, array, container, text or number.
 
     Args:
         data: The pickle. Arrays of the result view its memory.
@@ -77,7 +77,7 @@ def read_pickle(
         MalformedMessage: The bytes are no pickle, or have another opcode, name or shape than those listed here.
         MessageTooLarge: The pickle exceeds a limit.
     """
-    return _StackMachine(data, limits, records, calls).whole()
+    return _finished(_StackMachine(data, limits, records, calls).whole())
 
 
 class _StackMachine:
@@ -96,7 +96,7 @@ class _StackMachine:
         self._below: list[list[_StackValue]] = []  # the stacks below each open mark
         self._memo: list[_StackValue] = []
 
-    def whole(self) -> Record:
+    def whole(self) -> Any:
         """Read the pickle to its end."""
         if self.take(1)[0] != _PROTO or self.take(1)[0] not in _PROTOCOLS:
             raise MalformedMessage(f"pickle: want one of protocol {_PROTOCOLS[0]} or {_PROTOCOLS[1]}")
@@ -109,8 +109,6 @@ class _StackMachine:
         root = self.pop()
         if self._stack or self._below or self._at != len(self._data):
             raise MalformedMessage("pickle: more than one object in a message")
-        if not isinstance(root, Record) or root.fields is None:
-            raise MalformedMessage(f"pickle: got {_kind(root)}, want {[name.name for name in self._records]}")
         return root
 
     def take(self, length: int) -> memoryview:
