@@ -28,6 +28,11 @@ SUITES: Mapping[str, Suite] = {
 }
 
 
+def base_of(suite: str) -> str:
+    """The one of the five suites that `suite` is or varies, "libero_goal" of "libero_goal_swap"; "" if it is none."""
+    return next((base for base in SUITES if suite == base or suite.startswith(f"{base}_")), "")
+
+
 @dataclass(frozen=True, slots=True)
 class LiberoProtocol:
     """The conventions of an episode; comments say where openpi and OpenVLA differ.
@@ -61,9 +66,12 @@ class LiberoProtocol:
 
     @classmethod
     def of(cls, suite: str, **changes: Any) -> LiberoProtocol:
-        """Return the protocol of a suite with changes; a change that is None is ignored."""
+        """Return the protocol of a suite with changes; a change that is None is ignored.
+
+        A suite that varies one of the five has its step limit, as LIBERO-PRO's evaluation gives it.
+        """
         changed = {name: value for name, value in changes.items() if value is not None}
-        return cls(**{"max_steps": SUITES[suite].max_steps} | changed)
+        return cls(**{"max_steps": SUITES[base_of(suite)].max_steps} | changed)
 
     def to_json(self, suite: str) -> dict[str, Any]:
         """Return plain JSON values; `deviations` lists the differences from the published protocol of `suite`."""

@@ -13,7 +13,7 @@ import numpy as np
 from vlagents_ray.contract import Contract
 from vlagents_ray.envs.base import EvalEnv, one_row
 from vlagents_ray.envs.libero import assets as asset_files
-from vlagents_ray.envs.libero import robot
+from vlagents_ray.envs.libero import robot, variants
 from vlagents_ray.envs.libero.benchmark_protocol import LiberoProtocol
 from vlagents_ray.envs.libero.simulation import LiberoSimulation, SimulatorObs
 from vlagents_ray.envs.libero.tasks import find_task, read_states, require_suite, task_names
@@ -24,7 +24,7 @@ from vlagents_ray.interface import HIGH_RES, Act, Obs
 
 
 class Libero(EvalEnv):
-    """One environment of one LIBERO task, e.g. "libero_spatial/0".
+    """One environment of one LIBERO task, e.g. "libero_spatial/0", or of one that varies it, "libero_goal_swap/0".
 
     Observation: cameras "front" (LIBERO's agentview) and "wrist" (its eye in hand), turned as policies
     expect it, see `LiberoProtocol`; in `state` what policies for LIBERO take: `xyz_axis_angle` (6,), the end
@@ -56,6 +56,7 @@ class Libero(EvalEnv):
         gripper_closed: float | None = None,
         instruction: str | None = None,
         assets: str | None = None,
+        files: str | None = None,
     ) -> None:
         """Make the environment.
 
@@ -73,6 +74,8 @@ class Libero(EvalEnv):
             gripper_closed: The one that closes it; None is LIBERO's 1.
             instruction: None is the task's own.
             assets: The folder with LIBERO's meshes and textures; None is what LIBERO_ASSETS names.
+            files: The folder with `bddl_files` and `init_files` of suites that vary LIBERO's, such as LIBERO-PRO's;
+                None is what LIBERO_FILES names.
 
         Raises:
             UnknownEnv: There is no such task.
@@ -86,7 +89,7 @@ class Libero(EvalEnv):
         record = record_size_of(record_size, f"libero/{task}")
         if (settling_steps or 0) < 0:
             raise ConfigError(f"libero/{task}: settling_steps is {settling_steps}, want 0 or more")
-        self._task = find_task(task)
+        self._task = find_task(task, files)
         self._assets = asset_files.find_assets(assets)
         self._protocol = LiberoProtocol.of(
             self._task.suite,
@@ -178,6 +181,7 @@ class Libero(EvalEnv):
             "robosuite": version("robosuite"),
             "mujoco": version("mujoco"),
             "assets": asset_files.digest(self._assets),
+            **({"files": variants.digest(self._task.problem, self._task.states)} if self._task.varied else {}),
             "render_backend": os.environ.get("MUJOCO_GL", "glfw"),
         }
 

@@ -12,7 +12,8 @@ import numpy as np
 
 from vlagents_ray.errors import MalformedMessage
 from vlagents_ray.protocol.arrays import read_array
-from vlagents_ray.wire.lerobot.pickles import Call, Name, Reduced
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS
+from vlagents_ray.wire.lerobot.pickles import Call, Name, Reduced, read_pickle
 
 
 class _Dtype(str):
@@ -82,3 +83,16 @@ CALLS: dict[Name, Call | None] = {Name("numpy", "dtype"): _dtype, Name("numpy", 
         ("numeric", "_frombuffer", _frombuffer),
     )
 }
+
+
+def read_pickled_array(data: bytes) -> np.ndarray:
+    """Return the numpy array that a pickle consists of, which views `data`.
+
+    Raises:
+        MalformedMessage: The pickle has anything but such an array, see `pickles`.
+        MessageTooLarge: It exceeds a limit.
+    """
+    found = read_pickle(data, DEFAULT_LIMITS, {}, CALLS)
+    if not isinstance(found, np.ndarray):
+        raise MalformedMessage(f"pickle: got {type(found).__name__}, want a numpy array")
+    return found
