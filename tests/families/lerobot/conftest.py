@@ -24,7 +24,13 @@ collect_ignore = [] if PATCHED else ["test_pi.py", "test_pi_recipe.py"]
 if tiny.NEW:  # their code is that of the other version, with which they are tried
     collect_ignore += ["test_adapters.py", "test_learning.py", "test_pi_recipe.py", "test_plugins.py", "test_recipe.py"]
 if importlib.util.find_spec("ray") is None:  # in the environment of another Python than Ray's
-    collect_ignore += ["test_async_client.py", "test_commands.py", "test_datasets.py", "test_training.py"]
+    collect_ignore += [
+        "test_async_client.py",
+        "test_commands.py",
+        "test_datasets.py",
+        "test_policy_server.py",
+        "test_training.py",
+    ]
 
 Load = Callable[..., LeRobot]
 Made = Callable[[str], Path]

@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import pickle
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -41,21 +38,21 @@ Start = Callable[[int], Any]
 
 @pytest.fixture(scope="module")
 def start(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Start]:
-    folder = tmp_path_factory.mktemp("policy_server")  # it writes a folder of logs
-    with ExitStack() as stack:
+    started: list[Any] = []
 
-        def run(port: int) -> Any:
-            command = [sys.executable, policy_server.__file__, str(port)]
-            process = stack.enter_context(subprocess.Popen(command, cwd=folder))
-            stack.callback(process.kill)
-            return process
+    def run(port: int) -> Any:
+        started.append(policy_server.start(port, tmp_path_factory.mktemp("policy_server")))
+        return started[-1]
 
-        yield run
+    yield run
+    for process in started:
+        process.kill()
+        process.join()
 
 
 @pytest.fixture(scope="module")
 def server(start: Start) -> tuple[Any, int]:
-    """A server, whose start takes longer than these tests, and its port."""
+    """A server and its port."""
     port = free_port()
     return start(port), port
 
@@ -145,7 +142,7 @@ def test_it_is_killed_and_restarted_and_no_episode_fails(
     def kill() -> None:
         wait_for(lambda: len(replicas.frames) > 10, every_s=0.002)
         servers[0].kill()
-        servers[0].wait()
+        servers[0].join()
         servers.append(start(port))
 
     killer = threading.Thread(target=kill)
