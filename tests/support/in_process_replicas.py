@@ -59,7 +59,8 @@ class Replicas:
         """A client of them."""
         agent = RemoteAgent("http://127.0.0.1:9", **options)
         another = partial(InProcess, self) if options.get("resume", True) else None
-        agent._connection = Connection(agent.url, InProcess(self), CodecChoice("raw"), 30.0, 30.0, another)
+        timeout_s = options.get("timeout_s", 30.0)
+        agent._connection = Connection(agent.url, InProcess(self), CodecChoice("raw"), timeout_s, 30.0, another)
         return agent
 
     def close(self) -> None:

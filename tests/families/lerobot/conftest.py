@@ -29,7 +29,13 @@ else:
 if not PATCHED:
     LEFT_OUT |= dict.fromkeys(("test_pi.py", "test_pi_recipe.py"), "transformers is without openpi's changes")
 if importlib.util.find_spec("ray") is None:
-    of_ray = ("test_async_client.py", "test_datasets.py", "test_training.py")
+    of_ray = (
+        "test_async_client.py",
+        "test_commands.py",
+        "test_datasets.py",
+        "test_policy_server.py",
+        "test_training.py",
+    )
     LEFT_OUT |= dict.fromkeys(of_ray, "no Ray here, as its Python is another")
 collect_ignore = list(LEFT_OUT)
 

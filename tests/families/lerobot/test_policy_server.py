@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import pickle
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -35,26 +32,27 @@ from vlagents_ray.serve.ports import free_port
 pytestmark = FILTERS
 
 NAMES = [f"joint_{number}.pos" for number in range(tiny.STATE)]
+PATIENCE_S = 600.0  # for a server to start, which imports torch and LeRobot first
 Start = Callable[[int], Any]
 
 
 @pytest.fixture(scope="module")
 def start(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Start]:
-    folder = tmp_path_factory.mktemp("policy_server")  # it writes a folder of logs
-    with ExitStack() as stack:
+    started: list[Any] = []
 
-        def run(port: int) -> Any:
-            command = [sys.executable, policy_server.__file__, str(port)]
-            process = stack.enter_context(subprocess.Popen(command, cwd=folder))
-            stack.callback(process.kill)
-            return process
+    def run(port: int) -> Any:
+        started.append(policy_server.start(port, tmp_path_factory.mktemp("policy_server")))
+        return started[-1]
 
-        yield run
+    yield run
+    for process in started:
+        process.kill()
+        process.join()
 
 
 @pytest.fixture(scope="module")
 def server(start: Start) -> tuple[Any, int]:
-    """A server, whose start takes longer than these tests, and its port."""
+    """A server and its port."""
     port = free_port()
     return start(port), port
 
@@ -70,7 +68,8 @@ def settings(folder: Path, port: int, **more: Any) -> dict[str, Any]:
             "cameras": {tiny.CAMERA: f"observation.images.{tiny.CAMERA}"},
             "state": {"joints": {"key": "observation.state", "stop": tiny.STATE}},
         },
-        "retry_s": 120,
+        "retry_s": PATIENCE_S,
+        "timeout_s": PATIENCE_S,
         **more,
     }
 
@@ -81,20 +80,20 @@ class Theirs:
     def __init__(self, port: int, folder: Path) -> None:
         self._channel = grpc.insecure_channel(f"127.0.0.1:{port}")
         self._stub = services_pb2_grpc.AsyncInferenceStub(self._channel)
-        self._stub.Ready(services_pb2.Empty(), timeout=60, wait_for_ready=True)
+        self._stub.Ready(services_pb2.Empty(), timeout=PATIENCE_S, wait_for_ready=True)
         image = {"dtype": "image", "shape": (tiny.SIDE, tiny.SIDE, 3), "names": ["height", "width", "channels"]}
         features = {
             "observation.state": {"dtype": "float32", "shape": (tiny.STATE,), "names": NAMES},
             f"observation.images.{tiny.CAMERA}": image,
         }
         told = pickle.dumps(RemotePolicyConfig("act", str(folder), features, tiny.CHUNK, "cpu"))
-        self._stub.SendPolicyInstructions(services_pb2.PolicySetup(data=told), timeout=120)
+        self._stub.SendPolicyInstructions(services_pb2.PolicySetup(data=told), timeout=PATIENCE_S)
 
     def act(self, obs: Obs, task: str) -> np.ndarray:
         values = dict(zip(NAMES, obs.state["joints"].tolist(), strict=True)) | obs.cameras | {"task": task}
         data = pickle.dumps(TimedObservation(timestamp=time.time(), timestep=0, observation=values, must_go=True))
-        self._stub.SendObservations(send_bytes_in_chunks(data, services_pb2.Observation), timeout=60)
-        actions = pickle.loads(self._stub.GetActions(services_pb2.Empty(), timeout=60).data)  # noqa: S301 - a test's own
+        self._stub.SendObservations(send_bytes_in_chunks(data, services_pb2.Observation), timeout=PATIENCE_S)
+        actions = pickle.loads(self._stub.GetActions(services_pb2.Empty(), timeout=PATIENCE_S).data)  # noqa: S301 - a test's own
         return np.stack([one.get_action().numpy() for one in actions])
 
     def close(self) -> None:
@@ -143,7 +142,7 @@ def test_it_is_killed_and_restarted_and_no_episode_fails(
     def kill() -> None:
         wait_for(lambda: len(replicas.frames) > 10, every_s=0.002)
         servers[0].kill()
-        servers[0].wait()
+        servers[0].join()
         servers.append(start(port))
 
     killer = threading.Thread(target=kill)
@@ -153,10 +152,11 @@ def test_it_is_killed_and_restarted_and_no_episode_fails(
             {
                 "policies": [{"name": "upstream", "source": "upstream"}],
                 "suites": [{"envs": [f"{__name__}:{Reaching.__name__}"], "env_options": options, "episodes": 4}],
+                "policy_timeout_s": PATIENCE_S,
                 "out": tmp_path / "out",
             }
         )
-        results = play(config, lambda: replicas.agent(timeout_s=120.0))
+        results = play(config, lambda: replicas.agent(timeout_s=PATIENCE_S))
     finally:
         killer.join()
         replicas.close()
