@@ -23,6 +23,7 @@ _NEEDS = {
     "openvla": "transformers",
     "pi0": "transformers",
     "rcs": "rcs",
+    "robosuite": "robosuite",
     "vjepa2_ac": "transformers",
 }
 

@@ -83,9 +83,7 @@ def test_the_tasks_of_the_named_folder_are_listed(files: Path, monkeypatch: pyte
     assert not find_task("libero_object/0").varied
 
 
-def test_initial_states_of_another_instruction_or_other_positions_are_found(
-    files: Path, states: np.ndarray
-) -> None:
+def test_initial_states_of_another_instruction_or_other_positions_are_found(files: Path, states: np.ndarray) -> None:
     spoken = find_task(f"libero_object/{MILK}_language_2", str(files))
     assert spoken.language == "grasp the dairy and place it in the basket"
     np.testing.assert_array_equal(read_states(spoken.states), states)
