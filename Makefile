@@ -49,6 +49,7 @@ NOT_QUICK := ray or server or hosts or sim or vulkan or torch or gpu or browser 
 # OPENVLA_OFT_SRC, OCTO_SRC, DIFFUSION_POLICY_SRC, VJEPA2_SRC.
 # lerobot06 wants Python 3.12, and TORCH_CUDA=1 where no index has a torch without CUDA for it: several GB.
 FAMILIES ?= libero lerobot hf rcs
+TESTED_IN_libero := libero robosuite
 TESTED_IN_hf := pi0 arro vjepa2_ac
 TESTED_IN_lerobot06 := lerobot gr00t
 TORCH_FROM := $(if $(TORCH_INDEX_URL),--index-url $(TORCH_INDEX_URL))

@@ -43,6 +43,7 @@ ENVS: dict[str, str] = {
     "maniskill": "vlagents_ray.envs.maniskill:ManiSkill",
     "metaworld": "vlagents_ray.envs.metaworld:MetaWorld",
     "libero": "vlagents_ray.envs.libero:Libero",
+    "robosuite": "vlagents_ray.envs.robosuite:Robosuite",
     "simpler": "vlagents_ray.envs.simpler:Simpler",
     "aloha": "vlagents_ray.envs.aloha:Aloha",
     "pusht": "vlagents_ray.envs.gymnasium.pusht:PushT",
@@ -89,7 +90,6 @@ _EXTRAS = {
     "transforms3d": "maniskill",
     "metaworld": "metaworld",
     "libero": "libero",
-    "robosuite": "libero",
     "gym_pusht": "pusht",
     "gym_aloha": "aloha",
     "dm_control": "aloha",
@@ -130,7 +130,7 @@ _POLICY_REQUIREMENTS = {
 _POLICY_ADDITIONS = frozenset({"torchao"})
 
 # import name -> its file in requirements/, for an environment that runs the workers of an evaluation
-_SIMULATOR_REQUIREMENTS = {"rcs": "rcs", "duobench": "rcs"}
+_SIMULATOR_REQUIREMENTS = {"rcs": "rcs", "duobench": "rcs", "robosuite": "robosuite"}
 
 
 def require(module: str, *, extra: str | None = None) -> ModuleType:

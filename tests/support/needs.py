@@ -26,7 +26,9 @@ from typescript_client import node_version
 # Ray makes a session's folder in this one: in no process of the test does one start that finds a file in its place.
 _NO_RAY = "/dev/null/not-marked-ray"  # short: a longer name would be replaced, as sockets in it could not be named
 _RAY = ("ray", "server", "hosts")
-_SIMULATORS = {"gym_pusht", "gymnasium_robotics", "libero", "mani_skill", "metaworld", "mujoco", "rcs", "sapien"}
+_SIMULATORS = {
+    "gym_pusht", "gymnasium_robotics", "libero", "mani_skill", "metaworld", "mujoco", "rcs", "robosuite", "sapien"
+}  # fmt: skip
 
 
 def left_out(file: Path, markexpr: str) -> bool:

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from vlagents_ray.envs.libero import import_libero
 from vlagents_ray.envs.rendering import egl, graphics
 from vlagents_ray.envs.rendering.egl import EglDevice
 from vlagents_ray.envs.rendering.graphics import (
@@ -21,6 +20,7 @@ from vlagents_ray.envs.rendering.graphics import (
     require_own,
 )
 from vlagents_ray.envs.rendering.render_probe import VulkanDevice, usable_devices
+from vlagents_ray.envs.robosuite.importing import importing_robosuite
 from vlagents_ray.errors import ConfigError, EnvFailed
 
 LLVMPIPE = Renderer("llvmpipe (LLVM 15.0.6, 256 bits)", software=True, cuda=None)
@@ -136,7 +136,7 @@ def test_robosuite_sees_the_number_that_egl_has_for_the_gpu_while_it_is_imported
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     chosen(monkeypatch, "7")
-    with import_libero._egl_number():
+    with importing_robosuite("libero"):
         assert os.environ[GPUS] == os.environ[EGL_DEVICE] == "1"
     assert os.environ[GPUS] == "7"
 
@@ -144,7 +144,7 @@ def test_robosuite_sees_the_number_that_egl_has_for_the_gpu_while_it_is_imported
 def test_libero_without_a_gpu_and_without_software_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("MUJOCO_GL", "egl")
     monkeypatch.setenv(GPUS, "")
-    with pytest.raises(EnvFailed, match="no EGL device that renders in software"), import_libero._egl_number():
+    with pytest.raises(EnvFailed, match="no EGL device that renders in software"), importing_robosuite("libero"):
         pass
 
 

@@ -6,16 +6,15 @@ import contextlib
 import functools
 import importlib.util
 import json
-import logging
 import os
 import tempfile
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-from vlagents_ray.envs.rendering.graphics import EGL_DEVICE, GPUS
 from vlagents_ray.envs.rendering.headless import prepare_rendering
 from vlagents_ray.envs.rendering.render_probe import EGL_CURE
+from vlagents_ray.envs.robosuite.importing import importing_robosuite
 from vlagents_ray.errors import EnvFailed, MissingDependency
 from vlagents_ray.registry import require
 
@@ -37,7 +36,7 @@ def load() -> Path:
     prepare_rendering()
     folder = root()
     try:
-        with _own_config(folder), _no_log_file(), _egl_number(), warnings.catch_warnings():
+        with _own_config(folder), importing_robosuite("libero"), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # warnings of upstream code; LIBERO itself changes the filters
             require("libero.libero.benchmark")
             require("libero.libero.envs")
@@ -70,44 +69,3 @@ def _own_config(folder: Path) -> Iterator[None]:
                 del os.environ[_CONFIG]
             else:
                 os.environ[_CONFIG] = before
-
-
-@contextlib.contextmanager
-def _no_log_file() -> Iterator[None]:
-    """robosuite logs to one fixed file of the machine, which another user of it may own: then the import fails.
-
-    This also hides its advice about macros, which are not needed.
-    """
-
-    def nowhere(_filename: object) -> logging.Handler:
-        return logging.NullHandler()
-
-    log = logging.getLogger("robosuite_logs")
-    real, level = logging.FileHandler, log.level
-    logging.FileHandler = nowhere  # type: ignore[assignment,misc]
-    log.setLevel(logging.ERROR)
-    try:
-        yield
-    finally:
-        logging.FileHandler = real  # type: ignore[misc]
-        log.setLevel(level)
-
-
-@contextlib.contextmanager
-def _egl_number() -> Iterator[None]:
-    """Correct robosuite, which takes EGL's numbers for CUDA's and refuses those not in CUDA_VISIBLE_DEVICES.
-
-    It reads them when it is imported. Where no EGL device was chosen it would draw on the one with CUDA's number, and
-    fail on "": the worker finds out on which.
-    """
-    chosen, visible = os.environ.get(EGL_DEVICE), os.environ.get(GPUS)
-    if visible == "" and chosen is None and os.environ.get("MUJOCO_GL") == "egl":
-        raise EnvFailed(f"libero finds no EGL device that renders in software, and was given no GPU; {EGL_CURE}")
-    if chosen is None or not visible:
-        yield
-        return
-    os.environ[GPUS] = chosen
-    try:
-        yield
-    finally:
-        os.environ[GPUS] = visible

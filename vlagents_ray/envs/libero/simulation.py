@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ import numpy as np
 
 from vlagents_ray.envs.libero.benchmark_protocol import LiberoProtocol
 from vlagents_ray.envs.libero.tasks import LiberoTask
+from vlagents_ray.envs.robosuite.simulation import CameraRenderer, seeded
 from vlagents_ray.errors import EnvFailed
 from vlagents_ray.registry import require
 
@@ -55,7 +54,7 @@ class LiberoSimulation:
         self._use_assets()
         self._cameras.make_current()  # the last episode's rendering resources are freed in their own context
         self._cameras.open = False
-        with _seeded(self._protocol.simulator_seed):
+        with seeded(self._protocol.simulator_seed):
             self._reset()
             self._cameras.open = settling == 0
             raw = self._env.set_init_state(state)
@@ -108,55 +107,3 @@ class LiberoSimulation:
 
     def _use_assets(self) -> None:
         self._package._assets_path_cache = str(self._assets)  # global in the process: another env may have set it
-
-
-class CameraRenderer:
-    """Renders the cameras while it is `open`; otherwise they show black and cost nothing.
-
-    robosuite renders each camera for every observation, 14 times from the beginning of a reset to the policy's
-    first observation. It samples a step's observation, images included, after the first 2 ms of the step's 50;
-    the views for recordings are of the same moment.
-    """
-
-    def __init__(self, domain: Any, record_size: tuple[int, int] | None) -> None:
-        self.open = True
-        self.views: dict[str, np.ndarray] = {}
-        self._domain = domain
-        self._record_size = record_size
-        self._own = domain._create_camera_sensors
-        domain._create_camera_sensors = self._sensors  # called again in each reset
-
-    def make_current(self) -> None:
-        """Render in this simulator's OpenGL context: the process may have others."""
-        sim = self._domain.sim
-        if sim is not None and sim._render_context_offscreen is not None:  # after a failed reset there is none
-            sim._render_context_offscreen.gl_ctx.make_current()
-
-    def _sensors(self, cam_name: str, cam_w: int, cam_h: int, **rest: Any) -> tuple[list[Any], list[str]]:
-        [own], names = self._own(cam_name, cam_w=cam_w, cam_h=cam_h, **rest)
-        return [self._switched(own, cam_name, (cam_h, cam_w))], names
-
-    def _switched(self, own: Callable[[Any], np.ndarray], camera: str, size: tuple[int, int]) -> Callable[[Any], Any]:
-        @functools.wraps(own)  # keeps robosuite's attributes
-        def look(cache: Any) -> np.ndarray:
-            if not self.open:
-                return np.zeros((*size, 3), np.uint8)
-            self.make_current()
-            if self._record_size is not None:
-                height, width = self._record_size
-                view = self._domain.sim.render(camera_name=camera, height=height, width=width)
-                self.views = self.views | {camera: view}
-            return own(cache)
-
-        return look
-
-
-@contextmanager
-def _seeded(seed: int) -> Iterator[None]:
-    """robosuite and LIBERO draw from numpy's global generator, whose state is restored."""
-    before = np.random.get_state()  # noqa: NPY002
-    np.random.seed(seed)  # noqa: NPY002
-    try:
-        yield
-    finally:
-        np.random.set_state(before)  # noqa: NPY002

@@ -22,7 +22,8 @@ EXPERTS: dict[str, str] = {
     "rcs/pick": "vlagents_ray.policies.experts.rcs:RcsPick",
     "gymnasium/FetchReach-v4": "vlagents_ray.policies.experts.fetch:FetchReach",
     "gymnasium/FetchReachDense-v4": "vlagents_ray.policies.experts.fetch:FetchReach",
-    "libero": "vlagents_ray.policies.experts.libero:LiberoExpert",
+    "libero": "vlagents_ray.policies.experts.osc_pose.libero:LiberoExpert",
+    "robosuite": "vlagents_ray.policies.experts.osc_pose.robosuite:RobosuiteExpert",
     "simpler": "vlagents_ray.policies.experts.simpler:SimplerExpert",
 }
 

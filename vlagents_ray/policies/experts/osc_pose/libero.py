@@ -1,13 +1,11 @@
 """An expert for LIBERO's two suites of picking and placing one object, from the simulator's state.
 
-Its actions are (7,) for OSC_POSE: 0.05 m and 0.5 rad a unit, gripper -1 open, 1 closed. The hand keeps its
-initial orientation, in which the fingers close along y. Bowls in or on the cabinet (libero_spatial/4 and
-/9) are then out of reach: it acts there, and fails.
+The hand keeps its initial orientation, in which the fingers close along y. Bowls in or on the cabinet (libero_spatial/4
+and /9) are then out of reach: it acts there, and fails.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -16,12 +14,10 @@ import numpy as np
 
 from vlagents_ray.errors import ContractMismatch, InvalidObservation, NotReset
 from vlagents_ray.interface import Act, Obs
+from vlagents_ray.policies.experts.osc_pose.hand import CLOSED, OPEN, PickPhase, matrix, towards
 from vlagents_ray.registry import env_task
 
 _SUITES = ("libero_spatial", "libero_object")
-_OPEN, _CLOSED = -1.0, 1.0
-_PER_M, _PER_RAD = 10.0, 2.0  # units of the action: half of the remaining distance, and all of the rotation
-_MOST_TURN = 0.3
 _ARRIVED_M = 0.008
 _OVER_M = 0.12  # height above the grasp when approaching it
 _LIFT_M = 0.2
@@ -39,26 +35,15 @@ class Grip:
 _RIM = Grip((0.0, 0.048, 0.035), 0.02)  # bowls are wider than the hand: a finger goes inside
 _MIDDLE = Grip((0.0, 0.0, 0.0), 0.1)
 
-
-@dataclass(frozen=True, slots=True)
-class PickPhase:
-    """A phase of the motion, which ends when the hand arrives, or after `steps`."""
-
-    name: str
-    gripper: float
-    steps: int
-    waits: bool = False  # waits `steps` for the fingers, independent of the hand
-
-
 _PHASES = (
-    PickPhase("over", _OPEN, 80),
-    PickPhase("down", _OPEN, 60),
-    PickPhase("grasp", _CLOSED, 15, waits=True),
-    PickPhase("lift", _CLOSED, 60),
-    PickPhase("carry", _CLOSED, 120),
-    PickPhase("lower", _CLOSED, 60),
-    PickPhase("release", _OPEN, 12, waits=True),
-    PickPhase("leave", _OPEN, 25),
+    PickPhase("over", OPEN, 80),
+    PickPhase("down", OPEN, 60),
+    PickPhase("grasp", CLOSED, 15, waits=True),
+    PickPhase("lift", CLOSED, 60),
+    PickPhase("carry", CLOSED, 120),
+    PickPhase("lower", CLOSED, 60),
+    PickPhase("release", OPEN, 12, waits=True),
+    PickPhase("leave", OPEN, 25),
 )
 
 
@@ -105,10 +90,7 @@ class LiberoExpert:
             self._target = self._aim(hand, positions)
             phase = _PHASES[self._phase]
         self._spent += 1
-        turn = _rotation_vector(self._upright @ orientation.T)
-        move = np.clip((self._target - hand) * _PER_M, -1.0, 1.0)
-        back = np.clip(turn * _PER_RAD, -_MOST_TURN, _MOST_TURN)
-        return Act(np.concatenate([move, back, [phase.gripper]]).astype(np.float32))
+        return towards(hand, orientation, self._target, self._upright, phase.gripper)
 
     def _aim(self, hand: np.ndarray, positions: Mapping[str, np.ndarray]) -> np.ndarray:
         """Return the target of the hand in the phase that begins, (3,) m."""
@@ -143,20 +125,4 @@ def _hand(obs: Obs) -> tuple[np.ndarray, np.ndarray]:
     pose = obs.state.get("xyz_axis_angle")
     if pose is None or pose.shape != (6,):
         raise InvalidObservation("state 'xyz_axis_angle': want (6,), m and rad, as LIBERO's env gives it")
-    return pose[:3].astype(np.float64), _matrix(pose[3:].astype(np.float64))
-
-
-def _matrix(rotation_vector: np.ndarray) -> np.ndarray:
-    """Convert a rotation vector (3,) rad to a matrix (3, 3) by Rodrigues' formula."""
-    angle = float(np.linalg.norm(rotation_vector))
-    if angle == 0.0:
-        return np.eye(3)
-    x, y, z = rotation_vector / angle
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    matrix: np.ndarray = np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * (cross @ cross)
-    return matrix
-
-
-def _rotation_vector(matrix: np.ndarray) -> np.ndarray:
-    """Convert a matrix (3, 3) to a rotation vector (3,) rad, with sines for the small angles."""
-    return np.array([matrix[2, 1] - matrix[1, 2], matrix[0, 2] - matrix[2, 0], matrix[1, 0] - matrix[0, 1]]) / 2
+    return pose[:3].astype(np.float64), matrix(pose[3:].astype(np.float64))
