@@ -11,11 +11,12 @@ from typing import Any
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import require
 
-_NODE = "vlagents_ray"
-
 
 class Ros2:
     """A node of ROS 2. A thread spins it.
+
+    Args:
+        node: Its name.
 
     Raises:
         MissingDependency: rclpy is not installed, or its setup file has not been sourced.
@@ -25,11 +26,11 @@ class Ros2:
     up = True  # there is no connection to be lost; a peer that is gone is silent
     connections = 1
 
-    def __init__(self) -> None:
+    def __init__(self, node: str = "vlagents_ray") -> None:
         rclpy: Any = require("rclpy")
         self._context: Any = rclpy.context.Context()
         self._context.init()
-        self._node: Any = rclpy.create_node(_NODE, context=self._context)
+        self._node: Any = rclpy.create_node(node, context=self._context)
         self._publishers: dict[str, tuple[Any, type[Any]]] = {}
         self._executor: Any = None
         self._thread: threading.Thread | None = None
