@@ -129,6 +129,12 @@ _POLICY_REQUIREMENTS = {
 # packages that a key of a policy's configuration needs, and that no file in requirements/ installs
 _POLICY_ADDITIONS = frozenset({"torchao"})
 
+# import name -> how to come by a package that this machine's own system brings
+_SYSTEM = {
+    "rclpy": "source the setup file of ROS 2 (`. /opt/ros/jazzy/setup.bash`) and start its Python, or reach ROS "
+    "through a rosbridge, `link: ws://arm-pc:9090`"
+}
+
 # import name -> its file in requirements/, for an environment that runs the workers of an evaluation
 _SIMULATOR_REQUIREMENTS = {"rcs": "rcs", "duobench": "rcs", "robosuite": "robosuite"}
 
@@ -172,6 +178,8 @@ def _install(package: str, extra: str | None = None) -> str:
             f"run `vlagents-ray env make requirements/{'FILE' if family else files[0]}` and name the environment in "
             f"the deployment's `environment`{family}"
         )
+    if package in _SYSTEM:
+        return _SYSTEM[package]
     if package in _POLICY_ADDITIONS:
         return f"run `pip install {package}` in the policy's environment; its requirements file leaves it out"
     return f"install the package that provides {package!r}"

@@ -99,6 +99,29 @@ class Watched(SimulatedRobot):
         self.stops += 1
 
 
+def test_a_robot_that_must_not_move_is_stopped_and_goes_on_by_itself_with_a_new_plan() -> None:
+    robot = Watched(Going.contract)
+    asked: list[int] = []
+
+    class Asked(Going):
+        def act(self, obs: Obs) -> Act:
+            asked.append(len(robot.commanded))
+            return Act(np.tile(super().act(obs).action, (50, 1)))
+
+    def until() -> bool:  # before each tick
+        ticks.append(len(ticks))
+        robot.holds = "the camera hangs" if 5 <= len(ticks) < 15 else None
+        return len(ticks) > 20
+
+    ticks: list[int] = []
+    report = run_loop(robot, ChunkPlayer(Asked()), hz=HZ, until=until)
+    assert report.safe == {"the camera hangs": 10}
+    assert robot.stops == 2  # as it began to hold, and at the end
+    assert len(robot.commanded) == 10
+    assert asked[0] == 0
+    assert len(asked) >= 2, "the plan from before was dropped"
+
+
 def test_the_schedule_does_not_drift_and_says_what_it_missed() -> None:
     pacer = Pacer(HZ)
     begun = time.perf_counter()

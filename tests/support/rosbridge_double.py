@@ -14,7 +14,7 @@ import struct
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -42,6 +42,8 @@ class RosbridgeDouble:
     published: list[Published] = field(default_factory=list)
     advertised: dict[str, str] = field(default_factory=dict)
     subscribed: dict[str, str] = field(default_factory=dict)
+    subscriptions: list[str] = field(default_factory=list)  # in their order, with those that were made again
+    noticed: Callable[[dict[str, Any]], None] = lambda _: None  # gets each message that a client publishes
     _asked: dict[ServerConnection, dict[str, str]] = field(default_factory=lambda: defaultdict(dict))
     _server: Server | None = None
     _thread: threading.Thread | None = None
@@ -93,6 +95,7 @@ class RosbridgeDouble:
         match message["op"]:
             case "subscribe":
                 self.subscribed[message["topic"]] = message["type"]
+                self.subscriptions.append(message["topic"])
                 asked[message["topic"]] = message.get("compression", "none")
             case "unsubscribe":
                 asked.pop(message["topic"], None)
@@ -100,6 +103,7 @@ class RosbridgeDouble:
                 self.advertised[message["topic"]] = message["type"]
             case "publish":
                 self.published.append(Published(time.monotonic(), message["topic"], message["msg"]))
+                self.noticed(message["msg"])
             case "unadvertise":
                 self.advertised.pop(message["topic"], None)
             case other:

@@ -86,7 +86,12 @@ class CommandInbox:
             self._answers[command.id] = f"{command.do}: not allowed here"
 
     def put(self, do: str, text: str = "") -> None:
-        """Add a command that this machine gives by itself, such as an instruction that came on a topic of ROS."""
+        """Add a command that this machine gives by itself, such as an instruction that came on a topic of ROS.
+
+        Args:
+            do: One of `COMMANDS`.
+            text: The new instruction, of "instruct".
+        """
         self._waiting.append(Command("", do, text))
 
     @property

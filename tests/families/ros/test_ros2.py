@@ -1,4 +1,7 @@
-"""A robot behind topics of a real ROS 2: rclpy and its middleware, with a driver that knows nothing of this package."""
+"""A robot behind topics of a real ROS 2: rclpy and its middleware, with a driver that knows nothing of this package.
+
+If ROSBRIDGE_URL names a rosbridge_server of the same ROS_DOMAIN_ID, the tests run through it as well.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,8 @@ import ros_arm
 from eval_fakes import wait_for
 from ros_arm import BEAT, CAMERA, COMMANDS, JOINTS, TOLD, RosArm
 
-os.environ |= {"ROS_DOMAIN_ID": "87", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+os.environ.setdefault("ROS_DOMAIN_ID", "87")
+os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 
 import rclpy
 from geometry_msgs.msg import Twist
@@ -33,9 +37,13 @@ from vlagents_ray.robot.ros.ros2 import Ros2
 from vlagents_ray.robot.ros.settings import settings_from
 from vlagents_ray.robot.safety import measured_state
 
-pytestmark = pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning")  # of a parser that rclpy imports
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:module 'sre_:DeprecationWarning"),  # of a parser that rclpy imports
+    pytest.mark.filterwarnings("ignore:Deprecated in favor of:DeprecationWarning"),  # of rclpy's own, of logging
+]
 
 STEP, MAX_STEP = 0.01, 0.05
+each_link = pytest.mark.parametrize("link", ["ros2", *filter(None, [os.environ.get("ROSBRIDGE_URL")])])
 
 
 class Driver:
@@ -114,8 +122,9 @@ def driver() -> Iterator[Driver]:
         yield made
 
 
-def test_an_arm_is_driven_held_and_stopped_by_topics_of_ros(driver: Driver) -> None:
-    settings = settings_from(ros_arm.settings("ros2", instruction={"topic": TOLD}, max_age_s=0.5), "arm.yaml")
+@each_link
+def test_an_arm_is_driven_held_and_stopped_by_topics_of_ros(driver: Driver, link: str) -> None:
+    settings = settings_from(ros_arm.settings(link, instruction={"topic": TOLD}, max_age_s=0.5), "arm.yaml")
     over = threading.Event()
     with RosArm(driver.publish, driver.commands) as arm, RosRobot(settings) as robot:
         wait_for(lambda: driver.publish(TOLD, {"data": "fold"}) or robot.instruction == "fold")
@@ -144,7 +153,8 @@ def test_an_arm_is_driven_held_and_stopped_by_topics_of_ros(driver: Driver) -> N
     assert commands[-1][0] > 0.05
 
 
-def test_each_type_of_action_arrives_as_a_message_of_ros(driver: Driver) -> None:
+@each_link
+def test_each_type_of_action_arrives_as_a_message_of_ros(driver: Driver, link: str) -> None:
     names = ros_arm.NAMES
     actions = [
         {
@@ -165,7 +175,7 @@ def test_each_type_of_action_arrives_as_a_message_of_ros(driver: Driver) -> None
     ]
     for kind, topic in ((JointTrajectory, "/t"), (JointState, "/s"), (Twist, "/v")):
         driver.note(kind, topic)
-    settings = settings_from({**ros_arm.settings("ros2"), "actions": actions}, "arm.yaml")
+    settings = settings_from({**ros_arm.settings(link), "actions": actions}, "arm.yaml")
     with RosArm(driver.publish, driver.commands) as arm, RosRobot(settings) as robot:
         arm.joints = [0.25, -0.25]
         wait_for(lambda: robot.observe().state["joints"][0] == 0.25)

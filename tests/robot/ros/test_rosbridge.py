@@ -172,6 +172,29 @@ def test_a_link_that_is_lost_publishes_nothing_and_comes_back_with_its_topics() 
             link.close()
 
 
+@pytest.mark.parametrize("busy", [True, False])
+def test_a_silent_sensor_is_subscribed_to_again(busy: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A real server that subscribed before it knew the publisher may have chosen a quality that does not match it."""
+    monkeypatch.setattr("vlagents_ray.robot.ros.rosbridge._SILENT_S", 0.2)
+    with rosbridge_double.rosbridge_double() as double:
+        link = Rosbridge(double.url)
+        for topic, sensor in (("/silent", True), ("/busy", True), ("/told", False)):
+            link.subscribe(topic, "std_msgs/msg/String", lambda _: None, sensor=sensor)
+        link.open()
+
+        def again() -> bool:
+            if busy:
+                double.publish("/busy", {"data": "here"})
+            return double.subscriptions.count("/silent") >= 3
+
+        try:
+            wait_for(again)
+        finally:
+            link.close()
+        assert double.subscriptions.count("/told") == 1
+        assert not busy or double.subscriptions.count("/busy") < 3
+
+
 def test_a_server_that_is_not_there_is_an_error_with_the_cure() -> None:
     with rosbridge_double.rosbridge_double() as double:
         pass

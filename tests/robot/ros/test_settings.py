@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import re
+import shlex
 from pathlib import Path
 from typing import Any
 
 import pytest
 import yaml
 
+import vlagents_ray.robot.__main__ as robot_command
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.robot.ros import read_settings
 from vlagents_ray.robot.ros.settings import settings_from
@@ -26,6 +29,17 @@ ARM: dict[str, Any] = {
 @pytest.mark.parametrize("file", sorted(EXAMPLES.glob("*.yaml")), ids=lambda file: file.stem)
 def test_the_examples_are_read(file: Path) -> None:
     assert read_settings(file).dim >= 1
+
+
+def test_the_files_and_commands_of_the_documentation_are_read() -> None:
+    page = (EXAMPLES.parents[1] / "docs/ros.md").read_text()
+    files = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
+    lines = [*page.replace("\\\n", " ").splitlines(), *(EXAMPLES / "arm.yaml").read_text().splitlines()]
+    commands = [line.split("vlagents_ray.robot ")[1] for line in lines if "python -m vlagents_ray.robot " in line]
+    assert [settings_from(yaml.safe_load(file), "docs/ros.md").dim for file in files] == [4]
+    assert [robot_command._parser().parse_args(shlex.split(words)).url for words in commands] == 2 * [
+        "http://gpu-box:8000"
+    ]
 
 
 def test_types_and_limits_have_defaults(tmp_path: Path) -> None:

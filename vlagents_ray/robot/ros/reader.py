@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -31,6 +32,7 @@ class TopicReader:
         self._by_stamp = by_stamp
         self._clock = CaptureClock()
         self._seen_at = -math.inf  # s of `time.monotonic`
+        self._lock = threading.Lock()  # a watchdog that stops the robot reads where it is, beside the control loop
         self._came: tuple[Any, float] | None = None
         self._looked_at: tuple[Any, float] | None = None
 
@@ -40,10 +42,13 @@ class TopicReader:
 
     def refresh(self) -> None:
         """Read the newest message, if there is one. One that cannot be read counts as not sent, so the reading ages."""
-        came = self._came
-        if came is None or came is self._looked_at:
-            return
-        self._looked_at, (message, arrived_at) = came, came
+        with self._lock:
+            came = self._came
+            if came is not None and came is not self._looked_at:
+                self._looked_at = came
+                self._read_message(*came)
+
+    def _read_message(self, message: Any, arrived_at: float) -> None:
         try:
             value = self._read(message)
             at = (messages.stamp(message) if self._by_stamp else None) or arrived_at

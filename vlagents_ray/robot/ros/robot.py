@@ -182,6 +182,7 @@ class RosRobot:
             return np.zeros(command.dim, np.float32)
         reading = self.settings.state[command.stop]
         reader = self._readers[id(reading)]
+        reader.refresh()
         if reader.age_s > self.settings.max_age_of(reading):
             logger.warning("%s: not told where to stop, as %s is old", command.topic, reading.topic)
             return None

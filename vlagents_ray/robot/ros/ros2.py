@@ -8,14 +8,15 @@ from collections.abc import Callable, Mapping
 from importlib import import_module
 from typing import Any
 
-from vlagents_ray.errors import ConfigError, MissingDependency
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import require
-
-_NODE = "vlagents_ray"
 
 
 class Ros2:
     """A node of ROS 2. A thread spins it.
+
+    Args:
+        node: Its name.
 
     Raises:
         MissingDependency: rclpy is not installed, or its setup file has not been sourced.
@@ -25,17 +26,11 @@ class Ros2:
     up = True  # there is no connection to be lost; a peer that is gone is silent
     connections = 1
 
-    def __init__(self) -> None:
-        try:
-            self._rclpy: Any = require("rclpy")
-        except MissingDependency as error:
-            raise MissingDependency(
-                "'rclpy' is not installed: source the setup file of ROS 2 (`. /opt/ros/jazzy/setup.bash`) and start "
-                "its Python, or reach ROS through a rosbridge: `link: ws://arm-pc:9090`"
-            ) from error
-        self._context: Any = self._rclpy.context.Context()
+    def __init__(self, node: str = "vlagents_ray") -> None:
+        rclpy: Any = require("rclpy")
+        self._context: Any = rclpy.context.Context()
         self._context.init()
-        self._node: Any = self._rclpy.create_node(_NODE, context=self._context)
+        self._node: Any = rclpy.create_node(node, context=self._context)
         self._publishers: dict[str, tuple[Any, type[Any]]] = {}
         self._executor: Any = None
         self._thread: threading.Thread | None = None

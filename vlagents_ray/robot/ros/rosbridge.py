@@ -11,6 +11,7 @@ import json
 import logging
 import struct
 import threading
+import time
 from collections.abc import Callable
 from socket import SHUT_RDWR, SO_SNDTIMEO, SOL_SOCKET
 from typing import Any
@@ -45,6 +46,9 @@ class Rosbridge:
         self._url, self._compression = url, compression
         self._take: dict[str, Callable[[Any], None]] = {}
         self._types: dict[str, str] = {}
+        self._heard: dict[
+            str, float
+        ] = {}  # s of `time.monotonic` by a sensor's topic: its last message or subscription
         self._outlets: dict[str, str] = {}
         self._socket: ClientConnection | None = None
         self._open = contextlib.ExitStack()
@@ -59,9 +63,13 @@ class Rosbridge:
             topic: The topic.
             kind: Its type, "sensor_msgs/msg/Image".
             take: Gets each message.
-            sensor: Whether the topic is a sensor's; the server chooses the quality of service by itself.
+            sensor: Whether the topic is a sensor's: then it is subscribed to again while it is silent. The server
+                chooses the quality of service by the publishers that it knows at that moment, and gets nothing from one
+                with best effort that it found later.
         """
         self._take[topic], self._types[topic] = take, kind
+        if sensor:
+            self._heard[topic] = 0.0
 
     def advertise(self, topic: str, kind: str) -> None:
         """Say that messages of this type will be published; before `open`."""
@@ -116,10 +124,8 @@ class Rosbridge:
             socket.socket.setsockopt(SOL_SOCKET, SO_SNDTIMEO, _SEND_LIMIT)
             for topic, kind in self._outlets.items():
                 socket.send(json.dumps({"op": "advertise", "topic": topic, "type": kind}))
-            for topic, kind in self._types.items():
-                request = {"op": "subscribe", "topic": topic, "type": kind, "compression": self._compression}
-                # The newest message alone, as it replaces what a slow link has not carried yet.
-                socket.send(json.dumps({**request, "queue_length": 1}))
+            for topic in self._types:
+                self._ask_for(topic, socket)
         except (WebSocketException, OSError, TimeoutError) as error:
             raise ConnectionLost(
                 f"{self._url}: cannot connect ({error}); does a rosbridge_server run there? "
@@ -136,15 +142,31 @@ class Rosbridge:
                 continue
             try:
                 self._receive(socket.recv(_SILENT_S))
+                self._ask_silent_again(socket)
             except TimeoutError:
                 self._probe(socket)
             except (ConnectionClosed, OSError):
                 self._lose(socket)
 
+    def _ask_for(self, topic: str, socket: ClientConnection) -> None:
+        request = {"op": "subscribe", "topic": topic, "type": self._types[topic], "compression": self._compression}
+        # The newest message alone, as it replaces what a slow link has not carried yet.
+        socket.send(json.dumps({**request, "queue_length": 1}))
+        if topic in self._heard:
+            self._heard[topic] = time.monotonic()
+
+    def _ask_silent_again(self, socket: ClientConnection) -> None:
+        for topic, at in self._heard.items():
+            if time.monotonic() - at > _SILENT_S:
+                socket.send(json.dumps({"op": "unsubscribe", "topic": topic}))
+                self._ask_for(topic, socket)
+
     def _probe(self, socket: ClientConnection) -> None:
         """Lose a connection whose other end is gone without a word, as after a power cut."""
         try:
-            if not socket.ping().wait(_SILENT_S):
+            if socket.ping().wait(_SILENT_S):
+                self._ask_silent_again(socket)
+            else:
                 self._lose(socket)
         except (ConnectionClosed, OSError):
             self._lose(socket)
@@ -176,8 +198,10 @@ class Rosbridge:
             logger.warning("%s: sent what is left out: %s", self._url, error)
             return
         if came.get("op") == "publish":
-            take = self._take.get(str(came.get("topic")))
-            if take is not None:
+            topic = str(came.get("topic"))
+            if topic in self._heard:
+                self._heard[topic] = time.monotonic()
+            if (take := self._take.get(topic)) is not None:
                 take(came.get("msg"))
         elif came.get("op") == "status":
             logger.warning("%s: %s: %s", self._url, came.get("level"), came.get("msg"))
