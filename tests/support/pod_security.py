@@ -1,4 +1,4 @@
-"""The profile `restricted` of Kubernetes' Pod Security Standards (version 1.36), for pods that run Linux.
+"""The profile `restricted` of Kubernetes' Pod Security Standards as of Kubernetes 1.37, for pods that run Linux.
 
 Written after the tables of https://kubernetes.io/docs/concepts/security/pod-security-standards/, the profile
 `baseline`, which it contains, included. A field that is not there is allowed or not as the tables say.
@@ -31,7 +31,9 @@ SYSCTLS = {
     "net.ipv4.tcp_fin_timeout",
     "net.ipv4.tcp_keepalive_intvl",
     "net.ipv4.tcp_keepalive_probes",
+    "net.ipv4.tcp_notsent_lowat",
     "net.ipv4.tcp_rmem",
+    "net.ipv4.tcp_slow_start_after_idle",
     "net.ipv4.tcp_wmem",
 }
 SELINUX_TYPES = {None, "", "container_t", "container_init_t", "container_kvm_t", "container_engine_t"}
