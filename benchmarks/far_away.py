@@ -186,15 +186,15 @@ def main(
     congestion: Annotated[str, typer.Option(help="TCP's congestion control: cubic, bbr.")] = "cubic",
     json_file: Json = None,
 ) -> None:
-    """What a robot does whose policy is far away: over a clean link, a long one, one that loses packets or is cut."""
+    """What a robot does whose policy is far away."""
     with errors():
         chosen = modes.split(",")
         if unknown := sorted(set(chosen) - set(MODES)):
             raise ConfigError(f"--modes: got {unknown}, want some of {list(MODES)}")
         rows = measure(delay_ms, loss, mbit, cut_s, seconds, chosen, congestion, progress)
     shown = table(
-        "link", "mode", "period error p50/p99", "acted", "longest without", "spells (median)", "age p50/p99", "step p99",
-        "stops", "recovered",
+        "link", "mode", "period error p50/p99", "acted", "longest without", "spells (median)", "age p50/p99",
+        "step p99", "stops", "recovered",
     )  # fmt: skip
     for one in rows:
         shown.add_row(*_shown(one))
