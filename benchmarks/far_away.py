@@ -29,7 +29,7 @@ from vlagents_ray.errors import ConfigError
 _PORT = 8000
 _START_S = 180.0
 _END_S = 60.0
-_CUT_AFTER_S = 6.0
+_CUT_AFTER_S = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,7 +181,7 @@ def main(
     loss: Annotated[float, typer.Option(min=0, max=0.5, help="Share of the packets, each way.")] = 0.02,
     mbit: Annotated[float, typer.Option(min=0.1, help="What the link carries each way, Mbit/s.")] = 20.0,
     cut_s: Annotated[float, typer.Option(min=0.1, help="How long the link is cut.")] = 10.0,
-    seconds: Annotated[float, typer.Option(min=8, help="Of each run, beside the cut.")] = 20.0,
+    seconds: Annotated[float, typer.Option(min=8, help="Of each run, beside the cut.")] = 10.0,
     modes: Annotated[str, typer.Option(help="Which ones, with commas; default: all.")] = ",".join(MODES),
     congestion: Annotated[str, typer.Option(help="TCP's congestion control: cubic, bbr.")] = "cubic",
     json_file: Json = None,

@@ -86,6 +86,8 @@ def _arguments(value: Any) -> str:
     except (TypeError, ValueError):
         return ""
     kept = [one for one in signature.parameters.values() if one.name not in ("self", "cls")]
+    if [one.name for one in kept] == ["args", "kwargs"]:  # a class without an `__init__` of its own
+        kept = []
     return f"({', '.join(_argument(one) for one in kept)})"
 
 
