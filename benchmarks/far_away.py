@@ -26,9 +26,8 @@ from vlagents_ray.cli.bench import Json
 from vlagents_ray.cli.console import errors, out, progress, save, table
 from vlagents_ray.errors import ConfigError
 
-_PORT = 8000
+PORT = 8000
 _START_S = 180.0
-_END_S = 60.0
 _CUT_AFTER_S = 4.0
 
 
@@ -56,13 +55,12 @@ class Row:
 
 
 @contextlib.contextmanager
-def served(host: Host, port: int = _PORT) -> Iterator[None]:
-    """Serve the policy on a host, with a Ray of its own."""
+def served(host: Host, port: int = PORT) -> Iterator[LineProcess]:
+    """Serve the policy on a host."""
     command = host.command([sys.executable, "-m", "benchmarks.far_server", str(port)])
-    environment = our_environment() | {"RAY_USAGE_STATS_ENABLED": "0"}
-    with LineProcess("the server", command, environment, end_s=_END_S) as process:
+    with LineProcess("the server", command, our_environment()) as process:
         process.read(_START_S)
-        yield
+        yield process
 
 
 @contextlib.contextmanager
@@ -167,7 +165,7 @@ def measure(
         hosts(2) as [cloud, home],
         FarLink(cloud, home, congestion) as link,
         served(cloud),
-        robot(home, f"http://{link.address}:{_PORT}") as arm,
+        robot(home, f"http://{link.address}:{PORT}") as arm,
     ):
         for (name, (conditions, cut)), mode in itertools.product(links.items(), modes):
             found, healed = run(arm, link, conditions, cut, seconds=seconds + cut, mode=mode)
