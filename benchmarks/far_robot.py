@@ -125,6 +125,10 @@ class FarRobot(SimulatedRobot):
         self.ticks.acted.append(False)
         return obs
 
+    def here(self, obs: Obs) -> np.ndarray:
+        """Return the action that keeps it where it is, also before the first action of the policy."""
+        return np.array([self._joints[0], *obs.state["ticks"]], np.float32)
+
     def note(self, act: Act) -> None:
         """Note an action of the policy that is about to be executed."""
         ticks = self.ticks
@@ -165,7 +169,7 @@ def drive(
         guard = Guard(agent.contract, low=low, high=high, max_step=np.array([MAX_STEP, 1e6, 1e6]))
         watchdog = Watchdog(lambda _: robot.stop(), {"server": SILENCE_S, "loop": 1.0})
         player = NotingPlayer(
-            agent, deadline_s=0, safe="hold", max_age_s=MAX_AGE_S, check=guard, timeout_s=ACT_S, **MODES[mode]
+            agent, deadline_s=0, safe=robot.here, max_age_s=MAX_AGE_S, check=guard, timeout_s=ACT_S, **MODES[mode]
         )
         player.robot = robot
         ends = float("inf")

@@ -1,25 +1,56 @@
-"""Serves the policy of `benchmarks.far_robot` until its standard input ends: `python -m benchmarks.far_server PORT`."""
+"""The policy of `benchmarks.far_robot` behind the endpoints of a replica, in one process without Ray.
+
+`python -m benchmarks.far_server PORT` writes a line when it serves, and answers each line with how many sessions it
+holds, and how many it has opened. It ends with its standard input.
+"""
 
 from __future__ import annotations
 
 import json
 import sys
+import threading
+from dataclasses import asdict
 
+import uvicorn
+
+from benchmarks.far_robot import FarPolicy
 from vlagents_ray.bench.peers.peer import die_with_parent, own_stdout
-from vlagents_ray.serve.launch.deployment_file import deployment
-from vlagents_ray.serve.launch.server import running_server
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS, PROTOCOL_VERSION
+from vlagents_ray.serve.access.api_keys import NoKey
+from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
+from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.endpoints.websocket import WebSocketServer
+from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.ports import EVERYWHERE
-
-POLICY = "benchmarks.far_robot:FarPolicy"
 
 
 def main() -> None:
-    """Run the process; it writes a line when the server is ready."""
+    """Run the process."""
     die_with_parent()
     out = own_stdout()
-    with running_server(deployment(POLICY), host=EVERYWHERE, port=int(sys.argv[1]), insecure=True):
-        print(json.dumps("ready"), file=out, flush=True)
-        sys.stdin.read()
+    policy = FarPolicy()
+    engine = Engine(policy)
+    stream = WebSocketServer(engine, DEFAULT_LIMITS, EVERYWHERE, None, NoKey.OPEN)
+    stream.open()
+    engine.start()
+    metadata = {
+        "policy": "far",
+        "version": "0",
+        "protocol": PROTOCOL_VERSION,
+        "stream": asdict(stream.address),
+        "contract": policy.contract.to_json(),
+    }
+    app = AccessMiddleware(build_http_app(engine, lambda: metadata, DEFAULT_LIMITS), None, "far")
+    server = uvicorn.Server(uvicorn.Config(app, host=EVERYWHERE, port=int(sys.argv[1]), log_level="warning"))
+    serving = threading.Thread(target=server.run, daemon=True)
+    serving.start()
+    print(json.dumps("ready"), file=out, flush=True)  # who comes before uvicorn has started asks again
+    for _ in sys.stdin:
+        print(json.dumps([len(engine.sessions), engine.sessions.opened]), file=out, flush=True)
+    server.should_exit = True
+    serving.join(10)
+    stream.close()
+    engine.close()
 
 
 if __name__ == "__main__":

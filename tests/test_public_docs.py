@@ -11,20 +11,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import pytest
+from surface import MODULES
 
 from vlagents_ray import registry
 
-MODULES = (
-    "vlagents_ray",
-    "vlagents_ray.robot",
-    "vlagents_ray.robot.teleoperation",
-    "vlagents_ray.viewers",
-    "vlagents_ray.testing",
-    "vlagents_ray.envs",
-    "vlagents_ray.evaluate",
-    "vlagents_ray.evaluate.robot",
-    "vlagents_ray.learn",
-)
 UNFINISHED: tuple[str, ...] = ()
 # A summary that begins with one of these is a fragment, which is understood with the name beside it alone.
 FRAGMENTS = {"as", "how", "it", "likewise", "of", "that", "these", "they", "this", "those", "what", "which", "who"}

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from eval_fakes import wait_for
 
-from benchmarks.far_away import robot, run
+from benchmarks.far_away import PORT, robot, run, served
 from benchmarks.far_link import Conditions, FarLink
 from benchmarks.far_robot import HZ, MAX_AGE_S
 from benchmarks.hosts import Host, hosts
@@ -24,7 +24,6 @@ from vlagents_ray.bench.line_process import LineProcess, our_environment
 
 pytestmark = pytest.mark.hosts
 
-SERVER = Path(__file__).parents[1] / "support/far_server.py"
 ECHO = """
 import socket
 s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM); s.bind(("", 9000)); print(1, flush=True)
@@ -76,12 +75,9 @@ class Far(NamedTuple):
 
 @pytest.fixture(scope="module")
 def far() -> Iterator[Far]:
-    with hosts(2) as [cloud, home], FarLink(cloud, home) as link:
-        command = cloud.command([sys.executable, str(SERVER), "8000"])
-        with LineProcess("the server", command, our_environment()) as server:
-            server.read(60)
-            home.environment |= our_environment()
-            yield Far(cloud, home, link, server)
+    with hosts(2) as [cloud, home], FarLink(cloud, home) as link, served(cloud) as server:
+        home.environment |= our_environment()
+        yield Far(cloud, home, link, server)
 
 
 def test_the_link_delays_loses_and_cuts_packets_and_heals(far: Far) -> None:
@@ -109,7 +105,7 @@ def test_the_link_delays_loses_and_cuts_packets_and_heals(far: Far) -> None:
 
 
 def test_a_robot_stands_while_the_link_is_cut_and_then_goes_on_by_itself_with_what_it_sees_then(far: Far) -> None:
-    with robot(far.home, f"http://{far.link.address}:8000") as arm:
+    with robot(far.home, f"http://{far.link.address}:{PORT}") as arm:
         _, before = far.server.request("sessions", 30)
         conditions = Conditions(delay_ms=40, loss=0.01, mbit=20)
         found, healed = run(arm, far.link, conditions, 3.5, 1.0, seconds=90, mode="async", recovers=True)
@@ -160,8 +156,8 @@ def tunnel(near: Host, far: Host, address: str, *forwarded: str) -> Iterator[Non
 
 def test_a_robot_reaches_its_policy_through_a_tunnel_from_either_side(far: Far) -> None:
     far.link.set(Conditions(delay_ms=10))
-    from_home = tunnel(far.home, far.cloud, far.link.address, "-L", "9000:127.0.0.1:8000")
-    with from_home, tunnel(far.cloud, far.home, far.link.other_address, "-R", "9001:127.0.0.1:8000"):
+    from_home = tunnel(far.home, far.cloud, far.link.address, "-L", f"9000:127.0.0.1:{PORT}")
+    with from_home, tunnel(far.cloud, far.home, far.link.other_address, "-R", f"9001:127.0.0.1:{PORT}"):
         urls = [f"http://127.0.0.1:{port}" for port in (9000, 9001)]
         said = far.home.run([sys.executable, "-c", DRIVE, *urls]).splitlines()
     assert [json.loads(line)[::2] for line in said] == [["websocket", 50]] * 2

@@ -75,11 +75,11 @@ class RemoteAgent(Agent):
             connect_timeout_s: How long to wait for a server that is still loading; after 2 s, a warning is logged.
             codec: How images are encoded for a network. "auto" measures the link when the first ones are sent (0.3 s,
                 more for images of 720p and above, or if ten round trips take longer) and takes raw pixels, JPEG or PNG,
-                whichever is computed to be the fastest to encode, send and decode; "exact" leaves out JPEG, which
-                changes the pixels a little; "raw", "lossless" (PNG), "jpeg" or an `ImageCodec` with quality and
-                subsampling force one. `agent.codec` says which is used, `agent.link` what was measured. To a server on
-                this machine "auto" and "exact" measure nothing, and pixels stay raw, as in shared memory, plasma and
-                the handle.
+                whichever is computed to be the fastest to encode, send and decode; where ten round trips take a quarter
+                of the request's time, JPEG. "exact" leaves out JPEG, which changes the pixels a little; "raw",
+                "lossless" (PNG), "jpeg" or an `ImageCodec` force one. `agent.codec` says which is used, `agent.link`
+                what was measured. To a server on this machine "auto" and "exact" measure nothing, and pixels stay raw,
+                as in shared memory, plasma and the handle.
             rank: The class of the requests: a "robot" goes before a "simulation".
             resume: False raises the loss of a session as `ConnectionLost`; the episode then needs a new `reset`.
             api_key: The API key, for a server that requires one; by default the value of `VLAGENTS_RAY_API_KEY`.

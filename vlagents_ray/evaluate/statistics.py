@@ -1,7 +1,6 @@
 """The old place of `vlagents_ray.evaluate.results.statistics`, kept for those who import it from here."""
 
-import warnings
-
+from vlagents_ray.errors import deprecated
 from vlagents_ray.evaluate.results.statistics import (
     Pairs,
     Rate,
@@ -13,10 +12,6 @@ from vlagents_ray.evaluate.results.statistics import (
     wilson,
 )
 
-warnings.warn(
-    "vlagents_ray.evaluate.statistics has moved: write `from vlagents_ray.evaluate import mcnemar`",
-    DeprecationWarning,
-    stacklevel=2,
-)
+deprecated("vlagents_ray.evaluate.statistics", "write `from vlagents_ray.evaluate import mcnemar`", since="0.1")
 
 __all__ = ["Pairs", "Rate", "SuccessCurve", "difference_interval", "holm", "mcnemar", "success_curve", "wilson"]

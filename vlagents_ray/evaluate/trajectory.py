@@ -1,13 +1,8 @@
 """The old place of `vlagents_ray.evaluate.artifacts.trajectory`, kept for those who import it from here."""
 
-import warnings
-
+from vlagents_ray.errors import deprecated
 from vlagents_ray.evaluate.artifacts.trajectory import Trajectory
 
-warnings.warn(
-    "vlagents_ray.evaluate.trajectory has moved: write `from vlagents_ray.evaluate import Trajectory`",
-    DeprecationWarning,
-    stacklevel=2,
-)
+deprecated("vlagents_ray.evaluate.trajectory", "write `from vlagents_ray.evaluate import Trajectory`", since="0.1")
 
 __all__ = ["Trajectory"]

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from vlagents_ray.errors import ConfigError
+from vlagents_ray.errors import ConfigError, deprecated
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.adapters import ADAPTER
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
@@ -319,11 +318,12 @@ class ServerArgs(_DeploymentModel):
     @classmethod
     def _always_answered(cls, value: bool | None) -> bool | None:
         if value is not None:
-            warnings.warn(
-                "answer_while_loading has no effect any more: an application runs only once its policy has loaded, and "
-                "is answered 503 until then; remove it from the deployment file",
-                FutureWarning,
-                stacklevel=2,
+            deprecated(
+                "answer_while_loading",
+                "it has no effect, as an application runs only once its policy has loaded; remove it from the "
+                "deployment file",
+                since="0.1",
+                in_code=False,
             )
         return value
 
