@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import inspect
+import logging
 import socket
 import sqlite3
 from contextlib import closing
@@ -15,7 +16,7 @@ import pytest
 from typer.testing import CliRunner
 
 import vlagents_ray.evaluate
-from vlagents_ray.cli.evaluation import command, policies, run, watch
+from vlagents_ray.cli.evaluation import command, dry_run, policies, run, watch
 from vlagents_ray.cli.evaluation.live import live_address
 from vlagents_ray.cli.main import app
 from vlagents_ray.evaluate import EvalConfig, OutOfTime, PolicyConfig, Results, SuiteConfig, WorkerConfig
@@ -224,6 +225,21 @@ def test_a_page_that_cannot_be_is_told_before_anything_starts(
     assert done.exit_code == 2, done.output
     assert said in " ".join(done.stderr.split())
     assert not (tmp_path / "out").exists()
+
+
+def test_a_dry_run_keeps_warnings_of_what_is_meant_off_the_terminal(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    said = ("Token authentication is enabled for this Ray cluster", "the disk is almost full")
+
+    def measure(_config: EvalConfig) -> None:
+        for line in said:
+            logging.getLogger("ray._private.worker").warning(line)
+
+    monkeypatch.setattr(dry_run, "print_plan", measure)
+    done = CliRunner().invoke(app, [*WORDS, "--out", str(tmp_path / "out"), "--dry-run"])
+    assert done.exit_code == 0, done.output
+    assert [record.getMessage() for record in caplog.records if record.getMessage() in said] == [said[1]]
 
 
 def test_a_page_has_a_port_of_its_own_if_another_has_the_usual_one() -> None:

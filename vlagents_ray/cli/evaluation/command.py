@@ -20,7 +20,7 @@ from vlagents_ray.cli.options import (
     parse_time,
     read_run_file,
 )
-from vlagents_ray.cli.ray_session import RESUME, exit_if_ray_is_lost
+from vlagents_ray.cli.ray_session import RESUME, exit_if_ray_is_lost, quiet_ray
 from vlagents_ray.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -168,7 +168,8 @@ def evaluate_command(
         if dry_run:
             from vlagents_ray.cli.evaluation.dry_run import print_plan
 
-            print_plan(evaluation)
+            with quiet_ray(None):
+                print_plan(evaluation)
             return
         page = None
         if live or live_at:

@@ -193,7 +193,8 @@ def _read(
     path = Path(source)
     if path.suffix in (".yaml", ".yml"):
         if not path.is_file():
-            raise ConfigError(f"deployment file {source!r} does not exist")
+            where = "" if path.is_absolute() else f" in {Path.cwd()}; those of this project are in its checkout"
+            raise ConfigError(f"deployment file {source!r} does not exist{where}")
         if overrides:
             raise ConfigError(f"{source!r} holds the settings; edit it instead of giving {sorted(overrides)}")
         try:
