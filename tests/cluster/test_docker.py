@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import resolved
 import yaml
 from dockerfile import instructions
 from typer.testing import CliRunner
@@ -29,9 +30,7 @@ LOCKS = {  # of the stages that install
 }
 INSTALL = (FOLDER / "install.sh").read_text()
 SIMULATORS = re.findall(r'^(\w+) = \["vlagents-ray\[sim\]"', (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
-FAMILIES = sorted(
-    file.stem for file in (ROOT / "requirements").glob("*.txt") if "." not in file.stem and file.stem != "testing"
-)
+FAMILIES = [file.stem for file in resolved.families()]
 
 
 def of(word: str, stage: str | None = None) -> list[str]:

@@ -25,6 +25,7 @@ PAGE = ROOT / "docs" / "install.md"
 LOCKS = ROOT / "cluster" / "docker" / "locks"
 TORCH = ROOT / "cluster" / "docker" / "torch.txt"
 FAMILIES = ROOT / "requirements"
+WITHOUT_IMAGE = {"testing", "ros"}  # a robot has its own ROS
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
 OF_DEVELOPMENT = {"check", "docs", "dev"}  # these are for Python 3.11 alone
@@ -113,12 +114,16 @@ def written(page: str) -> str:
 # The locks of the images.
 
 
+def families() -> list[Path]:
+    """The requirements of families and simulators that have an image."""
+    return sorted(file for file in FAMILIES.glob("*.txt") if "." not in file.stem and file.stem not in WITHOUT_IMAGE)
+
+
 def locks() -> dict[str, tuple[str, list[str]]]:
     """Of each lock's name the Python and the requirements."""
     servers = ["serve", "sim", *(extra for extra in EXTRAS if f"{PROJECT['name']}[sim]" in EXTRAS[extra])]
-    families = sorted(file for file in FAMILIES.glob("*.txt") if "." not in file.stem and file.stem != "testing")
     found = {f"server-{extra}": (SERVER_PYTHON, direct(extra)) for extra in servers}
-    for file in families:
+    for file in families():
         python = re.match(r"# python: (\S+)", file.read_text())
         found[f"family-{file.stem}"] = (python[1] if python else SERVER_PYTHON, [*direct("serve"), *lines(file)])
     return found

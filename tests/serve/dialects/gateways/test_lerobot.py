@@ -19,7 +19,8 @@ from many import many
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.dialects.gateway_sessions import GatewaySessions
-from vlagents_ray.serve.dialects.lerobot import codec, handler
+from vlagents_ray.serve.dialects.lerobot import handler
+from vlagents_ray.wire.lerobot import codec
 
 
 def sessions(replicas: Replicas) -> int:
