@@ -8,6 +8,8 @@ With checkpoints of yours, served, `vlagents-ray eval` plays them, and the same 
 docs/tutorials/checkpoints.md leads there. `vlagents-ray merge` puts results of different runs into one folder.
 """
 
+import time
+
 import numpy as np
 
 from vlagents_ray import Act
@@ -38,7 +40,7 @@ def main():
     plan = EvalConfig(
         policies=[{"name": "trainee", "steps": [2000, 8000]}],
         suites=[{"name": env, "envs": [env], "episodes": 20} for env in ENVS],
-        out="runs/compared",
+        out=time.strftime("runs/compared-%H%M%S"),
         video="none",
     )
     evaluate(plan, agent_factory=Trainee, in_process=True)

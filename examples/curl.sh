@@ -9,13 +9,13 @@
 set -euo pipefail
 url=$1 picture=$2  # a JPEG or PNG of the camera
 session=robot-$$   # no other robot has this name
-key=${VLAGENTS_RAY_API_KEY:+x-api-key: $VLAGENTS_RAY_API_KEY}  # a header, read from stdin: arguments are seen by all users
+key=${VLAGENTS_RAY_API_KEY:+x-api-key: $VLAGENTS_RAY_API_KEY}  # a header, read from stdin: all users see arguments
 
 # post PATH OBS: one request; its answer is JSON, and an error's has a code that says what to do.
 post() {
   local answer status
-  answer=$(curl --silent --show-error --max-time 5 --write-out '\n%{http_code}' --header @- --header "x-session-id: $session" \
-    --form "obs=$2" --form "cameras.front=@$picture" "$url/v1/$1" <<<"$key")
+  answer=$(curl --silent --show-error --max-time 5 --write-out '\n%{http_code}' \
+    --header @- --header "x-session-id: $session" --form "obs=$2" --form "cameras.front=@$picture" "$url/v1/$1" <<<"$key")
   status=${answer##*$'\n'}
   answer=${answer%$'\n'*}
   if [ "$status" != 200 ]; then
@@ -25,12 +25,13 @@ post() {
   printf '%s\n' "$answer"
 }
 
-curl --silent --show-error --fail --retry 5 --retry-connrefused --header @- "$url/v1/metadata" <<<"$key" >/dev/null  # it is ready
+# The metadata comes once the policy is ready.
+curl --silent --show-error --fail --retry 5 --retry-connrefused --header @- "$url/v1/metadata" <<<"$key" >/dev/null
 post reset '{"instruction": "push the cube to the goal", "gripper": 1.0}' >/dev/null
 trap 'post close "{}" >/dev/null' EXIT
 
 for tick in $(seq 10); do
   answer=$(post act '{"gripper": 1.0, "state": {"joints": [0, 0, 0, 0, 0, 0, 0]}}')
-  [[ $answer =~ \"action\":\ *(\[[^]]*\]+) ]]  # D numbers, or rows of them: a chunk
-  echo "tick $tick: ${BASH_REMATCH[1]}"      # in place of this, command the robot
+  [[ $answer =~ \"action\":\ *\[+([^]]*) ]]  # the action's numbers, or those of the first row of a chunk
+  echo "tick $tick: ${BASH_REMATCH[1]}"     # in place of this, command the robot
 done

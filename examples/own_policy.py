@@ -10,6 +10,8 @@ your model takes the place of its 2 x 2 weights. In the folder of this file,
 `vlagents-ray new policy NAME` writes a skeleton with its test and its deployment file.
 """
 
+import time
+
 import numpy as np
 from pydantic import BaseModel, Field
 from rich.console import Console
@@ -73,6 +75,7 @@ if __name__ == "__main__":
     env = "own_env:CraneEnv"
     with make_env(env) as crane:
         check_agent(Servo(), obs=crane.reset(seed=0)[0])  # raises what is wrong with it
-    plan = EvalConfig(policies=[{"name": "servo"}], suites=[{"envs": [env], "episodes": 20}], out="runs/servo")
+    out = time.strftime("runs/servo-%H%M%S")
+    plan = EvalConfig(policies=[{"name": "servo"}], suites=[{"envs": [env], "episodes": 20}], out=out)
     summary = evaluate(plan, agent_factory=lambda: Servo(ServoConfig(camera_turn=120)), in_process=True)
     print_summary(Console(), summary)

@@ -11,6 +11,7 @@ reads words, with cloning, PPO, a teacher and GRPO: docs/tutorials/learn.md.
 """
 
 import sys
+import time
 
 import numpy as np
 from own_policy import Servo, offset
@@ -51,7 +52,8 @@ def main(url):
     join(url, log_to_driver=False)  # so that the workers run in the server's Ray, beside the policy
     learner = Learner()
     held_out = {"envs": [ENV], "episodes": 20, "seeds": [10_000]}
-    plan = EvalConfig(policies=[{"name": "servo"}], suites=[held_out], out="runs/rl", video="none")
+    out = time.strftime("runs/rl-%H%M%S")
+    plan = EvalConfig(policies=[{"name": "servo"}], suites=[held_out], out=out, video="none")
     evaluation = TrainingEvaluation(learner.policy, plan)  # in this process; or of the URL, by workers
     exploring = {"policy_options": {"spread": SPREAD}}
     with Publisher(url) as weights, Rollouts(ENV, url, workers=2, num_envs=4, **exploring) as rollouts:
@@ -65,7 +67,7 @@ def main(url):
                 columns = arrays(rollouts.collect(EPISODES))
                 print(f"servo@{version}: {columns['reward'].mean() * 100:+.1f} cm a step while it explores")
                 learner.improve(columns)
-    print("the curve: runs/rl/report.html")
+    print(f"the curve: {out}/report.html")
 
 
 if __name__ == "__main__":

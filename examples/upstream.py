@@ -13,6 +13,7 @@ docs/policies/upstream.md has the other protocols (GR00T, OpenVLA, RoboArena, vl
 import contextlib
 import sys
 import threading
+import time
 
 import msgpack
 import numpy as np
@@ -56,7 +57,8 @@ def main(url):
     """Evaluate the model behind a server of openpi."""
     config = {"protocol": "openpi", "urls": [url], "mapping": MAPPING, "contract": {"action": {"dim": 4}, "chunk": 10}}
     suite = {"envs": ["tabletop/lift"], "episodes": 3}
-    plan = EvalConfig(policies=[{"name": "theirs"}], suites=[suite], out="runs/upstream", video="none")
+    out = time.strftime("runs/upstream-%H%M%S")
+    plan = EvalConfig(policies=[{"name": "theirs"}], suites=[suite], out=out, video="none")
     print_summary(Console(), evaluate(plan, agent_factory=lambda: Upstream.from_config(config), in_process=True))
 
 

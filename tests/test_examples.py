@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import ast
 import json
+import os
 import re
 import runpy
 import shutil
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from client_servers import client_servers
 from example_files import EXAMPLES, code_of
+from readme_blocks import ROOT
 
 INDEX = (EXAMPLES / "README.md").read_text()
 FILES = sorted(path for path in EXAMPLES.iterdir() if path.suffix in (".py", ".sh", ".ipynb"))
@@ -71,6 +75,22 @@ def test_the_later_checkpoint_is_shown_to_be_better(
     low, p = re.search(r"rates: \+(\d+)% to .*, p = (\S+)", difference).groups()  # type: ignore[union-attr]
     assert int(low) > 0
     assert float(p) < 0.05
+
+
+def test_a_shell_is_a_client_with_a_key_or_is_told_that_it_lacks_one() -> None:
+    with client_servers() as server:
+        command = ["bash", EXAMPLES / "curl.sh", server["VLAGENTS_TEST_KEYED_URL"], ROOT / "clients/golden/gray.jpg"]
+        for environment in ({"VLAGENTS_RAY_API_KEY": server["VLAGENTS_TEST_KEY"]}, {}):
+            done = subprocess.run(
+                command, check=False, env=os.environ | environment, capture_output=True, text=True, timeout=60
+            )
+            if environment:
+                told = re.findall(r"^tick (\d+): (\d+)\.0,0\.0,1\.0,", done.stdout, re.MULTILINE)
+                assert told == [(str(tick), str(tick - 1)) for tick in range(1, 11)]
+                assert (done.returncode, done.stderr) == (0, "")
+            else:
+                assert done.returncode != 0
+                assert "401" in done.stderr
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
