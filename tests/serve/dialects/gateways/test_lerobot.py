@@ -19,7 +19,8 @@ from many import many
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.serve.access.api_keys import NoKey
 from vlagents_ray.serve.dialects.gateway_sessions import GatewaySessions
-from vlagents_ray.serve.dialects.lerobot import codec, handler
+from vlagents_ray.serve.dialects.lerobot import handler
+from vlagents_ray.wire.lerobot import codec
 
 
 def sessions(replicas: Replicas) -> int:
@@ -132,7 +133,7 @@ def test_policy_instructions_that_do_not_fit_are_refused(open_lerobot, changes: 
         (robot_saw(0, **{"gripper.pos": "open"}), "'gripper.pos': got str, want a number"),
         (robot_saw(-1), "timestep: got -1"),
         (robot_saw(2**31), "timestep: got 2147483648"),
-        (setup(), "got a RemotePolicyConfig, want a TimedObservation"),
+        (setup(), "got RemotePolicyConfig, want a TimedObservation"),
         (b"no pickle", "protocol 4 or 5"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
