@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import queue
 import threading
+import time
 from collections.abc import Iterator, Mapping
 from concurrent import futures
 from typing import Any
@@ -27,6 +28,8 @@ class PolicyServer:
         self.last: Any = None
         self.act_now = self.act
         self.wait_s = 2.0  # for an observation
+        self.load_s = 0.0
+        self.loads = 0
 
     def ready(self, _request: bytes, _context: Any) -> bytes:
         self.queue = queue.Queue(1)
@@ -34,7 +37,8 @@ class PolicyServer:
 
     def instruct(self, request: bytes, _context: Any) -> bytes:
         [(_, data)] = fields_in(request)
-        self.instructions = unpickled(data)
+        time.sleep(self.load_s)
+        self.instructions, self.loads = unpickled(data), self.loads + 1
         if self.instructions.pretrained_name_or_path == BROKEN:
             raise ValueError("a secret of the upstream")
         return b""

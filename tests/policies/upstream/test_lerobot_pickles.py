@@ -129,6 +129,12 @@ def test_a_state_of_another_length_is_refused_before_it_is_sent() -> None:
         upstream.write_observation(SEEN | {"observation.state": np.zeros(3, np.float32)}, INSTRUCTIONS, 0.0, 0)
 
 
+@pytest.mark.parametrize("name", ["observation.state", "observation.images.wrist"])
+def test_an_observation_without_what_the_server_wants_is_refused_before_it_is_sent(name: str) -> None:
+    with pytest.raises(InvalidInput, match=rf"got no \['{name}'\]"):
+        upstream.write_observation({key: value for key, value in SEEN.items() if key != name}, INSTRUCTIONS, 0.0, 0)
+
+
 def test_an_observation_in_parts_is_that_observation() -> None:
     data = np.random.default_rng(0).bytes(5 * 2**20 + 1)
     parts = [protobuf.read_observation_part(message) for message in protobuf.write_observation_parts(data)]

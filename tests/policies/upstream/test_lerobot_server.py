@@ -14,7 +14,7 @@ from upstream_servers import BROKEN, SLOW, answer
 
 from vlagents_ray.errors import ConfigError, PolicyFailed, PolicyUnavailable
 from vlagents_ray.interface import Act, Obs
-from vlagents_ray.policies.upstream import Upstream
+from vlagents_ray.policies.upstream import Upstream, lanes
 from vlagents_ray.serve.models.agent_copies import AgentCopies
 from vlagents_ray.serve.ports import free_port
 
@@ -142,6 +142,16 @@ def test_a_checkpoint_that_the_server_cannot_load_does_not_start(
         opened(server[1], lerobot=LOADED | {"pretrained_name_or_path": BROKEN})
     assert "secret" not in str(error.value)
     assert "a secret of the upstream" in caplog.text
+
+
+def test_a_checkpoint_may_load_for_longer_than_connecting_takes(
+    server: tuple[PolicyServer, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lanes, "_CONNECT_S", 0.3)
+    server[0].load_s = 0.9
+    with opened(server[1], connect_timeout_s=60) as agent:
+        require_right(agent, seen(1))
+    assert server[0].loads == 1  # it was not asked again meanwhile
 
 
 def test_a_server_that_returns_gets_its_policy_before_a_row() -> None:

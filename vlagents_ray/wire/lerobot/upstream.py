@@ -101,8 +101,11 @@ def write_observation(
         timestep: The server's answer repeats it.
 
     Raises:
-        InvalidObservation: The state has another length than the instructions say.
+        InvalidObservation: It lacks a camera or the state, or that has another length than the instructions say.
     """
+    wanted = (STATE, *(IMAGES + name for name in instructions.cameras))
+    if missing := [name for name in wanted if name not in theirs]:  # which the mapping calls optional
+        raise InvalidObservation(f"lerobot: got no {missing}; the server wants all that the mapping names")
     state = theirs[STATE]
     if len(state) != len(instructions.state):
         raise InvalidObservation(f"{STATE!r}: got {len(state)} numbers, the mapping says {len(instructions.state)}")

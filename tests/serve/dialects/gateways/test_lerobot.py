@@ -133,7 +133,7 @@ def test_policy_instructions_that_do_not_fit_are_refused(open_lerobot, changes: 
         (robot_saw(0, **{"gripper.pos": "open"}), "'gripper.pos': got str, want a number"),
         (robot_saw(-1), "timestep: got -1"),
         (robot_saw(2**31), "timestep: got 2147483648"),
-        (setup(), "got a RemotePolicyConfig, want a TimedObservation"),
+        (setup(), "got RemotePolicyConfig, want a TimedObservation"),
         (b"no pickle", "protocol 4 or 5"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
