@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -246,6 +246,71 @@ def test_a_lost_rosbridge_holds_the_arm_and_tells_it_so_as_soon_as_it_is_back() 
         assert drive.commands[0] == pytest.approx([0.5, -0.5])
         assert np.abs(np.diff(drive.commands, axis=0)).max() <= MAX_STEP
     assert "the connection to the rosbridge was lost" in drive.reports[0].safe
+
+
+class Wire:
+    """A link whose messages a test delivers."""
+
+    name, up, connections = "rosbridge", True, 1
+
+    def __init__(self) -> None:
+        self.takes: dict[str, Callable[[Any], None]] = {}
+        self.published: list[tuple[str, dict[str, Any]]] = []
+
+    def subscribe(self, topic: str, kind: str, take: Callable[[Any], None], *, sensor: bool) -> None:
+        self.takes[topic] = take
+
+    def advertise(self, topic: str, kind: str) -> None: ...
+
+    def open(self) -> None:
+        self.deliver(0.0, 0.0)
+
+    def publish(self, topic: str, message: dict[str, Any]) -> bool:
+        self.published.append((topic, message))
+        return True
+
+    def close(self) -> None: ...
+
+    def deliver(self, *joints: float) -> None:
+        arm = RosArm(lambda topic, message: self.takes[topic](message), list)
+        arm.joints = list(joints)
+        self.takes[JOINTS](arm._state())
+        self.takes[CAMERA](arm._image())
+
+    @property
+    def commands(self) -> list[list[float]]:
+        return [message["data"] for topic, message in self.published if topic == COMMANDS]
+
+
+def test_a_stop_into_a_dead_connection_is_sent_again_at_the_pose_after_the_loss() -> None:
+    wire = Wire()
+    with RosRobot(settings_from(ros_arm.settings("ws://dead"), "arm.yaml"), wire) as robot:
+        robot.observe()
+        assert robot.holds is None
+        robot.stop()  # as far as anybody knows, it arrives
+        assert wire.commands == [[0.0, 0.0]]
+        wire.connections = 2
+        robot.observe()
+        assert robot.holds == "the connection to the rosbridge was lost"
+        robot.stop()  # nobody knows where the arm is now
+        assert len(wire.commands) == 1
+        wire.deliver(0.5, -0.5)
+        robot.observe()
+        assert robot.holds is None
+        assert wire.commands[1:] == [[0.5, -0.5]]
+        wire.deliver(0.6, -0.5)
+        robot.observe()
+        assert len(wire.commands) == 2
+
+
+def test_a_clock_that_was_set_back_holds_the_arm_as_the_age_of_what_it_sees_is_unknown() -> None:
+    wire = Wire()
+    with RosRobot(settings_from(ros_arm.settings("ws://arm"), "arm.yaml"), wire) as robot:
+        image = RosArm(wire.publish, list)._image()
+        image["header"]["stamp"]["sec"] += 3600
+        wire.takes[CAMERA](image)
+        robot.observe()
+        assert robot.holds == f"no new message of {CAMERA} for more than 1 s"
 
 
 def test_a_killed_server_stops_the_arm(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
