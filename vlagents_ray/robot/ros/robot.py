@@ -171,23 +171,22 @@ class RosRobot:
         """Publish what stops the robot, on each topic: zeros, or the measured pose if that is not old."""
         self._stop_unsent = not self._link.up  # then it is sent when the link is back
         for command in self.settings.actions:
-            row = self._stop_row(command)
-            if row is not None:
-                self._publish(command, row)
+            if command.stop in ("", ZEROS):
+                self._publish(command, np.zeros(command.dim, np.float32))
+            elif command.stop != NOTHING:
+                self._stop_where_it_is(command, self.settings.state[command.stop])
 
-    def _stop_row(self, command: ActionTopic) -> np.ndarray | None:
-        if command.stop == NOTHING:
-            return None
-        if command.stop in ("", ZEROS):
-            return np.zeros(command.dim, np.float32)
-        reading = self.settings.state[command.stop]
+    def _stop_where_it_is(self, command: ActionTopic, reading: InputTopic) -> None:
         reader = self._readers[id(reading)]
         reader.refresh()
-        if reader.age_s > self.settings.max_age_of(reading):
+        if reader.age_s > self.settings.max_age_of(reading) or self._from_before_loss(reader):
+            self._stop_unsent = True  # until it is known where the robot is
             logger.warning("%s: not told where to stop, as %s is old", command.topic, reading.topic)
-            return None
-        row: np.ndarray = reader.value
-        return row
+        else:
+            self._publish(command, reader.value)
+
+    def _from_before_loss(self, reader: TopicReader) -> bool:
+        return time.monotonic() - self._lost_at <= reader.age_s < math.inf
 
     def _publish(self, command: ActionTopic, row: np.ndarray) -> None:
         if command.type == ARRAY:
@@ -204,9 +203,9 @@ class RosRobot:
         up, connections = self._link.up, self._link.connections
         if not up or connections != self._connections:  # or it was lost between two ticks
             self._connections, self._lost_at = connections, time.monotonic()
-        since_s = time.monotonic() - self._lost_at
-        before = any(reader.age_s >= since_s for reader in self._readers.values())  # from before the loss
-        self.holds = f"the connection to the {self._link.name} was lost" if before else None
+            self._stop_unsent = True  # the last may have been sent while nobody knew of the loss
+        lost = any(self._from_before_loss(reader) for reader in self._readers.values())
+        self.holds = f"the connection to the {self._link.name} was lost" if lost else None
         for reading in self.settings.sensors:
             reader = self._readers[id(reading)]
             limit = self.settings.max_age_of(reading)

@@ -46,9 +46,8 @@ class Rosbridge:
         self._url, self._compression = url, compression
         self._take: dict[str, Callable[[Any], None]] = {}
         self._types: dict[str, str] = {}
-        self._heard: dict[
-            str, float
-        ] = {}  # s of `time.monotonic` by a sensor's topic: its last message or subscription
+        # By a sensor's topic: when its last message came, or it was subscribed to, s of `time.monotonic`.
+        self._heard: dict[str, float] = {}
         self._outlets: dict[str, str] = {}
         self._socket: ClientConnection | None = None
         self._open = contextlib.ExitStack()
