@@ -47,7 +47,7 @@ def main() -> None:
     print(json.dumps("ready"), file=out, flush=True)  # who comes before uvicorn has started asks again
     for _ in sys.stdin:
         print(json.dumps([len(engine.sessions), engine.sessions.opened]), file=out, flush=True)
-    server.should_exit = True
+    server.should_exit = server.force_exit = True
     serving.join(10)
     stream.close()
     engine.close()
