@@ -38,7 +38,7 @@ def test_what_workflows_run_of_this_repository_exists(workflow: Path) -> None:
     assert commands
     for command in commands:
         assert set(re.findall(r"^make ([a-z]+)", command)) <= targets
-        for path in re.findall(r"(?:\.ci|tests)/[\w/]*", command):
+        for path in re.findall(r"(?:\.ci|tests)/[\w/.]*", command):
             assert (ROOT / path).exists(), path
 
 

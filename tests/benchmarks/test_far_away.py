@@ -17,7 +17,8 @@ import pytest
 from eval_fakes import wait_for
 
 from benchmarks.far_away import PORT, robot, run, served
-from benchmarks.far_link import Conditions, FarLink
+from benchmarks.far_carrier import Conditions
+from benchmarks.far_link import FarLink
 from benchmarks.far_robot import HZ, MAX_AGE_S
 from benchmarks.hosts import Host, hosts
 from vlagents_ray.bench.line_process import LineProcess, our_environment
@@ -82,7 +83,7 @@ def far() -> Iterator[Far]:
 
 
 def test_the_link_delays_loses_and_cuts_packets_and_heals(far: Far) -> None:
-    echo = LineProcess("the echo", far.cloud.command([sys.executable, "-c", ECHO]))
+    echo = LineProcess("the echo", far.cloud.command([sys.executable, "-c", ECHO]), end_s=0.1)
     asker = LineProcess("the asker", far.home.command([sys.executable, "-c", ASK, far.link.address]))
     with echo, asker:
         echo.read(30)
