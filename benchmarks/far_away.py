@@ -18,7 +18,8 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from benchmarks.far_link import Conditions, FarLink
+from benchmarks.far_carrier import Conditions
+from benchmarks.far_link import FarLink
 from benchmarks.far_robot import HZ, MODES
 from benchmarks.hosts import Host, hosts
 from vlagents_ray.bench.line_process import LineProcess, our_environment

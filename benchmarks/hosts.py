@@ -118,7 +118,11 @@ def hosts(number: int) -> Iterator[list[Host]]:
             host = Host(one, folder, pid, switch[1], _keeper=keeper)
             _set_up(host, inside, number)
             made.append(host)
-        yield made
+        try:
+            yield made
+        finally:
+            for host in made:  # all at once, as the kernel takes a second or two for each
+                host._keeper.kill()
 
 
 def require() -> None:

@@ -8,7 +8,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from benchmarks import autoscaling, evaluation, hop, scaling
+from benchmarks import autoscaling, evaluation, far_away, hop, scaling
 
 
 @pytest.mark.parametrize(
@@ -17,6 +17,7 @@ from benchmarks import autoscaling, evaluation, hop, scaling
         (autoscaling, ["--plot", "a.gif"], ".png"),
         (evaluation, ["--episodes", "5"], "multiple of the 2 workers"),
         (evaluation, ["--peers", "nobody"], "nobody"),
+        (far_away, ["--modes", "async,nobody"], "nobody"),
         (hop, ["--python", "nowhere"], "nowhere"),
         (scaling, ["--workers", "2,4"], "from 1 on"),
         (scaling, ["--nodes", "none"], "--nodes"),

@@ -73,5 +73,5 @@ def write(folder: Path) -> None:
 if __name__ == "__main__":
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     if (KEPT / version).exists():
-        sys.exit(f"{KEPT / version} is there: what users of {version} kept does not change any more")
+        sys.exit(f"{KEPT / version} is there; remove it if {version} is not published yet, and leave it if it is")
     write(KEPT / version)
