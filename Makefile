@@ -7,8 +7,8 @@
 #   make families [FAMILIES="lerobot lerobot06 hf rcs libero openvla …"]       tests of model families, in .venv-NAME each
 #   make verified [FAMILIES="lerobot hf"]                           what they verify, into the tables of docs/policies
 #   make docs                                                       the site of docs/, in build/docs, for a browser
-#   make extras                                                     resolve all extras, into the table of docs/install.md
-#   make locks                                                      resolve the images' packages, into cluster/docker/locks
+#   make extras [ONLY="record sim"]                                 resolve extras, into the table of docs/install.md
+#   make locks [ONLY=family-hf]                                     resolve the images' packages, into cluster/docker/locks
 #   make dist                                                       what a release publishes, checked, in dist
 #   make sbom [LOCK=server-sim]                                     what an image installs and its licences, in build/sbom
 #   make bench                                                      measure, and write the figures of docs/measured.md again
@@ -108,7 +108,7 @@ docs: $(VENV)-docs/.installed
 	NO_MKDOCS_2_WARNING=1 $(VENV)-docs/bin/mkdocs build --quiet --strict
 
 extras locks: $(TOOLS)/.installed
-	$(TOOLS)/bin/python tests/support/resolved.py $@
+	$(TOOLS)/bin/python tests/support/resolved.py $@ $(ONLY)
 
 # The same wheels again from the same commit. LeRobot's plug-in is a distribution of its own.
 PUBLISHING := build==1.6.1 twine==7.0.0 check-wheel-contents==0.6.3

@@ -154,3 +154,13 @@ except MissingDependency as error:
     print(error)
 """
     assert "pip install 'vlagents-ray[serve]'" in run(robot, code)
+
+
+@pytest.mark.parametrize("words", [["--help"], ["doctor"], ["serve", "noop"]], ids=" ".join)
+def test_a_robots_command_says_in_two_lines_what_to_install_for_it(robot: Path, words: list[str]) -> None:
+    command = [robot.parent / "vlagents-ray", *words]
+    done = subprocess.run(command, check=False, capture_output=True, text=True, timeout=300)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("vlagents-ray: 'typer' is not installed")
+    assert "pip install 'vlagents-ray[serve]'" in done.stderr
+    assert done.stderr.count("\n") == 2

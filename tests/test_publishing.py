@@ -54,14 +54,22 @@ def test_the_citation_names_this_version_and_licence() -> None:
 
 
 def test_the_table_of_extras_has_a_row_of_each_and_is_of_their_present_requirements() -> None:
-    table = resolved.written(resolved.PAGE.read_text())
-    rows = [[cell.strip(" `") for cell in line.strip("|").split("|")] for line in table.splitlines()[3:-1]]
-    assert [row[0] for row in rows] == [extra or "none" for extra in resolved.extras()]
+    page = resolved.PAGE.read_text()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in resolved.rows(page).values()]
+    assert list(resolved.rows(page)) == [extra or "none" for extra in resolved.extras()]
     for _, *counts, built in rows:
         assert len(counts) == len(resolved.PYTHONS)
         assert all(re.fullmatch(r"\d+\*?|no", count) for count in counts)
         assert any("*" in count for count in counts) == bool(built)
-    assert resolved.digest() in table, "run `make extras`"
+    assert resolved.digest() in page, "run `make extras`"
+
+
+def test_rows_that_are_not_named_stay_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(resolved, "cell", lambda _, python: ("7*", ["`a`"]) if python == "3.13" else ("6", []))
+    old = resolved.rows(resolved.PAGE.read_text())
+    new = resolved.table(["record"], old).splitlines()
+    assert new[2:] == [*(old | {"record": "| `record` | 6 | 6 | 6 | 7* | `a` |"}).values()]
+    assert len(new) == 2 + len(old)
 
 
 def test_a_changed_requirement_or_torch_makes_the_table_old(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

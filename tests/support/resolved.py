@@ -58,6 +58,7 @@ def resolve(requirements: Sequence[str], python: str, *words: str) -> list[dict[
         RuntimeError: uv failed otherwise, as without a network.
     """
     command = [sys.executable, "-m", "uv", "pip", "compile", "--quiet", "--no-config", "--format", "pylock.toml"]
+    command += ["--no-python-downloads"]  # it would look for that Python, which resolving does not need
     command += ["--python-version", python, "--python-platform", PLATFORM, "--override", str(TORCH), *words, "-"]
     done = subprocess.run(command, input="\n".join(requirements), capture_output=True, text=True, check=False)
     if done.returncode != 0:
@@ -92,15 +93,33 @@ def cell(extra: str | None, python: str) -> tuple[str, list[str]]:
     return found, built
 
 
-def table() -> str:
+def table(only: Sequence[str], old: dict[str, str]) -> str:
+    """All rows, of which those that `only` names are resolved, or all if it is empty; `old` has the others."""
     with ThreadPoolExecutor(8) as pool:
-        found = {extra: [pool.submit(cell, extra, python) for python in PYTHONS] for extra in extras()}
-    body = []
-    for extra, cells in found.items():
-        counts, built = zip(*(one.result() for one in cells), strict=True)
-        body.append([f"`{extra}`" if extra else "none", *counts, ", ".join(sorted(set().union(*built)))])
-    heads = [["extra", *(f"Python {python}" for python in PYTHONS), "* compiled"], ["---"] * (2 + len(PYTHONS))]
-    return "\n".join("| " + " | ".join(row).rstrip() + " |" for row in [*heads, *body])
+        cells = {
+            extra or "none": [pool.submit(cell, extra, python) for python in PYTHONS]
+            for extra in extras()
+            if not only or (extra or "none") in only
+        }
+    heads = ["extra", *(f"Python {python}" for python in PYTHONS), "* compiled"]
+    found = [row(*heads), row(*["---"] * len(heads))]
+    for extra in extras():
+        name = extra or "none"
+        if name not in cells:
+            found.append(old[name])
+            continue
+        counts, built = zip(*(one.result() for one in cells[name]), strict=True)
+        found.append(row(f"`{extra}`" if extra else name, *counts, ", ".join(sorted(set().union(*built)))))
+    return "\n".join(found)
+
+
+def row(*texts: str) -> str:
+    return "| " + " | ".join(texts).rstrip() + " |"
+
+
+def rows(page: str) -> dict[str, str]:
+    """The lines of the table that a page has, by extra."""
+    return {line.split("|")[1].strip(" `"): line for line in written(page).splitlines()[3:-1]}
 
 
 def written(page: str) -> str:
@@ -143,17 +162,21 @@ def lock(name: str) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("what", choices=["extras", "locks"])
-    if parser.parse_args().what == "extras":
-        found = f"{BEGIN.format(digest())}\n{table()}\n{END}"
+    parser.add_argument("only", nargs="*", metavar="NAME", help="an extra or a lock; all without one")
+    arguments = parser.parse_args()
+    if arguments.what == "extras":
+        found = f"{BEGIN.format(digest())}\n{table(arguments.only, rows(PAGE.read_text()))}\n{END}"
         page = PAGE.read_text()
         PAGE.write_text(page.replace(written(page), found))
         return
+    wanted = arguments.only or list(locks())
     with ThreadPoolExecutor(8) as pool:
-        texts = dict(zip(locks(), pool.map(lock, locks()), strict=True))
-    for old in LOCKS.glob("*.txt"):
-        old.unlink()
+        texts = dict(zip(wanted, pool.map(lock, wanted), strict=True))
     for name, text in texts.items():
         (LOCKS / f"{name}.txt").write_text(text)
+    for file in LOCKS.glob("*.txt"):
+        if file.stem not in locks():
+            file.unlink()
 
 
 if __name__ == "__main__":
