@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import resolved
 import tomllib
 import yaml
 
@@ -22,11 +23,16 @@ def steps(workflow: Path) -> list[dict[str, Any]]:
     return [step for job in yaml.safe_load(workflow.read_text())["jobs"].values() for step in job["steps"]]
 
 
-def test_zizmor_finds_nothing_that_is_unsafe_or_malformed() -> None:
-    zizmor = shutil.which("zizmor", path=Path(sys.executable).parent) or shutil.which("zizmor")
-    assert zizmor is not None
-    command = [zizmor, "--offline", "--strict-collection", "--no-progress", *WORKFLOWS]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+@pytest.mark.parametrize(
+    "words",
+    [["zizmor", "--offline", "--strict-collection", "--no-progress"], ["jactionlint", "--shellcheck="]],
+    ids=lambda words: words[0],
+)
+def test_workflows_are_well_formed_and_safe(words: list[str]) -> None:
+    name, *options = words
+    program = shutil.which(name, path=Path(sys.executable).parent) or shutil.which(name)
+    assert program is not None
+    done = subprocess.run([program, *options, *WORKFLOWS], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert len(WORKFLOWS) == 3
 
@@ -45,3 +51,32 @@ def test_what_workflows_run_of_this_repository_exists(workflow: Path) -> None:
 def test_the_citation_names_this_version_and_licence() -> None:
     citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
     assert (citation["version"], citation["license"]) == (PROJECT["version"], PROJECT["license"])
+
+
+def test_the_table_of_extras_has_a_row_of_each_and_is_of_their_present_requirements() -> None:
+    table = resolved.written(resolved.PAGE.read_text())
+    rows = [[cell.strip(" `") for cell in line.strip("|").split("|")] for line in table.splitlines()[3:-1]]
+    assert [row[0] for row in rows] == [extra or "none" for extra in resolved.extras()]
+    for _, *counts, built in rows:
+        assert len(counts) == len(resolved.PYTHONS)
+        assert all(re.fullmatch(r"\d+\*?|no", count) for count in counts)
+        assert any("*" in count for count in counts) == bool(built)
+    assert resolved.digest() in table, "run `make extras`"
+
+
+def test_a_changed_requirement_or_torch_makes_the_table_old(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    before = resolved.digest()
+    monkeypatch.setitem(resolved.EXTRAS, "check", [])
+    assert resolved.digest() == before  # what only developers install is not in it
+    (tmp_path / "torch.txt").write_text("torch==9.0\n")
+    with monkeypatch.context() as patch:
+        patch.setattr(resolved, "TORCH", tmp_path / "torch.txt")
+        assert resolved.digest() != before
+    monkeypatch.setitem(resolved.EXTRAS, "record", ["av>=13"])
+    assert resolved.digest() != before
+
+
+def test_the_requirements_of_an_extra_are_those_of_the_extras_that_it_names_too() -> None:
+    assert set(resolved.direct("maniskill")) > set(resolved.direct("sim")) > set(resolved.direct("serve"))
+    assert set(resolved.direct("serve")) > set(resolved.direct(None)) == set(PROJECT["dependencies"])
+    assert not any(one.startswith(PROJECT["name"]) for extra in resolved.EXTRAS for one in resolved.direct(extra))

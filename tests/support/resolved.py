@@ -53,11 +53,14 @@ def resolve(requirements: Sequence[str], python: str, *words: str) -> list[dict[
     """The packages, as in a `pylock.toml`: of each its `name`, `version`, and the `wheels` that fit the platform.
 
     Raises:
-        subprocess.CalledProcessError: Nothing fits; `stderr` says why.
+        LookupError: Nothing fits.
+        RuntimeError: uv failed otherwise, as without a network.
     """
     command = [sys.executable, "-m", "uv", "pip", "compile", "--quiet", "--no-config", "--format", "pylock.toml"]
     command += ["--python-version", python, "--python-platform", PLATFORM, "--override", str(TORCH), *words, "-"]
-    done = subprocess.run(command, input="\n".join(requirements), capture_output=True, text=True, check=True)
+    done = subprocess.run(command, input="\n".join(requirements), capture_output=True, text=True, check=False)
+    if done.returncode != 0:
+        raise (LookupError if "No solution found" in done.stderr else RuntimeError)(done.stderr)
     return list(tomllib.loads(done.stdout)["packages"])
 
 
@@ -75,25 +78,28 @@ def digest() -> str:
     return hashlib.sha256(json.dumps(wanted).encode()).hexdigest()[:16]
 
 
-def cell(extra: str | None, python: str) -> str:
+def cell(extra: str | None, python: str) -> tuple[str, list[str]]:
     """How many packages come, and which of them have to be compiled, where no versions with wheels alone fit."""
-    found = "no"
+    found, built = "no", list[str]()
     for words in ([], ["--no-build"]):
-        with suppress(subprocess.CalledProcessError):
+        with suppress(LookupError):
             packages = resolve(direct(extra), python, *words)
-            built = ", ".join(f"`{package['name']}`" for package in packages if not package.get("wheels"))
-            found = f"{len(packages)}, builds {built}" if built else str(len(packages))
+            built = [f"`{package['name']}`" for package in packages if not package.get("wheels")]
+            found = f"{len(packages)}*" if built else str(len(packages))
             if not built:
                 break
-    return found
+    return found, built
 
 
 def table() -> str:
-    with ThreadPoolExecutor(4) as pool:
-        rows = [(extra, [pool.submit(cell, extra, python) for python in PYTHONS]) for extra in extras()]
-        body = [[f"`{extra}`" if extra else "none", *(one.result() for one in cells)] for extra, cells in rows]
-    heads = [["extra", *(f"Python {python}" for python in PYTHONS)], ["---"] * (1 + len(PYTHONS))]
-    return "\n".join("| " + " | ".join(row) + " |" for row in [*heads, *body])
+    with ThreadPoolExecutor(8) as pool:
+        found = {extra: [pool.submit(cell, extra, python) for python in PYTHONS] for extra in extras()}
+    body = []
+    for extra, cells in found.items():
+        counts, built = zip(*(one.result() for one in cells), strict=True)
+        body.append([f"`{extra}`" if extra else "none", *counts, ", ".join(sorted(set().union(*built)))])
+    heads = [["extra", *(f"Python {python}" for python in PYTHONS), "* compiled"], ["---"] * (2 + len(PYTHONS))]
+    return "\n".join("| " + " | ".join(row).rstrip() + " |" for row in [*heads, *body])
 
 
 def written(page: str) -> str:
@@ -133,10 +139,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("what", choices=["extras", "locks"])
     if parser.parse_args().what == "extras":
+        found = f"{BEGIN.format(digest())}\n{table()}\n{END}"
         page = PAGE.read_text()
-        PAGE.write_text(page.replace(written(page), f"{BEGIN.format(digest())}\n{table()}\n{END}"))
+        PAGE.write_text(page.replace(written(page), found))
         return
-    with ThreadPoolExecutor(4) as pool:
+    with ThreadPoolExecutor(8) as pool:
         texts = dict(zip(locks(), pool.map(lock, locks()), strict=True))
     for old in LOCKS.glob("*.txt"):
         old.unlink()
