@@ -16,6 +16,7 @@ from vlagents_ray.cli.evaluation.command import read_run
 from vlagents_ray.envs import aloha, metaworld
 from vlagents_ray.envs.benchmark_protocol import BenchmarkProtocol
 from vlagents_ray.envs.gymnasium.known import known
+from vlagents_ray.envs.robosuite.tasks import TASKS
 from vlagents_ray.errors import BY_CODE, Overloaded, VLAgentsError
 from vlagents_ray.evaluate import EvalConfig
 from vlagents_ray.interface import Act
@@ -113,6 +114,7 @@ def test_files_of_runs_on_the_pages_are_accepted() -> None:
         ("aloha", aloha.PROTOCOL),
         ("pusht", known("gym_pusht/PushT-v0").protocol),
         ("gymnasium", known("FetchReach-v4").protocol),
+        ("robosuite", TASKS["Lift"].protocol),
     ],
 )
 def test_a_benchmarks_page_states_the_protocol_that_is_recorded(page: str, protocol: BenchmarkProtocol) -> None:

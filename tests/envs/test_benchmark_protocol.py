@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from vlagents_ray.envs.benchmark_protocol import BenchmarkProtocol
+from vlagents_ray.registry import ENVS
 from vlagents_ray.testing.comparing import require_wireable
+
+PAGES = Path(__file__).parents[2] / "docs" / "benchmarks"
+ANY_PROTOCOL = {"tabletop", "gymnasium", "hub"}  # our own example, and environments of others by their ids
 
 PROTOCOL = BenchmarkProtocol(
     name="Shelf",
@@ -39,3 +45,12 @@ def test_a_description_travels_in_a_result() -> None:
 def test_what_a_protocol_does_not_settle_cannot_deviate_from_it() -> None:
     with pytest.raises(AttributeError, match="colour"):
         PROTOCOL.describe(colour="red")
+
+
+@pytest.mark.parametrize("suite", sorted(set(ENVS) - ANY_PROTOCOL))
+def test_the_page_of_a_benchmark_states_its_protocol(suite: str) -> None:
+    page = (PAGES / f"{'rcs' if suite == 'duobench' else suite}.md").read_text()
+    section = re.search(r"^## Protocol\n(.*?)(?=^## |\Z)", page, re.DOTALL | re.MULTILINE)
+    assert section is not None
+    for stated in ("step", "success"):
+        assert stated in section[1].lower()

@@ -85,6 +85,8 @@ def test_the_tasks_of_the_named_folder_are_listed(files: Path, monkeypatch: pyte
 
 def test_initial_states_of_another_instruction_or_other_positions_are_found(files: Path, states: np.ndarray) -> None:
     spoken = find_task(f"libero_object/{MILK}_language_2", str(files))
+    assert (spoken.full_name, spoken.passes_for_own) == (f"libero_object/{MILK}_language_2", True)
+    assert not find_task("libero_object_task/0", str(files)).passes_for_own
     assert spoken.language == "grasp the dairy and place it in the basket"
     np.testing.assert_array_equal(read_states(spoken.states), states)
     moved = find_task(f"libero_object/{MILK}_level1_sample1", str(files))

@@ -170,13 +170,16 @@ class Libero(EvalEnv):
         return None if probe.ok else f"LIBERO cannot render without a display ({probe.error}); {probe.cure}"
 
     def describe(self) -> dict[str, Any]:
+        protocol = self._protocol.to_json(self._task.suite)
+        if self._task.passes_for_own:
+            protocol["deviations"].append(f"files: those of {self._task.name}, the protocol says LIBERO's own")
         return {
             "simulator": "libero",
             "task": self._task.full_name,
             "name": self._task.name,
             "language": self._task.language,
             "init_states": self.init_states,
-            "protocol": self._protocol.to_json(self._task.suite),
+            "protocol": protocol,
             "hf-libero": version("hf-libero"),
             "robosuite": version("robosuite"),
             "mujoco": version("mujoco"),

@@ -32,8 +32,13 @@ class LiberoTask:
 
     @property
     def full_name(self) -> str:
-        """The task's name in `Libero.tasks()`, e.g. "libero_object/7"."""
-        return f"{self.suite}/{self.number}"
+        """The task's name in `Libero.tasks()`, e.g. "libero_object/7"; a variant in one of these goes by its name."""
+        return f"{self.suite}/{self.name if self.passes_for_own else self.number}"
+
+    @property
+    def passes_for_own(self) -> bool:
+        """Whether it is a variant in one of LIBERO's own suites, with whose tasks it must not be counted."""
+        return self.varied and self.suite in SUITES
 
 
 def task_names() -> list[str]:
