@@ -47,6 +47,7 @@ def serving() -> Iterator[Serve]:
 
             def metadata() -> dict[str, Any]:
                 found: dict[str, Any] = {"protocol": PROTOCOL_VERSION, "act_parts": engine.models.act_parts}
+                found["continues_plans"] = engine.models.continues_plans
                 found["contract"] = None if engine.contract is None else engine.contract.to_json()
                 found["local"] = asdict(local.address) if way == "shm" else None
                 found["stream"] = asdict(port.address) if way == "websocket" else None
@@ -75,7 +76,7 @@ def test_the_rows_come_one_by_one(way: str, serving: Serve) -> None:
     assert policy.gate is not None
     stream = None
     agent = serving(policy, way)
-    assert agent.act_parts == "exact"
+    assert (agent.act_parts, agent.continues_plans) == ("exact", True)
     stream = agent.act_stream(Obs(info={"value": 5.0, "done": True}))
     for row in range(ROWS):
         policy.gate.release()

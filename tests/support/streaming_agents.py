@@ -32,6 +32,7 @@ class InParts(Agent):
 
     shared: ClassVar[tuple[str, ...]] = ("gate", "record")
     act_parts: Parts | None = "exact"
+    continues_plans = True
     contract = Contract(action=ActionSpec(dim=2), chunk=ROWS)
 
     def __init__(self, *, gated: bool = False) -> None:

@@ -1,4 +1,4 @@
-"""π0 and π0.5, where transformers has openpi's changes; conftest.py leaves this file out where it has not.
+"""π0, π0.5 and π0-FAST, where transformers has openpi's changes; conftest.py leaves this file out where it has not.
 
 LeRobot makes these models in two sizes only, so their sizes are changed under its hands.
 """
@@ -6,6 +6,7 @@ LeRobot makes these models in two sizes only, so their sizes are changed under i
 from __future__ import annotations
 
 import importlib
+import json
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -28,22 +29,40 @@ from vlagents_ray.interface import BEHAVIOUR, DELAY, DISTRIBUTION, LEFTOVER, SAM
 from vlagents_ray.policies.lerobot import LeRobot
 from vlagents_ray.testing import check_agent
 
-KINDS = ("pi0", "pi05")
+KINDS, FAST = ("pi0", "pi05"), "pi0_fast"
+# Code of an action tokenizer, as those on the hub have it, but without a vocabulary.
+ACTION_TOKENIZER = """
+class Characters:
+    scale, min_token = 16, -32
+    bpe_tokenizer = property(lambda self: self)
+
+    @classmethod
+    def from_pretrained(cls, *_, **__):
+        return cls()
+
+    @classmethod
+    def register_for_auto_class(cls, *_): ...
+
+    def decode(self, tokens):
+        return "".join(chr(int(token) % 64) for token in tokens)
+"""
 ATOL = 1e-5
-VOCABULARY = 400
+VOCABULARY = len(fast_tokenizer())  # π0-FAST turns each of its tokens into a word
 
 
 @pytest.fixture(scope="module")
 def shrunk() -> Iterator[pytest.MonkeyPatch]:
     """LeRobot makes small models."""
     with pytest.MonkeyPatch.context() as patch:
-        for kind in KINDS:
+        for kind in (*KINDS, FAST):
             modeling = importlib.import_module(f"lerobot.policies.{kind}.modeling_{kind}")
             size = modeling.GemmaConfig(width=32, depth=2, mlp_dim=64, num_heads=4, num_kv_heads=1, head_dim=16)
             patch.setattr(modeling, "get_gemma_config", lambda _, size=size: size)
             new = ("PaliGemmaForConditionalGenerationWithPiGemma", "PiGemmaForCausalLM")
             names = new if tiny.NEW else ("PaliGemmaForConditionalGeneration", "GemmaForCausalLM")
             for name, change in zip(names, (_small_vision, _few_words), strict=True):
+                if not hasattr(modeling, name):  # π0-FAST has no second network
+                    continue
                 made = getattr(modeling, name)
                 patch.setattr(modeling, name, lambda config, made=made, change=change: made(config=change(config)))
         yield patch
@@ -59,6 +78,8 @@ def made(shrunk: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -
         (folder / kind).mkdir()
         with local_tokenizer(kind, folder / "tokenizer"):
             tiny.write(folder / kind, tiny.config_of(kind, dtype="float32", image_resolution=(56, 56), **chunk))
+    if tiny.NEW:
+        _write_fast(folder)
     return lambda kind: folder / kind
 
 
@@ -189,6 +210,64 @@ def test_compiled_passes_act_as_without(kind: str, made: Callable[[str], Path]) 
         assert programs.rows == [2, 2]
 
 
+OF_FAST = pytest.mark.skipif(not tiny.NEW, reason="π0-FAST is tried with LeRobot 0.6 alone")
+
+
+def settings_of_fast(made: Callable[[str], Path]) -> dict[str, Any]:
+    """Of the checkpoint of π0-FAST; LeRobot does not save the name of its action tokenizer's text tokenizer."""
+    step = {"paligemma_tokenizer_name": str(made(FAST).parent / "tokenizer")}
+    return {"trust_remote_code": True, "processors": {"action_tokenizer_processor": step}}
+
+
+@OF_FAST
+@pytest.mark.verifies("parity")
+def test_tokens_drawn_from_the_same_seed_are_theirs(made: Callable[[str], Path]) -> None:
+    policy, theirs = (
+        _loaded(made(FAST), **settings_of_fast(made)),
+        Theirs(made(FAST), **settings_of_fast(made)["processors"]),
+    )
+    rows = begun(policy).act(view()).action
+    assert len(rows) == tiny.EXECUTED
+    torch.manual_seed(int(draws_of(policy).integers(2**63)))
+    for row in rows:
+        np.testing.assert_allclose(theirs.select(view()), row, atol=ATOL)
+
+
+@OF_FAST
+def test_pi0_fast_keeps_the_contract(made: Callable[[str], Path]) -> None:
+    fast = LeRobot.from_config({"checkpoint": str(made(FAST)), **settings_of_fast(made)})
+    check_agent(fast, instructions=TASKS, atol=ATOL)
+
+
+@OF_FAST
+@pytest.mark.verifies("isolation")
+def test_tokens_that_are_no_actions_fail_their_own_session(
+    made: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    policy = _loaded(made(FAST), **settings_of_fast(made))
+    alone = begun(policy, 2).act(view(2)).action
+    network, read = policy.model.kind.policy, list[int]()
+    decode = network.detokenize_actions
+
+    def checked(*tokens: Any, **shape: Any) -> Any:
+        read.append(1)
+        network.config.validate_action_token_prefix = len(read) == 1  # those of the first row, which are random
+        return decode(*tokens, **shape)
+
+    monkeypatch.setattr(network, "detokenize_actions", checked)
+    broken, whole = policy.act_batch([view(1), view(2)], [begun(policy, 1), begun(policy, 2)])
+    assert isinstance(broken, Exception)
+    assert isinstance(whole, Act)
+    np.testing.assert_allclose(whole.action, alone, atol=ATOL)
+
+
+@OF_FAST
+@pytest.mark.verifies("loading")
+def test_the_code_of_an_action_tokenizer_wants_trust(made: Callable[[str], Path]) -> None:
+    with pytest.raises(ConfigError, match="trust_remote_code: true"):
+        _loaded(made(FAST))
+
+
 @pytest.mark.verifies("loading")
 @pytest.mark.parametrize("kind", KINDS)
 def test_weights_that_lerobot_would_replace_by_random_ones_are_an_error(kind: str, made: Callable[[str], Path]) -> None:
@@ -205,6 +284,25 @@ def test_weights_that_lerobot_would_replace_by_random_ones_are_an_error(kind: st
         _loaded(made(kind))
     finally:
         save_file(whole, file)
+
+
+def _write_fast(folder: Path) -> None:
+    """A checkpoint of π0-FAST in a folder with a tokenizer, and the code of an action tokenizer beside it."""
+    code = folder / "actions"
+    code.mkdir()
+    (code / "characters.py").write_text(ACTION_TOKENIZER)
+    named = {"processor_class": "Characters", "auto_map": {"AutoProcessor": "characters.Characters"}}
+    (code / "processor_config.json").write_text(json.dumps(named))
+    names = {"text_tokenizer_name": str(folder / "tokenizer"), "action_tokenizer_name": str(code)}
+    tokens = {
+        "max_decoding_steps": 16,
+        "fast_skip_tokens": 0,
+        "temperature": 1.0,
+        "validate_action_token_prefix": False,
+    }
+    sizes = {"dtype": "float32", "n_action_steps": tiny.EXECUTED}  # images of 224 pixels, as it has no other
+    (folder / FAST).mkdir()
+    tiny.write(folder / FAST, tiny.config_of(FAST, chunk_size=tiny.CHUNK, **names, **tokens, **sizes))
 
 
 def _loaded(folder: Path, **config: Any) -> LeRobot:

@@ -21,6 +21,7 @@ from vlagents_ray.testing import check_agent
 pytestmark = FILTERS
 
 ATOL = 1e-5
+INSTRUCTED = ("smolvla", "xvla", *(("vla_jepa", "eo1", "evo1", "wall_x") if tiny.NEW else ()))
 DRAWING = sorted(set(tiny.KINDS) - {"act", "ensemble"})  # those whose actions depend on a session's random numbers
 
 
@@ -56,7 +57,7 @@ def test_what_is_drawn_depends_on_the_seed_alone(kind: str, loaded: Load) -> Non
     assert not np.allclose(played(1), played(2), atol=1e-3)
 
 
-@pytest.mark.parametrize("kind", ["smolvla", "xvla"])
+@pytest.mark.parametrize("kind", INSTRUCTED)
 def test_the_instruction_decides(kind: str, loaded: Load) -> None:
     policy = loaded(kind)
     chunks = []
@@ -87,7 +88,7 @@ def test_the_samples_of_an_observation_of_x_vla_are_of_one_reading_of_it(
 
 def test_a_policy_that_reads_no_instruction_does_without(loaded: Load) -> None:
     assert loaded("act").contract.instruction is None
-    assert loaded("smolvla").contract.instruction
+    assert all(loaded(kind).contract.instruction for kind in INSTRUCTED)
     with pytest.raises(InvalidObservation, match="instruction"):
         begun(loaded("smolvla")).reset(view(), None)
 

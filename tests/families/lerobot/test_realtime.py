@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from tests.families.lerobot import tiny
-from tests.families.lerobot.conftest import FILTERS, Load, begun, view
+from tests.families.lerobot.conftest import FILTERS, Load, Made, begun, view
 from vlagents_ray.errors import InvalidObservation
 from vlagents_ray.interface import DELAY, LEFTOVER
+from vlagents_ray.policies.lerobot import LeRobot
 
 pytestmark = FILTERS
 
@@ -46,3 +47,18 @@ def test_a_chunk_goes_on_from_what_the_robot_is_doing(loaded: Load) -> None:
     free = begun(policy).act(view()).action
     guided = begun(policy).act(view(**{LEFTOVER: plan, DELAY: 3})).action
     assert np.abs(guided[:3] - plan[:3]).max() < 0.2 * np.abs(free[:3] - plan[:3]).max()
+
+
+def test_the_settings_of_the_guidance_can_be_overridden(made: Made) -> None:
+    settings = {"execution_horizon": 4, "max_guidance_weight": 2.0, "prefix_attention_schedule": "EXP"}
+    policy = LeRobot.from_config({"checkpoint": str(made("smolvla")), "overrides": {"rtc_config": settings}})
+    policy.initialize()
+    assert policy.continues_plans
+    used = policy.model.kind.policy.rtc_processor.rtc_config
+    assert (used.execution_horizon, used.max_guidance_weight) == (4, 2.0)
+    assert used.prefix_attention_schedule.name == "EXP"
+
+
+def test_single_actions_do_not_go_on_from_a_plan(loaded: Load) -> None:
+    assert not loaded("smolvla", actions="queue").continues_plans
+    assert not loaded("act").continues_plans

@@ -23,19 +23,21 @@ from vlagents_ray.policies.lerobot import LeRobot
 pytestmark = FILTERS
 
 ATOL = 1e-5
-OF_THIS_VERSION = ["gaussian_actor", "groot", "multi_task_dit", "dit_flow"] if tiny.NEW else ["sac"]
+OF_THIS_VERSION = tiny.KINDS[4:] if tiny.NEW else ("sac",)
 
 
 class Theirs:
     """A checkpoint in LeRobot's own loop."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, **processors: dict[str, Any]) -> None:
         config = PreTrainedConfig.from_pretrained(folder)
         config.device = "cpu"
         if getattr(config, "rtc_config", False) is None:
             config.rtc_config = RTCConfig(enabled=False)
         self.policy = get_policy_class(config.type).from_pretrained(folder, config=config)
-        self.before, self.after = make_pre_post_processors(config, pretrained_path=str(folder))
+        self.before, self.after = make_pre_post_processors(
+            config, pretrained_path=str(folder), preprocessor_overrides=processors
+        )
 
     def see(self, obs: Obs, task: str = TASKS[0]) -> dict[str, Any]:
         images = {f"observation.images.{name}": image.copy() for name, image in obs.cameras.items()}

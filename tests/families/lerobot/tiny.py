@@ -154,6 +154,22 @@ def groot(folder: Path, **settings: Any) -> Any:
     return config_of("groot", **{**tiny06.groot(folder), "n_action_steps": EXECUTED, **settings})
 
 
+def vla_jepa(folder: Path, **settings: Any) -> Any:
+    return config_of("vla_jepa", **{**tiny06.vla_jepa(folder), "n_action_steps": EXECUTED, **settings})
+
+
+def eo1(folder: Path, **settings: Any) -> Any:
+    return config_of("eo1", **{**tiny06.eo1(folder), "n_action_steps": EXECUTED, **settings})
+
+
+def wall_x(folder: Path, **settings: Any) -> Any:
+    return config_of("wall_x", **{**tiny06.wall_x(folder), "n_action_steps": EXECUTED, **settings})
+
+
+def evo1(folder: Path, **settings: Any) -> Any:
+    return config_of("evo1", **{**tiny06.evo1(folder), "n_action_steps": EXECUTED, **settings})
+
+
 def multi_task_dit(folder: Path, **settings: Any) -> Any:
     return config_of("multi_task_dit", **{**tiny06.multi_task_dit(folder), "n_action_steps": EXECUTED, **settings})
 
@@ -176,6 +192,10 @@ _MAKERS: dict[str, Callable[..., Any]] = {
     "sac": sac,
     "gaussian_actor": gaussian_actor,
     "groot": groot,
+    "vla_jepa": vla_jepa,
+    "eo1": eo1,
+    "evo1": evo1,
+    "wall_x": wall_x,
     "multi_task_dit": multi_task_dit,
     "dit_flow": dit_flow,
     "full_act": full_act,
@@ -183,8 +203,9 @@ _MAKERS: dict[str, Callable[..., Any]] = {
 # What each kind is tried for, by version: those whose code differs, and all that the older one has.
 KINDS = ("act", "diffusion", "smolvla", "xvla", "ensemble", "vqbet", "tdmpc", "sac")
 if NEW:
-    KINDS = (*KINDS[:4], "gaussian_actor", "groot", "multi_task_dit", "dit_flow")
-_WITH_FILES = {"dit_flow", "groot", "multi_task_dit", "smolvla", "xvla"}  # of a tokenizer beside the checkpoint
+    KINDS = (*KINDS[:4], "gaussian_actor", "groot", "multi_task_dit", "dit_flow", "vla_jepa", "eo1", "evo1", "wall_x")
+# Those with files of a tokenizer beside the checkpoint.
+_WITH_FILES = {"dit_flow", "eo1", "evo1", "groot", "multi_task_dit", "smolvla", "vla_jepa", "wall_x", "xvla"}
 
 
 def make(folder: Path, kind: str = "act", **settings: Any) -> Path:

@@ -320,10 +320,10 @@ def test_the_weights_of_a_policy_in_a_child_process_are_out_of_reach() -> None:
 def test_parts_of_a_chunk_come_through_and_an_act_that_was_left_disturbs_no_other() -> None:
     settings = Settings("streaming_agents:InParts", {}, 16, "1")
     policy = ChildAgent(Child(sys.executable, settings, {"PYTHONPATH": f"{SUPPORT}:{ROOT}"}))
-    assert policy.act_parts is None
+    assert (policy.act_parts, policy.continues_plans) == (None, False)
     policy.initialize()
     try:
-        assert policy.act_parts == "exact"
+        assert (policy.act_parts, policy.continues_plans) == ("exact", True)
         policy.reset(Obs(), "task")
         parts = list(policy.act_stream(Obs(info={"value": 1.0})))
         assert [part.rows().tolist() for part in parts] == [[[1.0, row]] for row in range(4)]

@@ -55,6 +55,7 @@ def load(folder: Path, config: LeRobotConfig, device: Any) -> Any:
     factory = require("lerobot.policies.factory")
     require_served(_type(folder), folder)
     settings = _settings(folder, config)
+    settings.pretrained_path = folder  # as LeRobot's factory does; without it EO-1 loads its backbone from the hub
     as_saved = _prepare(settings, config, device)
     try:
         saved = SavedTensors.of(folder / WEIGHTS)
@@ -63,7 +64,7 @@ def load(folder: Path, config: LeRobotConfig, device: Any) -> Any:
         raise
     except Exception as error:
         raise ConfigError(
-            f"checkpoint {folder}: LeRobot cannot load it as {settings.type!r} ({type(error).__name__}: {error}); "
+            f"checkpoint {folder}: LeRobot cannot load it as {settings.type!r} ({_said(error)}); "
             f"is it complete? {other_version()}. Without a network, what it names on the hub has to be in the cache, "
             f"or to be replaced by `overrides`"
         ) from error

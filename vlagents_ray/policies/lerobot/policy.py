@@ -136,7 +136,7 @@ class LeRobot(ModelPolicy):
         inputs = [*cameras, *(key for key in (STATE, ENVIRONMENT) if key in settings.input_features)]
         processors.require_statistics(settings, inputs)
         environment = list(trained.environment or [ENVIRONMENT_STATE]) if settings.env_state_feature else []
-        width = processors.width(settings.action_feature.shape[0])
+        width = processors.width(kind.dim)
         action = trained.contract.action
         contract = Contract(
             cameras={ours: _camera(settings, key) for key, ours in cameras.items()},
@@ -185,10 +185,17 @@ class LeRobot(ModelPolicy):
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
         """Compute the chunks, in one pass for all rows with images of one size unless the type cannot batch."""
-        predictions: dict[int, Prediction] = {}
+        predictions: dict[int, Prediction | Exception] = {}
         for members in self._groups(rows):
             missing = len(rows) - len(members) if self.config.deterministic and self.model.kind.batched else 0
-            drawn = self._draw([rows[i] for i in members] + [copy.deepcopy(rows[members[-1]]) for _ in range(missing)])
+            extra = [copy.deepcopy(rows[members[-1]]) for _ in range(missing)]
+            drawn: list[Prediction | Exception] = []
+            try:
+                drawn += self._draw([rows[i] for i in members] + extra)
+            except Exception as error:
+                if self.model.kind.batched:
+                    raise
+                drawn.append(error)  # of that session alone
             predictions |= zip(members, drawn[: len(members)], strict=True)
         return [predictions[i] for i in range(len(rows))]
 
@@ -206,7 +213,8 @@ class LeRobot(ModelPolicy):
         kind, settings = model.kind, model.kind.config
         leftovers = [model.own.get(row.adapter, model.processors).leftover(row) for row in rows]
         device = torch.device(settings.device).type
-        with torch.inference_mode(), torch.autocast(device, enabled=settings.use_amp):
+        mixed = settings.use_amp and device == "cuda"  # as in LeRobot's own loop
+        with torch.inference_mode(), torch.autocast(device, enabled=mixed):
             seen = [rows[i] for i in kind.observations(rows)]
             inputs = model.processors.observe(seen, kind.steps)
             for adapter, own in model.own.items():

@@ -50,6 +50,14 @@ class Fast(Kind):
         return int(self.config.n_action_steps)
 
 
+class Evo1(Kind):
+    """EVO-1, whose post-processor takes away what its actions are padded with."""
+
+    @property
+    def dim(self) -> int:
+        return int(self.config.max_action_dim)
+
+
 class XVla(Kind):
     """X-VLA, which draws its noise itself and masks no padding, so that a batch needs instructions of one length."""
 
@@ -139,6 +147,7 @@ class Single(Kind):
 KINDS: Mapping[str, type[Kind]] = {
     "act": ActPolicy,
     "diffusion": Diffusion,
+    "evo1": Evo1,
     "gaussian_actor": Single,
     "groot": Groot,
     "multi_task_dit": MultiTaskDit,

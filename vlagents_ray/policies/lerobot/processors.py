@@ -27,6 +27,7 @@ _GROOT_TOKENIZER = "groot_n1_7_vlm_encode_v1"
 _NORMALIZERS = ("normalizer_processor", "unnormalizer_processor")
 _ABSOLUTE = "AbsoluteActionsProcessorStep"  # of LeRobot 0.6: it adds the state to actions that are relative to it
 _STATE_IN_PROMPT = ("pi05", "pi0_fast")  # their prompts differ at each act
+_TOKENIZING = ("eo1", "evo1", "fastwam", "molmoact2", "vla_jepa", "wall_x")  # types with a tokenizer in no such step
 _CONFIG = "config.json"
 # Settings of a policy, beside its cameras, that make another model of the same weights.
 _NETWORK = (
@@ -63,7 +64,7 @@ class Processors:
         overrides = {**own, **config.processors}
         trained = saved[0].get(_RENAME, {}).get("rename_map") or {}
         self.rename_map: dict[str, str] = dict(trained if config.rename_map is None else config.rename_map)
-        self.instructed = bool({_TOKENIZER, _GROOT_TOKENIZER} & set(saved[0]))
+        self.instructed = settings.type in _TOKENIZING or bool({_TOKENIZER, _GROOT_TOKENIZER} & set(saved[0]))
         try:
             self._before, self._after = require("lerobot.policies.factory").make_pre_post_processors(
                 settings,
@@ -77,7 +78,8 @@ class Processors:
             raise ConfigError(
                 f"checkpoint {folder}: its processors do not load ({type(error).__name__}: {error}); a tokenizer that "
                 f"is not here is replaced by processors: {{{_TOKENIZER}: {{tokenizer_name: …}}}}, "
-                f"GR00T's by {{{_GROOT_TOKENIZER}: {{model_name: …}}}}"
+                f"GR00T's by {{{_GROOT_TOKENIZER}: {{model_name: …}}}}, π0-FAST's second one by "
+                f"{{action_tokenizer_processor: {{paligemma_tokenizer_name: …}}}}"
             ) from error
         if settings.type not in _STATE_IN_PROMPT:
             self._keep_tokens()

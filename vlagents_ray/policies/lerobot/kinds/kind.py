@@ -45,6 +45,11 @@ class Kind:
         return int(getattr(self.config, "chunk_size", 0) or self.config.n_action_steps)
 
     @property
+    def dim(self) -> int:
+        """The number of values in an action that the policy returns to its post-processor."""
+        return int(self.config.action_feature.shape[0])
+
+    @property
     def usual(self) -> int:
         """The number of rows that the policy executes before the next inference, by its config."""
         return min(int(getattr(self.config, "n_action_steps", self.horizon)), self.horizon)
