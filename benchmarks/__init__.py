@@ -4,7 +4,7 @@
 long; `scaling` has more and more workers play on a Ray cluster over several `hosts`, which are made on one machine;
 `autoscaling` watches replicas while `robots` and rollouts come and go; `hop` measures a child process behind a replica,
 `adapters` sessions of many fine-tunes; `push` new weights under acting sessions, `rollouts` those of a learner;
-`clients` clients in other languages, `ros` a robot behind topics of ROS 2, `far_away` one whose policy is behind a long,
-lossy or cut link.
+`clients` clients in other languages, `ros` a robot behind topics of ROS 2, `far_away` one whose policy is behind a
+long, lossy or cut link.
 What users repeat is `vlagents-ray bench`.
 """
