@@ -6,7 +6,6 @@ gym-aloha. Images need OpenGL without a display: EGL, which Mesa also provides i
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
@@ -19,7 +18,7 @@ from vlagents_ray.envs.base import EvalEnv, one_row, require_known
 from vlagents_ray.envs.benchmark_protocol import BenchmarkProtocol
 from vlagents_ray.envs.recording import record_size_of
 from vlagents_ray.envs.rendering.headless import prepare_rendering
-from vlagents_ray.envs.rendering.render_probe import egl_probe, failing
+from vlagents_ray.envs.rendering.render_probe import failing, without, without_egl
 from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
 from vlagents_ray.interface import HIGH_RES, Act, Obs
 from vlagents_ray.registry import require
@@ -188,11 +187,9 @@ class Aloha(EvalEnv):
     @classmethod
     def missing(cls) -> str | None:
         """Say why gym-aloha cannot run here; the first call in a process renders one frame in a child."""
-        for module in ("gym_aloha", "dm_control", "mujoco"):
-            if importlib.util.find_spec(module) is None:
-                return f"{module} is not installed; pip install 'vlagents-ray[aloha]'"
-        probe = egl_probe()
-        return None if probe.ok else f"gym-aloha cannot render without a display ({probe.error}); {probe.cure}"
+        return without(("gym_aloha", "dm_control", "mujoco"), "pip install 'vlagents-ray[aloha]'") or without_egl(
+            "gym-aloha"
+        )
 
     def describe(self) -> dict[str, Any]:
         return {

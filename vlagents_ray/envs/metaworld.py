@@ -19,7 +19,7 @@ from vlagents_ray.envs.base import EvalEnv, one_row, require_known
 from vlagents_ray.envs.benchmark_protocol import BenchmarkProtocol
 from vlagents_ray.envs.recording import record_size_of
 from vlagents_ray.envs.rendering.headless import prepare_rendering
-from vlagents_ray.envs.rendering.render_probe import egl_probe, failing
+from vlagents_ray.envs.rendering.render_probe import failing, without, without_egl
 from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
 from vlagents_ray.interface import HIGH_RES, Act, Obs
 from vlagents_ray.registry import require
@@ -205,11 +205,7 @@ class MetaWorld(EvalEnv):
     @classmethod
     def missing(cls) -> str | None:
         """Say why Meta-World cannot run here; the first call in a process renders one frame in a child."""
-        for module in ("metaworld", "mujoco"):
-            if importlib.util.find_spec(module) is None:
-                return f"{module} is not installed; pip install 'vlagents-ray[metaworld]'"
-        probe = egl_probe()
-        return None if probe.ok else f"Meta-World cannot render without a display ({probe.error}); {probe.cure}"
+        return without(("metaworld", "mujoco"), "pip install 'vlagents-ray[metaworld]'") or without_egl("Meta-World")
 
     def describe(self) -> dict[str, Any]:
         return {

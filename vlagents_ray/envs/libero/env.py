@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
@@ -18,7 +17,7 @@ from vlagents_ray.envs.libero.benchmark_protocol import LiberoProtocol
 from vlagents_ray.envs.libero.simulation import LiberoSimulation, SimulatorObs
 from vlagents_ray.envs.libero.tasks import find_task, read_states, require_suite, task_names
 from vlagents_ray.envs.recording import record_size_of
-from vlagents_ray.envs.rendering.render_probe import egl_probe, failing
+from vlagents_ray.envs.rendering.render_probe import failing, without, without_egl
 from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
 from vlagents_ray.interface import HIGH_RES, Act, Obs
 
@@ -159,15 +158,13 @@ class Libero(EvalEnv):
     @classmethod
     def missing(cls) -> str | None:
         """The first call in a process renders one frame in a child."""
-        for module in ("libero", "robosuite", "mujoco"):
-            if importlib.util.find_spec(module) is None:
-                return f"{module} is not installed; pip install 'vlagents-ray[libero]'"
+        if missing := without(("libero", "robosuite", "mujoco"), "pip install 'vlagents-ray[libero]'"):
+            return missing
         try:
             asset_files.find_assets()
         except EnvFailed as error:
             return str(error)
-        probe = egl_probe()
-        return None if probe.ok else f"LIBERO cannot render without a display ({probe.error}); {probe.cure}"
+        return without_egl("LIBERO")
 
     def describe(self) -> dict[str, Any]:
         protocol = self._protocol.to_json(self._task.suite)

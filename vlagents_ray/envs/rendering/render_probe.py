@@ -18,7 +18,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Literal
@@ -90,6 +90,18 @@ def egl_probe(timeout_s: float = TIMEOUT_S) -> RenderProbe:
             "egl", ok=False, seconds=0.0, error="mujoco is not installed", cure="pip install 'vlagents-ray[metaworld]'"
         )
     return _run_child("egl", EGL_CURE, timeout_s)
+
+
+def without(modules: Sequence[str], cure: str) -> str | None:
+    """Say which of these modules is not installed, with the cure; None if all are."""
+    missing = next((module for module in modules if importlib.util.find_spec(module) is None), None)
+    return None if missing is None else f"{missing} is not installed; {cure}"
+
+
+def without_egl(simulator: str) -> str | None:
+    """Say why a simulator cannot render here; the first call in a process renders one frame in a child."""
+    probe = egl_probe()
+    return None if probe.ok else f"{simulator} cannot render without a display ({probe.error}); {probe.cure}"
 
 
 @contextlib.contextmanager

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import warnings
 from collections.abc import Mapping, Sequence
@@ -15,7 +14,7 @@ from vlagents_ray.contract import CameraSpec, Contract
 from vlagents_ray.envs.base import EvalEnv, one_row, require_known
 from vlagents_ray.envs.recording import record_size_of
 from vlagents_ray.envs.rendering.headless import prepare_rendering
-from vlagents_ray.envs.rendering.render_probe import egl_probe, failing
+from vlagents_ray.envs.rendering.render_probe import failing, without, without_egl
 from vlagents_ray.envs.robosuite.importing import importing_robosuite
 from vlagents_ray.envs.robosuite.simulation import CameraRenderer, seeded
 from vlagents_ray.envs.robosuite.tasks import CONTROL_HZ, TASKS, contract
@@ -163,11 +162,7 @@ class Robosuite(EvalEnv):
     @classmethod
     def missing(cls) -> str | None:
         """Say why robosuite cannot run here; the first call in a process renders one frame in a child."""
-        for module in ("robosuite", "mujoco"):
-            if importlib.util.find_spec(module) is None:
-                return f"{module} is not installed; {_CURE}"
-        probe = egl_probe()
-        return None if probe.ok else f"robosuite cannot render without a display ({probe.error}); {probe.cure}"
+        return without(("robosuite", "mujoco"), _CURE) or without_egl("robosuite")
 
     def describe(self) -> dict[str, Any]:
         return {
