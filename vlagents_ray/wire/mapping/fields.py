@@ -20,11 +20,12 @@ T = TypeVar("T")
 class CameraKey:
     """The location of an image, (H, W, 3) or (3, H, W) RGB; of (1, T, H, W, 3) the newest image is used, the last of T.
 
-    Pixels are uint8, or floats in [0, 1]. The layout `any` means channels first if the length of the first axis is 3.
+    Pixels are uint8, or floats in [0, 1]. The layout `any` means channels first if the length of the first axis is 3;
+    of `rgba`, (H, W, 4), the alpha is left out.
     """
 
     key: str
-    layout: Literal["hwc", "chw", "any"] = "hwc"
+    layout: Literal["hwc", "chw", "any", "rgba"] = "hwc"
     optional: bool = False
 
 
@@ -107,8 +108,8 @@ _FITS: dict[str, Callable[[Any], bool]] = {
     "int | None": lambda value: value is None or type(value) is int,
     "float": lambda value: type(value) in (int, float) and np.isfinite(value),
     "bool": lambda value: isinstance(value, bool),
-    "Literal['hwc', 'chw', 'any']": lambda value: value in ("hwc", "chw", "any"),
-    'Literal["hwc", "chw", "any"]': lambda value: value in ("hwc", "chw", "any"),
+    "Literal['hwc', 'chw', 'any', 'rgba']": lambda value: value in ("hwc", "chw", "any", "rgba"),
+    'Literal["hwc", "chw", "any", "rgba"]': lambda value: value in ("hwc", "chw", "any", "rgba"),
 }
 
 
@@ -118,6 +119,13 @@ def parts(value: Any, where: str) -> tuple[StateKey, ...]:
     if not values:
         raise ConfigError(f"{where}: got an empty list, want one key at least")
     return tuple(entry(StateKey, one, where) for one in values)
+
+
+def text(value: Any, where: str) -> str:
+    """Return a value that must be text."""
+    if not isinstance(value, str):
+        raise ConfigError(f"{where}: got {type(value).__name__}, want text")
+    return value
 
 
 def stated(value: Any) -> Any:

@@ -6,14 +6,15 @@ object that names a preset and changes some of its fields:
     {"cameras": {"front": "observation/image", "wrist": {"key": "images/wrist", "layout": "chw"}},
      "state": {"joints": {"key": "state", "stop": 6}, "pose": ["position", "rotation"]},
      "gripper": {"key": "state", "index": 6, "open": 0.04, "closed": 0.0},
-     "instruction": "prompt",
+     "instruction": "prompt|task_id", "instructions": {"0": "turn on the radio"},
      "info": {"unnorm_key": "unnorm_key"},
      "action": {"arm": {"stop": 6}, "hand": {"start": 6}},
      "action_gripper": {"index": 6, "open": -1, "closed": 1}}
 
 The client's keys are paths: `images/wrist` is either that key itself or `wrist` within `images`. `states|state` is the
 first of the two that exists. A name and a key that end with `*` stand for all keys that match: `"*": "video/*"`. Left
-sides are our names, right sides the client's, except in `action`, whose left sides are the names that the client reads.
+sides are our names, right sides the client's, except in `action`, whose left sides are the names that the client reads,
+and in `instructions`, which has the text of each integer that a client sends in place of an instruction.
 
 An observation is refused if the mapping reads nothing of it, or none of the cameras or none of the states in it.
 """
@@ -39,7 +40,6 @@ from vlagents_ray.errors import (
 )
 from vlagents_ray.interface import Obs
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
-from vlagents_ray.protocol.observations import as_camera, as_state, is_number
 from vlagents_ray.wire.mapping.fields import (
     ActionGripper,
     ActionRange,
@@ -51,6 +51,7 @@ from vlagents_ray.wire.mapping.fields import (
     entry,
     parts,
     stated,
+    text,
 )
 from vlagents_ray.wire.mapping.key_paths import (
     keys,
@@ -61,6 +62,7 @@ from vlagents_ray.wire.mapping.key_paths import (
     reads,
     shown,
 )
+from vlagents_ray.wire.mapping.values import may_be_camera, may_be_state, read_image, read_state, read_text, read_vector
 
 logger = logging.getLogger(__name__)
 
@@ -75,6 +77,7 @@ class KeyMapping:
     state: Mapping[str, tuple[StateKey, ...]] = field(default_factory=dict)  # joined in this order
     gripper: GripperKey | None = None
     instruction: str | None = None
+    instructions: Mapping[str, str] = field(default_factory=dict)  # by the integer that is sent in their place
     info: Mapping[str, str] = field(default_factory=dict)  # all optional
     action: Mapping[str, ActionRange] = field(default_factory=dict)
     action_gripper: tuple[ActionGripper, ...] = ()
@@ -93,6 +96,7 @@ class KeyMapping:
             state=each(top, "state", parts),
             gripper=None if gripper is None else entry(GripperKey, gripper, "mapping.gripper"),
             instruction=instruction,
+            instructions=each(top, "instructions", text),
             info=each(top, "info", lambda value, where: entry(StateKey, value, where).key),
             action=each(top, "action", lambda value, where: entry(ActionRange, value, where)),
             action_gripper=tuple(
@@ -126,10 +130,10 @@ class KeyMapping:
         cameras: dict[str, np.ndarray] = {}
         for name, camera in self.cameras.items():
             for ours, key, value in pick(flat, name, camera.key, camera.optional, MissingCamera):
-                cameras[ours] = _image(key, value, camera.layout, limits)
+                cameras[ours] = read_image(key, value, camera.layout, limits)
         state: dict[str, np.ndarray] = {}
         for name, sources in self.state.items():
-            state |= _state(flat, name, sources, limits)
+            state |= read_state(flat, name, sources, limits)
         if max(len(cameras), len(state)) > limits.cameras:
             raise MessageTooLarge(
                 f"observation: got {len(cameras)} cameras and {len(state)} states, the limit is {limits.cameras}"
@@ -139,7 +143,7 @@ class KeyMapping:
         obs = Obs(cameras, gripper, state, info)
         if not cameras or not state:
             self._require_read(flat, obs)
-        return obs, self._instruction(flat, limits)
+        return obs, self._instruction(flat, limits, needed=contract is not None and bool(contract.instruction))
 
     def rows(self, action: np.ndarray, spec: ActionSpec | None = None) -> np.ndarray:
         """Return our action, (D,) or (H, D), as (H, D) float32 with the gripper's commands in the client's convention.
@@ -200,7 +204,7 @@ class KeyMapping:
         It is logged once for all clients of a dialect that send the same ones. This looks at each key: call it when a
         session begins, not for each observation.
         """
-        if unread := self._unread(flat, _may_be_camera):
+        if unread := self._unread(flat, may_be_camera):
             _log_unread(dialect, tuple(unread), tuple(camera.key for camera in self.cameras.values()))
 
     def _unread(self, flat: Mapping[str, Any], is_one: Callable[[Any], bool]) -> list[str]:
@@ -223,8 +227,8 @@ class KeyMapping:
                 f"choose the preset of this client, or change the mapping"
             )
         for kind, wanted, found, is_one in (
-            ("cameras", images, obs.cameras, _may_be_camera),
-            ("state", numbers, obs.state, _may_be_state),
+            ("cameras", images, obs.cameras, may_be_camera),
+            ("state", numbers, obs.state, may_be_state),
         ):
             if not wanted or found:
                 continue
@@ -243,7 +247,7 @@ class KeyMapping:
             if gripper.optional:
                 return None
             raise MissingState(gripper.key, have=keys(flat))
-        vector = _vector(gripper.key, value, limits)
+        vector = read_vector(gripper.key, value, limits)
         if not -vector.size <= gripper.index < vector.size:
             raise InvalidObservation(
                 f"{gripper.key!r}: got {vector.size} numbers, want the gripper's at {gripper.index}"
@@ -259,18 +263,11 @@ class KeyMapping:
             )
         return min(1.0, max(0.0, opening))
 
-    def _instruction(self, flat: Mapping[str, Any], limits: Limits) -> str | None:
+    def _instruction(self, flat: Mapping[str, Any], limits: Limits, *, needed: bool) -> str | None:
         found = [] if self.instruction is None else pick(flat, "", self.instruction, True, MissingState)
-        value = found[0][2] if found else None
-        while isinstance(value, (list, tuple)) and len(value) == 1:  # some clients send a batch of one
-            value = value[0]
-        if isinstance(value, np.ndarray) and value.dtype.kind == "U" and value.size == 1:
-            value = value.item()
-        if value is not None and not isinstance(value, str):
-            raise InvalidObservation(f"{self.instruction!r}: got {type(value).__name__}, want text")
-        if value is not None and len(value) > limits.text:
-            raise MessageTooLarge(f"{self.instruction!r}: got {len(value)} characters, the limit is {limits.text}")
-        return value
+        if not found or self.instruction is None:
+            return None
+        return read_text(self.instruction, found[0][2], self.instructions, limits, needed=needed)
 
 
 @lru_cache(maxsize=64)  # logs only what it did not log before
@@ -279,70 +276,3 @@ def _log_unread(dialect: str, unread: tuple[str, ...], read: tuple[str, ...]) ->
         f"{dialect}: a client sends the cameras {list(unread)}, which the policy does not get: the mapping reads "
         f"{list(read)}; if the policy takes them, add them to mapping.cameras"
     )
-
-
-def _image(key: str, value: Any, layout: str, limits: Limits) -> np.ndarray:
-    if isinstance(value, np.ndarray):
-        value = _newest(key, value, 3)
-        if value.dtype.kind == "f":
-            value = _eight_bits(key, value)
-        if layout != "hwc" and value.ndim == 3 and value.shape[0] == 3:
-            value = np.ascontiguousarray(value.transpose(1, 2, 0))
-        elif layout == "chw":
-            raise InvalidObservation(f"camera {key!r}: got {value.shape} {value.dtype}, want (3, H, W) uint8 RGB")
-    return as_camera(key, value, limits)
-
-
-def _eight_bits(key: str, image: np.ndarray) -> np.ndarray:
-    """Convert floats in [0, 1] to uint8, rounded down as openpi's own server does (`_parse_image` in its policies)."""
-    if image.size and not (image.min() >= 0 and image.max() <= 1):  # true for NaN, too
-        raise InvalidObservation(
-            f"camera {key!r}: got {image.dtype} from {image.min():g} to {image.max():g}, want uint8, or floats "
-            f"in [0, 1]; scale it"
-        )
-    return (255 * image).astype(np.uint8)
-
-
-def _may_be_camera(value: Any) -> bool:
-    return isinstance(value, np.ndarray) and value.ndim >= 3
-
-
-def _may_be_state(value: Any) -> bool:
-    """Whether a value is a vector of numbers; images and camera matrices are not."""
-    if isinstance(value, list):
-        return bool(value) and all(map(is_number, value))
-    return isinstance(value, np.ndarray) and value.dtype.kind in "fiu" and value.squeeze().ndim == 1
-
-
-def _state(flat: Mapping[str, Any], name: str, sources: tuple[StateKey, ...], limits: Limits) -> dict[str, np.ndarray]:
-    joined: dict[str, list[np.ndarray]] = {}
-    for part in sources:
-        found = pick(flat, name, part.key, part.optional, MissingState)
-        for ours, key, value in found:
-            vector = _vector(key, value, limits)
-            if part.stop is not None and part.stop > vector.size:
-                raise InvalidObservation(f"state {key!r}: got {vector.size} numbers, want {part.stop} at least")
-            joined.setdefault(ours, []).append(vector[part.start : part.stop])
-    return {ours: vectors[0] if len(vectors) == 1 else np.concatenate(vectors) for ours, vectors in joined.items()}
-
-
-def _vector(key: str, value: Any, limits: Limits) -> np.ndarray:
-    """Return a value as (D,) float32."""
-    if isinstance(value, np.ndarray):
-        value = np.atleast_1d(_newest(key, value, 1))
-    elif isinstance(value, np.number):
-        value = [value.item()]
-    elif is_number(value):
-        value = [value]
-    return as_state(key, value, limits)
-
-
-def _newest(key: str, value: np.ndarray, ndim: int) -> np.ndarray:
-    """Remove the batch axis, of length 1, and the time axis that some clients add in front; keep the last time."""
-    if value.ndim > ndim and value.shape[0] != 1:
-        raise InvalidObservation(
-            f"{key!r}: got {value.shape}, a batch of {value.shape[0]}, want one; send each by itself"
-        )
-    if value.ndim == ndim + 2 and value.shape[1] > 0:
-        value = value[:, -1]
-    return value if value.ndim != ndim + 1 else value.reshape(value.shape[1:])

@@ -9,7 +9,8 @@ sends a traceback.
 
 A batch, `{"batch": [observation, ...]}`, is that of openpi's pull request 941 (its head 5bdadc8), which was open when
 this was written: the reply is one map, whose `actions` are stacked. openpi's own client sends nothing when it is reset;
-the message `{"reset": True}` is that of its derivatives, such as BEHAVIOR-1K's client, which waits for no reply.
+the message `{"reset": True}` is that of its derivatives, such as BEHAVIOR-1K's client, which waits for no reply. The
+replies that the latter reads are in `rows.py`.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import asyncio
 import time
 import uuid
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -37,6 +38,7 @@ from vlagents_ray.serve.dialects.base import (
     public_problem,
 )
 from vlagents_ray.serve.dialects.implicit_session import ImplicitSession, SessionObs, act_together
+from vlagents_ray.serve.dialects.openpi.rows import Rows, number_of_rows, unstacked
 from vlagents_ray.serve.engine.dispatch import Dispatcher
 from vlagents_ray.serve.engine.metrics_buffer import RequestTrace
 from vlagents_ray.wire.openpi import codec
@@ -80,6 +82,10 @@ class MapDialect(RouteDialect):
         """Return the observations of a message that is a batch; None if it is one observation."""
         return None
 
+    def rows_taken(self, message: dict[str, Any]) -> int | None:
+        """Return how many rows the client executes before its next message; None if it gets whole chunks."""
+        return None
+
     def reset_arguments(self, message: dict[str, Any]) -> dict[str, Any]:
         """Return the keyword arguments of the policy's reset, should this observation begin an episode."""
         return {}
@@ -119,6 +125,12 @@ class OpenPiDialectConfig(DialectConfig):
     answer_reset: bool = Field(
         default=False, description='whether {"reset": True} is answered, by the same; clients differ in waiting for it'
     )
+    answer: Literal["chunk", "row"] = Field(
+        default="chunk",
+        description="a reply has a whole chunk, as `actions`; or the next row of one that is kept here, as `action`, "
+        "which BEHAVIOR-1K's client reads",
+    )
+    execute: int | None = Field(default=None, ge=1, description="rows of each chunk that are used; null: all")
 
 
 class OpenPiDialect(MapDialect):
@@ -155,11 +167,17 @@ class OpenPiDialect(MapDialect):
 
     def batch(self, message: dict[str, Any]) -> list[Any] | None:
         if message.keys() != {"batch"}:
-            return None
+            return unstacked(message, self.context.engine.sessions.limit) if self.config.answer == "row" else None
         batch = message["batch"]
         if not isinstance(batch, list) or not batch:
             raise MalformedMessage(f"batch: got {str(batch)[:40]!r}, want a list of one observation or more")
         return batch
+
+    def rows(self, reply: Reply) -> np.ndarray:
+        return super().rows(reply)[: self.config.execute]
+
+    def rows_taken(self, message: dict[str, Any]) -> int | None:
+        return number_of_rows(message) if self.config.answer == "row" else None
 
 
 class MapConnection:
@@ -171,6 +189,7 @@ class MapConnection:
         self.session: ImplicitSession = dialect.session(self.sender)
         self.episode: str | None = None  # the client's name of the episode
         self._batched: list[ImplicitSession] = []  # the session of each place in a batch
+        self._rows = Rows()
         self._before_ms: float | None = None
 
     def end_episodes(self) -> None:
@@ -192,14 +211,24 @@ class MapConnection:
         sessions = [self.session] if batch is None else await self._of_batch(len(batch))
         if not sessions[0].episode.begun:
             dialect.mapping.warn_of_unread_cameras(observations[0], dialect.name)
-        trace.decoded_alike(len(observations))
         seen = [SessionObs(session, *one) for session, one in zip(sessions, read, strict=True)]
+        number, batched = dialect.rows_taken(message), batch is not None
+        begins = any(session.episode.begins(instruction) for session, _, instruction in seen)
+        if number is not None and not begins and self._rows.has(number, stacked=batched):
+            return codec.encode(self._rows.take(number))
+        trace.decoded_alike(len(observations))
         replies = await act_together(seen, request_id, **dialect.reset_arguments(message))
-        data = trace.written(
-            replies, lambda: codec.encode(dialect.answer(replies, self._before_ms, batched=batch is not None))
-        )
+        data = trace.written(replies, lambda: codec.encode(self._said(replies, number, batched=batched)))
         self._before_ms = (time.perf_counter() - trace.arrived) * 1e3
         return data
+
+    def _said(self, replies: Sequence[Reply], number: int | None, *, batched: bool) -> Any:
+        """Return the replies in the client's format, with the first `number` rows only unless it is None."""
+        said = self.dialect.answer(replies, self._before_ms, batched=batched)
+        if number is not None:
+            self._rows.replace(said.pop("actions"))
+            said |= self._rows.take(number)
+        return said
 
     async def _of_batch(self, number: int) -> list[ImplicitSession]:
         """Return the session of each place in a batch of that size; the episodes of another size end."""
