@@ -91,6 +91,7 @@ _EXTRAS = {
     "metaworld": "metaworld",
     "libero": "libero",
     "gym_pusht": "pusht",
+    "shapely": "pusht",
     "gym_aloha": "aloha",
     "dm_control": "aloha",
     "gymnasium_robotics": "robotics",

@@ -6,8 +6,11 @@ import importlib.util
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from vlagents_ray.envs.base import require_known
 from vlagents_ray.envs.gymnasium.env import Gymnasium
+from vlagents_ray.interface import Obs
 
 _ID = "gym_pusht/PushT-v0"
 # What is observed in each task: options of `Gymnasium`.
@@ -22,6 +25,8 @@ class PushT(Gymnasium):
 
     Observation: `state["agent_pos"]`, (2,) in pixels of the field, 512 by 512. With "image" also "front", (96, 96, 3)
     by default; with "keypoints" `state["environment_state"]`, (16,), x and y of eight points of the block, in pixels.
+    In `info["sim_state"]`, (7,) float64, what the simulator knows: x, y of the agent and its velocity, pixels and
+    pixels/s; x, y and angle of the block, pixels and rad.
 
     Action: (2,) in [0, 512]: where the disc shall go, in the same pixels.
     """
@@ -65,3 +70,9 @@ class PushT(Gymnasium):
         if importlib.util.find_spec("gym_pusht") is None:
             return "gym_pusht is not installed; pip install 'vlagents-ray[pusht]'"
         return None
+
+    def _observe(self, nested: Any) -> Obs:
+        obs = super()._observe(nested)
+        agent, block = self._env.unwrapped.agent, self._env.unwrapped.block
+        obs.info["sim_state"] = np.array([*agent.position, *agent.velocity, *block.position, block.angle])
+        return obs

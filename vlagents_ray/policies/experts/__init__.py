@@ -19,6 +19,7 @@ EXPERTS: dict[str, str] = {
     "maniskill/PickCube-v1": "vlagents_ray.policies.experts.maniskill:PickCube",
     "aloha": "vlagents_ray.policies.experts.aloha:AlohaExpert",
     "metaworld": "vlagents_ray.policies.experts.metaworld:MetaWorldExpert",
+    "pusht": "vlagents_ray.policies.experts.pusht:PushTExpert",
     "rcs/pick": "vlagents_ray.policies.experts.rcs:RcsPick",
     "gymnasium/FetchReach-v4": "vlagents_ray.policies.experts.fetch:FetchReach",
     "gymnasium/FetchReachDense-v4": "vlagents_ray.policies.experts.fetch:FetchReach",
