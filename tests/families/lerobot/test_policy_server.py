@@ -37,11 +37,11 @@ Start = Callable[[int], Any]
 
 
 @pytest.fixture(scope="module")
-def start(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Start]:
+def start() -> Iterator[Start]:
     started: list[Any] = []
 
     def run(port: int) -> Any:
-        started.append(policy_server.start(port, tmp_path_factory.mktemp("policy_server")))
+        started.append(policy_server.start(port))
         return started[-1]
 
     yield run
