@@ -3,7 +3,7 @@
 #   make setup [PYTHON=...] [TORCH_INDEX_URL=...] [TORCH_CUDA=1]     the environment, in .venv
 #   make demo                                                       serve a policy, evaluate it, show the table
 #   make check                                                      lint, types, layers, quick tests: no Ray, torch, simulator
-#   make test [TEST_PROCESSES=2]                                    lint, types, layers, families, all tests
+#   make test [TEST_PROCESSES=3]                                    lint, types, layers, families, all tests
 #   make families [FAMILIES="lerobot lerobot06 hf rcs libero openvla …"]       tests of model families, in .venv-NAME each
 #   make verified [FAMILIES="lerobot hf"]                           what they verify, into the tables of docs/policies
 #   make docs                                                       the site of docs/, in build/docs, for a browser
@@ -39,8 +39,8 @@ CONSTRAINTS := $(VENV)/constraints.txt
 STAMP := $(VENV)/.installed
 # `make check`, `lint`, `type` and `fmt` do with a smaller environment where the whole one is not installed.
 TOOLS := $(if $(wildcard $(STAMP)),$(VENV),$(VENV)-check)
-TEST_PROCESSES ?= 2
-# Quick tests wait for a third of their time.
+# On two cores: tests wait for a third of their time.
+TEST_PROCESSES ?= 3
 CHECK_PROCESSES ?= 3
 # Marked so: what wants more than Python, takes long, or wants the machine for itself (pyproject.toml, tests/support/needs.py).
 NOT_QUICK := ray or server or hosts or sim or vulkan or torch or gpu or browser or node or compiler or alone or slow
