@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
 from collections.abc import Iterator
 from importlib.metadata import version
 
@@ -55,6 +57,18 @@ def test_what_it_shows_is_robosuites_own_to_the_bit(lift: Robosuite) -> None:
         obs, got, *_ = lift.step(MOVE)
         assert got == reward
     theirs.close()
+
+
+def test_a_reset_frees_the_last_episodes_renderer_at_once(lift: Robosuite) -> None:
+    """One that is freed later, by a garbage collection, takes buffers from the renderer that is in use then."""
+    lift.reset(seed=1)
+    last = weakref.ref(lift._env.sim._render_context_offscreen)
+    gc.disable()
+    try:
+        lift.reset(seed=1)
+        assert last() is None
+    finally:
+        gc.enable()
 
 
 def test_an_episode_is_its_seeds_and_what_nobody_looks_at_is_not_rendered(lift: Robosuite) -> None:

@@ -98,6 +98,7 @@ class Robosuite(EvalEnv):
                 ignore_done=True,
                 has_renderer=False,
                 has_offscreen_renderer=bool(images),
+                renderer="mujoco",  # with 1.5's own, a reset leaves the last episode's to a garbage collection
                 use_camera_obs=bool(images),
                 camera_names=list(images) or "agentview",
                 camera_heights=[spec.height for spec in images.values()] or 1,
