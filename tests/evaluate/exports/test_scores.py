@@ -128,6 +128,52 @@ def test_a_suite_lacking_a_task_is_given_by_its_tasks(libero: Callable[..., Resu
     assert len(entry["task_scores"]) == SUITES["libero_goal"].tasks - 1
 
 
+PRO = [
+    f"libero_{suite}_{kind}"
+    for suite in ("spatial", "object", "goal", "10")
+    for kind in ("swap", "lan", "task", "object")
+]
+
+
+def of_suites(*suites: str) -> list[str]:
+    return [f"libero/{suite}/{number}" for suite in suites for number in range(10)]
+
+
+def test_libero_pro_has_its_scores_by_suite_and_kind_with_libero_as_the_original(
+    libero: Callable[..., Results], tmp_path: Path
+) -> None:
+    assert to_vla_eval(libero(of_suites(*FOUR, *PRO)), tmp_path / "entries.json", **ASKED) == 400
+    plain, pro = json.loads((tmp_path / "entries.json").read_text())["results"]
+    assert (plain["benchmark"], plain["overall_score"], pro["benchmark"]) == ("libero", 50.0, "libero_pro")
+    kinds = ("ori", "pos", "sem", "task", "obj")
+    assert set(pro["suite_scores"]) == {f"{a}_{b}" for a in ("spatial", "object", "goal", "long") for b in kinds}
+    assert (pro["overall_score"], pro["task_scores"]) == (50.0, {})
+
+
+def test_libero_pro_without_libero_or_a_kind_has_no_overall_score(
+    libero: Callable[..., Results], tmp_path: Path
+) -> None:
+    to_vla_eval(libero(of_suites("libero_goal_swap", "libero_10_env")), tmp_path / "entries.json", **ASKED)
+    [pro] = json.loads((tmp_path / "entries.json").read_text())["results"]
+    assert (pro["overall_score"], pro["suite_scores"]) == (None, {"goal_pos": 50.0, "long_env": 50.0})
+
+
+@pytest.mark.parametrize(
+    ("envs", "said"),
+    [
+        (of_suites("libero_goal_swap")[1:], "libero/libero_goal_swap: got results of 9 tasks, want all ten"),
+        (["libero/libero_goal/open_the_drawer_language_7"], "varies a task of libero_goal"),
+        (of_suites("libero_goal_temp"), "has no such benchmark, want LIBERO, LIBERO-PRO or SIMPLER"),
+    ],
+    ids=["part of a suite", "LIBERO-Plus", "another suite"],
+)
+def test_variants_of_libero_that_the_leaderboard_has_no_score_for_are_refused(
+    libero: Callable[..., Results], tmp_path: Path, envs: list[str], said: str
+) -> None:
+    with pytest.raises(ConfigError, match=said):
+        to_vla_eval(libero(envs), tmp_path / "entries.json", **ASKED)
+
+
 def test_a_benchmark_that_the_leaderboard_lacks_and_several_policies_are_refused(tmp_path: Path) -> None:
     results = record(runs(tmp_path / "run", episodes=2, steps=[]))
     with pytest.raises(ConfigError, match=r"got the policies \['learner', 'base'\], want one: name it with --policy"):

@@ -30,7 +30,12 @@ _WIDOWX = {
     "PutSpoonOnTableClothInScene-v1": "put_spoon_on_towel_vm",
     "StackGreenCubeOnYellowCubeBakedTexInScene-v1": "stack_block_vm",
 }
-_BENCHMARKS = {"libero": "libero", "simpler": "simpler_env"}
+# LIBERO-PRO's suites of ten tasks each by their names on the leaderboard; the overall score is the mean of the twenty
+# cells of four suites and five kinds, of which `ori` is LIBERO itself (its leaderboard's page).
+_PRO_SUITES = {"libero_spatial": "spatial", "libero_object": "object", "libero_goal": "goal", "libero_10": "long"}
+_PRO_KINDS = {"swap": "pos", "lan": "sem", "task": "task", "object": "obj", "env": "env"}
+_PRO = {f"{suite}_{kind}": f"{a}_{b}" for suite, a in _PRO_SUITES.items() for kind, b in _PRO_KINDS.items()}
+_PRO_MEAN = [f"{suite}_{kind}" for suite in _PRO_SUITES.values() for kind in ("ori", "obj", "pos", "sem", "task")]
 
 
 class VlaEvalSettings(BaseModel):
@@ -52,9 +57,10 @@ def to_vla_eval(results: Results, path: Path, **settings: Any) -> int:
 
     An overall score is only given for the standard protocol: all tasks of LIBERO's four suites, with every planned
     episode, no deviation and no real-time mode. Else the entry has the scores of the parts, and `notes` say why.
+    LIBERO-PRO's is given if its suites of positions, instructions, goals and objects and LIBERO's own are all there.
 
     Args:
-        results: Of one policy id, in LIBERO or SIMPLER.
+        results: Of one policy id, in LIBERO, LIBERO-PRO or SIMPLER.
         path: The file.
         settings: The fields of `VlaEvalSettings`.
 
@@ -62,28 +68,47 @@ def to_vla_eval(results: Results, path: Path, **settings: Any) -> int:
         The number of episodes that the entries count.
 
     Raises:
-        ConfigError: There are several policy ids, or an env of a benchmark that the leaderboard does not have.
+        ConfigError: There are several policy ids, or an env that the leaderboard has no score for.
     """
     given = VlaEvalSettings.model_validate(settings)
     by_benchmark: dict[str, list[Score]] = {}
     for score in scores(results):
-        suite = env_suite(score.cells[0].env)
-        if suite not in _BENCHMARKS:
-            raise ConfigError(
-                f"{score.name}: vla-eval's leaderboard has no such benchmark, want {sorted(_BENCHMARKS)}; choose with "
-                f"--env, or use another format"
-            )
-        by_benchmark.setdefault(_BENCHMARKS[suite], []).append(score)
+        by_benchmark.setdefault(_benchmark(score), []).append(score)
+    if "libero_pro" in by_benchmark:  # whose original suites are LIBERO's
+        by_benchmark["libero_pro"] += [one for one in by_benchmark.get("libero", []) if _suite(one) in _PRO_SUITES]
     entries = [_entry(name, found, given) for name, found in sorted(by_benchmark.items())]
     document = {"last_updated": max(str(one["date_added"]) for one in entries), "results": entries}
     with whole(path) as part:
         part.write_text(json.dumps(document, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-    return sum(score.rate.episodes for found in by_benchmark.values() for score in found)
+    return sum(score.rate.episodes for score in scores(results))
+
+
+def _benchmark(score: Score) -> str:
+    """The leaderboard's name of the benchmark.
+
+    Raises:
+        ConfigError: It has none.
+    """
+    found = {"simpler": "simpler_env"}.get(env_suite(score.cells[0].env))
+    if env_suite(score.cells[0].env) == "libero":
+        found = "libero" if _suite(score) in _LIBERO else "libero_pro" if _suite(score) in _PRO else None
+        counted = [cell for cell in score.cells if cell.counted]
+        if varied := [cell.env for cell in counted if not _task(cell).rpartition("/")[2].isdecimal()]:
+            raise ConfigError(
+                f"{varied[0]}: varies a task of {_suite(score)}; vla-eval's leaderboard scores LIBERO-Plus by kinds of "
+                f"changes, of which hf-libero cannot play all; choose with --env, or use another format"
+            )
+    if found is None:
+        raise ConfigError(
+            f"{score.name}: vla-eval's leaderboard has no such benchmark, want LIBERO, LIBERO-PRO or SIMPLER; choose "
+            f"with --env, or use another format"
+        )
+    return found
 
 
 def _entry(benchmark: str, found: list[Score], given: VlaEvalSettings) -> dict[str, Any]:
     name = found[0].results.contenders[0]
-    parts = _libero(found) if benchmark == "libero" else _simpler(found)
+    parts = {"libero": _libero, "libero_pro": _libero_pro, "simpler_env": _simpler}[benchmark](found)
     odd = list(dict.fromkeys(text for score in found for text in score.deviations))
     overall = parts.pop("overall_score", None)
     if odd:
@@ -122,6 +147,27 @@ def _libero(found: list[Score]) -> dict[str, Any]:
     return {"overall_score": overall, "suite_scores": suites, "task_scores": _rounded(rest)}
 
 
+def _libero_pro(found: list[Score]) -> dict[str, Any]:
+    """The suites, as the leaderboard has no scores of tasks here.
+
+    Raises:
+        ConfigError: A suite lacks a task.
+    """
+    own = _libero([score for score in found if _suite(score) in _PRO_SUITES])["suite_scores"]
+    suites: dict[str, float] = {f"{_PRO_SUITES[suite]}_ori": rate for suite, rate in own.items()}
+    tasks = _by_task([score for score in found if _suite(score) in _PRO])
+    for suite in dict.fromkeys(task.partition("/")[0] for task in tasks):
+        rates = [rate for task, rate in tasks.items() if task.partition("/")[0] == suite]
+        if len(rates) != _LIBERO["libero_10"]:
+            raise ConfigError(
+                f"libero/{suite}: got results of {len(rates)} tasks, want all ten, as the leaderboard has scores of "
+                f"LIBERO-PRO's suites alone; play the others, or choose with --env"
+            )
+        suites[_PRO[suite]] = _mean(rates)
+    overall = _mean([suites[name] for name in _PRO_MEAN]) if suites.keys() >= set(_PRO_MEAN) else None
+    return {"overall_score": overall, "suite_scores": suites, "task_scores": {}}
+
+
 def _simpler(found: list[Score]) -> dict[str, Any]:
     tasks = {_WIDOWX[task]: rate for task, rate in _by_task(found).items()}
     suites = {"widowx_vm": _mean(tasks.values())} if len(tasks) == len(_WIDOWX) else {}
@@ -143,6 +189,10 @@ def _by_task(found: list[Score]) -> Mapping[str, float]:
             if cell.counted:
                 rates[task] = 100 * (rate_of([cell], score.metric).rate or 0.0)
     return rates
+
+
+def _suite(score: Score) -> str:
+    return _task(score.cells[0]).partition("/")[0]
 
 
 def _task(cell: CellResults) -> str:
