@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import gc
+import logging
 import os
 import shutil
 import signal
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from pathlib import Path
 
 import many  # noqa: F401 - registers profiles
@@ -68,6 +69,16 @@ def pytest_collection_finish() -> None:
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Skip what this machine cannot run."""
     skip_what_is_missing(item)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def levels_of_loggers() -> Iterator[None]:
+    """Let no file change what the next one logs: `ray.init` sets the level of Ray's logger for the whole process."""
+    loggers = [one for one in logging.root.manager.loggerDict.values() if isinstance(one, logging.Logger)]
+    levels = [one.level for one in loggers]
+    yield
+    for logger, level in zip(loggers, levels, strict=True):
+        logger.setLevel(level)
 
 
 @pytest.hookimpl(wrapper=True, tryfirst=True)
