@@ -20,10 +20,10 @@ from vlagents_ray.protocol.arrays import Buffer
 from vlagents_ray.protocol.budget import Budget
 from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.protocol.observations import is_number
-from vlagents_ray.wire.lerobot.pickled_arrays import CALLS
-from vlagents_ray.wire.lerobot.pickles import Name, fields_of, read_pickle
 from vlagents_ray.wire.lerobot.presets import IMAGES, STATE, TASK
-from vlagents_ray.wire.lerobot.written_pickles import text
+from vlagents_ray.wire.pickles.arrays import CALLS
+from vlagents_ray.wire.pickles.reader import Name, fields_of, read_pickle
+from vlagents_ray.wire.pickles.writer import text
 
 HELPERS = "lerobot.async_inference.helpers"
 SETUP, OBSERVATION = Name(HELPERS, "RemotePolicyConfig"), Name(HELPERS, "TimedObservation")

@@ -19,11 +19,11 @@ from vlagents_ray.protocol.arrays import Buffer
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
 from vlagents_ray.protocol.observations import is_number
 from vlagents_ray.wire.lerobot.codec import HELPERS, OBSERVATION, SETUP, PolicyInstructions
-from vlagents_ray.wire.lerobot.pickled_tensors import CALLS
-from vlagents_ray.wire.lerobot.pickles import Name, fields_of, read_pickle
 from vlagents_ray.wire.lerobot.presets import IMAGES, STATE, TASK
-from vlagents_ray.wire.lerobot.written_pickles import write_record
 from vlagents_ray.wire.mapping.mapping import KeyMapping
+from vlagents_ray.wire.pickles.reader import Name, fields_of, read_pickle
+from vlagents_ray.wire.pickles.tensors import CALLS
+from vlagents_ray.wire.pickles.writer import write_record
 
 _ACTION = Name(HELPERS, "TimedAction")
 _RECORDS = {_ACTION: ("timestamp", "timestep", "action")}

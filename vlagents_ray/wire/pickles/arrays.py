@@ -13,7 +13,7 @@ import numpy as np
 from vlagents_ray.errors import MalformedMessage
 from vlagents_ray.protocol.arrays import read_array
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS
-from vlagents_ray.wire.lerobot.pickles import Call, Name, Reduced, read_pickle
+from vlagents_ray.wire.pickles.reader import Call, Name, Reduced, read_pickle
 
 
 class _Dtype(str):

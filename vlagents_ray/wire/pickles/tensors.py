@@ -14,7 +14,7 @@ import numpy as np
 
 from vlagents_ray.errors import MalformedMessage
 from vlagents_ray.protocol.arrays import read_array
-from vlagents_ray.wire.lerobot.pickles import Call, Name, Reduced
+from vlagents_ray.wire.pickles.reader import Call, Name, Reduced
 
 _DTYPES = {b"Float": "<f4", b"Double": "<f8", b"Half": "<f2", b"BFloat16": "<u2"}
 _CONSTANT = (

@@ -1,4 +1,4 @@
-"""Pickles that are written by hand, as Python's own pickler would need LeRobot's classes."""
+"""Pickles that are written by hand, as Python's own pickler would need the classes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from vlagents_ray.wire.lerobot.pickles import Name
+from vlagents_ray.wire.pickles.reader import Name
 
 _ARRAY, _KIND, _DTYPE = (
     Name("numpy._core.multiarray", "_reconstruct"),

@@ -1,0 +1,1 @@
+"""Pickles that other systems send or keep, read as data and written without their classes: nothing is unpickled."""
