@@ -170,6 +170,7 @@ def test_a_server_that_returns_gets_its_policy_before_a_row() -> None:
     [
         ({"lerobot": None}, "lerobot: want what the server loads"),
         ({"lerobot": {"policy_type": "act"}}, "pretrained_name_or_path"),
+        ({"lerobot": LOADED | {"policy_type": "vqbet"}}, "serve the checkpoint here, with `policy: lerobot`"),
         ({"urls": ["http://box:8080"]}, "want grpc://HOST:PORT for lerobot"),
         ({"urls": ["grpc://box:1", "grpc://box:1"]}, "one connection to each URL"),
         ({"connections": 2}, "one connection to each URL"),

@@ -26,6 +26,16 @@ class LoadedPolicy(BaseModel, extra="forbid"):
     actions_per_chunk: int = Field(ge=1, description="rows of a chunk that the server sends, at most")
     device: str = Field(default="cuda", description="on which the server computes")
 
+    @field_validator("policy_type")
+    @classmethod
+    def _needs_one_observation(cls, value: str) -> str:
+        if value in ("diffusion", "tdmpc", "vqbet"):  # async_inference/policy_server.py, LeRobot 0.4.4 and 0.6.1
+            raise ValueError(
+                f"got {value}, want a policy whose chunk depends on one observation: LeRobot's server asks for a chunk "
+                "without the earlier ones; serve the checkpoint here, with `policy: lerobot`"
+            )
+        return value
+
 
 class UpstreamConfig(BaseModel, extra="forbid"):
     """Where the other policy server is, how it is asked, and how long it is waited for."""
