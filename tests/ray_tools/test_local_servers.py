@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,7 +11,8 @@ import pytest
 from fake_raylet import raylet
 
 from vlagents_ray import ConfigError, join
-from vlagents_ray.ray_tools.local_servers import announce, local_servers
+from vlagents_ray.ray_tools.local_servers import announce, enter, local_servers
+from vlagents_ray.ray_tools.private import use_loopback
 from vlagents_ray.ray_tools.reaper import MARK
 
 
@@ -72,3 +74,27 @@ def test_of_several_servers_one_is_named_by_its_url_or_its_application(
         for name in ("pi0", "http://127.0.0.1:8001", "http://127.0.0.1:8001/", "http://localhost:8001"):
             with pytest.raises(ConfigError, match=r"RAY_AUTH_MODE=disabled: the Ray of http://127\.0\.0\.1:8001 wants"):
                 join(name)
+
+
+@pytest.mark.parametrize(
+    ("of_server", "token"),
+    [
+        ({"HOME": "/home/service"}, {"RAY_AUTH_TOKEN_PATH": "/home/service/.ray/auth_token"}),
+        ({"HOME": "/home/service", "RAY_AUTH_TOKEN_PATH": "/run/t"}, {"RAY_AUTH_TOKEN_PATH": "/run/t"}),
+        ({"HOME": "/home/service", "RAY_AUTH_TOKEN": "its"}, {"RAY_AUTH_TOKEN": "its"}),
+    ],
+)
+def test_a_program_with_another_home_or_token_joins_with_that_of_the_server(
+    monkeypatch: pytest.MonkeyPatch, of_server: dict[str, str], token: dict[str, str]
+) -> None:
+    ray = pytest.importorskip("ray")
+    found: dict[str, str] = {}
+    monkeypatch.setattr(os, "environ", os.environ | {"HOME": "/home/me", "RAY_AUTH_TOKEN": "mine"})
+    monkeypatch.setattr(ray, "init", lambda *_, **__: found.update(os.environ))
+    monkeypatch.setattr("vlagents_ray.ray_tools.private.reread_authentication_mode", lambda: None)
+    before = use_loopback(True)
+    try:
+        enter("http://127.0.0.1:8000", "127.0.0.1:1", of_server, {})
+    finally:
+        use_loopback(before)
+    assert {name: text for name, text in found.items() if name.startswith("RAY_AUTH_TOKEN")} == token

@@ -84,6 +84,10 @@ def enter(
     if os.environ.get(_MODE, "token").lower() != "token":
         raise ConfigError(f"{_MODE}={os.environ[_MODE]}: the Ray of {name} wants its token; unset {_MODE}")
     tokens = {one: environment[one] for one in _TOKENS if environment.get(one)}
+    if not tokens and environment.get("HOME"):  # where Ray keeps the token, which may not be this program's home
+        tokens = {_TOKENS[1]: f"{environment['HOME']}/.ray/auth_token"}
+    for one in _TOKENS:
+        os.environ.pop(one, None)
     os.environ.update({_MODE: "token", _ALONE: "0"} | tokens | dict(variables))
     use_loopback(True)  # Ray read the variables when it was imported
     reread_authentication_mode()
