@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -163,6 +165,26 @@ def test_a_server_that_returns_gets_its_policy_before_a_row() -> None:
     with serving(port) as again, agent:
         require_right(agent, seen(2))
         assert again.instructions.pretrained_name_or_path == "me/act"
+
+
+def test_a_client_that_is_closed_at_once_leaves_no_thread_that_fails(
+    server: tuple[PolicyServer, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    module = importlib.import_module("grpc._channel")
+    poll, failed = module._poll_connectivity, []
+
+    def late(*args: Any) -> None:
+        time.sleep(0.1)
+        try:
+            poll(*args)
+        except ValueError as error:
+            failed.append(error)
+
+    monkeypatch.setattr(module, "_poll_connectivity", late)
+    with opened(server[1]):
+        pass
+    time.sleep(0.3)
+    assert not failed
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
 import http.client
 import json
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 from asgi_server import served
 from eval_fakes import wait_for
+from starlette.types import Message, Receive, Scope, Send
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
@@ -252,6 +254,46 @@ def test_a_revoked_key_hangs_up_its_websockets_and_no_others(endpoint: Endpoint)
         assert closed.value.rcvd.code == 1008
         assert "revoked" in closed.value.rcvd.reason
         other.act(Obs())
+
+
+def test_a_key_that_is_revoked_at_the_moment_of_a_message_hangs_up_too(tmp_path: Path) -> None:
+    """`asyncio.wait_for` of Python 3.11 drops a cancellation that comes with the message that it waits for."""
+    file = tmp_path / "keys.json"
+    token = new_key(file, "leaver")
+    sent: list[Message] = []
+
+    async def app(_scope: Scope, receive: Receive, send: Send) -> None:
+        await receive()
+        await send({"type": "websocket.accept"})
+        with contextlib.suppress(asyncio.CancelledError):  # as `wait_for` does
+            await receive()
+        await receive()
+
+    async def run() -> None:
+        asked = 0
+
+        async def receive() -> Message:
+            nonlocal asked
+            asked += 1
+            assert asked < 3, "the WebSocket goes on"
+            if asked == 2:
+                await asyncio.sleep(3600)
+            return {"type": "websocket.connect"}
+
+        async def send(message: Message) -> None:
+            sent.append(message)
+            revoke(file, "leaver")
+
+        headers = [(b"authorization", f"Bearer {token}".encode())]
+        scope = {"type": "websocket", "path": "/v1/stream", "headers": headers}
+        guard = AccessMiddleware(app, Keys.from_file(file), "noop", idle_s=3600)
+        await guard(scope, receive, send)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(api_keys, "_CHECK_S", 0.0)
+        asyncio.run(run())
+    assert [one["type"] for one in sent] == ["websocket.accept", "websocket.close"]
+    assert "revoked" in sent[1]["reason"]
 
 
 def test_a_look_at_a_websocket_that_fails_is_not_the_last(endpoint: Endpoint, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -150,6 +150,7 @@ class _TimedUpload:
         timer = asyncio.get_running_loop().call_later(self._slow_s, time_out)
 
         async def timed() -> Message:
+            _cancel_again(self._late)
             message = await receive()
             if message["type"] == "http.disconnect" or not message.get("more_body", False):
                 timer.cancel()
@@ -210,6 +211,7 @@ class _TimedWebSocket:
             self._timer.cancel()
 
     async def _timed_receive(self) -> Message:
+        _cancel_again(self._end is not None)
         self._silent_since = self._loop.time()
         message = await self._receive()
         self._silent_since = None
@@ -235,6 +237,16 @@ class _TimedWebSocket:
         with suppress(asyncio.TimeoutError, RuntimeError):  # the client does not read, or has closed meanwhile
             closing = self._send({"type": "websocket.close", "code": code, "reason": reason[:120]})
             await asyncio.wait_for(closing, _TICK_S)
+
+
+def _cancel_again(over: bool) -> None:
+    """Cancel whoever wants to receive more once it is over, and has missed its cancellation.
+
+    Before Python 3.12, `asyncio.wait_for` drops a cancellation that comes together with what it waits for, such as
+    the message of a client whose key has just been revoked.
+    """
+    if over:
+        raise asyncio.CancelledError
 
 
 def _uncancel(task: asyncio.Task[object] | None) -> None:

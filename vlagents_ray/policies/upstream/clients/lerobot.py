@@ -22,6 +22,7 @@ _OPTIONS = [
     ("grpc.use_local_subchannel_pool", 1),
     ("grpc.max_send_message_length", -1),
 ]
+_POLLED_S = 5.0  # within which gRPC has looked at a channel's state once more: it does so every 0.2 s
 _FIRST_STEPS = 2**29  # a connection counts from a random one below: no other client's answer is taken for its own
 
 
@@ -44,6 +45,7 @@ class LeRobotClient(UpstreamClient):
         self._observe: Callable[..., bytes] | None = None
         self._act: Callable[..., bytes] | None = None
         self._ended = threading.Event()
+        self._watch: Callable[[Any], None] = lambda _: None
         self._step = 0
 
     @staticmethod
@@ -71,6 +73,7 @@ class LeRobotClient(UpstreamClient):
             if state is not self._grpc.ChannelConnectivity.READY:
                 ended.set()
 
+        self._watch = watch
         try:
             self._call(unary["Ready"], protobuf.EMPTY, timeout_s)
             channel.subscribe(watch)
@@ -103,9 +106,16 @@ class LeRobotClient(UpstreamClient):
         return [chunk.rows]
 
     def close(self) -> None:
-        if self._channel is not None:
-            self._channel.close()
-            self._channel = self._observe = self._act = None
+        channel, self._channel = self._channel, None
+        self._observe = self._act = None
+        if channel is None:
+            return
+        channel.unsubscribe(self._watch)
+        # gRPC polls the state of a watched channel in a thread, which fails aloud if the channel is closed under it.
+        end = time.monotonic() + _POLLED_S
+        while getattr(getattr(channel, "_connectivity_state", None), "polling", False) and time.monotonic() < end:
+            time.sleep(0.01)
+        channel.close()
 
     def _call(self, method: Callable[..., bytes], message: Any, timeout_s: float) -> bytes:
         try:
