@@ -192,7 +192,7 @@ def test_a_robot_pauses_resumes_and_is_marked(server: LiveServer) -> None:
         applied = arm.applied
         assert post(server, {"session": session, "do": "resume"})[0] == 200
         wait_for(lambda: arm.applied > applied, 30)
-        assert states(server, session) == ["pause done", "resume done"]
+        wait_for(lambda: states(server, session) == ["pause done", "resume done"], 30)  # the next request says so
         assert post(server, {"session": session, "do": "success"})[0] == 200
         wait_for(lambda: reports, 30)
         assert reports[0].outcome == "success"
