@@ -82,7 +82,11 @@ class EvalEnv(Environment):
     @property
     @abstractmethod
     def instruction(self) -> str:
-        """The task of the current episode in words."""
+        """The task of the current episode in words.
+
+        It may change with a step, if an episode has several tasks, as CALVIN's have. An evaluation then resets the
+        policy with it, and with the observation of that step, whose images are there whatever `looked_at` says.
+        """
 
     @abstractmethod
     def reset(self, *, seed: int, options: Options | None = None) -> tuple[Obs, dict[str, Any]]:
@@ -179,7 +183,7 @@ class BatchEnv(Environment):
     @property
     @abstractmethod
     def instructions(self) -> list[str]:
-        """The tasks of the current episodes in words."""
+        """The tasks of the current episodes in words; each may change with a step, see `EvalEnv.instruction`."""
 
     @abstractmethod
     def reset(self, *, seeds: Sequence[int], options: Sequence[Options | None] | None = None) -> list[Obs]:

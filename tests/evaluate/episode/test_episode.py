@@ -123,6 +123,33 @@ def test_the_step_limit_holds_for_an_env_that_forgets_it() -> None:
     assert run_episode(Endless(), Chunks(*[ROW] * 9), KEY).steps == 6
 
 
+def test_a_further_task_begins_the_policy_anew_in_the_middle_of_a_chunk() -> None:
+    class Tasks(Script):
+        @property
+        def instruction(self) -> str:
+            return f"task {len(self.actions) // 2}"
+
+        def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
+            seen, *rest = super().step(act)
+            return (replace(seen, info={"step": len(self.actions)}), *rest)
+
+    class Told(Chunks):
+        def __init__(self, *answers: Any) -> None:
+            super().__init__(*answers)
+            self.resets: list[tuple[str | None, int]] = []
+
+        def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+            self.resets.append((instruction, obs.info.get("step", 0)))
+            return super().reset(obs, instruction, **kwargs)
+
+    env, agent = Tasks(terminates_at=5), Told(CHUNK, CHUNK, CHUNK)
+    result = run_episode(env, agent, KEY)
+    assert agent.resets == [("task 0", 0), ("task 1", 2), ("task 2", 4)]
+    assert [obs.info.get("step", 0) for obs in agent.seen] == [0, 2, 4]
+    assert env.actions == [[1, 0], [2, 0]] * 2 + [[1, 0]]
+    assert (result.instruction, result.steps, result.ending) == ("task 0; task 1; task 2", 5, "terminated")
+
+
 @pytest.mark.parametrize(
     ("solved", "once", "at_end"), [((), False, False), ((2,), True, False), ((2, 6), True, True), ((6,), True, True)]
 )

@@ -30,10 +30,10 @@ class EnvStep(NamedTuple):
     success: bool
 
 
-def checked_instruction(instruction: object) -> str:
+def checked_instruction(instruction: object, where: str) -> str:
     """Return `instruction`; raises `EnvFailed` if it is not text."""
     if not isinstance(instruction, str):
-        raise EnvFailed(f"env reset: got the instruction {instruction!r}, want a str, empty if there is none")
+        raise EnvFailed(f"env {where}: got the instruction {instruction!r}, want a str, empty if there is none")
     return instruction
 
 

@@ -61,6 +61,7 @@ def run_episodes(
     `agent.act_batch` is called for all sessions that have no rows of a chunk left. Either `agent` is a `RemoteAgent`
     and `sessions` come from its `sessions(n)`, or it is an initialized policy in this process and they are copies of
     it. A single session may be `agent` itself, whose `act` is then called. A finished episode is idle until all are.
+    An environment whose `instruction` changes has a further task for the policy, which is then reset with it.
 
     Args:
         env: The environments.
@@ -103,7 +104,7 @@ def run_episodes(
             options=[options_of_reset(env, key.episode, reset_options) for key in keys],
         )
         first = [
-            (checked_obs(obs, contract, "reset"), checked_instruction(text))
+            (checked_obs(obs, contract, "reset"), checked_instruction(text, "reset"))
             for obs, text in zip(seen, env.instructions, strict=True)
         ]
     reset_ms = 1e3 * (perf_counter() - begun)
@@ -111,7 +112,7 @@ def run_episodes(
     for i, (key, session, (obs, instruction)) in enumerate(zip(keys, sessions, first, strict=True)):
         record(i, obs)
         stats = EpisodeStats(key, begun, instruction=instruction, reset_ms=reset_ms)
-        episodes.append(_Episode(i, session, stats, ChunkExecutor(execute, clock, contract), obs))
+        episodes.append(_Episode(i, session, stats, partial(ChunkExecutor, execute, clock, contract), obs))
     watch("policy reset", 0)
     _reset_policy(agent, episodes, contract, policy_options or {})
     steps, playing = 0, _unfinished(episodes)
@@ -126,6 +127,10 @@ def run_episodes(
             env.looked_at = images or asks
             _step(env, episodes, playing, contract, record, executed)
             steps, playing = steps + 1, _unfinished(playing)
+            if begun_anew := _instructed(env, playing):
+                watch("policy reset", steps)
+                _reset_policy(agent, begun_anew, contract, policy_options or {})
+                playing = _unfinished(playing)
     return [episode.outcome for episode in episodes if episode.outcome is not None]
 
 
@@ -136,14 +141,16 @@ def _unfinished(episodes: Sequence[_Episode]) -> list[_Episode]:
 class _Episode:
     """One of the episodes in lockstep."""
 
-    def __init__(self, number: int, session: Agent, stats: EpisodeStats, executor: ChunkExecutor, obs: Obs) -> None:
+    def __init__(
+        self, number: int, session: Agent, stats: EpisodeStats, executor: Callable[[], ChunkExecutor], obs: Obs
+    ) -> None:
         self.number = number
         self.session = session
         self.stats = stats
         self.obs = obs
         self.ticks: deque[Tick] = deque()  # the ticks before the next request
         self.outcome: Outcome | None = None  # set once the episode is over
-        self._executor = executor
+        self._new_executor, self._executor = executor, executor()
         self._done = False  # the policy ends the episode with these ticks
 
     def began(self, answer: dict[str, Any] | Exception) -> None:
@@ -155,6 +162,12 @@ class _Episode:
                 self.stats.began(answer)
         except VLAgentsError as error:
             self.failed(error)
+
+    def instructed(self, instruction: str) -> None:
+        """Take up a further task; what is left of the plan was for the last one."""
+        self.stats.instructed(instruction)
+        self.ticks.clear()
+        self._executor, self._done = self._new_executor(), False
 
     def request(self, info: Mapping[str, Any]) -> Obs:
         """Return the observation for the next request to the policy, with `info`."""
@@ -195,8 +208,18 @@ class _Episode:
             self.outcome = error
 
 
+def _instructed(env: BatchEnv, playing: Sequence[_Episode]) -> list[_Episode]:
+    """Return the episodes whose environment has a further task."""
+    with _STEPPING:
+        texts = env.instructions if playing else []
+        found = [one for one in playing if texts[one.number] != one.stats.instruction]
+        for episode in found:
+            episode.instructed(checked_instruction(texts[episode.number], "step"))
+    return found
+
+
 def _reset_policy(agent: Agent, episodes: Sequence[_Episode], contract: Contract, options: Mapping[str, Any]) -> None:
-    """Reset the session of each episode with its first observation; a server gets all of them in one message."""
+    """Reset the session of each episode with its observation; a server gets all of them in one message."""
     keys, sessions = [one.stats.key for one in episodes], [one.session for one in episodes]
     first, texts = [_for_policy(one.obs, {}) for one in episodes], [one.stats.instruction for one in episodes]
     seeds = [key.seed if key.policy_seed is None else key.policy_seed for key in keys]

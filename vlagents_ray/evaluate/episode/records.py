@@ -26,7 +26,7 @@ class EpisodeResult:
     steps: int = 0  # actions executed
     episode_return: float = 0.0  # sum of rewards
     ending: Ending = "error"
-    instruction: str = ""
+    instruction: str = ""  # several one after another with semicolons
     error: str | None = None
     seconds: float = 0.0  # from reset to the last step
     reset_ms: float | None = None  # reset of the environment

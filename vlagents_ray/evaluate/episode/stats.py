@@ -31,7 +31,8 @@ class EpisodeStats:
     success: bool = False
     first_success: int | None = None
     ending: Ending = "error"
-    instruction: str = ""
+    instruction: str = ""  # the present one
+    earlier: list[str] = field(default_factory=list)  # instructions of this episode before it
     checkpoint: str | None = None
     weights: str | None = None
     revision: str | None = None
@@ -55,6 +56,11 @@ class EpisodeStats:
             value if isinstance(value := said.get(name), str) else None
             for name in ("checkpoint", "weights", "revision")
         )
+
+    def instructed(self, instruction: str) -> None:
+        """Record a further instruction."""
+        self.earlier.append(self.instruction)
+        self.instruction = instruction
 
     def acted(self, act: Act, seconds: float, latency_s: float | None) -> None:
         """Record an answer of the policy, its duration and, in real-time mode, the latency that it counts as."""
@@ -98,7 +104,7 @@ class EpisodeStats:
             steps=self.steps,
             episode_return=self.episode_return,
             ending=self.ending if failed is None else "error",
-            instruction=self.instruction,
+            instruction="; ".join([*self.earlier, self.instruction]),
             error=None if failed is None else f"{failed.code}: {failed}",
             seconds=perf_counter() - self.started,
             reset_ms=self.reset_ms,
