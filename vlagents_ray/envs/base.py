@@ -48,6 +48,13 @@ class Environment(ABC):
     Nothing but the images may depend on this.
     """
 
+    several_tasks: bool = False
+    """Whether an episode has tasks one after another, as CALVIN's have, so that its instruction may change with a step.
+
+    An evaluation then resets the policy with the new instruction, and with the observation of that step, whose images
+    are there whatever `looked_at` says. What is left of a chunk is dropped.
+    """
+
     @property
     @abstractmethod
     def contract(self) -> Contract:
@@ -82,11 +89,7 @@ class EvalEnv(Environment):
     @property
     @abstractmethod
     def instruction(self) -> str:
-        """The task of the current episode in words.
-
-        It may change with a step, if an episode has several tasks, as CALVIN's have. An evaluation then resets the
-        policy with it, and with the observation of that step, whose images are there whatever `looked_at` says.
-        """
+        """The task of the current episode in words; with `several_tasks`, the present one."""
 
     @abstractmethod
     def reset(self, *, seed: int, options: Options | None = None) -> tuple[Obs, dict[str, Any]]:
@@ -183,7 +186,7 @@ class BatchEnv(Environment):
     @property
     @abstractmethod
     def instructions(self) -> list[str]:
-        """The tasks of the current episodes in words; each may change with a step, see `EvalEnv.instruction`."""
+        """The tasks of the current episodes in words; with `several_tasks`, the present ones."""
 
     @abstractmethod
     def reset(self, *, seeds: Sequence[int], options: Sequence[Options | None] | None = None) -> list[Obs]:

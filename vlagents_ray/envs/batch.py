@@ -51,6 +51,7 @@ class SequentialBatch(BatchEnv):
 
     def __init__(self, envs: Sequence[EvalEnv]) -> None:
         """Combine environments of one task, which are closed together with this object."""
+        self.several_tasks = envs[0].several_tasks
         self._envs = list(envs)
         self._playing = 0  # the first so many have an episode
         self._seen: list[Obs] = []  # the last observation of each

@@ -125,6 +125,8 @@ def test_the_step_limit_holds_for_an_env_that_forgets_it() -> None:
 
 def test_a_further_task_begins_the_policy_anew_in_the_middle_of_a_chunk() -> None:
     class Tasks(Script):
+        several_tasks = True
+
         @property
         def instruction(self) -> str:
             return f"task {len(self.actions) // 2}"

@@ -61,7 +61,7 @@ def run_episodes(
     `agent.act_batch` is called for all sessions that have no rows of a chunk left. Either `agent` is a `RemoteAgent`
     and `sessions` come from its `sessions(n)`, or it is an initialized policy in this process and they are copies of
     it. A single session may be `agent` itself, whose `act` is then called. A finished episode is idle until all are.
-    An environment whose `instruction` changes has a further task for the policy, which is then reset with it.
+    The policy is reset with each further instruction of an environment with `several_tasks`.
 
     Args:
         env: The environments.
@@ -127,7 +127,7 @@ def run_episodes(
             env.looked_at = images or asks
             _step(env, episodes, playing, contract, record, executed)
             steps, playing = steps + 1, _unfinished(playing)
-            if begun_anew := _instructed(env, playing):
+            if env.several_tasks and (begun_anew := _instructed(env, playing)):
                 watch("policy reset", steps)
                 _reset_policy(agent, begun_anew, contract, policy_options or {})
                 playing = _unfinished(playing)
