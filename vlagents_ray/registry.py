@@ -44,6 +44,7 @@ ENVS: dict[str, str] = {
     "metaworld": "vlagents_ray.envs.metaworld:MetaWorld",
     "libero": "vlagents_ray.envs.libero:Libero",
     "robosuite": "vlagents_ray.envs.robosuite:Robosuite",
+    "robocasa": "vlagents_ray.envs.robocasa:RoboCasa",
     "simpler": "vlagents_ray.envs.simpler:Simpler",
     "aloha": "vlagents_ray.envs.aloha:Aloha",
     "pusht": "vlagents_ray.envs.gymnasium.pusht:PushT",
@@ -137,7 +138,7 @@ _SYSTEM = {
 }
 
 # import name -> its file in requirements/, for an environment that runs the workers of an evaluation
-_SIMULATOR_REQUIREMENTS = {"rcs": "rcs", "duobench": "rcs", "robosuite": "robosuite"}
+_SIMULATOR_REQUIREMENTS = {"rcs": "rcs", "duobench": "rcs", "robosuite": "robosuite", "robocasa": "robocasa"}
 
 
 def require(module: str, *, extra: str | None = None) -> ModuleType:

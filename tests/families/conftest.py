@@ -23,6 +23,7 @@ _NEEDS = {
     "openvla": "transformers",
     "pi0": "transformers",
     "rcs": "rcs",
+    "robocasa": "robocasa",
     "robosuite": "robosuite",
     "ros": "rclpy",
     "vjepa2_ac": "transformers",
