@@ -1,9 +1,9 @@
 """A plain kitchen in place of RoboCasa's assets, about 10 GB that tests do not have.
 
 RoboCasa's package has its scenes, its counters, cabinets and drawers; textures, appliances and objects are a download.
-Here textures are of one colour, the appliances are boxes without doors or knobs, every object is a box, and all ten
-kitchens of the split "target" are one. What is proved with it is how RoboCasa's code is driven, seeded and read, not
-how its kitchens look or its objects behave.
+Here textures are of one colour, the appliances are boxes without doors or knobs, every object is a box, and all
+kitchens are one. What is proved with it is how RoboCasa's code is driven, seeded and read, not how its kitchens look or
+its objects behave.
 """
 
 from __future__ import annotations
@@ -50,6 +50,8 @@ main_group:
     - {name: counter_main, type: counter, size: [3.2, 0.65, 0.92], pos: [2.5, -0.325, 0.46]}
     - {name: stove, type: stove, align_to: counter_main, side: right, alignment: top_back}
     - {name: fridge, type: fridge_bottom_freezer, align_to: counter_main, side: left, alignment: bottom_back}
+  top_row:
+    - {name: cabinet, type: hinge_cabinet, size: [1, 0.4, 0.92], pos: [2.5, -0.2, 1.85]}
   drawers:
     - {name: drawers, type: stack, levels: [drawer, drawer], percentages: [0.7, 0.3], size: [0.6, 0.6, 0.84],
        pos: [2.5, -0.3, 0.47]}
@@ -73,9 +75,9 @@ def write_package(folder: Path) -> Path:
     shutil.copytree(installed, folder / "robocasa", ignore=shutil.ignore_patterns("assets", "__pycache__"))
     shutil.copytree(installed / "models" / "assets", assets)
     (folder / "robocasa" / "models" / "assets").symlink_to(assets)
-    for number in range(1, 11):
-        (assets / f"scenes/kitchen_layouts/test/layout{number:03}.yaml").write_text(_KITCHEN)
-        (assets / f"scenes/kitchen_styles/test/style{number:03}.yaml").write_text(_STYLE)
+    for kind, text in (("layout", _KITCHEN), ("style", _STYLE)):
+        for file in assets.glob(f"scenes/kitchen_{kind}s/*/{kind}*.yaml"):
+            file.write_text(text)
     for name, rgba in _APPLIANCES.items():
         _write_box(assets / "fixtures" / name, "0.4 0.4 0.9", "main", rgba)
     for name in _folders(installed / "models" / "objects" / "kitchen_objects.py"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import re
 import weakref
 
 import numpy as np
@@ -113,6 +114,25 @@ def test_the_last_number_opens_and_closes_the_gripper_and_success_is_robocasas_c
         assert (reward, done, info["success"]) == (0.0, False, False)
         env._env.drawer.open_door(env._env, min=1.0, max=1.0, partial_open=False)  # sets the joint
         assert env.step(Act(np.array(STILL, np.float32)))[1:] == (1.0, True, False, {"success": True})
+
+
+@pytest.mark.parametrize(
+    ("task", "instruction"),
+    [
+        ("OpenDrawer", "Open the (left|right) drawer."),
+        ("OpenCabinet", "Open the cabinet doors."),
+        ("PickPlaceCounterToCabinet", "Pick the .* and place it in the cabinet"),
+    ],
+)
+def test_it_begins_in_the_kitchens_of_either_split(task: str, instruction: str) -> None:
+    for split, layouts in (("target", range(1, 11)), ("pretrain", range(11, 61))):
+        with RoboCasa(task, cameras=(), split=split) as env:
+            _, info = env.reset(seed=4)
+            assert re.match(instruction, env.instruction), env.instruction
+            assert info["layout"] in layouts
+            assert info["style"] in layouts
+            assert env.step(Act(np.array(STILL, np.float32)))[1:] == (0.0, False, False, {"success": False})
+            assert {thing["info"]["split"] for thing in env._env.object_cfgs} <= {split}
 
 
 def test_the_table_of_tasks_and_the_downloads_are_robocasas(kitchen: object) -> None:
