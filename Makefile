@@ -49,6 +49,8 @@ NOT_QUICK := ray or server or hosts or sim or vulkan or torch or gpu or browser 
 # OPENVLA_OFT_SRC, OCTO_SRC, DIFFUSION_POLICY_SRC, VJEPA2_SRC.
 # ros is a ROS 2 of its own; it wants Python 3.11.
 # lerobot06 wants Python 3.12, and TORCH_CUDA=1 where no index has a torch without CUDA for it: several GB.
+# calvin wants CALVIN_SRC, a checkout.
+# robocasa is only tested where it is named: 1.3 GB, and a minute.
 FAMILIES ?= libero lerobot hf rcs ros
 TESTED_IN_libero := libero robosuite
 TESTED_IN_hf := pi0 arro vjepa2_ac

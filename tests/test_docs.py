@@ -15,7 +15,9 @@ from page_commands import PAGES, commands, read_as_typed
 from vlagents_ray.cli.evaluation.command import read_run
 from vlagents_ray.envs import aloha, metaworld
 from vlagents_ray.envs.benchmark_protocol import BenchmarkProtocol
+from vlagents_ray.envs.calvin import env as calvin
 from vlagents_ray.envs.gymnasium.known import known
+from vlagents_ray.envs.robocasa import tasks as robocasa
 from vlagents_ray.envs.robosuite.tasks import TASKS
 from vlagents_ray.errors import BY_CODE, Overloaded, VLAgentsError
 from vlagents_ray.evaluate import EvalConfig
@@ -115,6 +117,8 @@ def test_files_of_runs_on_the_pages_are_accepted() -> None:
         ("pusht", known("gym_pusht/PushT-v0").protocol),
         ("gymnasium", known("FetchReach-v4").protocol),
         ("robosuite", TASKS["Lift"].protocol),
+        ("calvin", calvin.PROTOCOL),
+        ("robocasa", robocasa.protocol("OpenDrawer", "target")),
     ],
 )
 def test_a_benchmarks_page_states_the_protocol_that_is_recorded(page: str, protocol: BenchmarkProtocol) -> None:

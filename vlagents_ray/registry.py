@@ -45,6 +45,7 @@ ENVS: dict[str, str] = {
     "libero": "vlagents_ray.envs.libero:Libero",
     "robosuite": "vlagents_ray.envs.robosuite:Robosuite",
     "calvin": "vlagents_ray.envs.calvin:Calvin",
+    "robocasa": "vlagents_ray.envs.robocasa:RoboCasa",
     "simpler": "vlagents_ray.envs.simpler:Simpler",
     "aloha": "vlagents_ray.envs.aloha:Aloha",
     "pusht": "vlagents_ray.envs.gymnasium.pusht:PushT",
@@ -138,7 +139,13 @@ _SYSTEM = {
 }
 
 # import name -> its file in requirements/, for an environment that runs the workers of an evaluation
-_SIMULATOR_REQUIREMENTS = {"rcs": "rcs", "duobench": "rcs", "robosuite": "robosuite", "pybullet": "calvin"}
+_SIMULATOR_REQUIREMENTS = {
+    "rcs": "rcs",
+    "duobench": "rcs",
+    "robosuite": "robosuite",
+    "robocasa": "robocasa",
+    "pybullet": "calvin",
+}
 
 
 def require(module: str, *, extra: str | None = None) -> ModuleType:

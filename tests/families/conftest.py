@@ -14,6 +14,7 @@ from verified import VerifyingTests
 # folder -> the package without which its tests cannot be imported
 _NEEDS = {
     "arro": "transformers",
+    "calvin": "pybullet",
     "diffusion_policy": "diffusers",
     "gr00t": "lerobot",
     "lerobot": "lerobot",
@@ -23,6 +24,7 @@ _NEEDS = {
     "openvla": "transformers",
     "pi0": "transformers",
     "rcs": "rcs",
+    "robocasa": "robocasa",
     "robosuite": "robosuite",
     "ros": "rclpy",
     "vjepa2_ac": "transformers",

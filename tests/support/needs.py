@@ -27,7 +27,8 @@ from typescript_client import node_version
 _NO_RAY = "/dev/null/not-marked-ray"  # short: a longer name would be replaced, as sockets in it could not be named
 _RAY = ("ray", "server", "hosts")
 _SIMULATORS = {
-    "gym_pusht", "gymnasium_robotics", "libero", "mani_skill", "metaworld", "mujoco", "rcs", "robosuite", "sapien"
+    "gym_pusht", "gymnasium_robotics", "libero", "mani_skill", "metaworld", "mujoco", "rcs", "robocasa", "robosuite",
+    "sapien",
 }  # fmt: skip
 
 

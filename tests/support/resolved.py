@@ -25,7 +25,8 @@ PAGE = ROOT / "docs" / "install.md"
 LOCKS = ROOT / "cluster" / "docker" / "locks"
 TORCH = ROOT / "cluster" / "docker" / "torch.txt"
 FAMILIES = ROOT / "requirements"
-WITHOUT_IMAGE = {"testing", "ros"}  # a robot has its own ROS
+# A robot has its own ROS; RoboCasa wants 10 GB besides its packages, CALVIN a checkout.
+WITHOUT_IMAGE = {"testing", "ros", "robocasa", "calvin"}
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
 OF_DEVELOPMENT = {"check", "docs", "dev"}  # these are for Python 3.11 alone

@@ -61,26 +61,33 @@ class Calvin(EvalEnv):
     the last is the gripper, 1 opens, -1 closes, and only its sign counts.
 
     The reward is 1 in the step that solves a task. Its sum over an episode is the number of tasks solved in a row,
-    whose mean is CALVIN's average length. The episode ends with the fifth task, or 360 steps after the last one was
-    solved. `info["tasks"]` are CALVIN's names of the chain, `info["solved"]` says how many are solved.
+    whose mean is CALVIN's average length. The episode ends with the fifth task, or with one that takes too long.
+    `info["tasks"]` are CALVIN's names of the chain, `info["solved"]` says how many are solved.
     """
 
     several_tasks = True
     init_states = chains.NUMBER
-    max_steps = PROTOCOL.max_steps
     _open: ClassVar[str | None] = None  # upstream's code takes the process's only simulation for its own
 
-    def __init__(self, task: str = "D", *, renderer: Renderer = "egl", source_dir: str | None = None) -> None:
+    def __init__(
+        self,
+        task: str = "D",
+        *,
+        task_steps: int = STEPS,
+        renderer: Renderer = "egl",
+        source_dir: str | None = None,
+    ) -> None:
         """Make the environment.
 
         Args:
             task: The scene.
+            task_steps: The steps that each task of a chain may take.
             renderer: "egl" draws as upstream does; "tiny" is PyBullet's own in software, with other light and shadows.
             source_dir: A checkout of CALVIN with its submodules; None is that of CALVIN_SRC.
 
         Raises:
             UnknownEnv: There is no such scene.
-            ConfigError: There is no checkout, the renderer is unknown, or this process has a CALVIN open already.
+            ConfigError: There is no checkout, an option has a wrong value, or this process has a CALVIN open already.
             MissingDependency: PyBullet, hydra or another package is not installed.
             EnvFailed: The simulator cannot be loaded.
         """
@@ -89,9 +96,12 @@ class Calvin(EvalEnv):
         self._name = f"calvin/{task}"
         if renderer not in ("egl", "tiny"):
             raise ConfigError(f"{self._name}: renderer is {renderer!r}, want egl or tiny")
+        if task_steps < 1:
+            raise ConfigError(f"{self._name}: task_steps is {task_steps}, want at least 1")
         if Calvin._open is not None:
             raise ConfigError(f"{self._name}: {Calvin._open} is open in this process, want one at a time; close it")
         self._renderer, self._checkout = renderer, find_checkout(source_dir)
+        self._task_steps, self.max_steps = task_steps, TASKS * task_steps
         prepare_rendering()
         with failing(self._name, "make"):
             self._env = make_simulator(self._checkout, task, renderer)
@@ -134,10 +144,13 @@ class Calvin(EvalEnv):
         return self._observe(look=True), self._info()
 
     def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-        """Execute an action; the reward is 1 if it solves the present task, else 0."""
+        """Execute an action; the reward is 1 if it solves the present task, else 0.
+
+        A task that is not solved in time ends the chain: `terminated`, and not the step limit of the whole.
+        """
         env, chain = self._alive(), self._playing()
-        if self._solved == TASKS:
-            raise NotReset(f"{self._name}: step after the fifth task; call reset(seed=...) first")
+        if self._solved == TASKS or self._steps >= self._task_steps:
+            raise NotReset(f"{self._name}: step after the end of the chain; call reset(seed=...) first")
         action = one_row(act, CONTRACT).astype(np.float64)
         action[-1] = 1.0 if action[-1] > 0 else -1.0
         with failing(self._name, "step"):
@@ -151,7 +164,7 @@ class Calvin(EvalEnv):
         if solved:
             self._solved, self._steps, self._begin = self._solved + 1, 0, now
         obs = self._observe(look=self.looked_at or solved)
-        return obs, float(solved), self._solved == TASKS, self._steps >= STEPS, self._info()
+        return obs, float(solved), self._solved == TASKS or self._steps >= self._task_steps, False, self._info()
 
     @classmethod
     def require_task(cls, task: str | None) -> None:
@@ -177,7 +190,7 @@ class Calvin(EvalEnv):
         return super().renderer() if self._renderer == "egl" else None
 
     def describe(self) -> dict[str, Any]:
-        protocol = PROTOCOL.describe()
+        protocol = PROTOCOL.describe(max_steps=self.max_steps)
         if self._renderer != "egl":
             protocol["deviations"].append(f"renderer: {self._renderer}, upstream draws by OpenGL")
         code = {name: code_in(self._checkout / name) for name in (".", "calvin_env")}

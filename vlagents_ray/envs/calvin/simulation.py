@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 import io
 import os
 import sys
@@ -52,8 +53,9 @@ def make_simulator(checkout: Path, scene: str, renderer: Renderer) -> Any:
     if device := os.environ.get(EGL_DEVICE):
         os.environ.setdefault("EGL_VISIBLE_DEVICES", device)
     with quietly():
+        require("pybullet")
         hydra, omegaconf = require("hydra"), require("omegaconf").OmegaConf
-        code: Any = require("calvin_env.envs.play_table_env")
+        code: Any = importlib.import_module("calvin_env.envs.play_table_env")
         code.get_git_commit_hash = lambda _: ""  # which wants a repository
         parts = {
             "env": "env/play_table_env",

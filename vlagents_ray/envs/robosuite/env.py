@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
@@ -11,24 +10,21 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.contract import CameraSpec, Contract
-from vlagents_ray.envs.base import EvalEnv, one_row, require_known
-from vlagents_ray.envs.recording import record_size_of
-from vlagents_ray.envs.rendering.headless import prepare_rendering
+from vlagents_ray.envs.base import require_known
 from vlagents_ray.envs.rendering.render_probe import failing, without, without_egl
+from vlagents_ray.envs.robosuite.base import RobosuiteEnv
 from vlagents_ray.envs.robosuite.importing import importing_robosuite
-from vlagents_ray.envs.robosuite.simulation import CameraRenderer, seeded
+from vlagents_ray.envs.robosuite.simulation import seeded
 from vlagents_ray.envs.robosuite.tasks import CONTROL_HZ, TASKS, contract
-from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
-from vlagents_ray.interface import HIGH_RES, Act, Obs
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.registry import require
 
 _CURE = (
     "run `vlagents-ray env make requirements/robosuite.txt` and give the evaluation's workers that environment's Python"
 )
-_OPEN_M = 0.04  # a finger's travel from closed to open
 
 
-class Robosuite(EvalEnv):
+class Robosuite(RobosuiteEnv):
     """One environment of one of robosuite's tasks, e.g. "Lift".
 
     Observation: cameras by robosuite's names, upright; in `state`, by robomimic's names, for each arm
@@ -71,18 +67,18 @@ class Robosuite(EvalEnv):
             EnvFailed: The simulator cannot be loaded.
         """
         self.require_task(task)
-        self._name, self._task = f"robosuite/{task}", TASKS[task]
-        for name, value in (("width", width), ("height", height), ("max_steps", max_steps)):
-            if value is not None and value < 1:
-                raise ConfigError(f"{self._name}: {name} is {value}, want at least 1")
-        record = record_size_of(record_size, self._name)
+        self._task = TASKS[task]
+        super().__init__(
+            f"robosuite/{task}",
+            protocol=self._task.protocol,
+            width=width,
+            height=height,
+            max_steps=max_steps,
+            ends_on_success=ends_on_success,
+            record_size=record_size,
+        )
         self._contract = self.known_contract({"task": task, "width": width, "height": height, "cameras": cameras})
-        self.max_steps = max_steps or self._task.max_steps
         self._instruction = instruction or self._task.instruction
-        self._ends_on_success = ends_on_success
-        self._steps: int | None = None
-        self._env: Any = None
-        prepare_rendering()
         with importing_robosuite("robosuite"), warnings.catch_warnings():
             warnings.simplefilter("ignore")  # warnings of upstream code
             simulator = require("robosuite")
@@ -90,7 +86,7 @@ class Robosuite(EvalEnv):
             raise ConfigError(f"{self._name}: robosuite {simulator.__version__} has no such task, 1.5 has; {_CURE}")
         images = self._contract.cameras or {}
         with failing(self._name, "make"), seeded(0):
-            self._env = simulator.make(
+            made = simulator.make(
                 task,
                 robots=["Panda"] * len(self._task.arms),
                 controller_configs=_controllers(simulator),
@@ -105,8 +101,8 @@ class Robosuite(EvalEnv):
                 camera_widths=[spec.width for spec in images.values()] or 1,
             )
             for arm in self._task.arms:  # which robosuite leaves out, and robomimic has
-                self._env.modify_observable(f"{arm}_joint_pos", "active", modifier=True)
-        self._renderer = CameraRenderer(self._env, record)
+                made.modify_observable(f"{arm}_joint_pos", "active", modifier=True)
+        self._use(made)
 
     @classmethod
     def known_contract(cls, arguments: Mapping[str, Any]) -> Contract:
@@ -123,35 +119,6 @@ class Robosuite(EvalEnv):
     def instruction(self) -> str:
         return self._instruction
 
-    def reset(self, *, seed: int, options: Mapping[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
-        """Begin the episode of `seed`, taken modulo 2^32; there are no options."""
-        if options:
-            raise ConfigError(f"{self._name}: unknown reset options {sorted(options)}, want none")
-        env, seed = self._alive(), seed % 2**32
-        with failing(self._name, "reset"), seeded(seed):
-            if hasattr(env, "rng"):  # robosuite 1.5 has a generator of its own, which its parts share
-                env.rng.bit_generator.state = np.random.default_rng(seed).bit_generator.state
-            self._renderer.make_current()  # the last episode's rendering resources are freed in their own context
-            self._renderer.open = True
-            raw = env.reset()
-        self._steps = 0
-        return self._observe(raw), {"success": False}
-
-    def step(self, act: Act) -> tuple[Obs, float, bool, bool, dict[str, Any]]:
-        """Execute an action; the reward is 1 if the task is solved, else 0."""
-        env = self._alive()
-        if self._steps is None:
-            raise NotReset(f"{self._name}: step before reset; call reset(seed=...) first")
-        action = one_row(act, self._contract)
-        with failing(self._name, "step"):
-            self._renderer.open = self.looked_at
-            raw, *_ = env.step(action.astype(np.float64))
-            success = bool(env._check_success())
-        self._steps += 1
-        obs = self._observe(raw, look=self.looked_at)
-        ended = success and self._ends_on_success
-        return obs, float(success), ended, self._steps >= self.max_steps, {"success": success}
-
     @classmethod
     def require_task(cls, task: str | None) -> None:
         require_known("robosuite", task or "Lift", cls.tasks())
@@ -166,53 +133,17 @@ class Robosuite(EvalEnv):
         return without(("robosuite", "mujoco"), _CURE) or without_egl("robosuite")
 
     def describe(self) -> dict[str, Any]:
-        return {
-            "simulator": "robosuite",
-            "task": self._name.partition("/")[2],
-            "robosuite": version("robosuite"),
-            "mujoco": version("mujoco"),
-            "control_mode": "OSC_POSE",
-            "render_backend": os.environ.get("MUJOCO_GL", "glfw"),
-            "protocol": self._task.protocol.describe(max_steps=self.max_steps, ends_on_success=self._ends_on_success),
-        }
-
-    def close(self) -> None:
-        env, self._env, self._steps = self._env, None, None
-        if env is not None:
-            self._renderer.make_current()
-            env.close()
-
-    def _observe(self, raw: Mapping[str, Any], *, look: bool = True) -> Obs:
-        cameras = list(self._contract.cameras or {}) if look else []
-        info: dict[str, Any] = {"sim_state": self._sim_state(raw)}
-        if look and self._renderer.views:
-            info[HIGH_RES] = {name: _upright(self._renderer.views[name]) for name in cameras}
-        fingers = float(raw["robot0_gripper_qpos"][0])
-        return Obs(
-            cameras={name: _upright(raw[f"{name}_image"]) for name in cameras},
-            gripper=min(max(fingers / _OPEN_M, 0.0), 1.0) if self._contract.gripper else None,
-            state={name: np.asarray(raw[name], np.float32) for name in self._contract.state or {}},
-            info=info,
-        )
+        played = self._protocol.describe(max_steps=self.max_steps, ends_on_success=self._ends_on_success)
+        return super().describe() | {"robosuite": version("robosuite"), "protocol": played}
 
     def _sim_state(self, raw: Mapping[str, Any]) -> dict[str, np.ndarray]:
-        """The positions and orientations of objects in robosuite's observation, and the place where one belongs."""
-        env = self._alive()
-        found = {
-            name: np.asarray(value, np.float64)
-            for name, value in raw.items()
-            if name.endswith(("_pos", "_quat")) and not {"robot0", "robot1", "to"} & set(name.split("_"))
-        }
+        """The positions and orientations of objects, and the place where one belongs."""
+        env, found = self._alive(), super()._sim_state(raw)
         if hasattr(env, "target_bin_placements"):
             found["target_pos"] = np.array(env.target_bin_placements[env.object_id], np.float64)
         elif hasattr(env, "peg1_body_id"):
             found["target_pos"] = np.array(env.sim.data.body_xpos[env.peg1_body_id], np.float64)
         return found
-
-    def _alive(self) -> Any:
-        if self._env is None:
-            raise EnvFailed(f"{self._name} is closed; make a new one")
-        return self._env
 
 
 def _controllers(simulator: Any) -> Any:
@@ -220,7 +151,3 @@ def _controllers(simulator: Any) -> Any:
     if hasattr(simulator, "load_composite_controller_config"):  # 1.5
         return simulator.load_composite_controller_config(robot="Panda")
     return simulator.load_controller_config(default_controller="OSC_POSE")
-
-
-def _upright(image: np.ndarray) -> np.ndarray:
-    return np.ascontiguousarray(image[::-1])
