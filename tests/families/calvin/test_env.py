@@ -177,6 +177,15 @@ def test_an_episode_of_five_solved_tasks_is_a_success_and_shows_each_beginning(
         env.step(MOVE)
 
 
+@pytest.mark.usefixtures("alone")
+def test_a_machine_without_egl_is_told_of_the_other_renderer(monkeypatch: pytest.MonkeyPatch) -> None:
+    import pybullet
+
+    monkeypatch.setattr(pybullet, "loadPlugin", lambda *_: -1)
+    with pytest.raises(EnvFailed, match=r"cannot draw through EGL; install EGL: .*, or set renderer to tiny"):
+        Calvin("D")
+
+
 def test_errors_and_the_description_say_what_a_reader_needs(env: Calvin) -> None:
     described = env.describe()
     assert described["protocol"]["deviations"] == ["renderer: tiny, upstream draws by OpenGL"]

@@ -13,9 +13,10 @@ from vlagents_ray.envs.base import EvalEnv, one_row, require_known
 from vlagents_ray.envs.benchmark_protocol import BenchmarkProtocol
 from vlagents_ray.envs.calvin import chains
 from vlagents_ray.envs.calvin.simulation import Renderer, find_checkout, make_simulator, quietly, read_tasks
+from vlagents_ray.envs.rendering import egl
 from vlagents_ray.envs.rendering.graphics import Renderer as Device
 from vlagents_ray.envs.rendering.headless import prepare_rendering
-from vlagents_ray.envs.rendering.render_probe import failing, without, without_egl
+from vlagents_ray.envs.rendering.render_probe import EGL_CURE, failing, without
 from vlagents_ray.errors import ConfigError, EnvFailed, NotReset
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.ray_tools.git_state import code_in
@@ -176,7 +177,6 @@ class Calvin(EvalEnv):
 
     @classmethod
     def missing(cls) -> str | None:
-        """Say why CALVIN cannot run here; the first call in a process renders one frame in a child."""
         cure = "run `vlagents-ray env make requirements/calvin.txt` and give the evaluation's workers that Python"
         if lacks := without(("pybullet", "hydra", "gym", "git", "quaternion"), cure):
             return lacks
@@ -184,7 +184,7 @@ class Calvin(EvalEnv):
             find_checkout(None)
         except ConfigError as error:
             return str(error)
-        return without_egl("CALVIN")
+        return None if egl.devices() else f"CALVIN finds no EGL device; {EGL_CURE}, or set the option renderer to tiny"
 
     def renderer(self) -> Device | None:
         return super().renderer() if self._renderer == "egl" else None

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from vlagents_ray.envs.rendering.graphics import EGL_DEVICE
-from vlagents_ray.errors import ConfigError
+from vlagents_ray.envs.rendering.render_probe import EGL_CURE
+from vlagents_ray.errors import ConfigError, EnvFailed
 from vlagents_ray.registry import require
 
 VARIABLE = "CALVIN_SRC"
@@ -46,6 +47,9 @@ def make_simulator(checkout: Path, scene: str, renderer: Renderer) -> Any:
         checkout: The checkout.
         scene: "A" to "D".
         renderer: As upstream draws, through OpenGL ("egl"), or PyBullet's renderer in software ("tiny").
+
+    Raises:
+        EnvFailed: PyBullet cannot draw through EGL.
     """
     folder = str(checkout / _PACKAGE)
     if folder not in sys.path:
@@ -77,7 +81,10 @@ def make_simulator(checkout: Path, scene: str, renderer: Renderer) -> Any:
                 "cameras": {"static": read["static"], "gripper": read["gripper"]},
             }
         )
-        return hydra.utils.instantiate(settings.env, use_scene_info=True, use_egl=renderer == "egl")
+        try:
+            return hydra.utils.instantiate(settings.env, use_scene_info=True, use_egl=renderer == "egl")
+        except SystemExit as error:  # PyBullet could not load its plug-in, which it has printed
+            raise EnvFailed(f"calvin: PyBullet cannot draw through EGL; {EGL_CURE}, or set renderer to tiny") from error
 
 
 def read_tasks(checkout: Path) -> tuple[Any, dict[str, str]]:
