@@ -35,20 +35,8 @@ from vlagents_ray.registry import require
 _CURE = (
     "run `vlagents-ray env make requirements/robocasa.txt` and give the evaluation's workers that environment's Python"
 )
-_FROM_BASE_FIRST = [
-    5,
-    6,
-    7,
-    8,
-    9,
-    10,
-    11,
-    0,
-    1,
-    2,
-    3,
-    4,
-]  # robosuite's hand, gripper, base, torso, mode in the datasets' order
+# robosuite's hand, gripper, base, torso and mode, in the datasets' order
+_FROM_BASE_FIRST = [*range(5, 12), *range(5)]
 _GRIPPER, _MODE = 6, 11  # in robosuite's order
 _ON = 0.5  # the threshold of RoboCasa's own Gymnasium environments, so that -1 and 1 serve as well as 0 and 1
 
