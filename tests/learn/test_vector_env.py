@@ -205,6 +205,20 @@ def test_wrong_actions_and_a_step_before_the_reset_are_errors() -> None:
         venv.reset(options={"reset_mask": np.zeros(2, np.bool_)})
 
 
+def test_an_env_with_several_tasks_tells_each_of_them() -> None:
+    class Tasks(Line):  # its instruction follows its position
+        several_tasks = True
+
+    envs = BatchVectorEnv(SequentialBatch([Tasks(), Tasks()]))
+    _, infos = envs.reset(seed=0)
+    told = [list(infos["instruction"])]
+    for _ in range(2):
+        _, _, _, _, infos = envs.step(np.full((2, 1), 0.5, np.float32))
+        told.append(list(infos["instruction"]))
+    for texts in zip(*told, strict=True):
+        assert len(set(texts)) == 3
+
+
 def test_an_error_of_the_simulator_is_the_envs() -> None:
     venv = as_vector_env(LINE, 2, observation="state", env_options={"trouble": {"raise": [1]}})
     venv.reset(seed=0)

@@ -71,7 +71,8 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
     an environment begins is the next number. Without a seed, numbers go on; the first S is drawn at random.
 
     `infos["success"]` says whether the task is solved. `infos["instruction"]` and `infos["episode_seed"]` are there
-    whenever an episode begins. A step limit of the environment truncates an episode.
+    whenever an episode begins, the former after each step as well if the episodes have several tasks. A step limit of
+    the environment truncates an episode.
     """
 
     def __init__(
@@ -153,6 +154,8 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
             rewards[i], terminated[i], self._seen[i] = step.reward, step.terminated, step.obs
             truncated[i] = not step.terminated and (step.truncated or self._steps[i] >= self._batch.max_steps)
             self._over[i] = terminated[i] or truncated[i]
+            if self._batch.several_tasks:
+                info["instruction"] = self._batch.instructions[i]
             last = self._over[i] and self._autoreset == vector.AutoresetMode.SAME_STEP
             said = {"final_obs": observed(step.obs, self._observation), "final_info": info} if last else info
             self._add_info(infos, said, i)
