@@ -274,7 +274,7 @@ def test_who_does_not_wait_for_answers_fills_no_memory_and_gets_them_all(
         (one,) = endpoint._clients
         wait_for(lambda: one._paused or not sending.is_alive())
         assert sending.is_alive()
-        assert endpoint._engine.queue.depth() < 300
+        assert endpoint._engine.queue.depth() < 400  # 256, and what was in the same read: 85 frames in 1 MiB
         hurry.set()
         replies = [decode_reply(client.recv(10)) for _ in frames]
         sending.join(10)
