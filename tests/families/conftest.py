@@ -15,7 +15,7 @@ from verified import VerifyingTests
 _NEEDS = {
     "arro": "transformers",
     "diffusion_policy": "diffusers",
-    "gr00t": "lerobot",
+    "gr00t": "diffusers",
     "lerobot": "lerobot",
     "libero": "libero",
     "octo": "jax",
