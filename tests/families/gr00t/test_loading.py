@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
+from tests.families.gr00t import tiny
 from tests.families.gr00t.conftest import MARKS, Checkpoint
-from tests.families.gr00t.tiny import LIBERO
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.policies.base.model_code import remote_code
 from vlagents_ray.policies.gr00t import Gr00t, network
@@ -37,10 +37,10 @@ def copied(checkpoint: Checkpoint, tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        ({}, rf"embodiment: got None, want one of \['{LIBERO}', 'new_embodiment'\]"),
-        ({"embodiment": "ours"}, rf"got 'ours', want one of \['{LIBERO}', 'new_embodiment'\]"),
-        ({"embodiment": LIBERO, "device": "tpu:1"}, "device 'tpu:1': not here"),
-        ({"embodiment": LIBERO, "checkpoint_step": 8, "checkpoint": "/nowhere/{step}"}, "no such file"),
+        ({}, rf"embodiment: got None, want one of \['{tiny.LIBERO}', 'new_embodiment'\]"),
+        ({"embodiment": "ours"}, rf"got 'ours', want one of \['{tiny.LIBERO}', 'new_embodiment'\]"),
+        ({"embodiment": tiny.LIBERO, "device": "tpu:1"}, "device 'tpu:1': not here"),
+        ({"embodiment": tiny.LIBERO, "checkpoint_step": 8, "checkpoint": "/nowhere/{step}"}, "no such file"),
     ],
 )
 def test_settings_that_do_not_fit_the_checkpoint(
@@ -139,6 +139,17 @@ def test_a_folder_that_is_no_checkout_or_an_older_one(
     monkeypatch.setattr(network.importlib.util, "find_spec", lambda _: None)
     with pytest.raises(ConfigError, match=r"code of N1\.5 or before.*policy `upstream`"):
         load(checkpoint("relative"), checkout)
+
+
+@pytest.mark.skipif(not tiny.N17, reason="N1.6 has its backbone in the checkout")
+def test_a_backbone_in_another_folder_is_named(copied: Path, checkout: Path) -> None:
+    elsewhere = str(copied / "nvidia/Cosmos-Reason2-2B")
+    missing = "/nowhere/nvidia/Cosmos-Reason2-2B"
+    changed("config.json", "model_name", value=missing)(copied)
+    changed("processor_config.json", "processor_kwargs", "model_name", value=missing)(copied)
+    with pytest.raises(ConfigError, match="a folder that `backbone` names"):
+        load(copied, checkout)
+    assert load(copied, checkout, backbone=elsewhere).model is not None
 
 
 def evil(folder: Path, *names: str) -> Path:

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from vlagents_ray.errors import ConfigError
-from vlagents_ray.policies.base import Row
 from vlagents_ray.policies.base.accelerator import ensure_torchvision, torch_device, torch_dtype
 from vlagents_ray.policies.base.checkpoint import SavedTensors, find_checkpoint, require_loaded
 from vlagents_ray.policies.base.model_code import remote_code, use_source
@@ -115,35 +114,39 @@ class Gr00tNetwork:
         processed = self.processor([{"type": types.MessageType.EPISODE_STEP.value, "content": step}])
         return {"processed": processed, "raw": raw}
 
-    def chunks(self, rows: Sequence[Row], inputs: Sequence[dict[str, Any]], *, alike: bool) -> list[np.ndarray]:
+    def chunks(
+        self, rngs: Sequence[np.random.Generator], inputs: Sequence[dict[str, Any]], *, alike: bool
+    ) -> list[np.ndarray]:
         """Compute the chunks of rows, (horizon, D) float32 each, in one pass, or in one for each length of prompts.
 
         Args:
-            rows: The rows.
+            rngs: The generator of each row's noise.
             inputs: What `inputs` returned for each of them.
             alike: Whether each pass is to have as many rows, with prompts of one length.
         """
         whole = self._collated(inputs)
         lengths = whole["inputs"]["attention_mask"].sum(1).tolist()
         if (self.masks_padding and not alike) or len(set(lengths)) == 1:
-            return self._chunks(rows, inputs, whole)
+            return self._chunks(rngs, inputs, whole)
         found: dict[int, np.ndarray] = {}
         for length in sorted(set(lengths)):
             places = [place for place, one in enumerate(lengths) if one == length]
-            filled = places + places[-1:] * (len(rows) - len(places) if alike else 0)
-            some = [inputs[place] for place in filled]
-            spare = [copy.deepcopy(rows[place]) for place in filled[len(places) :]]
-            chunks = self._chunks([*(rows[place] for place in places), *spare], some, self._collated(some))
+            spare = places[-1:] * (len(inputs) - len(places) if alike else 0)
+            some = [inputs[place] for place in places + spare]
+            noise = [*(rngs[place] for place in places), *(copy.deepcopy(rngs[place]) for place in spare)]
+            chunks = self._chunks(noise, some, self._collated(some))
             found |= zip(places, chunks[: len(places)], strict=True)
-        return [found[place] for place in range(len(rows))]
+        return [found[place] for place in range(len(inputs))]
 
     def _collated(self, inputs: Sequence[dict[str, Any]]) -> Any:
         return self.processor.collator([one["processed"] for one in inputs])
 
-    def _chunks(self, rows: Sequence[Row], inputs: Sequence[dict[str, Any]], collated: Any) -> list[np.ndarray]:
+    def _chunks(
+        self, rngs: Sequence[np.random.Generator], inputs: Sequence[dict[str, Any]], collated: Any
+    ) -> list[np.ndarray]:
         from vlagents_ray.policies.sampling_rng import RowDraws
 
-        with require("torch").inference_mode(), RowDraws([row.rng for row in rows]):
+        with require("torch").inference_mode(), RowDraws(rngs):
             drawn = self.model.get_action(**collated)["action_pred"].float().cpu().numpy()
         raw = {group: np.stack([one["raw"][group] for one in inputs]) for group in self.embodiment.state}
         decoded = self.processor.decode_action(drawn, self.embodiment, raw)

@@ -100,7 +100,7 @@ class Gr00t(ModelPolicy):
         found: list[Prediction | Exception] = list(read)  # type: ignore[arg-type]  # what is no error is replaced
         if places:
             chunks = self._loaded().chunks(
-                [rows[place] for place in places],
+                [rows[place].rng for place in places],
                 [read[place] for place in places],  # type: ignore[misc]
                 alike=self.config.deterministic,
             )
