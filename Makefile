@@ -46,7 +46,7 @@ CHECK_PROCESSES ?= 3
 NOT_QUICK := ray or server or hosts or sim or vulkan or torch or gpu or browser or node or compiler or alone or slow
 # Environments of model families: requirements/NAME.txt, in $(VENV)-NAME. What is tested in each is in tests/families,
 # in folders of the family's name. Those whose code is on no package index want its source, too: OPENPI_SRC, OPENVLA_SRC,
-# OPENVLA_OFT_SRC, OCTO_SRC, DIFFUSION_POLICY_SRC, VJEPA2_SRC.
+# OPENVLA_OFT_SRC, OCTO_SRC, DIFFUSION_POLICY_SRC, VJEPA2_SRC, GR00T_SRC.
 # ros is a ROS 2 of its own; it wants Python 3.11.
 # lerobot06 wants Python 3.12, and TORCH_CUDA=1 where no index has a torch without CUDA for it: several GB.
 # calvin wants CALVIN_SRC, a checkout.
@@ -55,6 +55,7 @@ FAMILIES ?= libero lerobot hf rcs ros
 TESTED_IN_libero := libero robosuite
 TESTED_IN_hf := pi0 arro vjepa2_ac
 TESTED_IN_lerobot06 := lerobot gr00t
+TESTED_IN_gr00t_n1d7 := gr00t
 TORCH_FROM := $(if $(TORCH_INDEX_URL),--index-url $(TORCH_INDEX_URL))
 
 setup: $(STAMP)

@@ -16,7 +16,7 @@ from vlagents_ray import registry
 from vlagents_ray.errors import MissingDependency, UnknownEnv, UnknownPolicy, UnknownWrapper
 
 ROOT = Path(vlagents_ray.__file__).parents[1]
-FAMILIES = ["diffusion_policy", "hf", "lerobot", "octo", "openpi", "openvla"]
+FAMILIES = ["diffusion_policy", "gr00t", "hf", "lerobot", "octo", "openpi", "openvla"]
 
 
 @pytest.fixture
@@ -39,10 +39,10 @@ def cure(module: str) -> str:
 @pytest.mark.parametrize(
     ("module", "files"),
     [
-        ("torch", ["diffusion_policy", "hf", "lerobot", "openpi", "openvla"]),
-        ("transformers", ["hf", "lerobot", "octo", "openpi", "openvla"]),
+        ("torch", ["diffusion_policy", "gr00t", "hf", "lerobot", "openpi", "openvla"]),
+        ("transformers", ["gr00t", "hf", "lerobot", "octo", "openpi", "openvla"]),
         ("jax", ["octo", "openpi"]),
-        ("diffusers", ["diffusion_policy"]),
+        ("diffusers", ["diffusion_policy", "gr00t"]),
         ("openpi.models.model", ["openpi"]),
         ("lerobot.processor", ["lerobot"]),
         ("rcs.envs.base", ["rcs"]),

@@ -18,6 +18,7 @@ from vlagents_ray.naming import did_you_mean
 
 POLICIES: dict[str, str] = {
     "diffusion_policy": "vlagents_ray.policies.diffusion_policy:DiffusionPolicy",
+    "gr00t": "vlagents_ray.policies.gr00t:Gr00t",
     "lerobot": "vlagents_ray.policies.lerobot:LeRobot",
     "noop": "vlagents_ray.policies.noop:Noop",
     "octo": "vlagents_ray.policies.octo:Octo",
@@ -108,17 +109,18 @@ _EXTRAS = {
 
 # import name -> the files in requirements/ that install it, for an environment that runs a policy
 _POLICY_REQUIREMENTS = {
-    "torch": ("diffusion_policy", "hf", "lerobot", "openpi", "openvla"),
-    "transformers": ("hf", "lerobot", "octo", "openpi", "openvla"),
-    "torchvision": ("diffusion_policy", "hf", "openvla"),
-    "tokenizers": ("hf", "lerobot", "octo", "openpi", "openvla"),
-    "huggingface_hub": ("diffusion_policy", "hf", "lerobot", "octo", "openpi", "openvla"),
-    "safetensors": ("hf", "lerobot", "openpi", "openvla"),
+    "torch": ("diffusion_policy", "gr00t", "hf", "lerobot", "openpi", "openvla"),
+    "transformers": ("gr00t", "hf", "lerobot", "octo", "openpi", "openvla"),
+    "torchvision": ("diffusion_policy", "gr00t", "hf", "openvla"),
+    "tokenizers": ("gr00t", "hf", "lerobot", "octo", "openpi", "openvla"),
+    "huggingface_hub": ("diffusion_policy", "gr00t", "hf", "lerobot", "octo", "openpi", "openvla"),
+    "safetensors": ("gr00t", "hf", "lerobot", "openpi", "openvla"),
     "timm": ("hf", "openvla"),
     "lerobot": ("lerobot",),
     "prismatic": ("openvla",),
-    "diffusers": ("diffusion_policy",),
+    "diffusers": ("diffusion_policy", "gr00t"),
     "diffusion_policy": ("diffusion_policy",),
+    "gr00t": ("gr00t",),
     "dill": ("diffusion_policy",),
     "hydra": ("diffusion_policy",),
     "omegaconf": ("diffusion_policy",),

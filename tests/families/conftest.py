@@ -16,7 +16,7 @@ _NEEDS = {
     "arro": "transformers",
     "calvin": "pybullet",
     "diffusion_policy": "diffusers",
-    "gr00t": "lerobot",
+    "gr00t": "diffusers",
     "lerobot": "lerobot",
     "libero": "libero",
     "octo": "jax",

@@ -66,6 +66,15 @@ FAMILIES = {
         "openvla_oft", "openvla", "openvla", ("oft",), config={"unnorm_key": "bridge_orig"}, source="OPENVLA_OFT_SRC"
     ),
     "octo": Family("octo", "octo", "octo", config={"batch_sizes": [1, 2]}, source="OCTO_SRC"),
+    "gr00t": Family(
+        "isaac_gr00t",
+        "gr00t",
+        "gr00t",
+        within="checkpoint",
+        config={"embodiment": "new_embodiment", "cameras": {"ego_view": "front"}, "state": ["xyzrpy"]},
+        env_vars={"GR00T_SRC": "{}/src"},  # with a small backbone
+        source="GR00T_SRC",
+    ),
     "diffusion_policy": Family(
         "diffusion_policy",
         "diffusion_policy",
@@ -102,7 +111,7 @@ def application(name: str, family: Family, home: Path) -> dict[str, Any]:
     args["environment"]["python"] = str(python)
     env_vars = {key: value.format(home / name) for key, value in family.env_vars.items()}
     if family.source is not None:
-        env_vars[family.source] = os.environ[family.source]
+        env_vars.setdefault(family.source, os.environ[family.source])
     args["environment"]["env_vars"] = env_vars
     args["config"] |= {"checkpoint": str(home / name / family.within), **family.config}
     args.pop("dialects", None)

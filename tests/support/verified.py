@@ -38,7 +38,7 @@ WHAT = {
 RUN_WITH = {
     "arro": ("hf", ("transformers", "torch")),
     "diffusion_policy": ("diffusion_policy", ("DIFFUSION_POLICY_SRC", "diffusers", "torch")),
-    "gr00t": ("lerobot06", ("lerobot", "transformers", "torch")),
+    "gr00t": ("gr00t lerobot06", ("GR00T_SRC", "lerobot", "transformers", "torch")),
     "lerobot": ("lerobot lerobot06", ("lerobot", "transformers", "torch")),
     "octo": ("octo", ("OCTO_SRC", "jax", "flax")),
     "openpi": ("openpi", ("OPENPI_SRC", "jax", "flax", "torch")),

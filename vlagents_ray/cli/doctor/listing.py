@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 # these, and the file in requirements/ that installs the rest.
 _NEEDS: dict[str, tuple[tuple[str, ...], tuple[str, ...], str]] = {
     "diffusion_policy": (("diffusion_policy", "torch"), ("DIFFUSION_POLICY_SRC",), "diffusion_policy.txt"),
+    "gr00t": (("gr00t", "transformers", "torch"), ("GR00T_SRC",), "gr00t.txt"),
     "lerobot": (("lerobot", "torch"), (), "lerobot.txt"),
     "octo": (("octo", "jax"), ("OCTO_SRC",), "octo.txt"),
     "openpi": (("openpi", "jax"), ("OPENPI_SRC",), "openpi.txt"),

@@ -48,26 +48,51 @@ def use_source(package: str, variable: str, source_dir: str | None = None, withi
 
 
 @contextlib.contextmanager
-def remote_code(*, allowed: bool) -> Iterator[None]:
+def remote_code(*, allowed: bool, source: Path | None = None) -> Iterator[None]:
     """Keep transformers from importing code of a checkpoint or hub repository in this context, unless it is allowed.
 
     That holds also if a library requests such code: some pass `trust_remote_code=True` with a name that they read from
     the checkpoint. A model that needs it fails with a `ConfigError`.
+
+    Args:
+        allowed: Whether all code may be imported.
+        source: The folder of a family's own code, which may be imported: some load a part of it in this way.
     """
     if allowed or importlib.util.find_spec("transformers") is None:
         yield
         return
     dynamic: Any = require("transformers.dynamic_module_utils")
+    # All imports of such code pass through these three: the first finds it, and calls the second, which copies it to
+    # the cache; the third executes it.
+    names = ("get_cached_module_file", "create_dynamic_module", "get_class_in_module")
+    find, create, execute = ways = [getattr(dynamic, name) for name in names]
+    own: set[str] = set()  # copies of the source's files
+    finding_own = False
 
-    def refuse(name: Any, *_: Any, **__: Any) -> NoReturn:
+    def refuse(name: Any) -> NoReturn:
         raise ConfigError(f"{str(name)!r}: is Python code of the checkpoint, or of what it names on the hub; {CURE}")
 
-    # All imports of such code pass through these two: the first copies it to the cache, the second executes it.
-    ways = {name: getattr(dynamic, name) for name in ("create_dynamic_module", "get_class_in_module")}
-    for name in ways:
-        setattr(dynamic, name, refuse)
+    def find_own(folder: Any, *args: Any, **options: Any) -> Any:
+        nonlocal finding_own
+        place = Path(folder)
+        finding_own = source is not None and place.is_dir() and source.resolve() in place.resolve().parents
+        try:
+            copy = find(folder, *args, **options)
+            own.update([copy] if finding_own else [])
+        finally:
+            finding_own = False
+        return copy
+
+    def create_own(name: Any, *args: Any, **options: Any) -> Any:
+        return create(name, *args, **options) if finding_own else refuse(name)
+
+    def execute_own(name: Any, copy: Any, *args: Any, **options: Any) -> Any:
+        return execute(name, copy, *args, **options) if copy in own else refuse(name)
+
+    for name, way in zip(names, (find_own, create_own, execute_own), strict=True):
+        setattr(dynamic, name, way)
     try:
         yield
     finally:
-        for name, way in ways.items():
+        for name, way in zip(names, ways, strict=True):
             setattr(dynamic, name, way)

@@ -158,9 +158,9 @@ def _require_no_nvidia(file: Path) -> None:
     """Raise `ConfigError` for a checkpoint of NVIDIA's own GR00T code, which LeRobot takes only as a base."""
     if file.is_file() and "gr00t" in str(_config(file).get("model_type", "")).lower():
         raise ConfigError(
-            f"checkpoint {file.parent}: is one of NVIDIA's own GR00T code, want one that LeRobot saved; train it on "
-            f"with LeRobot 0.6 (lerobot-train --policy.type=groot --policy.base_model_path={file.parent}), or serve it "
-            f"by NVIDIA's own server: docs/policies/gr00t.md"
+            f"checkpoint {file.parent}: is one of NVIDIA's own GR00T code, want one that LeRobot saved; serve it by "
+            f"the policy gr00t (docs/policies/gr00t.md), or train it on with LeRobot 0.6 (lerobot-train "
+            f"--policy.type=groot --policy.base_model_path={file.parent})"
         )
 
 

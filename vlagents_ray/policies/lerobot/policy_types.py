@@ -70,7 +70,7 @@ class XVla(Kind):
         self._look = policy.model.forward_vlm
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
-        from vlagents_ray.policies.lerobot.kinds.sampling_rng import RowDraws
+        from vlagents_ray.policies.sampling_rng import RowDraws
 
         firsts, owners = shared_frames(rows)
 
@@ -98,7 +98,7 @@ class VqBet(Kind):
         return int(self.config.action_chunk_size)
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
-        from vlagents_ray.policies.lerobot.kinds.sampling_rng import RowDraws
+        from vlagents_ray.policies.sampling_rng import RowDraws
 
         with RowDraws([row.rng for row in rows]):
             return self.policy.vqbet(stacked(batch, self.config, len(rows)), rollout=True)

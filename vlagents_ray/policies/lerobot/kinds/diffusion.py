@@ -31,7 +31,7 @@ class Diffusion(Kind):
         return int(self.config.horizon - self.steps + 1)
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
-        from vlagents_ray.policies.lerobot.kinds.sampling_rng import generator_of
+        from vlagents_ray.policies.sampling_rng import generator_of
 
         torch, model = require("torch"), self.policy.diffusion
         noise = np.stack([row.noise(self.config.horizon, self.config.action_feature.shape[0]) for row in rows])
@@ -61,7 +61,7 @@ class MultiTaskDit(Kind):
         return int(self.config.horizon - self.steps + 1)
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
-        from vlagents_ray.policies.lerobot.kinds.sampling_rng import RowDraws
+        from vlagents_ray.policies.sampling_rng import RowDraws
 
         seen = stacked(batch, self.config, len(rows))
         for name in _TOKENS:

@@ -39,7 +39,7 @@ class Groot(Kind):
         return int(self.policy._groot_model.config.action_horizon)
 
     def draw(self, batch: dict[str, Any], rows: Sequence[Row], leftovers: Sequence[Any]) -> Any:
-        from vlagents_ray.policies.lerobot.kinds.sampling_rng import RowDraws
+        from vlagents_ray.policies.sampling_rng import RowDraws
 
         groups: dict[int, list[int]] = {}
         for place, length in enumerate(batch["attention_mask"].sum(1).tolist()):

@@ -69,7 +69,7 @@ class Kind:
         Returns:
             The chunks, (B, horizon, D).
         """
-        from vlagents_ray.policies.lerobot.kinds.sampling_rng import seeded
+        from vlagents_ray.policies.sampling_rng import seeded
 
         [row] = rows
         with seeded(row.rng, require("torch").device(self.config.device)):
