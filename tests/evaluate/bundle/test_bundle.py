@@ -203,7 +203,15 @@ def test_an_environment_that_is_not_registered_is_made_for_those_who_trust_the_b
 
 
 @pytest.mark.parametrize(
-    "options", [{"assets": "../../etc"}, {"nested": {"a": 1}}, {"code": "os:system"}, {"trust_remote_code": True}]
+    "options",
+    [
+        {"assets": "../../etc"},
+        {"nested": {"a": 1}},
+        {"code": "os:system"},
+        {"trust_remote_code": True},
+        {"module": "evil"},
+        {"source_dir": "here"},
+    ],
 )
 def test_options_that_could_name_files_or_code_are_not_taken_from_a_stranger(
     bundle: Path, tmp_path: Path, options: dict[str, object]

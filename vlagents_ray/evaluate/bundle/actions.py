@@ -19,6 +19,7 @@ from vlagents_ray.evaluate.results.reader import CellResults, Episode
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.registry import env_suite, names
 
+_CODE = re.compile("trust.*|module|source_dir")  # options that say whose code is run, though they may be words
 _WORD = re.compile(r"\w[\w.+-]{0,63}")  # a value that is text, and no path, URL or "module:Class"
 
 
@@ -48,7 +49,7 @@ def require_harmless(cell: CellResults) -> None:
         raise ConfigError(f"{cell.env}: is no registered environment; --trust makes it, and runs its code")
     for kind in ("env_options", "reset_options"):
         stated = cell.settings.get(kind) or {}
-        odd = {name: value for name, value in stated.items() if name.startswith("trust") or not _is_plain(value)}
+        odd = {name: value for name, value in stated.items() if _CODE.fullmatch(name) or not _is_plain(value)}
         if odd:
             raise ConfigError(f"{cell.env}: got the {kind} {odd}, which could name files or code; --trust takes them")
 
