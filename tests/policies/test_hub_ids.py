@@ -21,6 +21,7 @@ NAMED = f"org/name@{COMMIT}"
 NEEDED = {"openpi": {"config": "pi0_droid"}, "diffusion_policy": {"trust_checkpoint": True}}
 # What needs the family's packages, and comes before the checkpoint is looked for.
 BEFORE = {
+    "gr00t": ["vlagents_ray.policies.gr00t.network._use_checkout"],
     "octo": ["vlagents_ray.policies.octo.network.octo_model_class"],
     "openpi": [f"vlagents_ray.policies.openpi.policy.{name}" for name in ("use_source", "train_config")],
 }
