@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import threading
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -171,7 +172,7 @@ def test_a_client_that_is_closed_at_once_leaves_no_thread_that_fails(
     server: tuple[PolicyServer, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     module = importlib.import_module("grpc._channel")
-    poll, failed = module._poll_connectivity, []
+    poll, failed, ended = module._poll_connectivity, [], threading.Event()
 
     def late(*args: Any) -> None:
         time.sleep(0.1)
@@ -179,11 +180,13 @@ def test_a_client_that_is_closed_at_once_leaves_no_thread_that_fails(
             poll(*args)
         except ValueError as error:
             failed.append(error)
+        finally:
+            ended.set()
 
     monkeypatch.setattr(module, "_poll_connectivity", late)
     with opened(server[1]):
         pass
-    time.sleep(0.3)
+    assert ended.wait(30)
     assert not failed
 
 

@@ -71,16 +71,17 @@ def to_vla_eval(results: Results, path: Path, **settings: Any) -> int:
         ConfigError: There are several policy ids, or an env that the leaderboard has no score for.
     """
     given = VlaEvalSettings.model_validate(settings)
+    found = scores(results)
     by_benchmark: dict[str, list[Score]] = {}
-    for score in scores(results):
+    for score in found:
         by_benchmark.setdefault(_benchmark(score), []).append(score)
     if "libero_pro" in by_benchmark:  # whose original suites are LIBERO's
         by_benchmark["libero_pro"] += [one for one in by_benchmark.get("libero", []) if _suite(one) in _PRO_SUITES]
-    entries = [_entry(name, found, given) for name, found in sorted(by_benchmark.items())]
+    entries = [_entry(name, theirs, given) for name, theirs in sorted(by_benchmark.items())]
     document = {"last_updated": max(str(one["date_added"]) for one in entries), "results": entries}
     with whole(path) as part:
         part.write_text(json.dumps(document, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
-    return sum(score.rate.episodes for score in scores(results))
+    return sum(score.rate.episodes for score in found)
 
 
 def _benchmark(score: Score) -> str:
@@ -89,8 +90,9 @@ def _benchmark(score: Score) -> str:
     Raises:
         ConfigError: It has none.
     """
-    found = {"simpler": "simpler_env"}.get(env_suite(score.cells[0].env))
-    if env_suite(score.cells[0].env) == "libero":
+    suite = env_suite(score.cells[0].env)
+    found = {"simpler": "simpler_env"}.get(suite)
+    if suite == "libero":
         found = "libero" if _suite(score) in _LIBERO else "libero_pro" if _suite(score) in _PRO else None
         counted = [cell for cell in score.cells if cell.counted]
         if varied := [cell.env for cell in counted if not _task(cell).rpartition("/")[2].isdecimal()]:
