@@ -79,7 +79,8 @@ check: lint type
 test: setup
 	@$(MAKE) --no-print-directory lint type docs families
 	@echo '== tests'
-	VLAGENTS_RAY_ENVIRONMENTS=$(abspath $(VENV)) $(BIN)/pytest -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder
+	VLAGENTS_RAY_ENVIRONMENTS=$(abspath $(VENV)) $(BIN)/python tests/support/play_again.py \
+	  -n $(TEST_PROCESSES) --dist loadfile --no-loadscope-reorder
 
 # Environments one after the other, as each installs this folder; then the tests of two at once.
 families:
@@ -88,7 +89,7 @@ families:
 
 family-%: $(VENV)-%/.installed
 	@echo '== tests of $(or $(TESTED_IN_$*),$*), in $(VENV)-$*'
-	$(VENV)-$*/bin/python -m pytest -p no:cacheprovider $(addprefix tests/families/,$(or $(TESTED_IN_$*),$*))
+	$(VENV)-$*/bin/python tests/support/play_again.py $(addprefix tests/families/,$(or $(TESTED_IN_$*),$*))
 
 verified-%: $(VENV)-%/.installed
 	$(VENV)-$*/bin/python -m pytest -p no:cacheprovider -m verifies --verified $(addprefix tests/families/,$(or $(TESTED_IN_$*),$*))
