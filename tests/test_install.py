@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import os
 import shutil
@@ -13,6 +14,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from vlagents_ray.serve.python_env.create import installed_wheel
 
 ROOT = Path(__file__).parents[1]
 LIGHT_DEPENDENCIES = {"numpy", "simplejpeg", "websockets"}
@@ -68,6 +71,21 @@ def test_the_wheel_holds_every_module_and_the_licence_and_no_tests(wheel: Path) 
     assert resources - names == set()
     assert [name for name in names if name.endswith(".dist-info/licenses/LICENSE")]
     assert [name for name in names if name.startswith(("benchmarks/", "tests/", "deployments/"))] == []
+
+
+def test_the_installed_package_makes_the_same_wheel_again(
+    wheel: Path, robot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (installed,) = robot.parents[1].glob("lib/*/site-packages/vlagents_ray-*.dist-info")
+    monkeypatch.setattr(importlib.metadata, "distribution", lambda _: importlib.metadata.PathDistribution(installed))
+    again = installed_wheel(tmp_path)
+    assert again.name == wheel.name
+    built, rebuilt = zipfile.ZipFile(wheel), zipfile.ZipFile(again)
+    (record,) = (name for name in built.namelist() if name.endswith("/RECORD"))
+    assert {name: rebuilt.read(name) for name in rebuilt.namelist() if name != record} == {
+        name: built.read(name) for name in built.namelist() if name != record
+    }
+    assert set(rebuilt.read(record).splitlines()) == set(built.read(record).splitlines())
 
 
 def test_a_robot_installs_three_packages_and_those_have_no_dependencies_of_their_own(robot: Path) -> None:

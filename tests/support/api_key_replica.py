@@ -69,7 +69,7 @@ from vlagents_ray.serve.live.fleet import Fleet
 from vlagents_ray.serve.live.snapshot import ReplicaView
 from vlagents_ray.serve.ports import free_port, reserve
 from vlagents_ray.serve.weights.updates import PushResult
-from vlagents_ray.weights.safetensors import header_of
+from vlagents_ray.weights.safetensors import ValueSpec, header_of, read_header
 from vlagents_ray.wire.vla_eval import codec as vla_eval_codec
 
 ANSWER_S = 10.0
@@ -520,8 +520,9 @@ class _Receiving:
     def __init__(self, replica: KeyedReplica) -> None:
         self._replica = replica
 
-    def require_fit(self, announced: Any, options: Any) -> None:
+    def read_header(self, header: bytes, options: Any) -> dict[str, ValueSpec]:
         """All fit."""
+        return read_header(header)
 
     async def push_received(self, named: Any, options: Any) -> PushResult:
         for mark in named:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import sys
 from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from vlagents_ray.errors import InvalidWeights, UnchangedWeights
 from vlagents_ray.weights.trainable import converted, dtype_name, is_array, portable
 
 _SHOWN = 5  # faults in a message
-_SAMPLED = 1024  # most elements of each value that the fingerprint covers
+_THREADS = 4  # that compute a fingerprint: hashing releases Python's lock
 _KINDS = (("float", "bfloat"), ("int", "uint"), ("bool",), ("complex",))
 
 
@@ -64,16 +65,19 @@ def require_fit(held: Mapping[str, Any], pushed: Mapping[str, Any], *, partial: 
 
 
 def fingerprint(named: Mapping[str, Any]) -> str:
-    """Return a digest of 16 hexadecimal characters over names, shapes, types and at most 1024 elements of each value.
+    """Return a digest of 32 hexadecimal characters over names, shapes, types and all bytes of the values.
+
+    A sample would be faster, and the same for weights that differ elsewhere.
 
     Args:
         named: Values by name, on any device.
     """
-    found = hashlib.blake2b(digest_size=8)
-    for name in sorted(named):
-        value = named[name]
-        found.update(f"{name} {dtype_name(value)} {tuple(value.shape)}\n".encode())
-        found.update(_sampled_bytes(value))
+    found = hashlib.blake2b(digest_size=16)
+    names = sorted(named)
+    with ThreadPoolExecutor(_THREADS, "fingerprint") as threads:
+        for name, digest in zip(names, threads.map(_digest, (named[name] for name in names)), strict=True):
+            found.update(f"{name} {dtype_name(named[name])} {tuple(named[name].shape)}\n".encode())
+            found.update(digest)
     return found.hexdigest()
 
 
@@ -120,6 +124,6 @@ def _size(value: Any) -> int:
     return int(np.prod(value.shape, dtype=np.int64))
 
 
-def _sampled_bytes(value: Any) -> bytes:
-    flat = value.reshape(-1)[:: max(1, -(-_size(value) // _SAMPLED))]
-    return portable(flat).tobytes()
+def _digest(value: Any) -> bytes:
+    data = np.ascontiguousarray(portable(value)).reshape(-1).view(np.uint8)
+    return hashlib.blake2b(data, digest_size=16).digest()  # type: ignore[arg-type]

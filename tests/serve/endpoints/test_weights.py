@@ -40,11 +40,13 @@ from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import Keys
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
+from vlagents_ray.serve.endpoints import weights as endpoint
 from vlagents_ray.serve.endpoints.weights import weights_routes
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.scaling.weight_push import OwnWeights, WeightPusher
+from vlagents_ray.serve.weights import versions
 from vlagents_ray.serve.weights.updates import PushOptions, PushResult
-from vlagents_ray.weights.safetensors import MESSAGE_BYTES, PART_BYTES, header_of, parts_of
+from vlagents_ray.weights.safetensors import MESSAGE_BYTES, PART_BYTES, header_of, parts_of, read_header
 
 LENGTH = 3 * 2**20  # 12 MiB, so that there are several parts
 
@@ -73,7 +75,7 @@ class Alone:
         async def others() -> tuple[()]:
             return ()
 
-        self.require_fit = engine.weights.require_fit
+        self.read_header = engine.weights.read_header
         self._pusher = WeightPusher(own, others)
         self._engine = engine
 
@@ -247,6 +249,34 @@ def test_a_learner_that_is_silent_is_not_waited_for(serving: Serving) -> None:
     assert Publisher(server.url).push(gains(1)) == 1
 
 
+def test_a_push_that_sends_too_little_does_not_hold_up_others(
+    serving: Serving, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server, values = serving(), gains(1)
+    monkeypatch.setattr(endpoint, "LEAST_RATE", 2**40)
+    monkeypatch.setattr(endpoint, "time", SimpleNamespace(monotonic=iter(range(0, 1000, 20)).__next__))  # 20 s a call
+    with opened(server) as socket:
+        assert answer(socket, header_of(values)) == {"received": 0}
+        parts = parts_of(values)
+        found = [answer(socket, next(parts)) for _ in range(2)]
+        assert "want at least" in str(read_error(found[-1]))
+    wait_for(lambda: _is_free(server))
+
+
+def _is_free(server: SimpleNamespace) -> bool:
+    with opened(server) as socket:
+        return answer(socket, header_of(gains(1))) == {"received": 0}
+
+
+def test_a_header_beyond_the_policys_own_names_is_not_parsed(serving: Serving, monkeypatch: pytest.MonkeyPatch) -> None:
+    parsed: list[bytes] = []
+    monkeypatch.setattr(versions, "read_header", lambda data: (parsed.append(data), read_header(data))[1])
+    many = header_of({f"name {number}": np.zeros(1, np.float32) for number in range(200)})
+    with opened(serving()) as socket:
+        assert isinstance(read_error(answer(socket, many)), MessageTooLarge)
+    assert not parsed
+
+
 @pytest.mark.parametrize(
     ("query", "parts", "error"),
     [
@@ -258,6 +288,8 @@ def test_a_learner_that_is_silent_is_not_waited_for(serving: Serving) -> None:
         ("?version=-1", [], InvalidInput),
         ("?version=9" + "9" * 5000, [], InvalidInput),
         ("", [b"garbage"], MalformedMessage),
+        ("", [b""], MalformedMessage),
+        ("?partial=true", [header_of({"offset": np.zeros(2, np.float32)}), b""], MalformedMessage),
         ("", [b"\0" * (MESSAGE_BYTES + 1)], MessageTooLarge),
         ("?partial=true", [header_of({"offset": np.zeros(2, np.float32)}), b"\0" * 9], MalformedMessage),
     ],
@@ -265,7 +297,7 @@ def test_a_learner_that_is_silent_is_not_waited_for(serving: Serving) -> None:
 def test_garbage_is_refused_with_its_reason(serving: Serving, query: str, parts: list[bytes], error: type) -> None:
     server = serving()
     with opened(server, query) as socket:
-        for part in parts or [b""]:
+        for part in parts or [b"garbage"]:
             found = answer(socket, part)
         assert type(read_error(found)) is error
     assert server.engine.weights.number == 0

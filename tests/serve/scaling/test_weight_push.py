@@ -164,6 +164,9 @@ def test_a_learner_numbers_versions_as_it_likes_if_they_rise(app: Application) -
     assert app.gains() == [(501, 6.0)] * 2
     with pytest.raises(InvalidInput, match=r"version: got 9007199254740992, want a number in \[1, 9007199254740991\]"):
         PushOptions(version=2**53)
+    with pytest.raises(InvalidInput, match="want at most 1000000000 above 501"):  # or no later number is above it
+        app.push(7, PushOptions(version=2**53 - 1))
+    assert app.push(7, PushOptions(version=502)).version == 502
 
 
 def test_if_one_replica_cannot_be_reached_none_acts_with_it(app: Application) -> None:

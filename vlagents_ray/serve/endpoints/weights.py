@@ -14,6 +14,7 @@ from __future__ import annotations
 import asyncio
 import json
 import logging
+import time
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import fields
@@ -30,11 +31,12 @@ from vlagents_ray.serve.access.api_keys import Caller, current_caller
 from vlagents_ray.serve.access.scope_check import ScopeCheck
 from vlagents_ray.serve.endpoints.http_messages import deny, problem_response, request_id
 from vlagents_ray.serve.weights.updates import PushOptions, PushResult
-from vlagents_ray.weights.safetensors import MESSAGE_BYTES, ValueSpec, ValuesReader, read_header
+from vlagents_ray.weights.safetensors import MESSAGE_BYTES, ValueSpec, ValuesReader
 
 logger = logging.getLogger(__name__)
 
 PATH = "/v1/weights"
+LEAST_RATE = 2**18  # bytes a second that a push has on average: no other push is taken meanwhile
 _SCOPE = "weights"
 _DIGITS = 20  # most of a version's number
 _TRUTH = {"true": True, "false": False}
@@ -43,8 +45,8 @@ _TRUTH = {"true": True, "false": False}
 class ReceivesWeights(Protocol):
     """The replicas of a policy, for which one of them receives new weights."""
 
-    def require_fit(self, announced: Mapping[str, ValueSpec], options: PushOptions) -> None:
-        """Raise an error if values of these types and shapes do not fit the policy."""
+    def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
+        """Return types and shapes of the values to come; raise an error if they do not fit the policy."""
         ...
 
     async def push_received(self, named: Mapping[str, Any], options: PushOptions) -> PushResult:
@@ -114,12 +116,16 @@ class _WeightsEndpoint:
             if isinstance(caller, Caller):
                 caller.admit()  # a push counts as one request
                 caller.note("pushes weights:", f"mode {options.mode}")
-            announced = await asyncio.to_thread(read_header, header)
-            await asyncio.to_thread(self._replicas.require_fit, announced, options)
-            reader = ValuesReader(announced)
+            reader = ValuesReader(await asyncio.to_thread(self._replicas.read_header, header, options))
+            begun = time.monotonic()
             while reader.received < reader.size:
                 await socket.send_text(json.dumps({"received": reader.received}))
                 reader.add(await self._message(socket))
+                if time.monotonic() - begun > self._slow_s + reader.received / LEAST_RATE:
+                    raise MalformedMessage(
+                        f"weights: got {reader.received} bytes in {time.monotonic() - begun:.0f} s, want at least "
+                        f"{LEAST_RATE} a second; another push may wait"
+                    )
             # Once all values are here, the push does not depend on the learner's connection.
             pushed = await asyncio.shield(self._replicas.push_received(reader.values(), options))
             replicas = len(pushed.replicas)
@@ -142,6 +148,8 @@ class _WeightsEndpoint:
             raise MalformedMessage("weights: got a text message, want a binary one")
         if len(part) > MESSAGE_BYTES:
             raise MessageTooLarge(f"weights: got a part of {len(part)} bytes, the limit is {MESSAGE_BYTES}")
+        if not part:
+            raise MalformedMessage("weights: got an empty message, want a header or a part of the values")
         return part
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
-import json
 import os
 import platform
 import re
@@ -12,6 +11,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import zipfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -24,6 +24,7 @@ Progress = Callable[[str], None]
 
 _US = "vlagents-ray"
 _FIXES = "vlagents_ray_import_fixes"  # a module and a .pth file in the environments created here
+_NOT_IN_A_WHEEL = {"RECORD", "INSTALLER", "REQUESTED", "direct_url.json"}  # an installer writes them
 _SHOWN = 2000  # last characters of uv's output that an error quotes
 _MINOR = "import sys; print('%d.%d' % sys.version_info[:2])"
 _CUDA = re.compile(r"^ \+ ((?:nvidia|cuda)-\S+)", re.MULTILINE)
@@ -134,8 +135,9 @@ def make_environment(
             f"Python {_minor(made)} is not this one's {_minor(Path(sys.executable))}: without Ray, for a child process"
         )
         light = True
-    wanted = [*_ourselves(light), *(word for file in files for word in ("--requirement", str(file)))]
     with tempfile.TemporaryDirectory() as scratch:
+        wanted = [*_ourselves(light, Path(scratch))]
+        wanted += [word for file in files for word in ("--requirement", str(file))]
         if not _has_gpu():
             for override in _overrides(requirements, Path(scratch)):
                 wanted += ["--override", str(override)]
@@ -147,21 +149,42 @@ def make_environment(
     return made
 
 
-def _ourselves(light: bool) -> list[str]:
-    """Return uv's arguments for this package as it is installed here, with the same Ray, or pydantic if `light`."""
+def _ourselves(light: bool, scratch: Path) -> list[str]:
+    """Return uv's arguments for this package as it is installed here, with the same Ray, or pydantic if `light`.
+
+    It is never installed by its name: an index may have another package under that name.
+    """
     extra = "" if light else "[serve]"
     source = Path(vlagents_ray.__file__).parents[1]
-    direct = importlib.metadata.distribution(_US).read_text("direct_url.json")
     if (source / "pyproject.toml").is_file():
         us = ["--editable", f"{source}{extra}"]
-    elif direct is not None:
-        us = [f"{_US}{extra} @ {json.loads(direct)['url']}"]
     else:
-        us = [f"{_US}{extra}=={importlib.metadata.version(_US)}"]
+        us = [f"{_US}{extra} @ {installed_wheel(scratch).as_uri()}"]
     if not light:
         return [*us, f"ray=={importlib.metadata.version('ray')}"]
     needed = importlib.metadata.requires(_US) or []
     return [*us, *(one.partition(";")[0].strip() for one in needed if one.startswith("pydantic"))]
+
+
+def installed_wheel(folder: Path) -> Path:
+    """Write a wheel of this package, from the files that are installed here, into `folder`, and return its path.
+
+    See https://packaging.python.org/en/latest/specifications/binary-distribution-format: the files, and a list of them.
+    """
+    here = importlib.metadata.distribution(_US)
+    kept = [
+        file
+        for file in here.files or ()
+        if ".." not in file.parts and "__pycache__" not in file.parts and file.name not in _NOT_IN_A_WHEEL
+    ]
+    made = folder / f"{_US.replace('-', '_')}-{here.version}-py3-none-any.whl"
+    record = next(str(file.parent / "RECORD") for file in kept if file.name == "METADATA")
+    with zipfile.ZipFile(made, "w", zipfile.ZIP_DEFLATED) as wheel:
+        for file in kept:
+            wheel.write(file.locate(), str(file))
+        listed = "".join(f"{file},{file.hash.mode}={file.hash.value},{file.size}\n" for file in kept if file.hash)
+        wheel.writestr(record, f"{listed}{record},,\n")
+    return made
 
 
 def _overrides(requirements: Path, scratch: Path) -> list[Path]:

@@ -56,9 +56,9 @@ class ReplicaWeights:
         reference = await asyncio.to_thread(ray.put, named)  # a copy, for which no robot on this event loop waits
         return await self._pusher.push([reference], options)
 
-    def require_fit(self, announced: Mapping[str, ValueSpec], options: PushOptions) -> None:
+    def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
         """Check weights that are to be received."""
-        self._weights_here.require_fit(announced, options)
+        return self._weights_here.read_header(header, options)
 
     async def versions_of_weights(self) -> list[int]:
         """Return the newest version of each replica that can be reached; called by a learner."""

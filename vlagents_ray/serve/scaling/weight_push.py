@@ -27,6 +27,7 @@ of a learner's memory on the GPU of all replicas."""
 
 logger = logging.getLogger(__name__)
 
+_MOST_AHEAD = 10**9  # of a version that a learner numbers, such as by its step of training
 _ATTEMPTS = 3  # at the commit of a replica that cannot be reached
 
 
@@ -139,6 +140,11 @@ class WeightPusher:
             number = last + 1 if options.version is None else options.version
             if number <= last:
                 raise InvalidInput(f"version: got {number}, want one above {last}, the newest that acts")
+            if number > last + _MOST_AHEAD:
+                raise InvalidInput(
+                    f"version: got {number}, want at most {_MOST_AHEAD} above {last}, the newest that acts: versions "
+                    f"never go back, so that a number beyond would end all numbered pushes"
+                )
             if isinstance(values, SharedValues):
                 _require_gpu(values.gpu, newest)
             staged: dict[WeightsReplica, str] = {}

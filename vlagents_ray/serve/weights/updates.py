@@ -80,9 +80,9 @@ class WeightUpdates:
         """Return the durations of the pushes since the last call."""
         return [self._pushes_ms.popleft() for _ in range(len(self._pushes_ms))]
 
-    def require_fit(self, announced: Mapping[str, ValueSpec], options: PushOptions) -> None:
-        """Check values before they arrive; see `ModelWeights.require_fit`."""
-        self._own().require_fit(announced, partial=options.partial)
+    def read_header(self, header: bytes, options: PushOptions) -> dict[str, ValueSpec]:
+        """Check values before they arrive; see `ModelWeights.read_header`."""
+        return self._own().read_header(header, partial=options.partial)
 
     def stage(self, number: int, pushed: Mapping[str, Any], options: PushOptions) -> str:
         """Check and hold a new version, and return its fingerprint; see `ModelWeights.stage`."""

@@ -14,14 +14,14 @@ from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 from weakref import WeakValueDictionary
 
-from vlagents_ray.errors import NotTrainable, Overloaded, UnknownSession, WeightsNotStaged
+from vlagents_ray.errors import MessageTooLarge, NotTrainable, Overloaded, UnknownSession, WeightsNotStaged
 from vlagents_ray.interface import POLICY, Agent
 from vlagents_ray.weights.check import fingerprint, fitted, require_fit
-from vlagents_ray.weights.safetensors import ValueSpec
+from vlagents_ray.weights.safetensors import ValueSpec, read_header
 from vlagents_ray.weights.shared_values import gpu_of
 from vlagents_ray.weights.trainable import is_copied, own_copy, portable
 
-DIGITS = 16  # of a fingerprint, hexadecimal
+DIGITS = 16  # of a checkpoint's digest in place of a fingerprint, hexadecimal
 STAGED_S = 60.0  # time for which a staged version waits for its commit, s
 
 PushMode = Literal["keep", "next_episode", "wait"]
@@ -119,16 +119,18 @@ class ModelWeights:
         if self._in_place:
             version.values = None
 
-    def require_fit(self, announced: Mapping[str, ValueSpec], *, partial: bool = False) -> None:
-        """Check values before they arrive.
+    def read_header(self, header: bytes, *, partial: bool = False) -> dict[str, ValueSpec]:
+        """Return types and shapes of values before they arrive, once they fit.
 
         Args:
-            announced: Their types and shapes, by name.
+            header: The header of a push, as `vlagents_ray.weights.safetensors.header_of` returns it.
             partial: Whether names may be missing.
 
         Raises:
             NotTrainable: The agent names no parameters.
-            InvalidWeights: They do not fit.
+            MessageTooLarge: The header is twice as long as one with the agent's own names would be. It is not parsed.
+            MalformedMessage: It is no header.
+            InvalidWeights: The values do not fit.
         """
         if self._refusal is not None:
             raise self._refusal
@@ -136,7 +138,15 @@ class ModelWeights:
         if held is None:
             with self._busy:
                 held = self._agent.parameters()
+        # An entry is its name, a type, numbers of up to 15 digits, and at most 60 characters of JSON around them.
+        most = 4096 + 2 * sum(len(name) + 90 + 16 * len(held[name].shape) for name in held)
+        if len(header) > most:
+            raise MessageTooLarge(
+                f"weights: got a header of {len(header)} bytes, want at most {most} for the policy's {len(held)} names"
+            )
+        announced = read_header(header)
         require_fit(held, announced, partial=partial)
+        return announced
 
     def stage(self, number: int, pushed: Mapping[str, Any], *, partial: bool = False, allow_same: bool = False) -> str:
         """Check a new version and hold it, without acting with it; return its fingerprint.
