@@ -30,8 +30,6 @@ RUN = {"vlagents-ray doctor", "vlagents-ray policies"}
 NOT_RUN = {
     "vlagents-ray envs": "a block of docs/evaluation/index.md runs it",
     "vlagents-ray slurm eval": "the name of a command",
-    "vlagents-ray up": "tests/integration/test_warm_cluster.py runs it with free ports",
-    "vlagents-ray down": "tests/integration/test_warm_cluster.py runs it",
     "vlagents-ray robot --env tabletop --teleop keyboard": "tests/cli/test_robot.py types its keys",
     "vlagents-ray serve my_policies:Reach --set gain=0.3": "test_served_pages.py serves examples/own_policy.py so",
     "vlagents-ray bench report": "minutes of measuring",

@@ -15,7 +15,6 @@ from vlagents_ray.cli.doctor.machine import Check
 from vlagents_ray.envs.rendering import render_probe
 from vlagents_ray.envs.rendering.egl import EglDevice
 from vlagents_ray.errors import MissingDependency
-from vlagents_ray.ray_tools.warm_cluster import WarmCluster
 from vlagents_ray.serve.ports import free_port
 
 GB = machine.GB
@@ -45,7 +44,6 @@ def test_every_check_gives_a_row_of_its_own_and_none_breaks() -> None:
         "Python",
         "Ray",
         "HAProxy",
-        "warm cluster",
         "GPU",
         "Vulkan",
         "EGL",
@@ -56,19 +54,6 @@ def test_every_check_gives_a_row_of_its_own_and_none_breaks() -> None:
         assert names.count(expected) == 1
     assert [row for row in rows if "the check itself broke" in row.detail] == []
     assert [row for row in rows if row.status != "ok" and not row.cure] == []
-
-
-def test_a_warm_cluster_that_cannot_be_used_from_here_is_a_warning(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(doctor, "warm_cluster", lambda: None)
-    assert doctor.warm().status == "ok"
-    cluster = WarmCluster("http://127.0.0.1:8000", "127.0.0.1:1", 5, tmp_path, str(tmp_path), {})
-    monkeypatch.setattr(doctor, "warm_cluster", lambda: cluster)
-    row = doctor.warm()
-    assert row.status == "warn"
-    assert row.detail == "the process that kept the warm cluster (5) has ended"
-    assert "`vlagents-ray down`" in row.cure
 
 
 def test_the_exit_code_is_1_only_if_a_check_failed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,8 @@ import pytest
 from fake_raylet import raylet
 
 from vlagents_ray import ConfigError, join
-from vlagents_ray.ray_tools.local_servers import announce, enter, local_servers
+from vlagents_ray.ray_tools import local_servers as found_here
+from vlagents_ray.ray_tools.local_servers import LocalServer, announce, local_servers
 from vlagents_ray.ray_tools.private import use_loopback
 from vlagents_ray.ray_tools.reaper import MARK
 
@@ -72,7 +73,7 @@ def test_of_several_servers_one_is_named_by_its_url_or_its_application(
             join("act")
         monkeypatch.setenv("RAY_AUTH_MODE", "disabled")  # so that it says which one it found, and goes no further
         for name in ("pi0", "http://127.0.0.1:8001", "http://127.0.0.1:8001/", "http://localhost:8001"):
-            with pytest.raises(ConfigError, match=r"RAY_AUTH_MODE=disabled: the Ray of http://127\.0\.0\.1:8001 wants"):
+            with pytest.raises(ConfigError, match=r"RAY_AUTH_MODE=disabled: the Ray of http://127\.0\.0\.1:8001 needs"):
                 join(name)
 
 
@@ -92,9 +93,11 @@ def test_a_program_with_another_home_or_token_joins_with_that_of_the_server(
     monkeypatch.setattr(os, "environ", os.environ | {"HOME": "/home/me", "RAY_AUTH_TOKEN": "mine"})
     monkeypatch.setattr(ray, "init", lambda *_, **__: found.update(os.environ))
     monkeypatch.setattr("vlagents_ray.ray_tools.private.reread_authentication_mode", lambda: None)
+    server = LocalServer("http://127.0.0.1:8000", ("noop",), "127.0.0.1:1")
+    monkeypatch.setattr(found_here, "_found", lambda: iter([(server, of_server)]))
     before = use_loopback(True)
     try:
-        enter("http://127.0.0.1:8000", "127.0.0.1:1", of_server, {})
+        join()
     finally:
         use_loopback(before)
     assert {name: text for name, text in found.items() if name.startswith("RAY_AUTH_TOKEN")} == token

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from vlagents_ray.cli.bench import bench
-from vlagents_ray.cli.cluster.command import down_command, up_command
 from vlagents_ray.cli.console import errors, fail, fresh, out, progress, table
 from vlagents_ray.cli.evaluation.command import evaluate_command
 from vlagents_ray.cli.evaluation.results import (
@@ -72,8 +71,6 @@ def demo(
 
 
 app.command("bundle")(bundle_command)
-app.command("up")(up_command)
-app.command("down")(down_command)
 app.command("eval")(evaluate_command)
 app.command("export")(export_command)
 app.command("merge")(merge_command)

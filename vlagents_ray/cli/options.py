@@ -19,7 +19,7 @@ Set = Annotated[list[str], typer.Option("--set", metavar="KEY=VALUE", help="A se
 Address = Annotated[
     str | None,
     typer.Option(
-        help="A running Ray cluster ('auto' finds that of `vlagents-ray up` or `ray start`), or the URL of a server on "
+        help="A running Ray cluster ('auto' finds that of `ray start`), or the URL of a server on "
         "this machine, for the one it has; default: one for the run, on this machine."
     ),
 ]

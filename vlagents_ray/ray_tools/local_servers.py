@@ -50,48 +50,30 @@ def join(server: str | None = None, **options: Any) -> LocalServer:
         ConfigError: No server of this user is ready on this machine, several are and `server` is None, or this process
             is in another Ray cluster.
     """
-    chosen, environment = _chosen(server)
-    enter(chosen.url, chosen.ray_address, environment, {}, **options)
-    return chosen
-
-
-def enter(
-    name: str, ray_address: str, environment: Mapping[str, str], variables: Mapping[str, str], **options: Any
-) -> None:
-    """Connect this process to a Ray of this user on the loopback address, unless it is connected to it.
-
-    Args:
-        name: The cluster's name, for messages.
-        ray_address: Its address, host:port.
-        environment: The environment of its daemon, from which come the variables of Ray's token.
-        variables: Further environment variables to set here.
-        options: Further options of `ray.init`.
-
-    Raises:
-        ConfigError: This process is in another Ray cluster, or is to use no token.
-    """
     import ray
 
     from vlagents_ray.ray_tools.private import reread_authentication_mode, use_loopback
 
+    chosen, environment = _chosen(server)
     if ray.is_initialized():
-        if ray.get_runtime_context().gcs_address == ray_address:
-            return
+        if ray.get_runtime_context().gcs_address == chosen.ray_address:
+            return chosen
         raise ConfigError(
             f"got a process in another Ray cluster, {ray.get_runtime_context().gcs_address}; want it in that of "
-            f"{name}: call ray.shutdown() before, or join() in place of ray.init()"
+            f"{chosen.url}: call ray.shutdown() before, or join() in place of ray.init()"
         )
     if os.environ.get(_MODE, "token").lower() != "token":
-        raise ConfigError(f"{_MODE}={os.environ[_MODE]}: the Ray of {name} wants its token; unset {_MODE}")
+        raise ConfigError(f"{_MODE}={os.environ[_MODE]}: the Ray of {chosen.url} needs its token; unset {_MODE}")
     tokens = {one: environment[one] for one in _TOKENS if environment.get(one)}
     if not tokens and environment.get("HOME"):  # where Ray keeps the token, which may not be this program's home
         tokens = {_TOKENS[1]: f"{environment['HOME']}/.ray/auth_token"}
     for one in _TOKENS:
         os.environ.pop(one, None)
-    os.environ.update({_MODE: "token", _ALONE: "0"} | tokens | dict(variables))
+    os.environ.update({_MODE: "token", _ALONE: "0"} | tokens)
     use_loopback(True)  # Ray read the variables when it was imported
     reread_authentication_mode()
-    ray.init(ray_address, **{"log_to_driver": True, "logging_level": "WARNING"} | options)
+    ray.init(chosen.ray_address, **{"log_to_driver": True, "logging_level": "WARNING"} | options)
+    return chosen
 
 
 def announce(url: str, apps: Mapping[str, str], ray_address: str) -> None:
@@ -131,19 +113,7 @@ def _chosen(wanted: str | None) -> tuple[LocalServer, dict[str, str]]:
 
 
 def _found() -> Iterator[tuple[LocalServer, dict[str, str]]]:
-    for content, environment in announced(_FILE):
-        yield LocalServer(content["url"], tuple(content["apps"]), content["ray_address"]), environment
-
-
-def announced(name: str) -> Iterator[tuple[dict[str, Any], dict[str, str]]]:
-    """Find the Ray clusters of this user on this machine that have announced themselves.
-
-    Args:
-        name: The file in a cluster's private folder: JSON with "ray_address", which is host:port.
-
-    Yields:
-        The content of the file, and the environment of the cluster's daemon.
-    """
+    """Yield the servers of this user on this machine, each with the environment of its Ray's daemon."""
     for process in Path("/proc").glob("[0-9]*"):
         try:
             words = (process / "cmdline").read_bytes().split(b"\0")
@@ -151,10 +121,10 @@ def announced(name: str) -> Iterator[tuple[dict[str, Any], dict[str, str]]]:
                 continue
             pairs = (one.partition(b"=") for one in (process / "environ").read_bytes().split(b"\0"))
             environment = {os.fsdecode(key): os.fsdecode(value) for key, _, value in pairs}
-            content = json.loads((Path(environment[MARK]) / name).read_text())
+            content = json.loads((Path(environment[MARK]) / _FILE).read_text())
             address = f"{_ADDRESS.decode()}{content['ray_address']}"
         except (OSError, KeyError, ValueError, TypeError):  # it has ended, is another user's, or not announced
             continue
         # What was killed may have left the folder, and another cluster may use it now.
         if any(address in os.fsdecode(word) for word in words):
-            yield content, environment
+            yield LocalServer(content["url"], tuple(content["apps"]), content["ray_address"]), environment

@@ -18,7 +18,6 @@ from vlagents_ray.ray_tools.local_servers import join, local_servers
 from vlagents_ray.ray_tools.private import address_of_ray_start, node_that_failed, only_needed_processes
 from vlagents_ray.ray_tools.reaper import MARK, reaped
 from vlagents_ray.ray_tools.signals import own_sigterm
-from vlagents_ray.ray_tools.warm_cluster import join_warm, warm_cluster
 
 log = logging.getLogger(__name__)
 
@@ -40,8 +39,8 @@ def joined(address: str | None = None, **options: Any) -> Iterator[None]:
 
     Args:
         address: The address of the cluster. None is the cluster of RAY_ADDRESS, or of this machine. The URL of a server
-            on this machine stands for its Ray cluster. "auto" is the cluster of `vlagents-ray up`; without one, that
-            of `ray start`; without that, a server's. "local" starts a cluster that ends with the context.
+            on this machine stands for its Ray cluster. "auto" is the cluster of `ray start`; without one, a
+            server's. "local" starts a cluster that ends with the context.
         options: Further options of `ray.init`.
 
     Raises:
@@ -59,9 +58,6 @@ def joined(address: str | None = None, **options: Any) -> Iterator[None]:
                 folder = stack.enter_context(ray_folder())
                 with _marked(folder):
                     start_ray(_temp_dir=str(folder / FILES), **options)
-            elif (address or os.environ.get("RAY_ADDRESS")) == "auto" and warm_cluster() is not None:
-                with own_sigterm(), _undone_by(stack):
-                    join_warm(**options)
             elif (server := _local_server(address or os.environ.get("RAY_ADDRESS"))) is not None:
                 with own_sigterm():
                     join(server or None, **options)
@@ -76,25 +72,6 @@ def joined(address: str | None = None, **options: Any) -> Iterator[None]:
             ) from error
         stack.push(unless_lost(ray.shutdown))
         yield
-
-
-@contextlib.contextmanager
-def _undone_by(stack: contextlib.ExitStack) -> Iterator[None]:
-    """Let the end of `stack` undo what this context changes in the environment of this process, and nothing else."""
-    before = dict(os.environ)
-    try:
-        yield
-    finally:
-        for name in before.keys() | os.environ.keys():
-            if os.environ.get(name) != before.get(name):
-                stack.callback(_set_variable, name, before.get(name))
-
-
-def _set_variable(name: str, value: str | None) -> None:
-    if value is None:
-        os.environ.pop(name, None)
-    else:
-        os.environ[name] = value
 
 
 def _local_server(address: str | None) -> str | None:
@@ -139,7 +116,10 @@ def _marked(folder: Path) -> Iterator[None]:
     try:
         yield
     finally:
-        _set_variable(MARK, before)
+        if before is None:
+            os.environ.pop(MARK, None)
+        else:
+            os.environ[MARK] = before
 
 
 def start_ray(**options: Any) -> None:

@@ -38,9 +38,9 @@ from vlagents_ray.protocol.frames import read_error
 from vlagents_ray.protocol.messages import Limits
 from vlagents_ray.serve.access import api_keys
 from vlagents_ray.serve.access.api_keys import Keys
+from vlagents_ray.serve.endpoints import weights as endpoint
 from vlagents_ray.serve.endpoints.access_middleware import AccessMiddleware
 from vlagents_ray.serve.endpoints.http import build_http_app
-from vlagents_ray.serve.endpoints import weights as endpoint
 from vlagents_ray.serve.endpoints.weights import weights_routes
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.scaling.weight_push import OwnWeights, WeightPusher

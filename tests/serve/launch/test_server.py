@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from ray.serve.schema import ServeDeploySchema
 
-from vlagents_ray.errors import ConfigError, PolicyUnavailable
+from vlagents_ray.errors import PolicyUnavailable
 from vlagents_ray.serve.launch.deployment_file import deployment, together, with_settings
 from vlagents_ray.serve.launch.serve_client import wait_for_proxies
 from vlagents_ray.serve.launch.server import _deploy
@@ -39,7 +39,7 @@ def test_a_server_on_its_own_ray_builds_its_applications_itself(ends_at_once: bo
     """For a file Serve starts a process that imports everything once more, which takes a second."""
     client = FakeClient()
     two = together({"a": deployment("noop", replicas=2), "b": with_settings(deployment("noop"), {"action_dim": 3})})
-    _deploy(client, two, own=True, warm=False, ingress=not ends_at_once)
+    _deploy(client, two, own=True, ingress=not ends_at_once)
     assert client.by_serve == []
     assert [(app.name, app.route_prefix) for app in client.built_here] == [("a", "/a"), ("b", "/b")]
     parts = [part for app in client.built_here for part in app.deployments]
@@ -61,33 +61,15 @@ def test_a_server_on_its_own_ray_builds_its_applications_itself(ends_at_once: bo
 def test_what_serve_must_apply_is_deployed_by_serve(config: ServeDeploySchema) -> None:
     """So that another deployment of the file changes it without new replicas."""
     client = FakeClient()
-    _deploy(client, config, own=True, warm=False, ingress=True)
+    _deploy(client, config, own=True, ingress=True)
     assert (client.by_serve, client.built_here) == ([config], [])
 
 
 def test_a_cluster_of_others_keeps_the_file() -> None:
     """There others may deploy it again."""
     client, config = FakeClient(), deployment("noop")
-    _deploy(client, config, own=False, warm=False, ingress=True)
+    _deploy(client, config, own=False, ingress=True)
     assert (client.by_serve, client.built_here) == ([config], [])
-
-
-@pytest.mark.parametrize(("ingress", "routes"), [(True, ["/a", "/b"]), (False, [None, None])])
-def test_a_server_in_a_warm_cluster_builds_them_itself_and_has_paths_only_if_it_listens(
-    ingress: bool, routes: list[str | None]
-) -> None:
-    """Serve would remove the other servers' applications for a file; an evaluation's are called by handles alone."""
-    client = FakeClient()
-    _deploy(client, together({"a": deployment("noop"), "b": deployment("noop")}), own=False, warm=True, ingress=ingress)
-    assert client.by_serve == []
-    assert [app.route_prefix for app in client.built_here] == routes
-
-
-def test_what_serve_must_apply_is_refused_in_a_warm_cluster() -> None:
-    client = FakeClient()
-    with pytest.raises(ConfigError, match="leave out --address"):
-        _deploy(client, changed({"runtime_env": {"env_vars": {"A": "b"}}}), own=False, warm=True, ingress=True)
-    assert (client.by_serve, client.built_here) == ([], [])
 
 
 @pytest.mark.parametrize("deaths", [0, 2])

@@ -16,8 +16,7 @@ import numpy as np
 
 from vlagents_ray.cli.doctor import machine
 from vlagents_ray.cli.doctor.machine import Check
-from vlagents_ray.errors import ConfigError, MissingDependency
-from vlagents_ray.ray_tools.warm_cluster import require_usable, warm_cluster
+from vlagents_ray.errors import MissingDependency
 from vlagents_ray.registry import require
 
 if TYPE_CHECKING:
@@ -57,7 +56,6 @@ def checks(port: int = DEFAULT_PORT) -> Iterator[Check]:
         ("Python", lambda: python(sys.version_info[:3])),
         ("Ray", ray),
         ("HAProxy", haproxy),
-        ("warm cluster", warm),
         ("GPU", gpu),
         ("Vulkan", vulkan),
         ("EGL", egl),
@@ -117,19 +115,6 @@ def haproxy() -> Check:
     version = re.search(r"version (\S+)", answer.stdout)
     where = "" if Path(binary).is_relative_to(sys.prefix) else f" at {binary}"
     return Check("HAProxy", "ok", f"{version[1] if version else 'unknown version'}{where}")
-
-
-def warm() -> Check:
-    """Check whether the cluster of `vlagents-ray up` is there, and whether commands can use it from here."""
-    cluster = warm_cluster()
-    if cluster is None:
-        return Check("warm cluster", "ok", "none; `vlagents-ray up` starts one, for many short runs")
-    try:
-        require_usable(cluster)
-    except ConfigError as error:
-        found, _, cure = str(error).partition("; ")
-        return Check("warm cluster", "warn", found, cure)
-    return Check("warm cluster", "ok", f"at {cluster.url}, process {cluster.keeper}: use it with --address auto")
 
 
 def gpu() -> Check:

@@ -40,7 +40,6 @@ def own_ray(
     num_cpus: int | None = None,
     show_logs: bool = False,
     ingress: bool = True,
-    variables: Mapping[str, str] | None = None,
 ) -> Iterator[PublicListener | None]:
     """Run a private Ray for the length of the context.
 
@@ -51,7 +50,6 @@ def own_ray(
         num_cpus: CPUs that Ray may use; None for all.
         show_logs: Whether the logs of Ray's workers are shown.
         ingress: Whether the server listens for HTTP at all.
-        variables: Further environment variables of Ray.
 
     Yields:
         HAProxy's listener for clients; None if Serve listens itself.
@@ -74,7 +72,7 @@ def own_ray(
         # Proxies start while policies load: on a slow machine Serve would replace them after three times its 5 s.
         environment = {"RAY_worker_niceness": "0", "RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S": "60"}
         # The address at which replicas listen for WebSockets: loopback if the network may see nothing but TLS.
-        ours = {MARK: str(folder), _ALONE: "0", HOST: host if tls is None else LOOPBACK} | dict(variables or {})
+        ours = {MARK: str(folder), _ALONE: "0", HOST: host if tls is None else LOOPBACK}
         listener = None
         if not ingress:
             ours |= NO_INGRESS

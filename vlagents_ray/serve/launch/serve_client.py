@@ -1,10 +1,10 @@
-"""Serve as the process sees it that started it: its proxies, its applications, and its end."""
+"""Serve as the process sees it that started it: its proxies, and its end."""
 
 from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from typing import Any
 
 from vlagents_ray.errors import PolicyUnavailable
@@ -13,7 +13,7 @@ from vlagents_ray.ray_tools.private import end_controller, forget_serve, long_po
 log = logging.getLogger(__name__)
 
 _SHUTDOWN_S = 30.0
-_LOOK_S = 0.2  # between two looks at the proxies, or the applications, that Serve has
+_LOOK_S = 0.2  # between two looks at the proxies that Serve has
 
 
 def wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) -> None:
@@ -35,25 +35,6 @@ def wait_for_proxies(proxies: list[Any], look_again: Callable[[], list[Any]]) ->
             proxies = look_again()
         else:
             return
-
-
-def remove_apps(client: Any, names: Collection[str], *, wait: bool) -> None:
-    """Remove applications from a Serve that goes on; `wait` until their replicas have ended.
-
-    Args:
-        client: Serve's client.
-        names: The applications.
-        wait: Whether to wait. Else Serve ends the replicas by itself.
-    """
-    from ray import serve
-
-    client.delete_apps(list(names), blocking=False)
-    deadline = time.monotonic() + _SHUTDOWN_S
-    while wait and not serve.status().applications.keys().isdisjoint(names):
-        if time.monotonic() > deadline:
-            log.warning("%s have not ended within %g s; Serve goes on with it", sorted(names), _SHUTDOWN_S)
-            return
-        time.sleep(_LOOK_S)
 
 
 def _stop_long_polls(client: Any) -> None:

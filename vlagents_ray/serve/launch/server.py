@@ -27,7 +27,6 @@ from vlagents_ray.ray_tools.private import (
     start_serve,
 )
 from vlagents_ray.ray_tools.session import joined, unless_lost
-from vlagents_ray.ray_tools.warm_cluster import owned_apps, this_warm_cluster
 from vlagents_ray.serve.access.api_keys import require_access, warn_of_plain_http
 from vlagents_ray.serve.access.tls import Tls
 from vlagents_ray.serve.config.deployment import AccessArgs, ServerArgs
@@ -35,8 +34,7 @@ from vlagents_ray.serve.launch.deployment_file import IMPORT_PATH, gpus_of_candi
 from vlagents_ray.serve.launch.haproxy import PublicListener, wait_for_haproxy
 from vlagents_ray.serve.launch.private_cluster import own_ray
 from vlagents_ray.serve.launch.readiness import wait_until_ready
-from vlagents_ray.serve.launch.serve_client import remove_apps, shut_down, wait_for_proxies
-from vlagents_ray.serve.launch.warm import listener_of, require_routes
+from vlagents_ray.serve.launch.serve_client import shut_down, wait_for_proxies
 from vlagents_ray.serve.ports import EVERYWHERE, LOOPBACK, free_port, keep
 
 __all__ = ["Server", "free_port", "running_server", "spread_over_gpus"]
@@ -78,8 +76,7 @@ def running_server(
     started, unless this process is connected to one. `timeout_s` defaults to 600 s, with an `address` to 3600 s.
     `keys_file`, `insecure` and `plain_http` replace those of `access` in the applications' args; unless `host` is a
     loopback address, one of the first two must be set somewhere. Without `ingress` a Ray that is started here serves
-    only its own processes, at `serve://APP`, and nothing over HTTP, which makes start and end faster. In the cluster of
-    `vlagents-ray up` the server listens where that cluster does, and its applications alone are ended.
+    only its own processes, at `serve://APP`, and nothing over HTTP, which makes start and end faster.
     Raises `ConfigError` if the deployment fails, `PolicyUnavailable` if it takes too long.
     """
     config = with_gateways_at(config, host)
@@ -98,45 +95,31 @@ def running_server(
     if own:
         _require_gpus(config, gpus_here())
     with contextlib.ExitStack() as stack:
-        with_http = ingress or len(_our_apps(config)) < len(config.applications)
-        ingress = with_http or not own
+        ingress = ingress or not own or len(_our_apps(config)) < len(config.applications)
         public = port or free_port(host)
         http = stack.enter_context(_ray(address, host, public, tls, num_cpus, show_logs, ingress))
-        warm = this_warm_cluster()
-        if warm is not None:
-            ingress = with_http
-            http = listener_of(warm, host, port)
-            public = http["port"]
-            stack.enter_context(owned_apps(warm, [app.name for app in config.applications]))
         location = "Disabled" if not ingress else "HeadOnly" if address is None else "EveryNode"
         client, proxies = start_serve(http, location)
-        if warm is not None:
-            require_routes(client, config, ingress=ingress)
-            names = [app.name for app in config.applications]
-            stack.push(unless_lost(lambda: remove_apps(client, names, wait=ingress)))
-            _require_gpus(config, ray.cluster_resources().get("GPU", 0.0))
-        else:
-            if running := sorted(serve.status().applications):
-                raise ConfigError(
-                    f"Serve runs {running} on this cluster already; use their URL (serve://{running[0]} inside the "
-                    f"cluster), or `serve deploy` one file that holds those and yours"
-                )
-            stack.push(unless_lost(lambda: shut_down(client)))
-            _require_gpus(config)
-        here = address is None or warm is not None
+        if running := sorted(serve.status().applications):
+            raise ConfigError(
+                f"Serve runs {running} on this cluster already; use their URL (serve://{running[0]} inside the "
+                f"cluster), or `serve deploy` one file that holds those and yours"
+            )
+        stack.push(unless_lost(lambda: shut_down(client)))
+        _require_gpus(config)
         remind = functools.partial(_missing_gpus, config)
-        _deploy(client, config, own=own, warm=warm is not None, ingress=ingress)
+        _deploy(client, config, own=own, ingress=ingress)
         url = f"{'http' if tls is None else 'https'}://{LOOPBACK if host == EVERYWHERE else host}:{public}"
         paths = {app.name: (app.route_prefix or "").rstrip("/") for app in config.applications}
         if timeout_s is None:
-            timeout_s = _START_S if here else _GROW_S
+            timeout_s = _START_S if address is None else _GROW_S
         deadline = time.monotonic() + timeout_s
         inside = _internal_url(http)
         ours = {app.name for app in _our_apps(config)}
         urls = {name: inside + path if ingress else None for name, path in paths.items()}
         wait_for_proxies(proxies, lambda: proxies_now(client))
         wait_until_ready(serve, urls, ours, deadline, remind)
-        if ingress and here and (stats_port := os.environ.get("RAY_SERVE_HAPROXY_STATS_PORT")):
+        if ingress and address is None and (stats_port := os.environ.get("RAY_SERVE_HAPROXY_STATS_PORT")):
             wait_for_haproxy(serve, paths, int(stats_port), deadline)
         if own and ingress:
             announce(url, paths, ray.get_runtime_context().gcs_address)
@@ -159,13 +142,12 @@ def _access(config: ServeDeploySchema, keys_file: Path | None, insecure: bool, p
     return changed
 
 
-def _deploy(client: Any, config: ServeDeploySchema, *, own: bool, warm: bool, ingress: bool) -> None:
+def _deploy(client: Any, config: ServeDeploySchema, *, own: bool, ingress: bool) -> None:
     """Deploy the applications, without waiting for them.
 
     Serve starts a process for a deployment file, which imports the server once more. On our `own` Ray, applications of
     this package are built here instead, unless their file has settings that Serve must apply: such a file may also be
-    deployed again, and Serve would replace all replicas of an application that it did not build. In a `warm` cluster
-    such a file is refused, as Serve would remove the applications of others.
+    deployed again, and Serve would replace all replicas of an application that it did not build.
     Without `ingress` replicas end without a wait for requests: their clients have ended before.
     """
     from vlagents_ray.serve.replica.app import build
@@ -173,19 +155,13 @@ def _deploy(client: Any, config: ServeDeploySchema, *, own: bool, warm: bool, in
     stated = [app.model_dump(exclude_defaults=True).keys() for app in config.applications]
     ours = len(_our_apps(config)) == len(config.applications)
     plain = ours and config.model_fields_set <= _OUR_KEYS and all(keys <= _OUR_APP_KEYS for keys in stated)
-    if warm and not plain:
-        raise ConfigError(
-            "the deployment file has settings that Serve itself applies, and then Serve would remove the other servers "
-            "of the warm cluster; leave out --address"
-        )
-    if not plain or not (own or warm):
+    if not plain or not own:
         client.deploy_apps(config)
         return
     changes = {} if ingress else {"graceful_shutdown_wait_loop_s": _END_S}
     built = []
     for app in config.applications:
-        route = app.route_prefix if ingress or own else None  # the ingress of a warm cluster would have it, too
-        one = build_app(build(ServerArgs(**app.args)), name=app.name, route_prefix=route)
+        one = build_app(build(ServerArgs(**app.args)), name=app.name, route_prefix=app.route_prefix)
         one.deployments[:] = [part.options(**changes) for part in one.deployments]
         built.append(one)
     client.deploy_applications(built, wait_for_ingress_deployment_creation=False, wait_for_applications_running=False)
