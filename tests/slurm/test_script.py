@@ -8,11 +8,14 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from vlagents_ray.errors import ConfigError
 from vlagents_ray.slurm.script import BODY, Script
 from vlagents_ray.slurm.submission import SubmissionFailed, outside_of_jobs, submit
 
+SETTINGS = (b"python", b"folder", b"setup", b"resubmit", b"unfinished")
 SBATCH = """#!/bin/bash
 printf '%s\\n' "$@" >"{folder}/words"
 env >"{folder}/environment"
@@ -40,6 +43,29 @@ def test_the_script_is_one_that_bash_reads(tmp_path: Path) -> None:
         check=True, capture_output=True, text=True,
     ).stdout.splitlines()  # fmt: skip
     assert shown == ["eval", "--", "env/*", "--set", "a b=$HOME", str(tmp_path / "it's here")]
+
+
+@given(
+    name=st.text(),
+    folder=st.text(min_size=1),
+    option=st.text(),
+    arguments=st.lists(st.text(st.characters(exclude_characters="\0", exclude_categories=["Cs"])), max_size=3),
+)
+@example(name="eval", folder="./runs/x\necho INJECTED\n#", option="", arguments=[])
+@example(name="eval", folder="runs", option="y\necho INJECTED\n#", arguments=[])
+@example(name="eval", folder="runs", option="", arguments=["\necho INJECTED\n#", "$(echo INJECTED)", "'`id`"])
+def test_no_name_path_or_option_becomes_a_command(name: str, folder: str, option: str, arguments: list[str]) -> None:
+    try:
+        text = Script(name, Path(folder), arguments, {"comment": option}).text()
+    except (ConfigError, ValueError):  # a path with a NUL
+        return
+    head = text.removesuffix(BODY.read_text()).encode(errors="surrogateescape")
+    commands = [line for line in head.split(b"arguments=(")[0].splitlines() if not line.startswith(b"#")]
+    assert [line.partition(b"=")[0] for line in commands] == [b"", *SETTINGS]
+    shown = b"".join(one.encode() + b"\0" for one in arguments)
+    show = b'printf "%s\\0" "${arguments[@]}"\n' if arguments else b""
+    done = subprocess.run(["bash"], input=head + show, check=True, capture_output=True)
+    assert (done.stdout, done.stderr) == (shown, b"")
 
 
 def test_the_users_options_win_over_the_usual_ones(tmp_path: Path) -> None:

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import socket
-import stat
 import sys
 import time
 import urllib.error
@@ -25,12 +25,12 @@ _POLL_S = 0.5
 _MOST_S = 3600.0  # limit for loading the policies
 
 _TEXT = """\
-serving {names} in job {job}, until it ends; all of this is in {file}
+serving {names} in job {job}, until it ends; all of this, and the key, is in {file}
 on the cluster's network:   {url}
 from elsewhere, first:      {ssh}
                             and use http://localhost:{port} in its place
 
-    export {variable}={key}
+    {key}
 
     from vlagents_ray import Obs, RemoteAgent
     with RemoteAgent("{url}") as agent:
@@ -50,8 +50,6 @@ def main() -> None:
         time.sleep(_POLL_S)
     found = connection_info(apps, port, os.environ)
     write(folder / FILE, found)
-    if stat.S_ISREG(os.fstat(sys.stdout.fileno()).st_mode):  # the job's log, which gets the key
-        os.fchmod(sys.stdout.fileno(), 0o600)
     sys.stdout.write(as_text(found, folder / FILE))
     sys.stdout.flush()
 
@@ -84,11 +82,14 @@ def connection_info(apps: Mapping[str, str], port: int, environ: Mapping[str, st
 
 
 def as_text(found: Mapping[str, Any], file: Path) -> str:
-    """Return the connection's information as text for people."""
+    """Return the connection's information as text for people, without the key: logs are read by others."""
     url = next(iter(found["apps"].values()))
-    key = found["key"] or "(the key that you were given; none, if the server is --insecure)"
+    key = f"export {KEY_VARIABLE}=(the key that you were given; none, if the server is --insecure)"
+    if found["key"]:
+        read = "import json, sys; print(json.load(open(sys.argv[1]))['key'])"
+        key = f'export {KEY_VARIABLE}=$(python3 -c "{read}" {shlex.quote(str(file))})'
     names = ", ".join(found["apps"])
-    return _TEXT.format(**{**found, "url": url, "key": key, "names": names, "file": file, "variable": KEY_VARIABLE})
+    return _TEXT.format(**{**found, "url": url, "key": key, "names": names, "file": file})
 
 
 def write(file: Path, found: Mapping[str, Any]) -> None:

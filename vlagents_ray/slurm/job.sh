@@ -6,7 +6,7 @@ stopped=
 trap 'stopped=1' TERM INT  # Slurm sends them to all of a job's processes: the command ends in order by itself
 
 logs=$folder/$SLURM_JOB_ID
-mkdir -p "$logs"
+mkdir -p -m 700 "$logs"  # the user's alone: it has the token, keys and logs
 arguments=("${arguments[@]//%a/${SLURM_ARRAY_TASK_ID:-%a}}")
 
 unset RAY_ADDRESS RAY_AUTH_TOKEN

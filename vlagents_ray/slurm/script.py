@@ -9,7 +9,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from vlagents_ray.errors import ConfigError
+
 BODY = Path(__file__).with_name("job.sh")
+_LINE_ENDS = "\x7f\x85\u2028\u2029"
 UNFINISHED = 75  # exit status of `vlagents-ray eval` when its time is over (EX_TEMPFAIL of sysexits.h)
 
 
@@ -35,7 +38,12 @@ class Script:
         return self.options.get("output") or str(self.folder.absolute() / "%j.log")
 
     def text(self) -> str:
-        """Return the content of the script."""
+        """Return the content of the script.
+
+        Raises:
+            ConfigError: A name, path or option has a control character, such as a line feed, after which the rest of a
+                comment would be a command; or quotes in a value with spaces, which sbatch cannot read.
+        """
         defaults = {
             "job-name": f"vlagents-ray-{self.name}",
             "nodes": "1",
@@ -49,6 +57,9 @@ class Script:
             f"--{option}" if value is None else f"--{option}={_quoted(value)}"
             for option, value in (defaults | dict(self.options)).items()
         ]
+        for word in (self.name, str(self.folder), *words):
+            if any(ord(sign) < ord(" ") or sign in _LINE_ENDS for sign in word):
+                raise ConfigError(f"slurm: got {word[:200]!r}, want no control characters, such as line feeds, in it")
         settings = {
             "python": sys.executable,
             "folder": str(self.folder.absolute()),
@@ -70,4 +81,8 @@ class Script:
 
 def _quoted(value: str) -> str:
     """Quote a value with spaces for a line of #SBATCH."""
-    return f'"{value}"' if any(sign.isspace() for sign in value) else value
+    if not any(sign.isspace() for sign in value):
+        return value
+    if '"' in value:
+        raise ConfigError(f"slurm: got the option {value[:200]!r}, want no quotes in a value with spaces")
+    return f'"{value}"'

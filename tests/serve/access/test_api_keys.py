@@ -9,11 +9,13 @@ import logging
 import os
 import stat
 import tempfile
+import threading
 import time
 from pathlib import Path
 from typing import Any
 
 import pytest
+from eval_fakes import wait_for
 
 from vlagents_ray.errors import ConfigError, Forbidden, TooManyRequests, Unauthorized
 from vlagents_ray.serve.access import api_keys, audit, key_store
@@ -155,6 +157,41 @@ def test_no_nonsense_in_the_file_gets_out_and_before_long_nobody_gets_in(
     keys.check(token, "noop")
     assert keys.unreadable_s == 0
     caller.admit()
+
+
+def test_a_network_drive_that_hangs_delays_one_request_and_closes_the_server_later(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    now, asked, answers = 1000.0, 0, threading.Event()
+    answers.set()
+    monkeypatch.setattr(api_keys.time, "monotonic", lambda: now)
+    monkeypatch.setattr(api_keys, "_CHECK_S", 0.0)
+
+    def changed() -> object:
+        nonlocal asked
+        asked += 1
+        answers.wait()
+        return asked
+
+    keys = Keys(lambda: json.dumps({"keys": [{"name": "arm", "sha256": hashlib.sha256(b"k").hexdigest()}]}), changed)
+    caller = keys.check("k", "noop")
+    answers.clear()
+    monkeypatch.setattr(api_keys, "_WAIT_S", 0.01)
+    caller.admit()
+    before = asked
+    monkeypatch.setattr(api_keys, "_WAIT_S", 3600.0)
+    for _ in range(3):
+        now += 100
+        caller.admit()
+    assert asked == before
+    assert keys.unreadable_s == 200
+    now += 101
+    with pytest.raises(Unauthorized):
+        caller.admit()
+    answers.set()
+    wait_for(lambda: keys.key(hashlib.sha256(b"k").digest()) is not None)
+    caller.admit()
+    assert keys.unreadable_s == 0
 
 
 @pytest.mark.parametrize("error", [PermissionError("no"), OSError("stale file handle"), RuntimeError("whatever")])

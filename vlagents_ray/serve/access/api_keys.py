@@ -35,6 +35,7 @@ FILE_VARIABLE, TEXT_VARIABLE = "VLAGENTS_RAY_KEYS_FILE", "VLAGENTS_RAY_KEYS"
 _KEY_PROTOCOL = "vlagents.key."  # begins the subprotocol of a WebSocket that states a key
 _THROTTLED_S = (0.05, 1.0)  # minimum and maximum time for which a sender over its rate is not read
 _CHECK_S = 1.0  # minimum time between two checks of the file
+_WAIT_S = 0.25  # for a check: a network drive that hangs delays one request, which may be on the policy's thread
 _CLOSE_S = 300.0  # time for which the keys stay valid while the file cannot be read
 _REMIND_S = 60.0  # time between two log lines about an unreadable file
 _UNREAD = object()  # the state of a file that could not be read: each check tries again
@@ -65,6 +66,7 @@ class Keys:
         self._checked = float("-inf")
         self._unreadable: float | None = None  # time since which the file is unreadable, s; None if it is readable
         self._reminded = 0.0
+        self._hung: threading.Thread | None = None  # a check that has not come back
         self._lock = threading.Lock()
         self.audit = Audit()
         self._state: object = self._changed()
@@ -149,21 +151,33 @@ class Keys:
             if now - self._checked < _CHECK_S:
                 return
             self._checked = now
-            try:
-                state = self._changed()
-                if state == self._state:
-                    return
-                self._load(None if state is None else self._read())
-            except Exception as error:  # noqa: BLE001 - no content of the file and no disk error may fail a request
-                self._handle_unreadable(error, now)
+            if self._hung is None:
+                reader = threading.Thread(target=self._read_again, args=(now,), name="keys", daemon=True)
+                reader.start()
+                reader.join(_WAIT_S)
+                self._hung = reader if reader.is_alive() else None
+            elif self._hung.is_alive():
+                self._handle_unreadable(TimeoutError(f"no answer of its file system for {_WAIT_S:g} s"), now)
+            else:
+                self._hung = None
+
+    def _read_again(self, now: float) -> None:
+        """Read the file if it has changed; on a thread of its own, which a network drive may hold up."""
+        try:
+            state = self._changed()
+            if state == self._state:
                 return
-            self._state = state
-            if self._unreadable is not None:
-                logger.warning("the key file can be read again")
-                self._unreadable = None
+            self._load(None if state is None else self._read())
+        except Exception as error:  # noqa: BLE001 - no content of the file and no disk error may fail a request
+            self._handle_unreadable(error, now)
+            return
+        self._state = state
+        if self._unreadable is not None:
+            logger.warning("the key file can be read again")
+            self._unreadable = None
 
     def _handle_unreadable(self, error: Exception, now: float) -> None:
-        """Handle a failed reading of the file; the caller holds the lock."""
+        """Handle a failed reading of the file."""
         first = self._unreadable is None
         since = self._unreadable = now if self._unreadable is None else self._unreadable
         self._state = _UNREAD
