@@ -173,6 +173,20 @@ def test_with_wait_no_episode_begins_until_all_have_ended_and_robots_are_not_hel
     assert served.learn.number == 2  # without a reset
 
 
+def test_with_wait_a_session_that_never_ends_holds_up_resets_for_a_limited_time(
+    serving: Callable[..., Served], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = serving(Gain())
+    served.reset("endless")
+    monkeypatch.setattr(versions, "WAIT_S", 0.2)
+    served.push(1, "wait")
+    served.reset("new")
+    assert served.act("new") == (1, 1.0)
+    assert served.act("endless") == (0, 0.0)
+    served.reset("endless")
+    assert served.act("endless") == (1, 1.0)
+
+
 @AGENTS
 def test_the_fingerprint_is_that_of_what_the_agent_holds(serving: Callable[..., Served], agent: type[Gain]) -> None:
     served = serving(agent())

@@ -9,6 +9,7 @@ no time if it is that already. A version is freed when no session acts with it a
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
@@ -22,6 +23,7 @@ from vlagents_ray.weights.shared_values import gpu_of
 from vlagents_ray.weights.trainable import is_copied, own_copy, portable
 
 DIGITS = 16  # of a checkpoint's digest in place of a fingerprint, hexadecimal
+WAIT_S = 600.0  # time for which a commit with the mode "wait" holds up resets, s: a session may never end its episode
 STAGED_S = 60.0  # time for which a staged version waits for its commit, s
 
 PushMode = Literal["keep", "next_episode", "wait"]
@@ -57,6 +59,7 @@ class _Commit:
     number: int
     sessions: Callable[[], Iterable[FollowingSession]]
     pin: bool
+    until: float  # time.monotonic()
 
 
 class ModelWeights:
@@ -217,7 +220,7 @@ class ModelWeights:
                     f"weights: version {number} is not staged here; push it again, and commit within {STAGED_S:g} s"
                 )
             self._stop_timer()
-            self._waiting = _Commit(number, sessions, pin)
+            self._waiting = _Commit(number, sessions, pin, time.monotonic() + WAIT_S)
             if mode != "wait":
                 self._finish(self._waiting)
             if mode == "keep":
@@ -226,12 +229,16 @@ class ModelWeights:
         self.settle()
 
     def settle(self) -> bool:
-        """Finish a commit that waits for the end of all episodes, if they have ended; return whether none waits."""
+        """Finish a commit that waits for the end of all episodes; return whether none waits.
+
+        It is finished once they have ended, or after `WAIT_S`: sessions that still run change at their next reset.
+        """
         if self._waiting is None:
             return True
         with self._lock:
-            if self._waiting is not None and not self._running(self._waiting.sessions):
-                self._finish(self._waiting)
+            waiting = self._waiting
+            if waiting is not None and (time.monotonic() > waiting.until or not self._running(waiting.sessions)):
+                self._finish(waiting)
             return self._waiting is None
 
     def _finish(self, commit: _Commit) -> None:
