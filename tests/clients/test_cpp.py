@@ -21,6 +21,7 @@ from asgi_server import served
 from cpp_client import CppClient, CppError, build
 from eval_fakes import wait_for
 from golden import GOLDEN, of_request
+from hostile_answers import ADDED_MB, ANSWERS
 from in_memory_keys import ChangingKeys
 from scripted_server import Visit, answer, document, scripted_server
 
@@ -248,6 +249,15 @@ def test_garbage_is_refused_and_never_read_past_its_end(shared_driver: CppClient
     deep = b'{"blobs":[],"info":' + b"[" * 100_000 + b"]" * 100_000 + b"}"
     framed = b"VLA\x01" + struct.pack("<I", len(deep)) + deep
     assert refused(shared_driver, "reply", data=framed.hex()).code == "malformed"
+
+
+def test_no_answer_fills_the_memory_of_a_robots_computer(programs: Path) -> None:
+    with CppClient(programs) as driver:
+        before = driver.peak_mb()
+        for answer in ANSWERS.values():
+            with suppress(CppError):
+                driver.call("reply", data=answer.hex())
+        assert driver.peak_mb() - before < ADDED_MB
 
 
 # A real server

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import subprocess
 from collections.abc import Iterator
@@ -10,6 +11,7 @@ from pathlib import Path
 import pytest
 import typescript_client
 from client_servers import client_servers
+from hostile_answers import ADDED_MB, ANSWERS
 
 pytestmark = pytest.mark.node
 
@@ -55,6 +57,28 @@ def test_it_passes_its_tests_with_the_golden_files_and_with_servers_that_fail_or
     assert (
         passed(node(client, "--test", "--test-reporter=tap", "--test-concurrency=4", *files, environment=servers)) > 0
     )
+
+
+def test_no_answer_fills_the_memory_of_a_robots_computer(client: Path, tmp_path: Path) -> None:
+    for number, answer in enumerate(ANSWERS.values()):
+        (tmp_path / f"{number}").write_bytes(answer)
+    script = """
+        import { readdirSync, readFileSync } from "node:fs";
+        import { decodeReplies } from "vlagents-ray";
+        const peak = () => process.resourceUsage().maxRSS / 1000;
+        const [before, folder, outcomes] = [peak(), process.argv[1] + "/", {}];
+        for (const file of readdirSync(folder)) {
+          try { decodeReplies(new Uint8Array(readFileSync(folder + file))); outcomes[file] = "read"; }
+          catch (error) { outcomes[file] = error.code; }
+        }
+        console.log(JSON.stringify([peak() - before, outcomes]));
+    """
+    added_mb, outcomes = json.loads(
+        node(client, "--max-old-space-size=512", "--input-type=module", "-e", script, str(tmp_path))
+    )
+    assert added_mb < ADDED_MB
+    assert len(outcomes) == len(ANSWERS)
+    assert set(outcomes.values()) == {"read", "malformed"}
 
 
 def test_its_example_runs(client: Path, servers: dict[str, str]) -> None:

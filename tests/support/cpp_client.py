@@ -99,6 +99,11 @@ class CppClient:
         self.begin(do, **arguments)
         return self.result()
 
+    def peak_mb(self) -> float:
+        """Most memory that its process has had."""
+        status = Path(f"/proc/{self._process.pid}/status").read_text()
+        return float(status.partition("VmHWM:")[2].split()[0]) / 1000
+
     def reset(self, **obs: Any) -> Any:
         return self.call("reset", obs=obs, instruction="push the cube", kwargs={"seed": 3})
 

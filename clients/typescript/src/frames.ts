@@ -169,8 +169,8 @@ function readAct(act: unknown, reader: ValueReader): Act {
   }
   const action = reader.array(act["action"]);
   const { data, shape } = action;
-  if (!(data instanceof Float32Array) || shape.length < 1 || shape.length > 2) {
-    throw malformed(`action: got ${action.dtype} of shape [${shape}], want <f4 of [D] or [H, D]`);
+  if (!(data instanceof Float32Array) || shape.length < 1 || shape.length > 2 || data.length === 0) {
+    throw malformed(`action: got ${action.dtype} of shape [${shape}], want <f4 of [D] or [H, D], neither 0`);
   }
   const width = shape[shape.length - 1] ?? 0;
   const height = shape.length === 2 ? (shape[0] ?? 0) : 1;

@@ -113,18 +113,25 @@ export class ValueWriter {
   }
 }
 
+/** Most bytes to which the references of a message may lead, counted as often as they are named: each is a copy. */
+const COPIED_BYTES = 128 * 2 ** 20;
+const MAX_DEPTH = 64; // more would overflow the stack
+
 /** Converts JSON and blobs back to values. */
 export class ValueReader {
+  private left = COPIED_BYTES;
+
   constructor(private readonly blobs: readonly Uint8Array[]) {}
 
-  value(node: unknown): Value {
+  value(node: unknown, depth = 0): Value {
     if (node === null || typeof node !== "object") return node as Value;
-    if (Array.isArray(node)) return node.map((item) => this.value(item));
+    if (depth > MAX_DEPTH) throw malformed(`JSON: got more than ${MAX_DEPTH} levels`);
+    if (Array.isArray(node)) return node.map((item) => this.value(item, depth + 1));
     if (Object.hasOwn(node, "$")) return this.reference(node as { $: unknown });
     const found: { [key: string]: Value } = {};
     for (const [key, item] of Object.entries(node)) {
       // `__proto__` is an ordinary key of a message
-      Object.defineProperty(found, key, { value: this.value(item), enumerable: true, writable: true, configurable: true });
+      Object.defineProperty(found, key, { value: this.value(item, depth + 1), enumerable: true, writable: true, configurable: true });
     }
     return found;
   }
@@ -151,7 +158,11 @@ export class ValueReader {
 
   private blob(index: unknown): Uint8Array {
     const found = typeof index === "number" && Number.isInteger(index) ? this.blobs[index] : undefined;
-    if (found === undefined) throw malformed(`reference: got blob ${show(index)}, want one of ${this.blobs.length}`);
+    if (found === undefined) {
+      throw malformed(`reference: got blob ${show(index)}, want a number below ${this.blobs.length}`);
+    }
+    this.left -= found.length;
+    if (this.left < 0) throw malformed(`reference: the blobs named take more than ${COPIED_BYTES} bytes`);
     return found;
   }
 }
@@ -162,8 +173,8 @@ function readArray(data: Uint8Array, dtype: unknown, shape: unknown): NdArray {
     throw malformed(`array: got type ${show(dtype)}, want one like '<f4' or '|u1'`);
   }
   const View = VIEWS[dtype as DType];
-  if (!Array.isArray(shape) || !shape.every((n) => Number.isInteger(n) && n >= 0)) {
-    throw malformed(`array: got shape ${show(shape)}, want non-negative integers`);
+  if (!Array.isArray(shape) || shape.length > 32 || !shape.every((n) => Number.isInteger(n) && n >= 0)) {
+    throw malformed(`array: got shape ${show(shape)}, want at most 32 non-negative integers`);
   }
   const sizes = shape as number[];
   if (sizes.reduce((all, n) => all * n, View.BYTES_PER_ELEMENT) !== data.length) {

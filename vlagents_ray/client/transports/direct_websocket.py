@@ -18,6 +18,7 @@ from websockets.uri import parse_uri
 
 from vlagents_ray.client.credentials import WEBSOCKET_LOG
 from vlagents_ray.protocol.arrays import Buffer
+from vlagents_ray.protocol.messages import DEFAULT_LIMITS
 
 _READ_BYTES = 256 * 1024
 _KEPT_BYTES = 1024 * 1024  # holds a message with two or three raw images
@@ -70,7 +71,9 @@ class Stream:
         host = base.hostname or ""
         deadline = time.monotonic() + timeout_s
         self._protocol = ClientProtocol(
-            parse_uri(f"ws://{f'[{host}]' if ':' in host else host}:{port}{path}"), max_size=None, logger=WEBSOCKET_LOG
+            parse_uri(f"ws://{f'[{host}]' if ':' in host else host}:{port}{path}"),
+            max_size=DEFAULT_LIMITS.body_bytes,
+            logger=WEBSOCKET_LOG,
         )
         self._messages: list[bytes] = []
         self._frames = _FrameMemory()

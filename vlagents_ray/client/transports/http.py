@@ -35,6 +35,7 @@ from vlagents_ray.protocol.frames import (
     read_error,
 )
 from vlagents_ray.protocol.messages import (
+    DEFAULT_LIMITS,
     MACHINE_HEADER,
     REQUEST_ID_HEADER,
     SESSION_HEADER,
@@ -147,7 +148,14 @@ class HttpTransport:
         try:
             connection.request(method, self._url.path.rstrip("/") + path, body, headers | self._credentials.headers)
             answer = connection.getresponse()
-            return answer.status, answer.headers.get("content-type", ""), answer.read()
+            content = answer.read(DEFAULT_LIMITS.body_bytes + 1)
+            if len(content) > DEFAULT_LIMITS.body_bytes:
+                self.close()
+                raise MessageTooLarge(
+                    f"{self._url.geturl()}: got an answer of more than {DEFAULT_LIMITS.body_bytes} bytes, want that of "
+                    f"a policy server"
+                )
+            return answer.status, answer.headers.get("content-type", ""), content
         except TimeoutError as error:
             self.close()
             raise DeadlineExceeded(f"{self._url.geturl()}: no answer within {timeout_s:g} s") from error

@@ -36,6 +36,7 @@ from vlagents_ray.errors import (
 from vlagents_ray.protocol.arrays import Buffer
 from vlagents_ray.protocol.frames import decode_replies, decode_reply, request_parts
 from vlagents_ray.protocol.messages import (
+    DEFAULT_LIMITS,
     SERVERS_MACHINE,
     STREAM_BYTES,
     Reply,
@@ -73,7 +74,7 @@ class ProxiedSocket:
                 open_timeout=timeout_s,
                 close_timeout=1,
                 compression=None,
-                max_size=None,
+                max_size=DEFAULT_LIMITS.body_bytes,
                 ssl=credentials.context(url),
                 additional_headers=credentials.headers,
                 logger=WEBSOCKET_LOG,

@@ -168,45 +168,63 @@ inline Json value_of(Half half) {
   return half.bits >> 15 != 0 ? -size : size;
 }
 
+/// Values and bytes that the references of one message may still take. A value of `Json` takes 16 bytes and more, a list of
+/// one value over 100, so a small array of many axes, named again and again, could fill the memory of a robot's computer.
+struct Room {
+  std::size_t values = 1'000'000;
+  std::size_t bytes = 128 * 1024 * 1024;
+
+  static void take(std::size_t& left, std::size_t size) {
+    if (size > left) throw Error("too_large", "frame: got more than 1,000,000 values, or 128 MiB, behind its references");
+    left -= size;
+  }
+};
+
 template <typename Number>
-Json numbers(const Array& array, std::size_t axis, std::size_t& at) {
+Json numbers(const Array& array, std::size_t axis, std::size_t& at, Room& room) {
   if (axis == array.shape.size()) {
     Number found;
     std::memcpy(&found, array.bytes.data() + at, sizeof found);
     at += sizeof found;
     return value_of(found);
   }
+  Room::take(room.values, array.shape[axis]);
   Json list = Json::array();
-  for (std::size_t number = 0; number < array.shape[axis]; ++number) list.push_back(numbers<Number>(array, axis + 1, at));
+  for (std::size_t number = 0; number < array.shape[axis]; ++number)
+    list.push_back(numbers<Number>(array, axis + 1, at, room));
   return list;
 }
 
-inline Json numbers_of(const Array& array) {
+inline Json numbers_of(const Array& array, Room& room) {
   if (array.bytes.empty()) return Json::array();  // also of a shape such as [4000000000, 0]
   std::size_t at = 0;
-  if (array.type == "|b1") return numbers<Truth>(array, 0, at);
-  if (array.type == "|i1") return numbers<std::int8_t>(array, 0, at);
-  if (array.type == "<i2") return numbers<std::int16_t>(array, 0, at);
-  if (array.type == "<i4") return numbers<std::int32_t>(array, 0, at);
-  if (array.type == "<i8") return numbers<std::int64_t>(array, 0, at);
-  if (array.type == "|u1") return numbers<std::uint8_t>(array, 0, at);
-  if (array.type == "<u2") return numbers<std::uint16_t>(array, 0, at);
-  if (array.type == "<u4") return numbers<std::uint32_t>(array, 0, at);
-  if (array.type == "<u8") return numbers<std::uint64_t>(array, 0, at);
-  if (array.type == "<f2") return numbers<Half>(array, 0, at);
-  if (array.type == "<f4") return numbers<float>(array, 0, at);
-  return numbers<double>(array, 0, at);
+  if (array.type == "|b1") return numbers<Truth>(array, 0, at, room);
+  if (array.type == "|i1") return numbers<std::int8_t>(array, 0, at, room);
+  if (array.type == "<i2") return numbers<std::int16_t>(array, 0, at, room);
+  if (array.type == "<i4") return numbers<std::int32_t>(array, 0, at, room);
+  if (array.type == "<i8") return numbers<std::int64_t>(array, 0, at, room);
+  if (array.type == "|u1") return numbers<std::uint8_t>(array, 0, at, room);
+  if (array.type == "<u2") return numbers<std::uint16_t>(array, 0, at, room);
+  if (array.type == "<u4") return numbers<std::uint32_t>(array, 0, at, room);
+  if (array.type == "<u8") return numbers<std::uint64_t>(array, 0, at, room);
+  if (array.type == "<f2") return numbers<Half>(array, 0, at, room);
+  if (array.type == "<f4") return numbers<float>(array, 0, at, room);
+  return numbers<double>(array, 0, at, room);
 }
 
 }  // namespace parts
 
 /// A value of a header in which each reference is replaced by what it stands for: arrays of numbers by lists of lists,
 /// files and bytes by nlohmann's binary values, and numbers that JSON lacks by floating-point ones.
-inline Json resolved(const Json& value, const std::vector<Bytes>& blobs) {
+inline Json resolved(const Json& value, const std::vector<Bytes>& blobs, parts::Room& room) {
   if (const Json* found = reference(value)) {
     const std::string kind = (*found)[0].get<std::string>();
-    if (kind == "nd") return parts::numbers_of(array_of(*found, blobs));
-    if (kind == "img" || kind == "bin") return Json::binary(blob_of(*found, blobs));
+    if (kind == "nd") return parts::numbers_of(array_of(*found, blobs), room);
+    if (kind == "img" || kind == "bin") {
+      const Bytes& blob = blob_of(*found, blobs);
+      parts::Room::take(room.bytes, blob.size());
+      return Json::binary(blob);
+    }
     if (kind == "float" && (*found)[1] == "nan") return std::numeric_limits<double>::quiet_NaN();
     if (kind == "float" && (*found)[1] == "inf") return std::numeric_limits<double>::infinity();
     if (kind == "float" && (*found)[1] == "-inf") return -std::numeric_limits<double>::infinity();
@@ -214,8 +232,13 @@ inline Json resolved(const Json& value, const std::vector<Bytes>& blobs) {
   }
   if (!value.is_object() && !value.is_array()) return value;
   Json copy = value;
-  for (Json& each : copy) each = resolved(Json(each), blobs);
+  for (Json& each : copy) each = resolved(Json(each), blobs, room);
   return copy;
+}
+
+inline Json resolved(const Json& value, const std::vector<Bytes>& blobs) {
+  parts::Room room;
+  return resolved(value, blobs, room);
 }
 
 }  // namespace vlagents_ray::detail
