@@ -249,6 +249,20 @@ def test_a_certificate_that_is_not_to_be_trusted_is_named_with_the_cure(served: 
         agent.reset(Obs(), "x")
 
 
+def test_an_old_way_to_encrypt_is_refused(served: Served) -> None:
+    """Without forward secrecy, or in blocks whose padding tells something."""
+    parts = urlsplit(served.url)
+    for ciphers, taken in (("AES256-SHA:AES128-GCM-SHA256:ECDHE-RSA-AES128-SHA", False), ("ECDHE+AESGCM", True)):
+        trust = served.threaded_trust
+        trust.set_ciphers(ciphers)
+        with socket.create_connection((parts.hostname, parts.port), 10) as raw:
+            if taken:
+                trust.wrap_socket(raw, server_hostname="127.0.0.1").close()
+            else:
+                with pytest.raises((ssl.SSLError, ConnectionResetError)):
+                    trust.wrap_socket(raw, server_hostname="127.0.0.1")
+
+
 def test_requests_that_never_end_are_cut_off(served: Served) -> None:
     parts = urlsplit(served.url)
     with (
@@ -355,6 +369,14 @@ def test_off_loopback_nothing_starts_until_somebody_decides_who_is_let_in(tmp_pa
         running_server(deployment("noop"), host=EVERYWHERE, keys_file=tmp_path / "none.json"),
     ):
         pytest.fail("started")
+
+
+def test_ipv6_is_not_supported_and_says_so() -> None:
+    with (
+        pytest.raises(ConfigError, match="IPv6 is not supported"),
+        running_server(deployment("noop"), host="::1", insecure=True),
+    ):
+        pass
 
 
 def test_files_that_are_no_certificate_are_refused_before_anything_starts(tmp_path: Path) -> None:

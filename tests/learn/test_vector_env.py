@@ -14,7 +14,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from vlagents_ray.contract import CameraSpec, Contract
 from vlagents_ray.envs.batch import SequentialBatch
-from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, MissingDependency, NotReset
+from vlagents_ray.errors import ConfigError, EnvFailed, InvalidAction, InvalidInput, MissingDependency, NotReset
 from vlagents_ray.evaluate.plan.jobs import EpisodeKey
 from vlagents_ray.interface import Act, Obs
 from vlagents_ray.learn import as_vector_env
@@ -168,6 +168,21 @@ def test_episodes_have_the_seeds_of_an_evaluation() -> None:
         again, _ = venv.reset(seed=key.seed)
         np.testing.assert_array_equal(seen[key.seed], again["cameras/front"][0])
         assert (seen[103] != seen[104]).any()
+
+
+def test_a_list_of_seeds_is_one_for_each_environment_and_later_episodes_go_on_after_them() -> None:
+    with as_vector_env_of_tabletop(3, "all") as venv:
+        several, infos = venv.reset(seed=[107, 4, 100])
+        assert infos["episode_seed"].tolist() == [107, 4, 100]
+        alone, _ = venv.reset(seed=4)
+        np.testing.assert_array_equal(several["cameras/front"][1], alone["cameras/front"][0])
+        venv.reset(seed=range(5, 8))
+        for _ in range(6):
+            _, _, _, _, infos = venv.step(np.zeros((3, 4), np.float32))
+        assert infos["episode_seed"].tolist() == [8, 9, 10]
+        for wrong in ([1, 2], [1, 2, None], [1, 2, -3], [1, 2, "3"]):
+            with pytest.raises(InvalidInput, match="seed"):
+                venv.reset(seed=wrong)
 
 
 def test_spaces_are_those_of_the_contract() -> None:

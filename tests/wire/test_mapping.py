@@ -109,8 +109,6 @@ def test_groots_newest_frame_counts_and_names_are_the_clients() -> None:
         ({"observation/state": np.zeros(5)}, InvalidObservation, "observation/state"),
         ({"observation/state": np.zeros((2, 8))}, InvalidObservation, "observation/state"),
         ({"observation/state": ["0"] * 8}, InvalidObservation, "observation/state"),
-        ({"observation/state": np.full(8, 5.0)}, InvalidObservation, "mapping.gripper"),
-        ({"observation/state": np.full(8, np.nan)}, InvalidObservation, "mapping.gripper"),
         ({"prompt": 3}, InvalidObservation, "prompt"),
         ({"prompt": "x" * 20_000}, MessageTooLarge, "prompt"),
         ({"observation/image": np.zeros((70, 70, 3), np.uint8)}, MessageTooLarge, "observation/image"),
@@ -120,6 +118,16 @@ def test_what_is_wrong_is_said_with_their_key(change: dict[str, Any], error: typ
     flat = {name: value for name, value in (LIBERO | change).items() if value is not None}
     with pytest.raises(error, match=key):
         presets()["openpi-libero"].obs(flat, Limits(pixels=64 * 64))
+
+
+@pytest.mark.parametrize("reading", [5.0, np.nan])
+def test_a_reading_that_is_no_grippers_is_refused_only_where_the_contract_needs_one(reading: float) -> None:
+    flat = LIBERO | {"observation/state": np.full(8, reading)}
+    with pytest.raises(InvalidObservation, match=r"mapping\.gripper"):
+        presets()["openpi-libero"].obs(flat, contract=Contract(gripper=True))
+    for contract in (None, Contract(gripper=False)):
+        obs, _ = presets()["openpi-libero"].obs(flat, contract=contract)
+        assert obs.gripper is None
 
 
 def test_states_are_joined_in_their_order() -> None:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
 
 from vlagents_ray.envs.batch import BatchEnv, make_batch
-from vlagents_ray.errors import ConfigError, InvalidAction, NotReset
+from vlagents_ray.errors import ConfigError, InvalidAction, InvalidInput, NotReset
 from vlagents_ray.evaluate.episode.env_outputs import checked_obs, checked_step
 from vlagents_ray.evaluate.episode.episode import options_of_reset
 from vlagents_ray.evaluate.episode.failures import env_side
@@ -108,25 +108,32 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         self._steps = np.zeros(self.num_envs, np.int64)
         self._seen: list[Obs] = []  # the current observation of each; none before the first reset
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
         """Begin an episode in each environment.
 
         Args:
-            seed: The seed S of episode 0; None to go on with the next numbers.
+            seed: The seed S of episode 0; None to go on with the next numbers. Or, as Gymnasium's vectors take it, the
+                seed of each environment's episode; later episodes go on after the largest of them.
             options: Options of the environments' resets. `reset_mask`, (N,) bool, is Gymnasium's: only these begin one.
 
         Returns:
             The observations, and the infos.
         """
-        super().reset(seed=seed)
         given = dict(options or {})
         mask = given.pop(_RESET_MASK, None)
-        if seed is not None:
+        which = np.ones(self.num_envs, np.bool_) if mask is None else _checked(mask, self.num_envs)
+        stated = None if seed is None or isinstance(seed, int) else _seeds(seed, which)
+        super().reset(seed=seed if stated is None else stated[0])
+        if stated is not None:
+            self._seed, self._begun = max(stated) + 1 - len(stated), 0
+        elif isinstance(seed, int):
             self._seed, self._begun = seed, 0
         elif self._seed is None:
             self._seed = int(self.np_random.integers(2**31))
         infos: dict[str, Any] = {}
-        self._begin(np.ones(self.num_envs, np.bool_) if mask is None else _checked(mask, self.num_envs), infos, given)
+        self._begin(which, infos, given, stated)
         return self._observations(), infos
 
     def step(self, actions: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
@@ -185,7 +192,13 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
             for i in np.flatnonzero(moving).tolist()
         ]
 
-    def _begin(self, which: np.ndarray, infos: dict[str, Any], given: Mapping[str, Any] | None = None) -> None:
+    def _begin(
+        self,
+        which: np.ndarray,
+        infos: dict[str, Any],
+        given: Mapping[str, Any] | None = None,
+        stated: Sequence[int] | None = None,
+    ) -> None:
         """Begin an episode in these environments, and add what is said of it to `infos`."""
         assert self._seed is not None  # noqa: S101 - `reset` has set it
         chosen = np.flatnonzero(which).tolist()
@@ -197,7 +210,7 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
         if not which.all() and not self._seen:
             raise NotReset(f"reset: got a {_RESET_MASK} before the first reset; call reset(seed=...) for all first")
         numbers = range(self._begun, self._begun + len(chosen))
-        seeds = [self._seed + number for number in numbers]
+        seeds = stated or [self._seed + number for number in numbers]
         options = [
             options_of_reset(self._batch, number, {**self._reset_options, **(given or {})}) for number in numbers
         ]
@@ -228,6 +241,16 @@ class BatchVectorEnv(vector.VectorEnv):  # type: ignore[misc]
                 f"environments {np.flatnonzero(self._over).tolist()} are over, and autoreset is disabled; call "
                 f"reset(options={{'reset_mask': ...}})"
             )
+
+
+def _seeds(seeds: Sequence[int | None], which: np.ndarray) -> list[int]:
+    """Return the seeds of the environments that begin an episode, from a list with one for each environment."""
+    if len(seeds) != which.size:
+        raise InvalidInput(f"seed: got {len(seeds)} seeds, want {which.size}, one for each environment")
+    found = [seeds[i] for i in np.flatnonzero(which).tolist()]
+    if not found or not all(isinstance(one, (int, np.integer)) and one >= 0 for one in found):
+        raise InvalidInput(f"seed: got {list(seeds)}, want a whole number for each environment that begins an episode")
+    return [int(one) for one in found if one is not None]
 
 
 def _checked(mask: Any, number: int) -> np.ndarray:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from starlette.testclient import TestClient
+from starlette.testclient import TestClient, WebSocketDenialResponse
 
 from vlagents_ray.contract import CameraSpec, Contract, StateSpec
 from vlagents_ray.images.jpeg_png import encode_jpeg
@@ -366,6 +366,11 @@ def test_a_deadline_that_passed_is_504(client: TestClient) -> None:
 
 def test_unknown_paths_and_methods_are_problems(client: TestClient) -> None:
     assert (client.get("/nope").status_code, client.get("/nope").json()["code"]) == (404, "unknown_app")
+    assert client.get("/v1/metadata/", follow_redirects=False).status_code == 404
+    for path in ("/nope", "/v1/act"):  # 403 would read as a problem of keys
+        with pytest.raises(WebSocketDenialResponse) as refused, client.websocket_connect(path):
+            pass
+        assert (refused.value.status_code, refused.value.json()["code"]) == (404, "unknown_app")
     assert client.get("/v1/act").status_code == 405
     assert client.get("/v1/act").headers["content-type"] == "application/problem+json"
 

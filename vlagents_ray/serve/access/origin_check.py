@@ -35,7 +35,10 @@ def require_own_page(headers: Mapping[str, str], hosts: Collection[str] = ()) ->
     """
     origin, host = headers.get("origin"), headers.get("host")
     if origin is not None and not _is_own(origin, host):
-        raise Forbidden(f"origin {origin[:100]!r}: a page of another site commands no robot; serve with keys to let it")
+        raise Forbidden(
+            f"origin {origin[:100]!r}: a page of another site reaches no robot, not even with a key; let the program "
+            f"behind that page send the request"
+        )
     if host is not None and not _is_ours(host, hosts):
         raise Forbidden(
             f"host {host[:100]!r}: a name that could be another site's, which has it lead here; if it is the server's, "

@@ -17,6 +17,7 @@ import logging
 import time
 import uuid
 from collections.abc import Awaitable, Callable, Sequence
+from functools import partial
 from typing import Any, cast
 
 from starlette.applications import Starlette
@@ -25,7 +26,7 @@ from starlette.requests import ClientDisconnect
 from starlette.requests import Request as HttpRequest
 from starlette.responses import HTMLResponse, JSONResponse, PlainTextResponse, Response
 from starlette.routing import BaseRoute, Route, WebSocketRoute
-from starlette.types import Message
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from vlagents_ray.client.transports.probe import answer, is_probe, read_probe
@@ -46,6 +47,7 @@ from vlagents_ray.serve.access.api_keys import current_caller
 from vlagents_ray.serve.endpoints.docs_page import docs_page
 from vlagents_ray.serve.endpoints.http_messages import (
     RequestDecoder,
+    deny,
     headers_of,
     problem_response,
     request_id,
@@ -84,7 +86,7 @@ def build_http_app(
             `vlagents_ray.serve.live`.
     """
     server = _HttpEndpoint(engine, metadata, limits, machine_metadata)
-    return Starlette(
+    app = Starlette(
         routes=[
             *(Route(f"/v1/{op}", server.endpoint(op), methods=["POST"]) for op in OPS),
             Route("/v1/probe", server.probe, methods=["POST"]),
@@ -97,6 +99,9 @@ def build_http_app(
         ],
         exception_handlers={HTTPException: _http_problem},
     )
+    app.router.redirect_slashes = False  # a redirected POST loses its body with many clients
+    app.router.default = partial(_no_such_path, app.router.default)
+    return app
 
 
 class _HttpEndpoint:
@@ -268,6 +273,14 @@ def _timed(http: HttpRequest, trace: RequestTrace) -> HttpRequest:
         return message
 
     return HttpRequest(http.scope, receive)
+
+
+async def _no_such_path(of_http: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
+    """Refuse a path that no route has: Starlette would refuse a WebSocket with 403, which is for keys."""
+    if scope["type"] == "websocket":
+        await deny(WebSocket(scope, receive, send), UnknownApp("no such path; GET /docs lists what there is"))
+    else:
+        await of_http(scope, receive, send)
 
 
 async def _http_problem(http: HttpRequest, error: Exception) -> Response:

@@ -32,6 +32,7 @@ _CHECK_FAILURES = "RAY_SERVE_HAPROXY_HEALTH_CHECK_FALL"
 _WAIT_MS = 1800  # maximum time of a reply to `/healthz`, and of any reply while no replica runs
 _RETRY_AFTER_S = 1
 _REFUSAL = "no-replica.http"  # file name, in the folder of the script that starts HAProxy
+_CIPHERS = "ECDHE+AESGCM:ECDHE+CHACHA20"  # of TLS 1.2: with forward secrecy, without CBC
 _REPLICA_PORTS = 200  # size of the block of ports at which the replicas of one server listen
 # HAProxy's settings on every Serve cluster that robots connect to. The files in cluster/ contain the same settings,
 # for clusters that are started in another way.
@@ -76,7 +77,11 @@ class PublicListener:
 
     def settings(self) -> str:
         """Return a section of HAProxy's settings for this listener."""
-        tls = "" if self.bundle is None else f' ssl crt "{self.bundle}" ssl-min-ver TLSv1.2 alpn http/1.1'
+        tls = (
+            ""
+            if self.bundle is None
+            else f' ssl crt "{self.bundle}" ssl-min-ver TLSv1.2 ciphers {_CIPHERS} alpn http/1.1'
+        )
         if self.client_ca is not None:
             tls += f' ca-file "{self.client_ca}" verify required'
         bind, server = f"bind {self.host}:{self.port}{tls}", f"server inside {LOOPBACK}:{self.inside}"

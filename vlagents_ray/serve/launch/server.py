@@ -79,6 +79,10 @@ def running_server(
     only its own processes, at `serve://APP`, and nothing over HTTP, which makes start and end faster.
     Raises `ConfigError` if the deployment fails, `PolicyUnavailable` if it takes too long.
     """
+    if ":" in host:
+        raise ConfigError(
+            f"host {host}: IPv6 is not supported; use an IPv4 address, or 0.0.0.0 for all of this machine"
+        )
     config = with_gateways_at(config, host)
     config = _access(config, keys_file, insecure, plain_http)
     if address is None:  # otherwise each replica checks and warns on its own machine

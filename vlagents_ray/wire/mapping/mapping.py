@@ -139,7 +139,7 @@ class KeyMapping:
                 f"observation: got {len(cameras)} cameras and {len(state)} states, the limit is {limits.cameras}"
             )
         info = {name: value for name, key in self.info.items() if (value := lookup(flat, key)) is not None}
-        gripper = self._opening(flat, limits, needed=contract is None or bool(contract.gripper))
+        gripper = self._opening(flat, limits, needed=contract is not None and bool(contract.gripper))
         obs = Obs(cameras, gripper, state, info)
         if not cameras or not state:
             self._require_read(flat, obs)
