@@ -53,7 +53,7 @@ def decode_request(frame: Buffer, limits: Limits = DEFAULT_LIMITS) -> Request:
     return request
 
 
-names = st.text(min_size=1, max_size=8).filter(lambda name: name != "$")
+names = st.text(min_size=1, max_size=8).filter(lambda name: name != "$" and name.isprintable())
 arrays = hnp.arrays(
     dtype=st.sampled_from([np.dtype(t) for t in ("?", "u1", "i2", "i4", "i8", "f2", "f4", "f8")]),
     shape=hnp.array_shapes(min_dims=0, max_dims=3, max_side=5),
@@ -126,9 +126,8 @@ def test_a_step_is_text_since_some_parsers_round_it() -> None:
     for frame in (encode_request(Request("act", Obs(), step=step)), encode_replies([Reply("r1", info={}, step=step)])):
         assert json.loads(frame[8 : 8 + struct.unpack("<I", frame[4:8])[0]])["step"] == str(step)
         assert (decode_request(frame) if b'"op"' in frame else decode_reply(frame)).step == step
-    for said in (3, "3"):
-        assert decode_request(b"".join(pack({"op": "act", "obs": {}, "step": said}, []))).step == 3
-    for wrong in ("x", "-1", "1.5", "\u00b2", "1" * 99, 2.0, -1, True, []):
+    assert decode_request(b"".join(pack({"op": "act", "obs": {}, "step": "3"}, []))).step == 3
+    for wrong in (3, "x", "-1", "1.5", "\u00b2", "1" * 99, 2.0, -1, True, []):
         with pytest.raises(MalformedMessage, match="step"):
             decode_request(b"".join(pack({"op": "act", "obs": {}, "step": wrong}, [])))
 

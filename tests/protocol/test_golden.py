@@ -18,7 +18,7 @@ from vlagents_ray.errors import MalformedMessage
 from vlagents_ray.images.jpeg_png import decode
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.budget import Budget
-from vlagents_ray.protocol.frame_layout import unpack
+from vlagents_ray.protocol.frame_layout import pack, unpack
 from vlagents_ray.protocol.frames import (
     CONTENT_TYPE,
     decode_replies,
@@ -126,6 +126,44 @@ def test_a_document_is_one_of_the_schema(name: str) -> None:
 def test_the_schema_refuses_what_the_protocol_does_not_allow(name: str, document: Any) -> None:
     with pytest.raises(jsonschema.ValidationError):
         require_valid(document, name)
+
+
+REFUSED_ACTS = [
+    {"instruction": "push"},
+    {"kwargs": {"seed": 3}},
+    {"contract": {"chunk": 2}},
+    {"deadline_ms": 1e9},
+    {"deadline_ms": 0},
+    {"request_id": "x" * 129},
+    {"state": {"x" * 129: [0.0]}},
+    {"state": {"": [0.0]}},
+    {"state": {"joints": [-1.1e49]}},
+    {"gripper": 2},
+]
+
+
+@pytest.mark.parametrize("document", REFUSED_ACTS, ids=str)
+def test_what_the_schema_refuses_the_server_refuses_too_in_json_and_in_frames(document: dict[str, Any]) -> None:
+    engine = Engine(Chunks())
+    engine.start()
+    app = AccessMiddleware(build_http_app(engine, dict, DEFAULT_LIMITS), None, "app")
+    of_obs = {key: value for key, value in document.items() if key in ("state", "gripper")}
+    header = {"op": "act", "obs": of_obs, **{key: value for key, value in document.items() if key not in of_obs}}
+    try:
+        with TestClient(app) as client:
+            client.post("/v1/reset", json={}, headers={"x-session-id": "robot-1"})
+            for name, said, kind in (
+                ("act_request", document, "application/json"),
+                ("requests_header", header | {"blobs": []}, CONTENT_TYPE),
+            ):
+                with pytest.raises(jsonschema.ValidationError):
+                    require_valid(said, name)
+                content = b"".join(pack(header, [])) if kind == CONTENT_TYPE else json.dumps(said).encode()
+                headers = {"x-session-id": "robot-1", "content-type": kind}
+                answer = client.post("/v1/act", content=content, headers=headers)
+                assert answer.json()["code"] in ("malformed", "invalid_observation", "too_large"), answer.text
+    finally:
+        engine.close()
 
 
 class Chunks(Agent):

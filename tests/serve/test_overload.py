@@ -17,6 +17,7 @@ from types import SimpleNamespace
 from typing import Any
 from urllib.parse import urlsplit
 
+import api_key_replica
 import numpy as np
 import pytest
 from api_key_replica import (
@@ -61,7 +62,6 @@ from vlagents_ray.protocol.messages import (
     Request,
 )
 from vlagents_ray.serve.access.api_keys import NoKey
-from vlagents_ray.serve.endpoints import weights
 from vlagents_ray.serve.endpoints.local.shm import ShmServer
 from vlagents_ray.serve.endpoints.websocket import WebSocketServer
 from vlagents_ray.serve.engine.admission import Admission, MessageAdmission, NeedsDecodingThread
@@ -108,7 +108,7 @@ def decoded(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     by: list[str] = []
     for module, name in (
         (jpeg_png, "decode"),
-        (weights, "read_header"),
+        (api_key_replica, "read_header"),
         (openpi_codec, "decode"),
         (openvla_codec, "decode"),
         (gr00t_codec, "read_request"),

@@ -120,16 +120,6 @@ def test_what_is_wrong_is_said_with_their_key(change: dict[str, Any], error: typ
         presets()["openpi-libero"].obs(flat, Limits(pixels=64 * 64))
 
 
-@pytest.mark.parametrize("reading", [5.0, np.nan])
-def test_a_reading_that_is_no_grippers_is_refused_only_where_the_contract_needs_one(reading: float) -> None:
-    flat = LIBERO | {"observation/state": np.full(8, reading)}
-    with pytest.raises(InvalidObservation, match=r"mapping\.gripper"):
-        presets()["openpi-libero"].obs(flat, contract=Contract(gripper=True))
-    for contract in (None, Contract(gripper=False)):
-        obs, _ = presets()["openpi-libero"].obs(flat, contract=contract)
-        assert obs.gripper is None
-
-
 def test_states_are_joined_in_their_order() -> None:
     mapping = KeyMapping.from_json({"state": {"pose": ["b", {"key": "a", "start": 1}]}})
     obs, instruction = mapping.obs({"a": np.arange(3.0), "b": [9, 8]})
@@ -238,13 +228,7 @@ def test_a_mapping_of_junk_is_refused_by_name(value: Any) -> None:
         return
 
 
-def test_a_number_too_large_for_float32_is_infinite_without_a_warning() -> None:
-    for value in ([1e308], np.array([1e308])):
-        obs, _ = KeyMapping.from_json({"state": {"joints": "joints"}}).obs({"joints": value})
-        assert np.isinf(obs.state["joints"]).all()
-
-
-@pytest.mark.parametrize("value", [10**400, [10**400], [-(10**400), 1.0]])
-def test_a_number_too_large_for_any_float_is_refused(value: Any) -> None:
+@pytest.mark.parametrize("value", [[1e308], np.array([1e308]), 10**400, [10**400], [-(10**400), 1.0]])
+def test_a_number_too_large_for_float32_is_refused(value: Any) -> None:
     with pytest.raises(InvalidObservation, match="joints"):
         KeyMapping.from_json({"state": {"joints": "joints"}}).obs({"joints": value})

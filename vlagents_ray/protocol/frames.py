@@ -31,6 +31,7 @@ from vlagents_ray.protocol.frame_layout import (
 )
 from vlagents_ray.protocol.messages import (
     DEFAULT_LIMITS,
+    MOST_DEADLINE_MS,
     NAME_CHARACTERS,
     OPS,
     RANKS,
@@ -52,6 +53,7 @@ _OPTIONAL: dict[str, Any] = {
     "parts": False,
 }  # with defaults
 _WITH_OBS = ("reset", "act", "observe")
+_OF_RESET = ("instruction", "kwargs", "contract", "history")
 _OF_CLOSE = ("op", "step", *_OPTIONAL)
 _REQUEST_KEYS = {"op", "obs", "instruction", "kwargs", "contract", "history", "blobs", "step", *_OPTIONAL}
 
@@ -149,11 +151,17 @@ def _read_request(node: dict[str, Any], reader: ValueReader, limits: Limits, ops
 def _step(node: dict[str, Any]) -> Any:
     """Return the step of a request or reply, which is text, since some parsers of JSON round numbers over 2**53."""
     step = node.get("step")
-    return int(step) if isinstance(step, str) and step.isascii() and step.isdecimal() and len(step) < 20 else step
+    if step is None:
+        return None
+    if not (isinstance(step, str) and step.isascii() and step.isdecimal() and len(step) < 20):
+        raise MalformedMessage(f"step: got {str(step)[:40]}, want the text of the last answer, such as '7'")
+    return int(step)
 
 
 def check_request(request: Request, limits: Limits) -> Request:
     """Check the types and sizes that JSON does not fix, for requests of any format; returns the request."""
+    if request.op in ("act", "close") and (of_reset := [name for name in _OF_RESET if getattr(request, name)]):
+        raise MalformedMessage(f"{request.op}: got {of_reset}, which a reset states for its whole episode")
     if request.obs is None and request.op in _WITH_OBS:
         raise MalformedMessage(f"{request.op}: no 'obs'; send the observation")
     for name in ("instruction", "request_id", "session"):
@@ -174,8 +182,12 @@ def check_request(request: Request, limits: Limits) -> Request:
         raise MalformedMessage(f"rank: got {str(request.rank)[:40]!r}, want one of {list(RANKS)}")
     if request.step is not None and (type(request.step) is not int or request.step < 0):
         raise MalformedMessage(f"step: got {str(request.step)[:40]}, want a whole number of acts")
-    if request.deadline_ms is not None and not (is_number(request.deadline_ms) and request.deadline_ms > 0):
-        raise MalformedMessage(f"deadline_ms: got {str(request.deadline_ms)[:40]}, want a positive number")
+    if request.deadline_ms is not None and not (
+        is_number(request.deadline_ms) and 0 < request.deadline_ms < MOST_DEADLINE_MS
+    ):
+        raise MalformedMessage(
+            f"deadline_ms: got {str(request.deadline_ms)[:40]}, want a number above 0 and below {MOST_DEADLINE_MS:g}"
+        )
     return request
 
 

@@ -19,6 +19,7 @@ DEADLINE_HEADER = "x-deadline-ms"
 # of a reply: the session's step; a request with it is refused if the session is at any other step
 STEP_HEADER = "x-step"
 RANK_HEADER = "x-rank"
+MOST_DEADLINE_MS = 1e9  # 11 days
 NAME_CHARACTERS = 128  # most characters of a session's or a request's id
 STREAM_PATH = "/v1/stream/"  # on a replica's own port; an unguessable part follows
 STREAM_BYTES = 16 * 2**20  # most bytes of one WebSocket message: uvicorn's limit, which Serve does not let us change

@@ -9,7 +9,7 @@ import numpy as np
 from vlagents_ray.errors import InvalidObservation, MalformedMessage, MessageTooLarge
 from vlagents_ray.images.codecs import ImageCodec, encode_files
 from vlagents_ray.interface import Obs
-from vlagents_ray.protocol.messages import Limits
+from vlagents_ray.protocol.messages import NAME_CHARACTERS, Limits
 from vlagents_ray.protocol.values import ValueReader, ValueWriter
 
 _OBS_KEYS = {"cameras", "gripper", "state", "info"}
@@ -29,6 +29,11 @@ def read_obs(node: Any, reader: ValueReader, limits: Limits) -> Obs:
             raise MalformedMessage(f"obs.{name}: got {type(value).__name__}, want an object")
     if max(len(cameras), len(state)) > limits.cameras:
         raise MessageTooLarge(f"obs: got {len(cameras)} cameras and {len(state)} states, the limit is {limits.cameras}")
+    for name in (*cameras, *state):
+        if not 0 < len(name) <= NAME_CHARACTERS or not name.isprintable():
+            raise InvalidObservation(
+                f"obs: got a camera or state named {name[:40]!r}, want 1 to {NAME_CHARACTERS} printable characters"
+            )
     if gripper is not None and not is_number(gripper):
         raise InvalidObservation(f"gripper: got {str(gripper)[:40]!r}, want a number in [0, 1] where 1 = open")
     reader.decode_images(cameras)
@@ -63,19 +68,21 @@ def as_state(name: str, part: Any, limits: Limits) -> np.ndarray:
             raise MessageTooLarge(f"state {name!r}: got {len(part)} values, the limit is {limits.state_values}")
         if not all(is_number(x) for x in part):
             raise InvalidObservation(f"state {name!r}: want a list of numbers")
-        return _single(np.array(part, dtype=np.float64))
+        return _single(name, np.array(part, dtype=np.float64))
     if not isinstance(part, np.ndarray) or part.ndim != 1 or part.dtype.kind not in "fiu":
         got = f"{part.shape} {part.dtype}" if isinstance(part, np.ndarray) else type(part).__name__
         raise InvalidObservation(f"state {name!r}: got {got}, want (D,) float32")
     if part.size > limits.state_values:
         raise MessageTooLarge(f"state {name!r}: got {part.size} values, the limit is {limits.state_values}")
-    return _single(part)
+    return _single(name, part)
 
 
-def _single(part: np.ndarray) -> np.ndarray:
-    """Convert to float32; values too large for it become infinite, which `check_observation` refuses."""
-    with np.errstate(over="ignore"):
-        return part.astype(np.float32, copy=False)
+def _single(name: str, part: np.ndarray) -> np.ndarray:
+    try:
+        with np.errstate(over="raise"):
+            return part.astype(np.float32, copy=False)
+    except FloatingPointError as error:
+        raise InvalidObservation(f"state {name!r}: got a number beyond those of float32, want it within") from error
 
 
 def write_obs(obs: Obs, writer: ValueWriter, codec: ImageCodec) -> dict[str, Any]:

@@ -157,7 +157,7 @@ class ValueReader:
 
     def _get(self, index: Any) -> Buffer:
         if type(index) is not int or not 0 <= index < len(self._blobs):
-            raise MalformedMessage(f"reference: got blob {str(index)[:20]}, want one of {len(self._blobs)}")
+            raise MalformedMessage(f"reference: got blob {str(index)[:20]}, want a number below {len(self._blobs)}")
         return self._blobs[index]
 
 

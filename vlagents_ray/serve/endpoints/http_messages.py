@@ -19,6 +19,7 @@ from vlagents_ray.protocol.frames import CONTENT_TYPE, check_request, decode_req
 from vlagents_ray.protocol.json_messages import CAMERA_PREFIX, PROBLEM_TYPE, problem, request_from_parts
 from vlagents_ray.protocol.messages import (
     DEADLINE_HEADER,
+    MOST_DEADLINE_MS,
     RANK_HEADER,
     REQUEST_ID_HEADER,
     SESSION_HEADER,
@@ -80,6 +81,11 @@ class RequestDecoder:
 
     def _checked(self, op: Op, requests: list[Request | Reply], http: HttpRequest) -> list[Request | Reply]:
         headers = headers_of(http.scope)
+        stated = headers.get(REQUEST_ID_HEADER, "")
+        if not is_name(stated):
+            raise MalformedMessage(
+                f"header {REQUEST_ID_HEADER}: got {stated[:40]!r}, want 1 to 128 visible ASCII characters"
+            )
         deadline, rank, step = headers.get(DEADLINE_HEADER), headers.get(RANK_HEADER), headers.get(STEP_HEADER)
         for request in requests:
             if not isinstance(request, Request):
@@ -215,8 +221,10 @@ def _positive(text: str) -> float:
         value = float(text)
     except ValueError:
         value = -1.0
-    if not 0 < value < 1e9:
-        raise MalformedMessage(f"header {DEADLINE_HEADER}: got {text[:40]!r}, want a positive number of milliseconds")
+    if not 0 < value < MOST_DEADLINE_MS:
+        raise MalformedMessage(
+            f"header {DEADLINE_HEADER}: got {text[:40]!r}, want milliseconds above 0 and below {MOST_DEADLINE_MS:g}"
+        )
     return value
 
 
