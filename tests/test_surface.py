@@ -12,7 +12,7 @@ def test_the_public_surface_is_the_one_that_was_reviewed() -> None:
         pytest.fail(
             "the public surface is another one:\n"
             + "\n".join(changes)
-            + "\nIf that is meant, run `python tests/support/surface.py`. See docs/stability.md for what may change."
+            + "\nIf that is meant, run `python tests/support/surface.py`."
         )
 
 

@@ -45,7 +45,6 @@ was received, what was expected, and how to cure it.
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable
 from typing import ClassVar
 
@@ -319,18 +318,3 @@ def from_code(code: str, detail: str) -> VLAgentsError:
     error = cls.__new__(cls)
     Exception.__init__(error, detail)
     return error
-
-
-def deprecated(what: str, instead: str, *, since: str, in_code: bool = True) -> None:
-    """Warn of something that a later version will not have any more.
-
-    Args:
-        what: What is deprecated: "vlagents_ray.evaluate.statistics", "answer_while_loading".
-        instead: What to write instead, as an order: "write `from vlagents_ray.evaluate import mcnemar`".
-        since: The first version that warns: "0.1".
-        in_code: Whether it stands in Python code, whose author is warned (`DeprecationWarning`); otherwise in a file or
-            on a command line, whose user is (`FutureWarning`).
-    """
-    category = DeprecationWarning if in_code else FutureWarning
-    # Of the caller's caller: who imports a module, or calls a function, that says so of itself.
-    warnings.warn(f"{what} is deprecated since version {since}: {instead}", category, stacklevel=3)

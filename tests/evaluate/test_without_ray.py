@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import importlib
 import subprocess
 import sys
 from collections.abc import Callable
 
-import pytest
 from eval_fakes import ToZero
 from in_process_pool import without_ray
 
-from vlagents_ray import evaluate as package
 from vlagents_ray.evaluate import EvalConfig, evaluate
 
 READ = """
@@ -31,12 +28,3 @@ def test_results_are_read_without_ray(config: Callable[..., EvalConfig]) -> None
     told = subprocess.run(command, check=False, capture_output=True, text=True, timeout=60)
     assert told.returncode == 0, told.stderr
     assert told.stdout.strip() == str(summary.total.episodes)
-
-
-@pytest.mark.parametrize(
-    ("module", "name"), [("comparison", "compare"), ("statistics", "mcnemar"), ("trajectory", "Trajectory")]
-)
-def test_the_old_places_name_the_new_ones(module: str, name: str) -> None:
-    with pytest.warns(DeprecationWarning, match=f"from vlagents_ray.evaluate import {name}"):
-        old = importlib.import_module(f"vlagents_ray.evaluate.{module}")
-    assert getattr(old, name) is getattr(package, name)

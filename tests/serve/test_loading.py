@@ -116,9 +116,3 @@ def test_serve_leaves_a_replica_that_does_not_answer_as_much_time_as_a_call_may_
     policy = build(ServerArgs(policy="noop", limits={"act_s": act_s}))._bound_deployment
     silent_s = 3 * policy._deployment_config.health_check_timeout_s
     assert act_s <= silent_s <= max(15.0, act_s)
-
-
-@pytest.mark.parametrize("value", [True, False])
-def test_whether_to_answer_while_loading_is_no_choice_any_more(value: bool) -> None:
-    with pytest.warns(FutureWarning, match="remove it from the deployment file"):
-        ServerArgs(policy="noop", answer_while_loading=value)

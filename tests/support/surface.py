@@ -1,7 +1,6 @@
 """What users write down, and so what must not change unnoticed: names, settings, paths, series, columns, options.
 
-`python tests/support/surface.py` writes tests/surface.txt again, whose changes are seen in a review. What is stable of
-it says docs/stability.md.
+`python tests/support/surface.py` writes tests/surface.txt again, whose changes are seen in a review.
 """
 
 from __future__ import annotations

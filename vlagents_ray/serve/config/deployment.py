@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
-from vlagents_ray.errors import ConfigError, deprecated
+from vlagents_ray.errors import ConfigError
 from vlagents_ray.interface import Agent
 from vlagents_ray.policies.adapters import ADAPTER
 from vlagents_ray.protocol.messages import DEFAULT_LIMITS, Limits
@@ -293,10 +293,6 @@ class ServerArgs(_DeploymentModel):
     checkpoints: CheckpointArgs = CheckpointArgs()
     replicas: int | None = Field(default=None, ge=1, description="a fixed number; excludes `autoscaling`")
     autoscaling: AutoscalingArgs | None = None
-    answer_while_loading: bool | None = Field(
-        default=None,
-        description="deprecated, without effect: a replica runs only once its policy has loaded; remove it",
-    )
     batch: BatchArgs = BatchArgs()
     sessions: SessionArgs = SessionArgs()
     limits: LimitArgs = LimitArgs()
@@ -313,19 +309,6 @@ class ServerArgs(_DeploymentModel):
         default=None, description="a candidate that acts on live observations; its actions are never executed"
     )
     viewers: ViewerArgs = Field(default=ViewerArgs(), description="recordings of all sessions for Rerun and Foxglove")
-
-    @field_validator("answer_while_loading")
-    @classmethod
-    def _always_answered(cls, value: bool | None) -> bool | None:
-        if value is not None:
-            deprecated(
-                "answer_while_loading",
-                "it has no effect, as an application runs only once its policy has loaded; remove it from the "
-                "deployment file",
-                since="0.1",
-                in_code=False,
-            )
-        return value
 
     @model_validator(mode="after")
     def _one_scaling(self) -> ServerArgs:

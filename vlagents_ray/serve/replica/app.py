@@ -25,7 +25,6 @@ _OUTSIDE: Any = {
     "replicas": True,
     "autoscaling": True,
     "resources": True,
-    "answer_while_loading": True,
 }
 
 
