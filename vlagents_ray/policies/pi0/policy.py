@@ -207,7 +207,7 @@ class Pi0(StreamingPolicy):
             )
         if int((tokens["input_ids"] == processor.image_token_id).sum()) != patches:
             raise InvalidObservation(
-                f"instruction: got {instruction!r} with {processor.image_token!r}, which stands for an image; leave it out"
+                f"instruction: got {processor.image_token!r} in {instruction!r}, want words; it stands for an image"
             )
         self._begun().prompt = dict(tokens)
 
