@@ -281,9 +281,11 @@ class Engine:
                 ticket.begun = ticket.begun and ticket.request.op != "act"  # the policy has not received this act
                 ticket.answer(Reply(ticket.request.request_id, error=public_error(error, ticket)))
         for (model, weights, in_parts), group in acting.items():
-            prepared, prepared_s = self._prepared(model, group)
-            if prepared:
-                (self._streams.run if in_parts else self._act)(model, weights, prepared, prepared_s)
+            prepared_s = 0.0
+            if self.queue.window.slow:
+                group, prepared_s = self._prepared(model, group)  # noqa: PLW2901 - without those that failed
+            if group:
+                (self._streams.run if in_parts else self._act)(model, weights, group, prepared_s)
 
     def _ready(self, ticket: PendingRequest) -> tuple[Session[LoadedModel], LoadedModel, WeightsVersion]:
         session = self.sessions.get(ticket.session_id)
@@ -314,7 +316,7 @@ class Engine:
             The other requests, and the time that this took, s, which counts as inference.
         """
         preparations = [(ticket.preparation, session.agent) for ticket, session in acting]
-        if not self.queue.window.slow or all(preparation is None for preparation, _ in preparations):
+        if all(preparation is None for preparation, _ in preparations):
             return acting, 0.0
         with model.busy, model.call("act", "prepare") as call:
             errors = {} if model.closed else Preparations.finish(preparations)
