@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import sys
 import threading
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -24,6 +25,7 @@ _SESSIONS = 3
 _THREADS = 4  # as many prepare observations in a server
 _ROUNDS = 20  # acts beside those threads, each after `_RESETS` resets
 _RESETS = 15  # since a reset is short, few of them coincide with a preparation
+_LONGEST_S = 5.0  # time after which a slow agent, whose other threads compete with it, makes no further act
 _SWITCH_S = 1e-5  # time after which Python lets another thread run, so that more of them interleave
 
 
@@ -136,7 +138,10 @@ def _check_threads(suite: _Suite, first: list[Act]) -> None:
         usual = sys.getswitchinterval()
         sys.setswitchinterval(_SWITCH_S)
         try:
+            begun = time.monotonic()
             for number in range(_ROUNDS):
+                if number >= _SESSIONS and time.monotonic() - begun > _LONGEST_S:
+                    break
                 i = number % _SESSIONS
                 *_, session = (suite.begin(i) for _ in range(_RESETS))
                 found = suite.act(i, session, prepared=number % 2 == 0)
