@@ -232,14 +232,16 @@ class Agent:
 
         A server may call this on a session's copy while other sessions, or an earlier request of this one, are acted
         on, on several threads at once, and sets `obs.prepared` to the result before `act`. It does not have to: `act`
-        computes the same where that is None. Override this if it takes a noticeable part of the time of `act`.
+        computes the same where that is None. An error fails the request of that observation. Override this if it takes
+        a noticeable part of the time of `act`.
 
         Args:
             obs: The observation to act on next; it must not be changed.
 
         Returns:
             Anything that does not share memory with the observation. The agent, and what its sessions share, must not
-            be changed; read only what `initialize` and `reset` have set and what no new weights change.
+            be changed, such as the padding of a tokenizer; read only what `initialize` and `reset` have set and what no
+            new weights change.
         """
         return None
 

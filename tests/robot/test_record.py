@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -21,6 +22,7 @@ from vlagents_ray import ConfigError, Obs
 from vlagents_ray.contract import ActionSpec, CameraSpec, Contract, StateSpec
 from vlagents_ray.dataset_contract import BYTES, INFO, STATISTICS, DatasetContract
 from vlagents_ray.errors import InvalidObservation
+from vlagents_ray.robot import dataset
 from vlagents_ray.robot.dataset import Dataset
 from vlagents_ray.robot.record import Recorder
 
@@ -227,9 +229,35 @@ for episode in range(3):
         os.kill(process.pid, signal.SIGKILL)
     assert info(tmp_path)["total_episodes"] == 2
     assert len(list(tmp_path.glob("data/*/*.parquet"))) == 2
-    dataset = Dataset(tmp_path, FPS)
-    assert dataset.episodes == 2
+    assert Dataset(tmp_path, FPS).episodes == 2
     assert not (tmp_path / "unfinished").exists()
+
+
+def test_a_kill_at_any_moment_of_a_save_leaves_nothing_of_its_episode(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, expected = tmp_path / "dataset", tmp_path / "expected"
+    killed: list[Path] = []
+    move = dataset._move
+
+    def moved(part: Path, path: Path) -> None:
+        killed.append(tmp_path / f"killed-{len(killed)}")
+        shutil.copytree(root, killed[-1])
+        move(part, path)
+
+    record(root, 5)
+    record(expected, 5)
+    record(expected, 7, "stack the plates")
+    with monkeypatch.context() as patched:
+        patched.setattr(dataset, "_move", moved)
+        record(root, 9, "unstack the cups")
+    assert killed[-1].joinpath("meta/stats.json").read_bytes() != killed[0].joinpath("meta/stats.json").read_bytes()
+    for left in killed:
+        record(left, 7, "stack the plates")
+        for name in ("meta/info.json", "meta/stats.json"):
+            assert json.loads((left / name).read_text()) == json.loads((expected / name).read_text()), (left, name)
+        for name in ("meta/tasks.parquet", "data/chunk-000/file-001.parquet"):
+            assert pq.read_table(left / name) == pq.read_table(expected / name), (left, name)
 
 
 def test_what_info_does_not_count_is_removed(tmp_path: Path) -> None:

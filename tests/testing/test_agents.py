@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
@@ -151,6 +152,91 @@ class PreparesOtherwise(GoodAgent):
         return super().act(obs if obs.prepared is None else replace(obs, state={"joints": obs.prepared}))
 
 
+class Prepares(GoodAgent):
+    """Gives `act` what it computes in `prepare`."""
+
+    def prepare(self, obs: Obs) -> Any:
+        return {"joints": obs.state["joints"] * 1, "text": self.told}
+
+    def act(self, obs: Obs) -> Any:
+        return super().act(obs if obs.prepared is None else replace(obs, state=obs.prepared))
+
+
+class Tokenizer:
+    """Keeps its padding as state, as fast tokenizers do; padded texts have five letters."""
+
+    padded = False
+
+    def __call__(self, text: str, *, padded: bool) -> list[str]:
+        self.padded = padded
+        time.sleep(1e-4)  # another thread may call it
+        return [*text, *(" " * (5 - len(text)) if self.padded else "")]
+
+
+class SharesItsTokenizer(Prepares):
+    shared = ("tokenizer", "weights")
+
+    def initialize(self) -> None:
+        super().initialize()
+        self.tokenizer = Tokenizer()
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        self.tokenizer("ab", padded=False)
+        return super().reset(obs, instruction, **kwargs)
+
+    def prepare(self, obs: Obs) -> Any:
+        return {**super().prepare(obs), "tokens": self.tokenizer("ab", padded=True)}
+
+
+class CountsTokensWithIt(SharesItsTokenizer):
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        if len(self.tokenizer("ab", padded=False)) > 2:
+            raise ValueError("too many tokens")
+        return super().reset(obs, instruction, **kwargs)
+
+    def prepare(self, obs: Obs) -> Any:
+        self.tokenizer("ab", padded=True)
+        return Prepares.prepare(self, obs)
+
+
+class PreparesOnOneThread(Prepares):
+    def prepare(self, obs: Obs) -> Any:
+        if threading.current_thread() is not threading.main_thread():
+            raise RuntimeError("Already borrowed")
+        return super().prepare(obs)
+
+
+class LocksItsTokenizer(SharesItsTokenizer):
+    shared = ("tokenizer", "weights", "lock")
+
+    def initialize(self) -> None:
+        super().initialize()
+        self.lock = threading.Lock()
+
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        with self.lock:
+            return super().reset(obs, instruction, **kwargs)
+
+    def prepare(self, obs: Obs) -> Any:
+        with self.lock:
+            return super().prepare(obs)
+
+
+class ParsesItsInstruction(GoodAgent):
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        {"go home": 0}[instruction or ""]
+        return super().reset(obs, instruction, **kwargs)
+
+
+class ParsesItInAct(ParsesItsInstruction):
+    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
+        return GoodAgent.reset(self, obs, instruction, **kwargs)
+
+    def act(self, obs: Obs) -> Any:
+        {"go home": 0}[self.told]
+        return super().act(obs)
+
+
 class WrongChunk(GoodAgent):
     @property
     def contract(self) -> Contract | None:
@@ -259,6 +345,11 @@ BROKEN_AGENTS: list[tuple[type[GoodAgent], str]] = [
     (with_act(lambda act: replace(act, done=np.bool_(True))), "done is bool"),
     (with_act(lambda act: replace(act, info={"t": np.float32(1)})), r"info\['t'\]"),
     (PreparesOtherwise, "on a prepared observation.*`prepare` must compute what"),
+    (SharesItsTokenizer, r"prepare of session . on a thread.*\['tokens'\].*a tokenizer's padding"),
+    (CountsTokensWithIt, "reset: raised ValueError.*too many tokens.*on several threads"),
+    (PreparesOnOneThread, "prepare: raised RuntimeError.*Already borrowed.*on several threads"),
+    (ParsesItsInstruction, r"reset: raised KeyError.* for the instruction 'pick up the cube', .*instructions=\["),
+    (ParsesItInAct, r"act: raised KeyError.* for the instruction 'pick up the cube' .*instructions=\["),
     (WrongChunk, "has 1 rows, the contract states 4"),
     (PartsOfAnotherChunk, 'the parts must be the chunk that `act` returns; else `act_parts` is "approximate"'),
     (PartsWithoutALast, "`more` is .*, want True in all parts but the last"),
@@ -272,7 +363,7 @@ BROKEN_AGENTS: list[tuple[type[GoodAgent], str]] = [
 ]
 
 
-@pytest.mark.parametrize("cls", [GoodAgent, SharesItsLock, GivesParts, RoughParts])
+@pytest.mark.parametrize("cls", [GoodAgent, SharesItsLock, GivesParts, RoughParts, Prepares, LocksItsTokenizer])
 def test_a_good_agent_passes(cls: type[GoodAgent]) -> None:
     check_agent(cls())
 
@@ -281,6 +372,10 @@ def test_a_good_agent_passes(cls: type[GoodAgent]) -> None:
 def test_a_broken_agent_is_told_what_is_wrong(cls: type[GoodAgent], message: str) -> None:
     with pytest.raises(ContractViolation, match=f"(?s){message}"):
         check_agent(cls())
+
+
+def test_instructions_that_the_policy_knows_can_be_given() -> None:
+    check_agent(ParsesItsInstruction(), instructions=["go home"])
 
 
 def test_an_agent_without_contract_is_shown_some_observation() -> None:

@@ -74,7 +74,7 @@ from vlagents_ray.testing import check_agent
 
 
 def test_the_policy_keeps_its_contract():
-    check_agent($title())
+    check_agent($title())  # a policy that parses its instructions needs its own: instructions=["go home"]
 """,
     "$name.yaml": """\
 # vlagents-ray serve $name.yaml

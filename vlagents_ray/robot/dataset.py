@@ -171,7 +171,22 @@ class Dataset:
         stats.pop(STATISTICS, None)
         self._stats = {key: {name: np.array(value) for name, value in one.items()} for key, one in stats.items()}
         table = self._pq.read_table(self.root / "meta/tasks.parquet")
-        self.tasks = table.column("__index_level_0__").to_pylist()
+        self.tasks = table.column("__index_level_0__").to_pylist()[: info["total_tasks"]]
+        if int(self._stats[ACTION]["count"][0]) != info["total_frames"]:  # a crash left an episode that is not counted
+            self._stats = {}
+            for number in range(self.episodes):
+                self._stats = joined(self._stats, self._stats_of(number))
+
+    def _stats_of(self, number: int) -> dict[str, Stats]:
+        """Return the statistics of one episode."""
+        place = {"chunk_index": number // FILES_IN_CHUNK, "file_index": number % FILES_IN_CHUNK}
+        [about] = self._pq.read_table(self.root / EPISODES.format(**place)).to_pylist()
+        found: dict[str, Stats] = {}
+        for column, value in about.items():
+            if column.startswith("stats/"):
+                key, _, name = column.removeprefix("stats/").rpartition("/")
+                found.setdefault(key, {})[name] = np.array(value)
+        return found
 
     def _sweep(self) -> None:
         """Remove the files that a crash left: those of the running episode, and of one not counted yet."""
@@ -232,8 +247,13 @@ _ARROW = {"float64": "float64", "float32": "float32", "int64": "int64", "bool": 
 
 
 def _move(part: Path, path: Path) -> None:
-    """Rename a complete file to its name, after it has reached the disk."""
+    """Rename a complete file to its name, after it has reached the disk; its name has when this returns."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with part.open("rb") as file:
         os.fsync(file.fileno())
     os.replace(part, path)
+    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)

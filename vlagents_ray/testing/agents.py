@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+import sys
+import threading
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -17,6 +22,11 @@ from vlagents_ray.testing.observations import random_observation
 from vlagents_ray.validation import check_action
 
 _SESSIONS = 3
+_THREADS = 4  # as many prepare observations in a server
+_ROUNDS = 20  # acts beside those threads, each after `_RESETS` resets
+_RESETS = 15  # since a reset is short, few of them coincide with a preparation
+_LONGEST_S = 5.0  # time after which a slow agent, whose other threads compete with it, makes no further act
+_SWITCH_S = 1e-5  # time after which Python lets another thread run, so that more of them interleave
 
 
 def check_agent(
@@ -32,13 +42,15 @@ def check_agent(
 
     Three sessions, copies of the initialized agent, run with an observation, an instruction and a seed each: one after
     the other, then in turn, with prepared observations, then in batches of 1, 2 and 3. Their actions must not depend on
-    the other sessions, nor on whether `prepare` was called. If the agent gives parts, those of its chunks must be the
-    same in a batch, and be what `act` returns if its `act_parts` are "exact".
+    the other sessions, nor on whether `prepare` was called. If the agent defines `prepare`, several threads call it
+    while sessions are reset and acted on, as in a server, and every result must be that of one thread. If the agent
+    gives parts, those of its chunks must be the same in a batch, and be what `act` returns if its `act_parts` are
+    "exact".
 
     Args:
         agent: The agent, not initialized yet.
         obs: The observations of the sessions, in turn; by default random values that fit the contract.
-        instructions: The instructions of the sessions, in turn.
+        instructions: The instructions of the sessions, in turn; give some that the policy knows, if it parses them.
         reset_kwargs: Further arguments of each `reset`, beside `seed`.
         steps: The number of calls of `act` in a session.
         atol: The largest difference between an action in a batch and the same action of a session alone.
@@ -83,6 +95,7 @@ def check_agent(
                     f"act {step} of session {i} on a prepared observation",
                     "`prepare` must compute what `act` computes without it",
                 )
+        _check_threads(suite, [acts[0] for acts in alone])
     for size in range(1, _SESSIONS + 1):
         batch = [suite.begin(i) for i in range(size)]
         for step in range(steps):
@@ -103,6 +116,41 @@ def check_agent(
             raise ContractViolation(
                 f"close: the {attempt} call raised {error!r}; it must be safe to call twice"
             ) from error
+
+
+def _check_threads(suite: _Suite, first: list[Act]) -> None:
+    """Check that threads may prepare observations while sessions are reset and acted on, whose acts are `first`."""
+    sessions = [suite.begin(i) for i in range(_SESSIONS)]
+    serial = [suite.prepare(i, session) for i, session in enumerate(sessions)]
+    ended = threading.Event()
+    cure = suite.cure = (
+        "a server calls `prepare` on several threads, also while others are reset and acted on: change nothing in it "
+        "that sessions share, such as a tokenizer's padding; compute tokens in `reset`, or hold a lock"
+    )
+
+    def prepare(number: int) -> None:
+        while not ended.is_set():
+            i = number % _SESSIONS
+            require_same(serial[i], suite.prepare(i, sessions[i]), f"prepare of session {i} on a thread", cure)
+
+    with ThreadPoolExecutor(_THREADS) as threads:
+        running = [threads.submit(prepare, number) for number in range(_THREADS)]
+        usual = sys.getswitchinterval()
+        sys.setswitchinterval(_SWITCH_S)
+        try:
+            begun = time.monotonic()
+            for number in range(_ROUNDS):
+                if number >= _SESSIONS and time.monotonic() - begun > _LONGEST_S:
+                    break
+                i = number % _SESSIONS
+                *_, session = (suite.begin(i) for _ in range(_RESETS))
+                found = suite.act(i, session, prepared=number % 2 == 0)
+                require_same(first[i], found, f"act of session {i} while threads prepare", cure)
+        finally:
+            sys.setswitchinterval(usual)
+            ended.set()
+    for one in running:
+        one.result()
 
 
 def _check_parts(suite: _Suite, whole: list[list[Act]] | None, steps: int, atol: float) -> None:
@@ -140,6 +188,10 @@ class _Suite:
         self._views = views
         self._instructions = instructions
         self._reset_kwargs = reset_kwargs
+        self.cure = (  # of errors that the agent raises
+            "if the policy parses its instructions or takes only some observations, give "
+            "check_agent(…, instructions=[…], obs=[…]) those that it knows"
+        )
 
     def begin(self, i: int) -> Agent:
         """Begin session `i`: copy the agent except for its shared objects, and reset the copy."""
@@ -153,7 +205,8 @@ class _Suite:
             ) from error
         obs = self._view(i)
         before = copy.deepcopy(obs)
-        info = session.reset(obs, self._instructions[i % len(self._instructions)], seed=i, **self._reset_kwargs)
+        with self._calling("reset", i):
+            info = session.reset(obs, self._instruction(i), seed=i, **self._reset_kwargs)
         require_same(before, obs, "the observation", "reset changed the caller's: work on a copy")
         if not isinstance(info, dict):
             raise ContractViolation(f"reset: got {type(info).__name__}, want a dict")
@@ -173,9 +226,16 @@ class _Suite:
     def act(self, i: int, session: Agent, *, prepared: bool = False) -> Act:
         obs = self._view(i)
         before = copy.deepcopy(obs)
-        act = session.act(replace(obs, prepared=session.prepare(obs)) if prepared else obs)
+        if prepared:
+            obs = replace(obs, prepared=self.prepare(i, session))
+        with self._calling("act", i):
+            act = session.act(obs)
         require_same(before, obs, "the observation", "act changed the caller's: work on a copy")
         return self._checked(act, "act")
+
+    def prepare(self, i: int, session: Agent) -> Any:
+        with self._calling("prepare", i):
+            return session.prepare(self._view(i))
 
     def act_batch(self, sessions: list[Agent]) -> list[Act]:
         views = [self._view(i) for i in range(len(sessions))]
@@ -207,6 +267,19 @@ class _Suite:
             rows = np.concatenate([part.rows() for part in own]) if len(own) > 1 else own[0].action
             joined.append(self._checked(replace(own[-1], action=rows), "act_stream"))
         return joined
+
+    @contextmanager
+    def _calling(self, method: str, i: int) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:
+            got = f"{method}: raised {error!r} for the instruction {self._instruction(i)!r}"
+            if method != "reset":
+                got += f" and the observation of session {i}"
+            raise ContractViolation(f"{got}, want no error; {self.cure}") from error
+
+    def _instruction(self, i: int) -> str:
+        return self._instructions[i % len(self._instructions)]
 
     def _view(self, i: int) -> Obs:
         return self._views[i % len(self._views)]

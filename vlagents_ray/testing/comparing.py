@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -43,7 +44,7 @@ def difference(a: object, b: object, where: str, atol: float = 0.0) -> str | Non
     """Describe the first difference between two values.
 
     Args:
-        a: A value: an `Obs`, an `Act`, an array, or a mapping or list of them.
+        a: A value: an `Obs`, an `Act`, an array or tensor, a dataclass, or a mapping or list of them.
         b: The other value.
         where: The values' name, for the description.
         atol: The largest difference of numbers in arrays that count as equal.
@@ -51,7 +52,9 @@ def difference(a: object, b: object, where: str, atol: float = 0.0) -> str | Non
     Returns:
         The description; None if the values are equal.
     """
-    a, b = _as_dict(a), _as_dict(b)
+    if a is b:
+        return None
+    a, b = _plain(a), _plain(b)
     if isinstance(a, np.ndarray) and isinstance(b, np.ndarray):
         return _array_difference(a, b, where, atol)
     if isinstance(a, Mapping) and isinstance(b, Mapping):
@@ -59,7 +62,7 @@ def difference(a: object, b: object, where: str, atol: float = 0.0) -> str | Non
             return f"{where} has {sorted(a)} once and {sorted(b)} the other time"
         found_inside = (difference(a[key], b[key], f"{where}[{key!r}]", atol) for key in a)
         return next((found for found in found_inside if found), None)
-    if isinstance(a, list) and isinstance(b, list):
+    if isinstance(a, (list, tuple)) and isinstance(b, (list, tuple)):
         if len(a) != len(b):
             return f"{where} has {len(a)} items once and {len(b)} the other time"
         in_items = (difference(x, y, f"{where}[{i}]", atol) for i, (x, y) in enumerate(zip(a, b, strict=True)))
@@ -67,11 +70,18 @@ def difference(a: object, b: object, where: str, atol: float = 0.0) -> str | Non
     return None if type(a) is type(b) and a == b else f"{where} is {a!r} once and {b!r} the other time"
 
 
-def _as_dict(value: object) -> object:
-    if isinstance(value, Obs):
-        return {name: getattr(value, name) for name in ("cameras", "gripper", "state", "info")}
+def _plain(value: object) -> object:
+    """Return arrays for tensors and images, and dictionaries for objects that have attributes but no equality."""
     if isinstance(value, Act):  # without its info, which may contain times
         return {"action": value.action, "done": value.done}
+    if isinstance(value, Obs):
+        return {name: getattr(value, name) for name in ("cameras", "gripper", "state", "info")}
+    if is_dataclass(value) and not isinstance(value, type):
+        return {part.name: getattr(value, part.name) for part in fields(value)}
+    if hasattr(value, "__array__") and not isinstance(value, (np.ndarray, np.generic)):
+        return np.asarray(value.float() if "bfloat16" in str(getattr(value, "dtype", "")) else value)  # type: ignore[attr-defined]
+    if type(value).__eq__ is object.__eq__ and hasattr(value, "__dict__"):
+        return vars(value)
     return value
 
 

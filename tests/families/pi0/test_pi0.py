@@ -175,6 +175,11 @@ def test_a_long_instruction_is_refused_and_not_cut_off(loaded: Pi0) -> None:
         copy.copy(loaded).reset(seen(0), "pick up the cube " * 20)
 
 
+def test_an_instruction_with_the_token_of_an_image_is_refused(loaded: Pi0) -> None:
+    with pytest.raises(InvalidObservation, match="it stands for an image"):
+        copy.copy(loaded).reset(seen(0), "pick up the <image>")
+
+
 def test_a_camera_that_is_not_there_is_named(loaded: Pi0) -> None:
     obs = seen(0)
     del obs.cameras["wrist"]

@@ -7,6 +7,7 @@ import hashlib
 import json
 import logging
 import os
+import queue
 import stat
 import tempfile
 import threading
@@ -17,7 +18,10 @@ from typing import Any
 import pytest
 from eval_fakes import wait_for
 
+from vlagents_ray import Obs
 from vlagents_ray.errors import ConfigError, Forbidden, TooManyRequests, Unauthorized
+from vlagents_ray.policies.noop import Noop
+from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.access import api_keys, audit, key_store
 from vlagents_ray.serve.access.api_keys import (
     Keys,
@@ -31,6 +35,8 @@ from vlagents_ray.serve.access.key_store import (
     read_keys,
     revoke,
 )
+from vlagents_ray.serve.engine.dispatch import Dispatcher
+from vlagents_ray.serve.engine.engine import Engine
 
 
 @pytest.fixture
@@ -424,6 +430,22 @@ def test_the_audit_log_says_which_key_did_what_and_not_each_time(
     caller.note("reset session", repr("robot-2"))
     assert caplog.records[-1].getMessage() == "key arm: reset session 'robot-2' (49 more like this since the last line)"
     assert token not in caplog.text
+
+
+def test_a_reset_stands_in_the_audit_log_with_its_key_and_its_session(
+    file: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO", audit.LOG)
+    token = new_key(file, "arm")
+    caller = Keys.from_file(file).check(token, "noop")
+    engine = Engine(Noop.from_config({}))
+    engine.start()
+    answered: queue.SimpleQueue[list[Reply]] = queue.SimpleQueue()
+    Dispatcher(engine, "http", "robot-1", connected=False, caller=caller).send([Request("reset", Obs())], answered.put)
+    [reply] = answered.get(timeout=30)
+    engine.close()
+    assert reply.error is None
+    assert "key arm: reset session 'robot-1'" in [record.getMessage() for record in caplog.records]
 
 
 def test_a_replica_writes_the_audit_log_where_nobody_has_set_up_logging(

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 from ray.serve.schema import ServeDeploySchema
 
 from vlagents_ray.errors import PolicyUnavailable
+from vlagents_ray.serve.access.key_store import new_key
+from vlagents_ray.serve.launch import server
 from vlagents_ray.serve.launch.deployment_file import deployment, together, with_settings
 from vlagents_ray.serve.launch.serve_client import wait_for_proxies
 from vlagents_ray.serve.launch.server import _deploy
@@ -100,3 +103,31 @@ def test_proxies_that_never_listen_are_an_error(monkeypatch: pytest.MonkeyPatch,
     monkeypatch.setattr("vlagents_ray.serve.launch.serve_client.proxy_timeout_s", lambda: 0.0)
     with pytest.raises(PolicyUnavailable, match="proxies do not listen within 0 s"):
         wait_for_proxies([], list)
+
+
+ANYWHERE = "0.0.0.0"  # noqa: S104 - what is warned of
+
+
+@pytest.mark.parametrize(
+    ("host", "plain", "warned"), [(ANYWHERE, False, True), (ANYWHERE, True, False), ("127.0.0.1", False, False)]
+)
+def test_a_server_whose_keys_cross_a_network_unencrypted_warns(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    host: str,
+    plain: bool,
+    warned: bool,
+) -> None:
+    new_key(tmp_path / "keys", "arm")
+
+    def no_ray(*_: object) -> None:
+        raise PolicyUnavailable("this test starts no Ray")
+
+    monkeypatch.setattr(server, "_ray", no_ray)
+    with (
+        pytest.raises(PolicyUnavailable, match="no Ray"),
+        server.running_server(deployment("noop"), host=host, keys_file=tmp_path / "keys", plain_http=plain),
+    ):
+        pass
+    assert ("--plain-http" in caplog.text) == warned

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from eval_fakes import wait_for
 
-from vlagents_ray.errors import PolicyUnavailable
+from vlagents_ray.errors import PolicyFailed, PolicyUnavailable
 from vlagents_ray.interface import Act, Agent, Obs
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
@@ -120,12 +120,22 @@ def test_the_policy_prepares_itself_what_has_not_begun(serving: Callable[[int], 
     assert [text.partition(":")[0] for text in found] == one.names[1:]
 
 
-def test_an_observation_that_cannot_be_prepared_goes_to_the_policy_as_it_is(serving: Callable[[int], Serving]) -> None:
-    one = serving(2)
+@pytest.mark.parametrize("sessions", [3, 16], ids=["on another thread", "on the policy's thread"])
+def test_an_error_of_a_preparation_is_that_of_its_request_alone(
+    serving: Callable[[int], Serving], caplog: pytest.LogCaptureFixture, sessions: int
+) -> None:
+    one, begun = serving(sessions), threading.Event()
+    others = [one.submit(name, "act", begun=begun) for name in one.names[1:-1]]
+    assert begun.wait(30)
+    answer = one.submit(one.names[-1], "act", wrong=True)
     one.agent.gates["prepare"].set()
-    answer = one.submit("s1", "act", wrong=True)
     one.agent.gates["act"].set()
-    assert prepared(answer) is None
+    error = answer.get(timeout=30).error
+    assert isinstance(error, PolicyFailed)
+    assert "the policy raised ValueError" in str(error)
+    assert "not an observation" in caplog.text
+    assert [prepared(other).partition(":")[0] for other in others] == one.names[1:-1]
+    prepared(one.submit(one.names[-1], "act"))  # its session goes on
 
 
 def test_what_was_prepared_for_the_episode_before_is_not_used(serving: Callable[[int], Serving]) -> None:

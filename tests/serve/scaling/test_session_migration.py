@@ -390,6 +390,35 @@ def test_an_act_whose_deadline_passed_while_its_session_was_fetched_is_not_execu
     assert obeys(b) == ("episode 1", 1)
 
 
+def test_an_act_whose_client_has_gone_while_its_session_was_fetched_is_not_executed(
+    replicas: Callable[[int], Replicas], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    served = replicas(2)
+    a, b = served.engines
+    ask(a, "reset", instruction="episode 1")
+    release, adopting = threading.Event(), threading.Event()
+    prepare = b.transfer.prepare
+
+    def slow(*args: Any) -> Any:
+        adopting.set()
+        assert release.wait(20)
+        return prepare(*args)
+
+    monkeypatch.setattr(b.transfer, "prepare", slow)
+
+    async def go() -> None:
+        sender = Dispatcher(b, "http", "robot-1", connected=False, caller=NoKey.OPEN)
+        asked = asyncio.create_task(sender.ask([Request("act", Obs())]))  # without a deadline
+        assert await asyncio.to_thread(adopting.wait, 20)
+        asked.cancel()
+        await asyncio.wait([asked])
+        release.set()
+
+    asyncio.run(go())
+    wait_for(lambda: "robot-1" in b.sessions)
+    assert [obeys(b) for _ in range(3)] == [("episode 1", 1), ("episode 1", 2), ("episode 1", 3)]
+
+
 def test_an_act_that_was_begun_before_its_deadline_is_said_to_be(replicas: Callable[[int], Replicas]) -> None:
     engine = replicas(1).engines[0]
     ask(engine, "reset", instruction="episode 1")

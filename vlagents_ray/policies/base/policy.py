@@ -58,6 +58,7 @@ class PolicyEpisode:
     plan: ChunkBuffer  # the actions still to be returned, where single ones are
     memory: dict[str, Any] = field(default_factory=dict)
     adapter: str = ""  # fingerprint of its adapter; empty: none
+    prompt: Any = None  # the instruction's tokens, of families that compute them when the episode begins
 
 
 class ModelPolicy(Agent, abc.ABC):

@@ -7,8 +7,9 @@ import copy
 import importlib.util
 import json
 import os
+import threading
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,9 @@ class Gr00tNetwork:
     model: Any
     processor: Any
     embodiment: Embodiment
+    # Held while the processor reads an observation, as several threads do: its transforms keep their parameters, and
+    # it changes the filters of warnings of the whole process.
+    reading: threading.Lock = field(default_factory=threading.Lock, repr=False, compare=False)
 
     @classmethod
     def load(cls, config: Gr00tConfig) -> Gr00tNetwork:
@@ -111,7 +115,8 @@ class Gr00tNetwork:
             text=instruction,
             embodiment=robot,
         )
-        processed = self.processor([{"type": types.MessageType.EPISODE_STEP.value, "content": step}])
+        with self.reading:
+            processed = self.processor([{"type": types.MessageType.EPISODE_STEP.value, "content": step}])
         return {"processed": processed, "raw": raw}
 
     def chunks(

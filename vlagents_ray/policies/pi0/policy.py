@@ -167,36 +167,49 @@ class Pi0(StreamingPolicy):
                 f"serve that as a checkpoint of its own"
             )
 
-    def reset(self, obs: Obs, instruction: str | None, **kwargs: Any) -> dict[str, Any]:
-        """Begin an episode; an instruction longer than in training is refused, not truncated."""
-        info = super().reset(obs, instruction, **kwargs)
-        if self.model is not None:
-            tokens = len(self.model.processor.tokenizer(f"{instruction}\n")["input_ids"]) + 1  # the first is BOS
-            if tokens > self.config.max_tokens:
-                raise InvalidObservation(
-                    f"instruction: got {tokens} tokens, want at most {self.config.max_tokens}, as in training; "
-                    f"shorten it, or set the policy's max_tokens"
-                )
-        return info
-
     def perceive(self, obs: Obs) -> dict[str, Any]:
-        """Return the model's inputs for one row, on the CPU, padded to the longest allowed instruction."""
-        model = self._loaded()
-        side = model.processor.image_processor.pad_size
+        """Return the model's inputs for one row, on the CPU: images, state, and the episode's tokens.
+
+        It is called on several threads, and so never uses the tokenizer: padding is a state of that.
+        """
+        processor = self._loaded().processor
+        torch, side = require("torch"), processor.image_processor.pad_size
         found = camera_images(obs, self.cameras)
-        return dict(
-            model.processor(
-                images=[[resize_with_pad(found[name], side["height"], side["width"]) for name in self.cameras]],
-                text=[self._begun().instruction],
-                state=state_vector(obs, self.state, self.state_dim)[None],
-                text_kwargs={
-                    "padding": "max_length",
-                    "max_length": self.config.max_tokens + len(self.cameras) * model.processor.image_seq_length,
-                    "padding_side": "right",
-                    "return_tensors": "pt",
-                },
-            )
+        images = [resize_with_pad(found[name], side["height"], side["width"]) for name in self.cameras]
+        state = torch.zeros(1, processor.max_state_dim)
+        values = state_vector(obs, self.state, self.state_dim)
+        state[0, : len(values)] = processor.normalize(torch.from_numpy(values), "state")
+        return {
+            **self._begun().prompt,
+            "pixel_values": processor.image_processor(images, return_tensors="pt")["pixel_values"][None],
+            "pixel_attention_mask": torch.ones(1, len(images), dtype=torch.bool),
+            "state": state,
+        }
+
+    def _begin(self, instruction: str, seed: int, adapter: str = "") -> None:
+        """Begin an episode, with its tokens; an instruction longer than in training is refused, not truncated."""
+        super()._begin(instruction, seed, adapter)
+        if self.model is None:
+            return
+        processor, most = self.model.processor, self.config.max_tokens
+        patches = len(self.cameras) * processor.image_seq_length
+        tokens = processor.tokenizer(
+            [f"{processor.image_token * patches}{processor.tokenizer.bos_token}{instruction}\n"],
+            padding="max_length",
+            max_length=patches + most,
+            padding_side="right",
+            return_tensors="pt",
         )
+        if (got := int(tokens["attention_mask"].sum()) - patches) > most:
+            raise InvalidObservation(
+                f"instruction: got {got} tokens, want at most {most}, as in training; shorten it, or set the policy's "
+                f"max_tokens"
+            )
+        if int((tokens["input_ids"] == processor.image_token_id).sum()) != patches:
+            raise InvalidObservation(
+                f"instruction: got {processor.image_token!r} in {instruction!r}, want words; it stands for an image"
+            )
+        self._begun().prompt = dict(tokens)
 
     def predict(self, rows: Sequence[Row]) -> list[Prediction]:
         """Compute the chunks of all rows with one flow, and the images and instructions of each observation once."""

@@ -10,7 +10,6 @@ from vlagents_ray.serve.engine.metrics_buffer import MetricsBuffer
 from vlagents_ray.serve.engine.responses import build_reply, timing
 from vlagents_ray.serve.models.loaded_model import LoadedModel
 from vlagents_ray.serve.queue.batch_queue import BatchQueue, PendingRequest
-from vlagents_ray.serve.queue.preparation import Preparations
 from vlagents_ray.serve.sessions import Session, SessionTable
 from vlagents_ray.serve.weights.versions import WeightsVersion
 
@@ -37,8 +36,8 @@ class ActStreams:
         self._batch_sizes = batch_sizes
         self._reply_bytes = reply_bytes
 
-    def run(self, model: LoadedModel, weights: WeightsVersion, acting: Sequence[Acting]) -> None:
-        """Answer the act requests of sessions with one version of one model's weights.
+    def run(self, model: LoadedModel, weights: WeightsVersion, acting: Sequence[Acting], prepared_s: float) -> None:
+        """Answer the act requests of sessions with one version of one model's weights; see `Engine` for `prepared_s`.
 
         An act counts as one step, with its last part. One that fails later than with its first part is answered with
         the error after the parts so far. The policy stops early if no caller is left.
@@ -56,7 +55,7 @@ class ActStreams:
             ticket, session = acting[i]
             more = isinstance(part, Act) and part.more
             reply = build_reply(ticket, session, part, model.contract, left_bytes[i], weights.info, more=more)
-            reply.timing = timing(ticket.arrived, call.began, self._clock())
+            reply.timing = timing(ticket.arrived, call.began - prepared_s, self._clock())
             reply.timing["batch_size"] = len(acting)
             if more and reply.act is not None:
                 left_bytes[i] -= reply.act.action.nbytes
@@ -69,8 +68,6 @@ class ActStreams:
             with model.busy, call:
                 model.require_open()
                 model.parameters.use(weights)
-                if self._queue.window.slow:
-                    Preparations.finish([(ticket.preparation, session.agent) for ticket, session in acting])
                 stream = model.agent.act_batch_stream(observations, agents)  # type: ignore[arg-type]
                 del observations  # they may lie in memory that their sender needs back
                 for ticket, _ in acting:

@@ -281,7 +281,11 @@ class Engine:
                 ticket.begun = ticket.begun and ticket.request.op != "act"  # the policy has not received this act
                 ticket.answer(Reply(ticket.request.request_id, error=public_error(error, ticket)))
         for (model, weights, in_parts), group in acting.items():
-            (self._streams.run if in_parts else self._act)(model, weights, group)
+            prepared_s = 0.0
+            if self.queue.window.slow:
+                group, prepared_s = self._prepared(model, group)  # noqa: PLW2901 - without those that failed
+            if group:
+                (self._streams.run if in_parts else self._act)(model, weights, group, prepared_s)
 
     def _ready(self, ticket: PendingRequest) -> tuple[Session[LoadedModel], LoadedModel, WeightsVersion]:
         session = self.sessions.get(ticket.session_id)
@@ -305,7 +309,24 @@ class Engine:
         ticket.request.obs = None
         ticket.answer(Reply(ticket.request.request_id, info={}))
 
-    def _act(self, model: LoadedModel, weights: WeightsVersion, acting: list[Acting]) -> None:
+    def _prepared(self, model: LoadedModel, acting: list[Acting]) -> tuple[list[Acting], float]:
+        """Finish the preparations of observations, and answer the requests whose preparation failed.
+
+        Returns:
+            The other requests, and the time that this took, s, which counts as inference.
+        """
+        preparations = [(ticket.preparation, session.agent) for ticket, session in acting]
+        if all(preparation is None for preparation, _ in preparations):
+            return acting, 0.0
+        with model.busy, model.call("act", "prepare") as call:
+            errors = {} if model.closed else Preparations.finish(preparations)
+        for place, error in errors.items():
+            ticket = acting[place][0]
+            ticket.request.obs = None
+            ticket.answer(Reply(ticket.request.request_id, error=public_error(error, ticket)))
+        return [one for place, one in enumerate(acting) if place not in errors], call.ended - call.began
+
+    def _act(self, model: LoadedModel, weights: WeightsVersion, acting: Sequence[Acting], prepared_s: float) -> None:
         """Answer the act requests of sessions with one version of one model's weights."""
         observations = [ticket.request.obs for ticket, _ in acting]
         agents = [session.agent for _, session in acting]
@@ -316,8 +337,6 @@ class Engine:
             with model.busy, call:
                 model.require_open()
                 model.parameters.use(weights)
-                if self.queue.window.slow:
-                    Preparations.finish([(ticket.preparation, session.agent) for ticket, session in acting])
                 results: Sequence[Act | Exception] = model.agent.act_batch(observations, agents)  # type: ignore[arg-type]
                 synchronise()
             if len(results) != rows:
@@ -334,7 +353,7 @@ class Engine:
         unsent = []
         for (ticket, session), result in zip(acting, results, strict=True):
             reply = build_reply(ticket, session, result, model.contract, self._reply_bytes, weights.info)
-            reply.timing = timing(ticket.arrived, call.began, call.ended)
+            reply.timing = timing(ticket.arrived, call.began - prepared_s, call.ended)
             reply.timing["batch_size"] = len(acting)
             if defer and ticket.rank is not Rank.ROBOT:
                 unsent.append((ticket, reply))

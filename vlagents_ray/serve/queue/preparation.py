@@ -6,15 +6,12 @@ the last one. So a robot whose request comes last does not wait for the preparat
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
 from vlagents_ray.images import cpu_affinity
 from vlagents_ray.interface import Agent, Obs
-
-logger = logging.getLogger(__name__)
 
 _THREADS = 4  # at most; images are resized without Python's lock
 
@@ -35,14 +32,11 @@ class Preparation:
     def finish(self, agent: Agent | None, *, begun: bool) -> None:
         """Wait for the result, if it has `begun`, else compute it here; it is set only if `agent` is the session's.
 
-        An error is raised by `act`, which then does the same without a preparation.
+        Raises:
+            Exception: Any error of the agent's `prepare`.
         """
-        if agent is not self._agent:  # the session was reset meanwhile
-            return
-        try:
+        if agent is self._agent:  # otherwise the session was reset meanwhile
             self._obs.prepared = self._future.result() if begun else self._agent.prepare(self._obs)
-        except Exception:
-            logger.debug("an observation could not be prepared", exc_info=True)
 
 
 class Preparations:
@@ -61,16 +55,29 @@ class Preparations:
             return None
 
     @staticmethod
-    def finish(preparations: Sequence[tuple[Preparation | None, Agent | None]]) -> None:
-        """Return when the observations of a batch are prepared. Called on the policy's thread."""
+    def finish(preparations: Sequence[tuple[Preparation | None, Agent | None]]) -> dict[int, Exception]:
+        """Return when the observations of a batch are prepared, with the errors by their places in the batch.
+
+        Called on the policy's thread.
+        """
+        errors: dict[int, Exception] = {}
+
+        def finish(place: int, *, begun: bool) -> None:
+            preparation, agent = preparations[place]
+            try:
+                preparation.finish(agent, begun=begun)  # type: ignore[union-attr]
+            except Exception as error:  # noqa: BLE001 - fails the request of that observation
+                errors[place] = error
+
         begun = []
-        for preparation, agent in reversed(preparations):
+        for place, (preparation, _) in reversed(list(enumerate(preparations))):
             if preparation is not None and preparation.cancel():
-                preparation.finish(agent, begun=False)
+                finish(place, begun=False)
             elif preparation is not None:
-                begun.append((preparation, agent))
-        for preparation, agent in begun:
-            preparation.finish(agent, begun=True)
+                begun.append(place)
+        for place in begun:
+            finish(place, begun=True)
+        return errors
 
     def close(self) -> None:
         """End the threads after the preparations that they have begun."""
