@@ -66,8 +66,7 @@ class ActStreams:
                 ticket.answer(reply)
 
         try:
-            with model.busy, call:
-                model.require_open()
+            with model.running(call):
                 model.parameters.use(weights)
                 if self._queue.window.slow:
                     Preparations.finish([(ticket.preparation, session.agent) for ticket, session in acting])
@@ -89,6 +88,7 @@ class ActStreams:
             failure, padded = error, [error] * padding
         for i, (ticket, _) in list(waiting.items()):
             send(i, failure or self._unfinished(ticket))
+        model.calls.record_batch([failure] if failure else [None])
         model.padding.check_results(padded)
         self._stats.batch(len(acting), rows)
 
