@@ -23,26 +23,33 @@ class CaptureLock:
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._acting = 0
+        self._acting: set[int] = set()  # threads
         self._capturing = False  # or about to
         self.pushes = threading.RLock()  # the context of a push, within which its thread may also act
 
     @contextmanager
     def act(self) -> Iterator[None]:
-        """Wait for the end of a capture; none begins within this context."""
+        """Wait for the end of a capture; none begins within this context, which a thread does not enter twice."""
+        thread = threading.get_ident()
         with self._changed:
             self._changed.wait_for(lambda: not self._capturing)
-            self._acting += 1
+            self._acting.add(thread)
         try:
             yield
         finally:
             with self._changed:
-                self._acting -= 1
+                self._acting.discard(thread)
                 self._changed.notify_all()
 
     @contextmanager
     def capture(self) -> Iterator[None]:
-        """Wait for running acts and pushes; none begins within this context."""
+        """Wait for running acts and pushes; none begins within this context.
+
+        Raises:
+            RuntimeError: This thread acts itself.
+        """
+        if threading.get_ident() in self._acting:
+            raise RuntimeError("a CUDA graph cannot be captured within an act; capture it in Agent.initialize")
         with self.pushes:
             try:
                 with self._changed:
