@@ -1,8 +1,8 @@
 """A CUDA of two devices on a CPU: streams, graphs and errors as torch has them, for tests without a GPU.
 
-A tensor of `FakeCuda.tensor` computes on the CPU and says that it is on a GPU. While a graph is captured, the operations
-of its stream are recorded, and their results are then overwritten, as a capture computes nothing; a replay computes them
-again from the same tensors. The rules are CUDA's, or stricter:
+A tensor of `FakeCuda.tensor` computes on the CPU and says that it is on a GPU. While a graph is captured, the
+operations of its stream are recorded, and their results are then overwritten, as a capture computes nothing; a replay
+computes them again from the same tensors. The rules are CUDA's, or stricter:
 
 - A capture fails, on both threads, if another thread waits for its device or makes a tensor there.
 - An operation on another stream or device than the captured one runs at once and is not recorded.
@@ -24,7 +24,9 @@ import pytest
 import torch
 from torch.utils._pytree import tree_leaves, tree_map
 
-_EMPTY = "The CUDA Graph is empty. This usually means that the graph was attempted to be captured on wrong device or stream."
+_EMPTY = (
+    "The CUDA Graph is empty. This usually means that the graph was attempted to be captured on wrong device or stream."
+)
 _GARBAGE = 55  # in memory that a capture has not written
 
 
@@ -125,7 +127,9 @@ class FakeCuda:
             self._streams()[stream.index] = before
 
     @contextmanager
-    def _graph(self, capture: Capture, stream: Stream | None = None, capture_error_mode: str = "global") -> Iterator[None]:
+    def _graph(
+        self, capture: Capture, stream: Stream | None = None, capture_error_mode: str = "global"
+    ) -> Iterator[None]:
         self._capture_stream = self._capture_stream or Stream(self, self._index(None))
         capture.stream = stream or self._capture_stream
         self.synchronize()
