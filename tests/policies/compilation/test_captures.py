@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import queue
 import threading
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -13,10 +13,13 @@ import torch
 from fake_cuda import FakeCuda
 
 from vlagents_ray import Obs
-from vlagents_ray.errors import ConfigError
+from vlagents_ray.contract import ActionSpec, Contract
+from vlagents_ray.errors import ConfigError, PolicyFailed, PolicyUnavailable
 from vlagents_ray.interface import Act, Agent
+from vlagents_ray.policies.base import ModelConfig, ModelPolicy, Prediction, Row
 from vlagents_ray.policies.compilation import Compilation
 from vlagents_ray.policies.compilation.cuda_graph import CAPTURES, CudaGraph
+from vlagents_ray.policies.loading import report_device
 from vlagents_ray.protocol.messages import Reply, Request
 from vlagents_ray.serve.engine.engine import Engine
 from vlagents_ray.serve.weights.versions import ModelWeights
@@ -217,3 +220,67 @@ def test_a_capture_that_waits_for_a_push_delays_no_act_and_is_not_starved_by_act
 def test_a_capture_may_not_begin_within_an_act_of_its_thread(cuda: FakeCuda) -> None:
     with CAPTURES.act(), pytest.raises(RuntimeError, match="within an act"):
         CudaGraph(lambda x: x.tanh(), [numbers(cuda)])
+
+
+class OnGpu(ModelPolicy):
+    """A model on the fake GPU, whose actions are a linear layer of noise."""
+
+    Config = ModelConfig
+    cuda: ClassVar[FakeCuda]
+
+    @property
+    def contract(self) -> Contract:
+        return Contract(action=ActionSpec(dim=DIM), chunk=self.chunk(1))
+
+    def load(self) -> Any:
+        report_device({"kind": "cuda"})
+        w = self.cuda.tensor(torch.eye(DIM))
+        self.core = self.compilation.core("layer", lambda x: x @ w)
+        return {}
+
+    def perceive(self, obs: Obs) -> None:
+        return None
+
+    def predict(self, rows: Sequence[Row]) -> list[Prediction | Exception]:
+        noise = self.cuda.tensor(torch.from_numpy(np.stack([row.noise(1, DIM)[0] for row in rows])))
+        with torch.inference_mode():
+            chunks = self.core(noise)
+        torch.cuda.current_stream().synchronize()
+        return [Prediction(chunk[None]) for chunk in chunks.values.numpy()]
+
+
+def test_a_model_on_a_gpu_acts_from_graphs_in_less_memory_and_until_the_gpu_fails(cuda: FakeCuda) -> None:
+    OnGpu.cuda = cuda
+    policy = OnGpu.from_config({"checkpoint": "none", "compile": "require", "batch_sizes": [1, 2, 4]})
+    engine = Engine(policy)
+    engine.start()
+
+    def act(rows: int) -> list[Reply]:
+        replies: queue.SimpleQueue[Reply] = queue.SimpleQueue()
+        tickets = []
+        for op in ("reset", "act"):
+            tickets = [
+                engine.ticket(str(seed), Request(op, Obs(), "go", {"seed": seed} if op == "reset" else {}), replies.put)  # type: ignore[arg-type]
+                for seed in range(rows)
+            ]
+            engine.queue.put(*tickets)
+            found = [replies.get(timeout=10) for _ in tickets]
+        return found
+
+    def actions(replies: Sequence[Reply]) -> list[Any]:
+        return sorted(reply.act.action.tolist() for reply in replies if reply.act is not None)
+
+    try:
+        assert engine.models.devices == [{"kind": "cuda"}]
+        alone = actions(act(4))
+        assert len(alone) == 4
+        cuda.most_rows = 2
+        assert actions(act(4)) == alone
+        assert policy.most_rows == 2
+        engine.check_health()
+        cuda.fail()
+        assert all(isinstance(reply.error, PolicyFailed) for reply in act(4))
+        with pytest.raises(PolicyUnavailable, match="device-side assert"):
+            engine.check_health()
+    finally:
+        engine.close()
