@@ -198,17 +198,22 @@ def test_a_batch_that_does_not_fit_is_halved_and_acts_as_if_it_had(
     emptied: list[bool] = []
     monkeypatch.setattr(torch.cuda, "is_initialized", lambda: True)
     monkeypatch.setattr(torch.cuda, "empty_cache", lambda: emptied.append(True))
-    for samples in (0, 3):
-        for one, other in zip(acted(policy, 5, samples), acted(made(Roomy), 5, samples), strict=True):
-            np.testing.assert_array_equal(one.action, other.action)
-            if samples:
-                np.testing.assert_array_equal(one.info[DISTRIBUTION]["samples"], other.info[DISTRIBUTION]["samples"])
-        if not samples:
-            assert policy.model["passes"] == passes
-            assert emptied
-            policy.model["passes"].clear()
-            acted(policy, 5)
-            assert policy.model["passes"] == later
+    acts = acted(policy, 5)
+    assert (policy.model["passes"], len(emptied)) == (passes, 1)
+    policy.model["passes"].clear()
+    acted(policy, 5)
+    assert policy.model["passes"] == later
+    for one, other in zip(acts, acted(made(Roomy), 5), strict=True):
+        np.testing.assert_array_equal(one.action, other.action)
+
+
+def test_samples_that_do_not_fit_are_those_that_would_have_fitted() -> None:
+    policy = made(Crowded, max_rows=3)
+    policy.config = policy.config.model_copy(update={"max_rows": 64})
+    for one, other in zip(acted(policy, 2, samples=6), acted(made(Roomy), 2, samples=6), strict=True):
+        np.testing.assert_array_equal(one.action, other.action)
+        np.testing.assert_array_equal(one.info[DISTRIBUTION]["samples"], other.info[DISTRIBUTION]["samples"])
+    assert policy.most_rows == 3
 
 
 def test_one_row_that_does_not_fit_is_an_error_and_counted(monkeypatch: pytest.MonkeyPatch) -> None:

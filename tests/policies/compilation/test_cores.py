@@ -251,6 +251,24 @@ def test_a_program_that_keeps_an_input_of_its_first_call_is_not_used(
     torch._dynamo.reset()
 
 
+def test_a_program_is_not_made_with_the_inputs_with_which_it_is_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    kept: list[Any] = []
+
+    def stale(graph: Any, examples: Sequence[Any]) -> Callable[..., Any]:
+        def program(*inputs: Any) -> Any:
+            kept.extend([] if kept else [graph(*inputs)])
+            return kept[0]
+
+        return program
+
+    monkeypatch.setattr(Compilation, "backend", staticmethod(stale))
+    compilation, always = Compilation("require"), torch.ones(2, 3)
+    core = compilation.core("sum", lambda numbers: numbers.sum(-1))
+    with pytest.raises(ConfigError, match="'sum': its results are off by"):
+        compilation.add_size(2, lambda: core(always))
+    torch._dynamo.reset()
+
+
 def test_each_comparison_has_inputs_of_its_own(compiler: CountingCompiler) -> None:
     """A program that is right once, for the inputs after which it was made, is not used."""
     right = iter([True, True])  # the first call, and the first comparison

@@ -140,7 +140,11 @@ class Core:
         return wanted
 
     def _compiled(self, tensors: Sequence[Any]) -> Callable[..., Any]:
-        """Return the program for tensors of these shapes, made with other values than those of any comparison."""
+        """Return the program for tensors of these shapes.
+
+        It is made with other values than those of a comparison: a CUDA graph that missed a part of the core returns the
+        results of the values with which it was captured.
+        """
         function, torch = self._function, require("torch")
         tensors = [torch.zeros_like(tensor) for tensor in tensors]
 

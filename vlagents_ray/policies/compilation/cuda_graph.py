@@ -77,14 +77,13 @@ class CudaGraph:
 
         Args:
             function: The function.
-            tensors: Arguments of the shapes of later calls, on one GPU. Their values are not used, so that the results
-                of a graph that misses a part of the function differ from those of the function.
+            tensors: Its arguments, on one GPU, whose values do not matter.
 
         Raises:
             RuntimeError: The function cannot be captured, or none of its work was.
         """
         torch = require("torch")
-        self._inputs, device = [torch.zeros_like(tensor) for tensor in tensors], tensors[0].device
+        self._inputs, device = [tensor.clone() for tensor in tensors], tensors[0].device
         # The stream is named, since torch's own one is on the device of the first capture of the process. The current
         # one is entered again, since `torch.cuda.graph` leaves its own if the capture fails.
         own, current = torch.cuda.Stream(device), torch.cuda.current_stream(device)
